@@ -19,6 +19,7 @@ from residnet.core.log import Log
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.data.windows import WindowStore
+from residnet.identification.currents import through_currents
 from residnet.identification.fit import fit
 from residnet.identification.prepared import prepare_logs, shortened
 from residnet.identification.settings import FitSettings
@@ -137,3 +138,37 @@ def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.Monkey
     few_rows = torch.arange(1000) < 100
     assert torch.equal(paged.taken(values, few_rows), values[few_rows])
     assert len(placed) == 2
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="pages are counted on Linux only")
+def test_a_look_at_each_item_holds_the_pages_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pages() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[2]) * mmap.PAGESIZE
+
+    def most(items: list[np.ndarray]) -> int:
+        paged.forget()
+        before, found = pages(), []
+        for item in items:
+            assert item[::512].sum() == 0.0
+            found.append(pages() - before)
+        return max(found)
+
+    # nobody else gives them back here
+    monkeypatch.setattr(paged, "_RESIDENT", 1 << 40)
+    size = 1 << 23
+    items = [paged.empty((size // 8,)) for _ in range(8)]
+    for item in items:
+        item[...] = 0.0
+    assert most(items) >= 6 * size
+    assert most(paged.OneByOne(items)) < 2.5 * size
+
+
+def test_prepared_logs_are_gone_through_one_by_one() -> None:
+    settings = validate(
+        {key: TINY[key] for key in ("prepare", "signals", "baseline", "evaluation")},
+        FitSettings,
+        "here",
+    )
+    prepared = prepare_logs(read_logs(validate(TINY["data"], SimulatedTrials, "here")), settings)
+    for logs in (prepared, through_currents(prepared, settings)[0]):
+        assert all(isinstance(members, paged.OneByOne) for members in logs.values())

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from residnet.core.arrays import paged
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import VELOCITIES
@@ -45,7 +46,7 @@ class Data:
         source: the `data` section of a config that the logs came from; None for others.
     """
 
-    splits: dict[str, list[Prepared]]
+    splits: Mapping[str, list[Prepared]]
     signals: SignalsConfig
     prepare: PrepareConfig
     evaluation: EvaluationConfig
@@ -190,7 +191,7 @@ def _prepared(
     done, total = 0, sum(map(len, splits.values()))
     out: dict[str, list[Prepared]] = {}
     for split, members in splits.items():
-        out[split] = []
+        out[split] = paged.OneByOne()
         for log in members:
             report("preparing logs", done, total)
             out[split].append(prepare_log(log, split, signals.columns, config))

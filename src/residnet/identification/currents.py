@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from residnet.baselines import RegressorBaseline
+from residnet.core.arrays import paged
 from residnet.core.progress import say
 from residnet.data.prepare import Prepared
 from residnet.identification.prepared import PreparedSplits
@@ -30,7 +31,7 @@ def through_currents(
     Raises:
         FitError: where the logs do not determine their currents.
     """
-    splits = {split: list(members) for split, members in logs.items()}
+    splits = {split: paged.OneByOne(members) for split, members in logs.items()}
     if settings.current is None:
         return splits, []
     signals = settings.signals.build()
@@ -41,7 +42,8 @@ def through_currents(
     moved = [through_water(log, value, signals) for log, value in zip(fitted, values, strict=True)]
     count = len(logs["train"])
     say(f"  {_summary(table)}")
-    return {**splits, "train": moved[:count], "validation": moved[count:]}, table
+    train, validation = paged.OneByOne(moved[:count]), paged.OneByOne(moved[count:])
+    return {**splits, "train": train, "validation": validation}, table
 
 
 def _summary(table: list[dict[str, Any]]) -> str:

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from residnet.core.arrays import paged
 from residnet.core.errors import DataError
 from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.log import Log
@@ -16,7 +17,7 @@ from residnet.identification.settings import FitSettings
 
 _LONGEST = 500_000
 """Samples of a log that are prepared at once."""
-PreparedSplits = dict[str, list[Prepared]]
+PreparedSplits = dict[str, paged.OneByOne[Prepared]]
 
 
 def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> PreparedSplits:
@@ -30,11 +31,11 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
         DataError: where a log has nothing to learn from or to predict.
     """
     prepared = {
-        split: [
+        split: paged.OneByOne(
             prepare(part, split, settings.signals.columns, settings.prepare)
             for log in logs
             for part in shortened(log)
-        ]
+        )
         for split, logs in splits.items()
     }
     for logs in prepared.values():

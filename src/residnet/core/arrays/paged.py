@@ -9,13 +9,15 @@ import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event, Lock, Thread
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from residnet.core.errors import DataError
+
+Item = TypeVar("Item")
 
 LARGE = 200_000
 """Samples of all logs together from which further ones are kept on disk."""
@@ -142,6 +144,20 @@ def row_pieces(count: int) -> Iterator[slice]:
     step = PIECE if count > LARGE else max(count, 1)
     for start in range(0, count, step):
         yield slice(start, min(start + step, count))
+
+
+class OneByOne(list[Item]):
+    """A list of items with arrays in files: on the way through, each item's pages are given back.
+
+    A loop that only looks at a few samples of each log reaches the pages of all logs sooner than
+    anyone else could notice.
+    """
+
+    def __iter__(self) -> Iterator[Item]:
+        """Yield the items; before each further one, no pages of arrays are held."""
+        for item in super().__iter__():
+            yield item
+            forget()
 
 
 def taken(values: Tensor, keep: Tensor) -> Tensor:

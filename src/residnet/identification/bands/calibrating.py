@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from residnet.core.arrays import paged
 from residnet.core.progress import say
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
@@ -50,7 +51,9 @@ def calibrate_bands(
     for protocol in identified.settings.evaluation.protocols:
         runs = _Calibration(identified, protocol, config, left_out.failed)
         for k, models in enumerate(refitted):
-            own = [log for log, number in zip(identified.train, fold, strict=True) if number == k]
+            own = paged.OneByOne(
+                log for log, number in zip(identified.train, fold, strict=True) if number == k
+            )
             runs.add(models, own, validation=False)
         runs.add({name: entry.model for name, entry in identified.items()}, validation, True)
         for name, band in runs.bands().items():
