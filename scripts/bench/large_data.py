@@ -1,12 +1,14 @@
 """Memory and time of fits on many samples: logs of a simulated boat, fitted by heads of each kind.
 
     python scripts/bench/large_data.py [--samples 1000000 10000000] [--logs 1000] [--folder DIR]
+        [--in-memory]
 
 The logs (10 Hz, twin propellers, random steps of both, sensor noise) are written as canonical
 Parquet files; four logs of 10,000 samples for validation and test stand beside them. Each head is
 fitted by a run of its own, in a process of its own: PLSR, ridge, and an MLP for 100 steps of
 training. Printed are the largest resident memory of the process (VmHWM), its time from start to
-end, and the samples a second, each for every number of samples.
+end, and the samples a second, each for every number of samples. With --in-memory each fit is made
+a second time with all arrays in memory, as those of few samples are, and the rates are compared.
 """
 
 from __future__ import annotations
@@ -36,6 +38,14 @@ HEADS = {
         {"steps": 100, "one_step": {"epochs": 1, "window": "2 s"}, "multi_step": []},
     ),
 }
+_IN_MEMORY = """
+import runpy, torch
+from residnet.core.arrays import paged
+paged.on_disk = lambda values: values
+paged.rows = lambda count, *shape, dtype=torch.float64: torch.zeros(count, *shape, dtype=dtype)
+paged.row_pieces = lambda count: iter([slice(0, count)])
+runpy.run_module("residnet", run_name="__main__")
+"""
 
 
 def simulate(count: int, length: int, seed: int) -> list[Log]:
@@ -126,14 +136,17 @@ def config(folder: Path, head: str) -> Path:
     return file
 
 
-def carried_out(file: Path, out: Path) -> tuple[float, float]:
+def carried_out(file: Path, out: Path, in_memory: bool = False) -> tuple[float, float]:
     """Run a config; return the seconds and the largest resident memory in bytes.
+
+    With `in_memory` no array goes to a file, and none is gone through in pieces.
 
     Raises:
         RuntimeError: where the run fails, with the end of what it said.
     """
     started = time.perf_counter()
-    argument = [sys.executable, "-m", "residnet", "run", str(file), "--out", str(out)]
+    module = ["-c", _IN_MEMORY] if in_memory else ["-m", "residnet"]
+    argument = [sys.executable, *module, "run", str(file), "--out", str(out), "--workers", "1"]
     said = out.with_suffix(".log")
     with said.open("w") as stream:
         process = subprocess.Popen(argument, stdout=stream, stderr=subprocess.STDOUT)
@@ -150,6 +163,7 @@ def main() -> int:
     parser.add_argument("--samples", type=int, nargs="+", default=[1_000_000, 10_000_000])
     parser.add_argument("--logs", type=int, default=1000)
     parser.add_argument("--heads", nargs="+", default=list(HEADS), choices=list(HEADS))
+    parser.add_argument("--in-memory", action="store_true", help="compare with arrays in memory")
     parser.add_argument("--folder", type=Path, help="keeps the logs; a temporary one otherwise")
     given = parser.parse_args()
     print(f"residnet {residnet.__version__}, torch {torch.__version__}, {platform.machine()}")
@@ -160,12 +174,20 @@ def main() -> int:
             if not folder.is_dir():
                 write_logs(folder, samples, given.logs)
             for head in given.heads:
-                out = Path(name) / f"run_{head}"
-                seconds, peak = carried_out(config(folder, head), out)
-                rate = samples / seconds
-                print(
-                    f"{samples:11}{head:>8}{peak / 1e9:9.2f}{seconds:9.1f}{rate:11.0f}", flush=True
-                )
+                out, rates = Path(name) / f"run_{head}", []
+                for in_memory in (False, True)[: 1 + given.in_memory]:
+                    place = out.with_name(f"{out.name}_in_memory") if in_memory else out
+                    seconds, peak = carried_out(config(folder, head), place, in_memory)
+                    rates.append(samples / seconds)
+                    print(
+                        f"{samples:11}{head:>8}{peak / 1e9:9.2f}{seconds:9.1f}{rates[-1]:11.0f}",
+                        "in memory" if in_memory else "",
+                        flush=True,
+                    )
+                if given.in_memory:
+                    print(
+                        f"{'':11}{head:>8} rate from files / in memory: {rates[0] / rates[1]:.2f}"
+                    )
     return 0
 
 
