@@ -262,17 +262,20 @@ def _shifted(
 ) -> tuple[HybridDynamics, ParametricBaseline | OffsetBaseline]:
     """The model with the offset of its log in every window, and its baseline."""
     assert isinstance(model.baseline, ParametricBaseline)
-    if not offsets.axes:
-        return model, model.baseline
-    baseline = OffsetBaseline(
-        model.baseline, offsets.accelerations()[problem.log], offsets.axes, offsets.speed
-    )
-    return HybridDynamics(model.signals, baseline, model.head, model.dt, model.integrator), baseline
+    baseline: ParametricBaseline | OffsetBaseline = model.baseline
+    if offsets.axes:
+        baseline = OffsetBaseline(
+            model.baseline, offsets.accelerations()[problem.log], offsets.axes, offsets.speed
+        )
+    shifted = HybridDynamics(model.signals, baseline, model.head, model.dt, model.integrator)
+    # the cost is that of velocities
+    shifted.positions = False
+    return shifted, baseline
 
 
 def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
     """The step of the rollout, without a residual."""
-    return model.integrate(x, p, zero_acceleration(x))
+    return model.advanced(x, model.signals(x, p), p, zero_acceleration(x))
 
 
 @torch.no_grad()

@@ -7,6 +7,7 @@ no choice.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ from residnet.core.layout import POSE, RANGE_VELOCITIES, SURGE, VELOCITIES
 from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.scripted import scripted
 from residnet.dynamics.store import ModelSpec
 from residnet.judge.verdict.sanity_points import acceleration
 
@@ -116,11 +119,16 @@ def runaway(
     limit = torch.from_numpy(reach).clamp(min=1e-9)
     x, s = points.x, model.initial_state(len(points.x)).double()
     before, pause = x[:, VELOCITIES], max(round(_PAUSE / model.dt), 1)
+    steps = round(max(_LONG_RUN, points.longest) / model.dt)
+    held = points.w.unsqueeze(1).expand(-1, pause, -1)
+    # where the vessel is says nothing of how fast it is
+    alone = copy.deepcopy(model)
+    alone.positions = False
+    run = scripted(Rollout(alone), steps)
     with torch.no_grad():
-        for k in range(1, round(max(_LONG_RUN, points.longest) / model.dt) + 1):
-            x, s = model.step(x, points.w, s)
-            if k % pause:
-                continue
+        for k in range(pause, steps + 1, pause):
+            states, _, s = run(x, held, s)
+            x = states[:, -1]
             ratio = torch.nan_to_num(x[:, VELOCITIES].abs() / limit, nan=math.inf).amax(1)
             if float(ratio.max()) > divergence:
                 row = int(ratio.argmax())
