@@ -50,7 +50,7 @@ class ForceConfig(Config):
     """
 
     of: str
-    settle: tuple[Annotated[Seconds, Field(gt=0)], ...] = (5.0, 15.0, 45.0)
+    settle: tuple[Annotated[Seconds, Field(gt=0)], ...] = (5.0, 15.0, 45.0, 120.0)
     decay: tuple[Annotated[Seconds, Field(gt=0)], ...] = (60.0,)
 
     def candidates(self) -> list[DisturbanceConfig]:
