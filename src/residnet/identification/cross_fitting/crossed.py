@@ -13,6 +13,9 @@ from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import FreeRun
 from residnet.judge.verdict.selection import Blocks, blocks_of, shares
 
+_MADE_GOOD = 0.5
+"""Share of its baseline's error below which a model is no longer judged by that baseline."""
+
 
 @dataclass(frozen=True)
 class Crossed:
@@ -61,8 +64,11 @@ def with_crossed(
     folds, times the ratio of its error to the baseline's on the validation logs. That ratio spreads
     less than either of the two errors, as both run over the same windows (a ratio estimator, as in
     sampling from surveys: W. G. Cochran, 1977, chapter 6). A difference would not do: folds of
-    other manoeuvres may be easier than the validation logs, and a network that only mends a poor
-    baseline's worst errors would gain more there than there is.
+    other manoeuvres may be easier than the validation logs.
+
+    A network that takes more than half of the error off its baseline has little left of it: how
+    well the network does elsewhere does not follow from how badly the baseline does there. In the
+    baseline's place stands the model whose error on the validation logs is nearest to its own.
 
     Args:
         own: shares over the validation logs, [B] by model.
@@ -70,17 +76,31 @@ def with_crossed(
         crossed: errors over the folds, `zero` and all baselines among them.
         fitted: the models.
     """
+    known = [name for name in crossed.shares if name in own]
     out = {}
     for name, entry in fitted.items():
-        roots = [
+        others = [
             _root(fitted[member], fitted, crossed) for member in entry.notes.get("members", (name,))
         ]
-        if any(root not in crossed.shares for root in roots):
+        if any(other not in known for other in others):
             return None
-        over_folds = np.mean([crossed.shares[root] for root in roots], axis=0)
-        beside = np.mean([own[root] for root in roots], axis=0)
+        if own[name].sum() < _MADE_GOOD * np.mean([own[other].sum() for other in others]):
+            others = [_nearest(name, known, own)]
+        over_folds = np.mean([crossed.shares[other] for other in others], axis=0)
+        beside = np.mean([own[other] for other in others], axis=0)
         out[name] = _transferred(over_folds, own[name], beside)
     return out, crossed.blocks.beside(blocks)
+
+
+def _nearest(name: str, known: Sequence[str], own: Mapping[str, np.ndarray]) -> str:
+    """Return which of the known models errs most nearly as much as another one, in proportion."""
+
+    def apart(other: str) -> float:
+        least = np.finfo(float).tiny
+        pair = (max(float(own[one].sum()), least) for one in (name, other))
+        return abs(float(np.diff(np.log(list(pair)))[0]))
+
+    return min(known, key=apart)
 
 
 def _transferred(over_folds: np.ndarray, own: np.ndarray, beside: np.ndarray) -> np.ndarray:
@@ -89,9 +109,9 @@ def _transferred(over_folds: np.ndarray, own: np.ndarray, beside: np.ndarray) ->
     The latter are how its error follows the ratio, linearised: they say how uncertain that is.
 
     Args:
-        over_folds: shares of its baseline, [F].
+        over_folds: shares of the other model, [F].
         own: its shares over the validation logs, [B].
-        beside: those of its baseline there, [B].
+        beside: those of the other model there, [B].
     """
     base = float(beside.sum())
     if base <= 0.0:

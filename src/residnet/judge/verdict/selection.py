@@ -101,10 +101,10 @@ class Blocks:
 def difference(one: Contender, other: Contender, blocks: Blocks) -> tuple[float, float]:
     """Return by how much one model errs more than another, and the standard error of that.
 
-    Over folds a network is judged by way of its baseline, in proportion. Where two networks stand
-    on baselines that differ much from log to log, this tells less than the validation logs alone,
-    and where it does, these speak. Stretches of fewer than five logs do not: they resemble each
-    other, and tell nothing of how logs differ.
+    Over folds a network is judged by way of another model, in proportion. Where two networks are
+    judged by models that differ much from log to log, this tells less than the validation logs
+    alone, and where it does, these speak. Stretches of fewer than five logs do not: they resemble
+    each other, and tell nothing of how logs differ.
     """
     told = one.error - other.error, blocks.standard_error(one.shares, other.shares)
     further = blocks.further
