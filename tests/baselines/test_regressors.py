@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from residnet.baselines import RegressorsConfig, StillConfig
+from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
@@ -123,3 +124,20 @@ def test_still_knows_nothing() -> None:
     baseline = StillConfig().build(NAMES)
     assert StillConfig().fit(baseline, made()) == []
     assert torch.equal(baseline(torch.randn(4, 7, 5)), torch.zeros(4, 7, 3))
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+def test_derivatives_of_a_model_along_directions(bounded: bool) -> None:
+    """By differences, inside the range in which the model is as fitted and far outside it."""
+    baseline = RegressorBaseline([[*row] for row in TRUTH.values()], NAMES, bounded=bounded)
+    torch.manual_seed(1)
+    baseline.theta.data.normal_()
+    if bounded:
+        assert baseline.bound is not None
+        baseline.bound.calibrate(made())
+    z = torch.randn(40, 5, dtype=torch.float64) * torch.tensor([3.0, 0.9, 0.9, 900.0, 600.0])
+    ahead = torch.randn(3, 40, 5, dtype=torch.float64)
+    about = (baseline(z + 1e-6 * ahead) - baseline(z - 1e-6 * ahead)) / 2e-6
+    torch.testing.assert_close(baseline.along(z, ahead), about, rtol=1e-6, atol=1e-6)
+    if bounded:
+        assert not torch.equal(baseline.bound.held(z), z)

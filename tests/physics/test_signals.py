@@ -192,3 +192,22 @@ def test_signals_are_frozen() -> None:
     config = SignalsConfig(inputs=("n",))
     with pytest.raises(ValidationError):
         config.inputs = ("m",)  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("exogenous", [(), ("wind_speed", "wind_dir")])
+@pytest.mark.parametrize("forces", [None, "wam_v_cal"])
+def test_slopes_are_the_derivatives_by_heading_and_velocities(
+    exogenous: tuple[str, ...], forces: str | None
+) -> None:
+    inputs = ("n_port", "n_stbd")
+    signals = SignalsConfig(inputs=inputs, exogenous=exogenous, forces=forces).build().double()
+    torch.manual_seed(4)
+    x = torch.randn(5, 6, dtype=torch.float64)
+    p = signals.prepare(torch.randn(5, len(inputs + exogenous), dtype=torch.float64))
+    found = signals.slopes(x, p)
+    assert found.shape == (4, 5, signals.count)
+    for row, column in enumerate((2, 3, 4, 5)):
+        step = torch.zeros(6, dtype=torch.float64)
+        step[column] = 1e-6
+        about = (signals(x + step, p) - signals(x - step, p)) / 2e-6
+        torch.testing.assert_close(found[row], about, rtol=1e-6, atol=1e-7)

@@ -163,3 +163,22 @@ def test_polynomials_are_all_products_once() -> None:
     z = torch.rand(1, 3, dtype=torch.float64) + 0.5
     values = TermLibrary(terms[:19], names)(z)[0]
     assert len({round(float(value), 12) for value in values}) == 19
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [
+        ["1", "u", "u|u|", "|u|v", "v |r|", "n_port^2 delta2", "|v|^3 u^2"],
+        ["r", "v"],
+        ["1"],
+        ["u sin(v)", "n_port^-1 r", "sqrt(r) u"],
+    ],
+)
+def test_derivatives_along_directions(terms: Sequence[str]) -> None:
+    torch.manual_seed(2)
+    library = TermLibrary(terms, NAMES)
+    z = torch.randn(6, len(NAMES), dtype=torch.float64)
+    ahead = torch.randn(3, 6, len(NAMES), dtype=torch.float64)
+    step = 1e-6
+    about = (library(z + step * ahead) - library(z - step * ahead)) / (2.0 * step)
+    torch.testing.assert_close(library.along(z, ahead), about, rtol=1e-6, atol=1e-6)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
+from residnet.physics.terms import along
 from residnet.regression.solutions import Coefficient, Solution
 
 
@@ -64,6 +65,15 @@ class ParametricBaseline(Baseline, ABC):
 
         They are taken at channels z [B, nz].
         """
+
+    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
+        """Return the derivatives of nu_dot [D, B, 3] along directions.
+
+        Args:
+            z: channels [B, nz].
+            ahead: the directions [D, B, nz].
+        """
+        return along(self, z, ahead)
 
     @abstractmethod
     def information(self, samples: Samples) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, final
 
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres
 from residnet.baselines.damping import own_slopes, undamped, undamped_terms
@@ -99,10 +99,20 @@ class RegressorBaseline(ParametricBaseline):
         """Return d nu_dot / d theta [B, 3, P]: a coefficient moves its own axis by its term."""
         free = self.free_indices()
         axis, column = free // self.library.count, free % self.library.count
-        out = torch.zeros(z.shape[0], 3, free.numel(), dtype=z.dtype)
+        own = nn.functional.one_hot(axis, 3).T.to(z.dtype)
         seen = z if self.bound is None else self.bound.held(z)
-        out[:, axis, torch.arange(free.numel())] = self.library(seen)[:, column]
+        out: Tensor = self.library(seen).index_select(1, column).unsqueeze(1) * own
         return out
+
+    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
+        """Return the derivatives of nu_dot [D, B, 3] at z [B, nz] along directions [D, B, nz]."""
+        weights = self.theta * self.allowed
+        if self.bound is None:
+            return self.library.along(z, ahead) @ weights.T
+        held = self.bound.along(z, ahead)
+        return self.library.along(self.bound.held(z), held) @ weights.T + self.bound.back(
+            held, ahead
+        )
 
     def information(self, samples: Samples) -> Tensor:
         """Return the mean information of a sample [P, P].

@@ -64,6 +64,13 @@ class VelocityBound(nn.Module):
         """Return the acceleration at channels z [..., nz] whose held ones are known."""
         return self.rate.to(z.dtype) * (held[..., :3] - z[..., :3])
 
+    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
+        """Return directions [D, B, nz] from channels z [B, nz] as the held ones go along them."""
+        near = z[:, : self.channels]
+        inside = (near >= self.low.to(z.dtype)) & (near <= self.high.to(z.dtype))
+        held = ahead[..., : self.channels] * inside
+        return torch.cat((held, ahead[..., self.channels :]), dim=-1)
+
     def forward(self, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz]."""
         return self.back(self.held(z), z)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
-from residnet.core.layout import velocities
+from residnet.core.layout import PLANAR, heading, surge, sway, velocities
 from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
 from residnet.physics.actuators import DifferentialThrustConfig
 from residnet.physics.environment.wind import WIND_INPUTS
@@ -182,3 +182,25 @@ class Signals(nn.Module):
     def at(self, nu: Tensor, p: Tensor) -> Tensor:
         """Return the channels z [..., nz] at velocities nu [..., 3], where there is no wind."""
         return torch.cat((nu, p), dim=-1)
+
+    def slopes(self, x: Tensor, p: Tensor) -> Tensor:
+        """Return the derivatives of the channels by heading and velocities, [4, B, nz].
+
+        Args:
+            x: states [B, nx].
+            p: what `prepare` returned for the step's inputs, [B, k].
+        """
+        out = x.new_zeros(1 + PLANAR.dof, x.shape[0], self.count)
+        for place in range(PLANAR.dof):
+            out[1 + place, :, place] = 1.0
+        if not self.wind:
+            return out
+        known = p.shape[-1] - 2
+        ahead, starboard = to_body(p[:, known], p[:, known + 1], heading(x))
+        along, across = ahead - surge(x), starboard - sway(x)
+        magnitude = torch.sqrt(along * along + across * across + 1e-8)
+        out[0, :, -3], out[0, :, -2] = starboard, -ahead
+        out[0, :, -1] = (along * starboard - across * ahead) / magnitude
+        out[1, :, -3], out[1, :, -1] = -1.0, -along / magnitude
+        out[2, :, -2], out[2, :, -1] = -1.0, -across / magnitude
+        return out

@@ -7,16 +7,14 @@ from typing import final
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from residnet.baselines import Baseline, ParametricBaseline
 from residnet.core.layout import HEADING, PLANAR, YAW_RATE, zero_acceleration
 from residnet.dynamics.hybrid import HybridDynamics
 
-_ROWS = len(PLANAR.names) - HEADING
-"""Sensitivities have a row for the heading and one for each velocity."""
+# sensitivities have a row for the heading and one for each velocity
 _HEADING_ROW = slice(0, 1)
-_YAW_RATE_ROW = slice(YAW_RATE - HEADING, _ROWS)
+_YAW_RATE_ROW = slice(YAW_RATE - HEADING, len(PLANAR.names) - HEADING)
 
 
 @final
@@ -51,6 +49,12 @@ class OffsetBaseline(Baseline):
         """Return the square of the speed over that at which the values hold, [B, 1]."""
         return z[:, :2].square().sum(1, keepdim=True) / self.speed**2
 
+    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
+        """Return the derivatives of nu_dot [D, B, 3] at z [B, nz] along directions [D, B, nz]."""
+        offsets = self.value.repeat(z.shape[0] // self.value.shape[0], 1)
+        growth = 2.0 * (z[:, :2] * ahead[..., :2]).sum(-1, keepdim=True) / self.speed**2
+        return self.baseline.along(z, ahead) + growth * offsets
+
     def parameter_count(self) -> list[float]:
         """Return the parameters of each axis; the offsets are no part of the model."""
         return self.baseline.parameter_count()
@@ -84,36 +88,20 @@ def step_sensitivities(
         p: prepared inputs, held over the step [B, k].
         s: sensitivities at the step's start [B, 4, P].
     """
-    stage_rate, total = torch.zeros_like(s), torch.zeros_like(s)
-    stage_x = x
+    stage_x, stage_s = x, s
+    after, stage_rate = s, s
     for node, weight in zip(model.nodes, model.weights, strict=True):
-        stage_s = s + node * model.dt * stage_rate
         if node > 0.0:
+            stage_s = torch.add(s, stage_rate, alpha=node * model.dt)
             residual = zero_acceleration(x)
             stage_x = x + node * model.dt * model.rate(stage_x, p, residual)
-        direct = baseline.sensitivity(model.signals(stage_x, p))
-        nu_dot = _slopes(model, stage_x, p) @ stage_s + direct
+        z = model.signals(stage_x, p)
+        slopes = baseline.along(z, model.signals.slopes(stage_x, p)).permute(1, 2, 0)
+        nu_dot = torch.baddbmm(baseline.sensitivity(z), slopes, stage_s)
         stage_rate = torch.cat((stage_s[:, _YAW_RATE_ROW], nu_dot), dim=1)
-        total = total + weight * stage_rate
-    after = s + model.dt * total
+        after = torch.add(after, stage_rate, alpha=weight * model.dt)
     if model.semi_implicit:
         # the heading moves with the new yaw rate
         turned = s[:, _HEADING_ROW] + model.dt * after[:, _YAW_RATE_ROW]
         after = torch.cat((turned, after[:, _HEADING_ROW.stop :]), dim=1)
     return after
-
-
-def _slopes(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
-    """Return the derivative of nu_dot by (psi, u, v, r), [B, 3, 4], in one forward pass."""
-    batch = x.shape[0]
-    tangent = torch.zeros(_ROWS, batch, x.shape[1], dtype=x.dtype)
-    for direction in range(_ROWS):
-        tangent[direction, :, HEADING + direction] = 1.0
-    repeated, inputs = x.repeat(_ROWS, 1), p.repeat(_ROWS, 1)
-    # half the time of torch.func.jvp, to the same digits
-    with forward_ad.dual_level():
-        state = forward_ad.make_dual(repeated, tangent.reshape(-1, x.shape[1]))
-        found = forward_ad.unpack_dual(model.baseline(model.signals(state, inputs))).tangent
-    # None where the baseline depends on no velocity
-    slopes = torch.zeros(len(repeated), PLANAR.dof, dtype=x.dtype) if found is None else found
-    return slopes.reshape(_ROWS, batch, PLANAR.dof).permute(1, 2, 0)
