@@ -9,9 +9,9 @@ from typing import Self, final
 from torch import Tensor, nn
 
 from residnet.core.config import Config
+from residnet.core.derivatives import derivatives_along
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
-from residnet.physics.terms import along
 from residnet.regression.solutions import Coefficient, Solution
 
 
@@ -73,7 +73,7 @@ class ParametricBaseline(Baseline, ABC):
             z: channels [B, nz].
             ahead: the directions [D, B, nz].
         """
-        return along(self, z, ahead)
+        return derivatives_along(self, z, ahead)
 
     @abstractmethod
     def information(self, samples: Samples) -> Tensor:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from residnet.core.names import VELOCITY
@@ -22,12 +21,10 @@ _POINTS = 400
 def own_slopes(library: TermLibrary, samples: Samples) -> Tensor:
     """Return the slopes [3, K, J] of the terms along u, v and r at samples spread evenly."""
     z = samples.z[:: max(1, len(samples) // _POINTS)].double()
-    along = []
-    for name in VELOCITY:
-        tangent = torch.zeros_like(z)
-        tangent[:, samples.names.index(name)] = 1.0
-        along.append(torch.func.jvp(library, (z,), (tangent,))[1])
-    return torch.stack(along).detach()
+    ahead = z.new_zeros(len(VELOCITY), *z.shape)
+    for axis, name in enumerate(VELOCITY):
+        ahead[axis, :, samples.names.index(name)] = 1.0
+    return library.along(z, ahead)
 
 
 def undamped(theta: Tensor, slopes: Tensor) -> int | None:
