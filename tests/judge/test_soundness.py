@@ -158,3 +158,17 @@ def test_steady_runs_are_stretches_of_held_inputs() -> None:
     assert runs[1].x[5] == pytest.approx(0.1, abs=0.002)
     assert runs[1].growth < 2.0
     assert runs[0].decay < 3.0 < runs[1].decay
+
+
+def test_a_small_swing_in_a_turn_is_no_fault_where_the_vessel_swings_as_much() -> None:
+    """Nobody measured the wind, and a model swings a little where it blew the vessel about: its
+    linearised growth says nothing of how far it goes.
+    """
+    change = {"v": (0, -0.3, -0.6), "r": (0, -0.4, -0.3)}
+    _, runs_off = made(change)
+    _, swings = made({**change, "v^3": (0, -30.0, 0)})
+    steady = steady_runs([log()], STEP)
+    blown = [replace(run, scatter=np.array([0.2, 0.2])) for run in steady]
+    assert "unstable where the logs are not" in contradiction(runs_off, blown)
+    assert "unstable where the logs are not" in contradiction(swings, steady)
+    assert contradiction(swings, blown) == ""

@@ -4,10 +4,14 @@ A full hull may be unstable in truth, so that an unstable model is no fault by i
 where the vessel, its inputs held, settled from a disturbance such as the entry of a turn, and
 stayed so for several times as long as the model's disturbances take to grow. A straight run that
 nothing disturbs proves nothing: a simulated hull keeps its course on it, stable or not.
+
+Disturbances have the size that they had in the log. A model of logs whose wind nobody measured may
+swing a little in a steady turn, as the vessel did.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,12 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from residnet.core.layout import SURGE, SWAY, VELOCITIES, YAW_RATE
+from residnet.core.layout import LATERAL, SURGE, VELOCITIES
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
 from residnet.judge.verdict.sanity import growth_rate
-from residnet.judge.verdict.sanity_points import OperatingPoint
+from residnet.judge.verdict.sanity_points import OperatingPoint, settled_memory
 
 _HELD = 0.02
 _GROWN = 20.0
@@ -28,6 +33,7 @@ _STAYED = 3.0
 _DECAYED = 3.0
 _MOST = 20
 _SETTLING = 0.25
+_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,7 @@ class SteadyRun:
             stretch begins than in the end.
         growth: how many times farther the lateral velocities lie from their first third's mean in
             the last third than in the first.
+        scatter: standard deviations of the lateral velocities [2].
     """
 
     log: str
@@ -51,6 +58,7 @@ class SteadyRun:
     w: np.ndarray
     decay: float
     growth: float
+    scatter: np.ndarray
 
 
 def steady_runs(logs: Sequence[Prepared], step: float, shortest: float = 5.0) -> list[SteadyRun]:
@@ -72,17 +80,18 @@ def steady_runs(logs: Sequence[Prepared], step: float, shortest: float = 5.0) ->
             rows = slice(begin + int(_SETTLING * (end - begin)), end)
             y = log.smooth[rows]
             x = np.concatenate((np.zeros(VELOCITIES.start), y[:, VELOCITIES].mean(0)))
-            lateral = y[:, SWAY : YAW_RATE + 1]
+            lateral = y[:, LATERAL]
             third = max(len(lateral) // 3, 1)
             left = np.abs(lateral[-third:] - lateral[-third:].mean(0)).mean(0)
-            entry = log.smooth[begin : begin + max(third // 10, 1), SWAY : YAW_RATE + 1]
+            entry = log.smooth[begin : begin + max(third // 10, 1), LATERAL]
             began = np.abs(entry - lateral[-third:].mean(0)).mean(0)
             decay = float((began / np.maximum(left, 1e-9)).max())
             apart = np.abs(lateral - lateral[:third].mean(0))
             first, last = apart[:third].mean(0), apart[-third:].mean(0)
             growth = float((last / np.maximum(first, 1e-9)).max())
             seconds = len(y) * step
-            out.append(SteadyRun(log.log.name, seconds, x, log.w[rows].mean(0), decay, growth))
+            w, scatter = log.w[rows].mean(0), lateral.std(0)
+            out.append(SteadyRun(log.log.name, seconds, x, w, decay, growth, scatter))
     return out
 
 
@@ -106,7 +115,8 @@ def contradiction(model: HybridDynamics, runs: Sequence[SteadyRun]) -> str:
 
     A disturbance of the model, linearised about the mean of a steady run, would have grown
     twentyfold over it; the vessel had settled from three times its deviations at the end, and these
-    did not even grow threefold. The twenty longest of such runs are looked at.
+    did not even grow threefold. The model itself, begun with the vessel's deviations, ends farther
+    than three of them from where the vessel stayed. The twenty longest of such runs are looked at.
 
     Args:
         model: in float64 and evaluation mode.
@@ -116,10 +126,29 @@ def contradiction(model: HybridDynamics, runs: Sequence[SteadyRun]) -> str:
     for run in sorted(telling, key=lambda run: -run.seconds)[:_MOST]:
         x, w = torch.from_numpy(run.x), torch.from_numpy(run.w)
         rate = growth_rate(model, OperatingPoint("", float(run.x[SURGE]), x, w, True))
-        if rate * run.seconds > math.log(_GROWN):
+        if rate * run.seconds > math.log(_GROWN) and _departure(model, run) > _STAYED:
             return (
                 "it is unstable where the logs are not (a disturbance would double in"
                 f" {math.log(2.0) / rate:.2g} s; log {run.log} runs steadily for"
                 f" {run.seconds:.0f} s)"
             )
     return ""
+
+
+def _departure(model: HybridDynamics, run: SteadyRun) -> float:
+    """How far the model ends from a steady run, in deviations of the vessel; infinite out of range.
+
+    It begins with deviations of the vessel's size; the mean over the last third is looked at.
+    """
+    scatter = torch.from_numpy(np.maximum(run.scatter, 1e-9))
+    begin = torch.from_numpy(run.x).repeat(len(_SIGNS), 1)
+    begin[:, LATERAL] += torch.tensor(_SIGNS, dtype=torch.float64) * scatter
+    w = torch.from_numpy(run.w).expand(len(begin), -1)
+    memory = settled_memory(model, begin, w)
+    alone = copy.deepcopy(model)
+    alone.positions = False
+    steps = max(round(run.seconds / model.dt), 3)
+    with torch.no_grad():
+        states, _, _ = Rollout(alone)(begin, w[:, None].expand(-1, steps, -1), memory)
+    away = states[:, -(steps // 3) :, LATERAL] - torch.from_numpy(run.x)[LATERAL]
+    return float(torch.nan_to_num(away.abs() / scatter, nan=math.inf).mean(1).max())
