@@ -140,6 +140,19 @@ def test_a_diverged_window_holds_the_prediction_of_zero(growth: float, limit: fl
         assert np.isfinite(p.states).all()
 
 
+def test_a_window_beyond_short_training_logs_is_no_divergence() -> None:
+    """A vessel that does more than it did in training exceeds the limit itself, and so does `zero`
+    that holds its velocities.
+    """
+    log = made(random_states(80, np.random.default_rng(3)), STEP)
+    fast = float(np.abs(log.y[:, 3]).max())
+    theta = np.zeros((3, 6))
+    windows = [window(0, 0, 80, nu=(fast, 0.0, 0.0)), window(0, 0, 80, nu=(2.1 * fast, 0.0, 0.0))]
+    limit = np.full(3, 0.1 * fast)
+    found = free_run([Candidate("m", "head", hybrid(theta))], windows, [log], STEP, limit)["m"]
+    assert [p.diverged for p in found] == [False, True]
+
+
 def test_divergence_is_judged_within_the_window_only() -> None:
     """A short window shares its batch with a long one; what happens after its own end is not its
     business.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from residnet.core.layout import POSE
+from residnet.core.layout import POSE, VELOCITIES
 from residnet.core.names import STATE, VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
@@ -23,6 +23,8 @@ _LONGER = 4
 """Times its own length that a window may be kept going beside longer ones."""
 _LARGEST = 30_000_000
 """Numbers that the windows of a batch may hold."""
+_OWN = 2.0
+"""Times what the vessel itself did in a window that a prediction may reach."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,9 @@ def free_run(
 ) -> dict[str, list[Prediction]]:
     """Free-run every candidate over every window.
 
-    A window whose prediction is not finite or whose velocities exceed `limit` [3] has diverged and
-    holds the prediction of `zero`, velocities held, instead.
+    A window whose prediction is not finite, or whose velocities exceed both `limit` [3] and twice
+    what the vessel itself did in it, has diverged and holds the prediction of `zero`, velocities
+    held, instead. Beyond a negative limit everything has diverged.
     """
     return {
         candidate.name: _run(candidate, windows, logs, step, limit, dtype)
@@ -183,6 +186,11 @@ def _prediction(
     window: Window, nu: np.ndarray, logs: Sequence[Prepared], step: float, limit: np.ndarray
 ) -> Prediction:
     """Return velocities [L, 3] with their pose, or those of `zero` where they ran away."""
+    log, rows = logs[window.log], slice(window.start, window.stop)
+    recorded = np.abs(log.y[rows, VELOCITIES][log.usable[rows]])
+    # short training logs may hold far less than the window, and then it is the vessel that exceeds
+    own = _OWN * recorded.max(0, initial=0.0)
+    limit = np.where(limit < 0.0, limit, np.maximum(limit, own))
     bad = not np.isfinite(nu).all() or bool((np.abs(nu) > limit).any())
     if bad:
         nu = np.tile(window.nu, (len(nu), 1))
