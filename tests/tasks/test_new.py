@@ -20,6 +20,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Question
 from residnet.data.readers import ReaderConfig
+from residnet.tasks.drafting.recipe import window_length
 from residnet.tasks.drafting.verb import new_config
 from residnet.tasks.loading import load_task
 
@@ -42,6 +43,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory, logs: list[Log]) -> Path:
     style = Style(told=False, units={"psi": "deg", "u": "kn", "v": "kn", "r": "°/min"})
     foreign_tables.write(logs, folder / "trials", Style(**{**style.__dict__, "signs": ("delta",)}))
     return folder
+
+
+def test_free_runs_are_no_longer_than_the_logs_of_any_split() -> None:
+    def lasting(seconds: float) -> Log:
+        return Log("made", np.arange(0.0, seconds + 0.5, 1.0), {})
+
+    tests = [lasting(180.0) for _ in range(4)]
+    assert window_length([[lasting(180.0)], tests], 20.0) == 100.0
+    assert window_length([[lasting(95.0)], tests], 20.0) == 60.0
+    assert window_length([[], [lasting(30.0)]], 20.0) == 20.0
+    assert window_length([[lasting(95.0), lasting(200.0)], tests], 20.0) == 100.0
+    assert window_length([[], []], 20.0) == 0.5
 
 
 def test_a_config_from_logs_alone(folder: Path) -> None:

@@ -45,7 +45,7 @@ def prepared_alone(logs: Any) -> Data:
         )
     time = recipe.timing(whole)
     held = recipe.held(whole, inputs)
-    judged = [log for name in ("validation", "test") for log in splits.get(name, ())]
+    judged = [splits.get(name, []) for name in ("validation", "test")]
     return prepare(
         splits,
         inputs,

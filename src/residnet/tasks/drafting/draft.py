@@ -176,7 +176,7 @@ def _assembled(
     preparation = _preparation(time, whole, inputs, codes)
     usable = _usable(read, (*inputs, *wind), preparation)
     split, splits = _split(read, usable, folder, marks)
-    judged = [*splits["validation"], *splits["test"]]
+    judged = [splits[name] for name in ("validation", "test")]
     length = recipe.window_length(judged, time.memory)
     split, splits = _long_enough(split, splits, length, marks)
     samples = int(sum(log.t[-1] - log.t[0] for log in splits["train"]) / time.step)

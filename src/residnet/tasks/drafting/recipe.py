@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,10 +68,16 @@ def _readable(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def window_length(logs: Sequence[Log], memory: float) -> float:
-    """Return the length of free runs that most of the logs hold, s."""
-    lengths = sorted(float(log.t[-1] - log.t[0]) for log in logs)
-    usual = lengths[int(0.25 * (len(lengths) - 1))] if lengths else 1.0
+def window_length(splits: Iterable[Sequence[Log]], memory: float) -> float:
+    """Return the length of free runs that most of the logs hold, and one of each split, s.
+
+    Args:
+        splits: logs of the validation and of the test; empty splits say nothing.
+        memory: how long the vessel remembers, s.
+    """
+    spans = [[float(log.t[-1] - log.t[0]) for log in logs] for logs in splits if logs]
+    lengths = sorted(length for split in spans for length in split)
+    usual = min((lengths[int(0.25 * (len(lengths) - 1))], *map(max, spans)) if spans else (1.0,))
     room = [length for length in _WINDOWS if 1.15 * length <= usual] or [0.5 * usual]
     return next((length for length in room if length <= 15.0 * memory), room[-1])
 
