@@ -172,8 +172,10 @@ class Trained:
         return float(np.mean(out))
 
 
-def compared(splits: dict[str, list[Log]], effort: float, steps: int) -> tuple[float, float, str]:
-    """Test errors of the selected model and of the peer, and a line about the fit."""
+def compared(
+    splits: dict[str, list[Log]], effort: float, steps: int
+) -> tuple[float, float, float, str]:
+    """Test errors of the selected model, the peer and the best one, and a line about the fit."""
     began = time.process_time()
     models = residnet.fit(splits, effort=effort, bands=None)
     fitted = time.process_time()
@@ -188,15 +190,18 @@ def compared(splits: dict[str, list[Log]], effort: float, steps: int) -> tuple[f
     )
     spent = f"{fitted - began:.0f} s, peer {time.process_time() - fitted:.0f} s"
     own = float(rows.loc[models.selected].nrmse_mean)
-    return own, peer, f"{data.evaluation.selection} ({spent}): {errors}; GRU {peer:.3f}"
+    best = float(rows[rows.kind != "ensemble"].nrmse_mean.min())
+    return own, peer, best, f"{data.evaluation.selection} ({spent}): {errors}; GRU {peer:.3f}"
 
 
-def table(records: Sequence[tuple[float, float]]) -> str:
+def table(records: Sequence[tuple[float, float, float]]) -> str:
     """The means over the draws."""
-    own, peer = np.array(records).T
+    own, peer, best = np.array(records).T
     return (
         f"{len(own)} draws: selected {own.mean():.3f}, GRU {peer.mean():.3f};"
-        f" selected no worse in {int((own <= peer).sum())}"
+        f" selected no worse in {int((own <= peer).sum())}; best single model in hindsight"
+        f" {best.mean():.3f}, on average of the draws selected"
+        f" {100 * (own / best - 1).mean():+.1f} %"
     )
 
 
@@ -214,8 +219,9 @@ def main() -> None:
     for number in range(given.seed, given.seed + given.count):
         random = np.random.default_rng([number, 17])
         folder = root / [*CHANNELS][number % len(CHANNELS)]
-        own, peer, said = compared(drawn(folder, random, given.minutes), given.effort, given.steps)
-        records.append((own, peer))
+        logs = drawn(folder, random, given.minutes)
+        own, peer, best, said = compared(logs, given.effort, given.steps)
+        records.append((own, peer, best))
         print(f"{folder.name} {number} {said}", flush=True)
     print(table(records))
 

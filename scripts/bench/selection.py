@@ -166,7 +166,7 @@ def drawn_fit(name: str, logs: list[Log], random: np.random.Generator) -> dict[s
         found = find(judged["test"].rows, model=row["model"], protocol="manoeuvre")
         row["test"] = float(found["nrmse"]["mean"])
         row["test_diverged"] = int(found["diverged"])
-        row["shares"] = contender.shares.tolist()
+        row["scores"] = contender.scores.tolist()
         findings = models.findings.get(row["model"], [])
         row["reported"] = [finding.check for finding in findings if finding.ok is False]
     weights = chosen.blocks.weights.tolist()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from residnet.identification.cross_fitting.crossed import Crossed, with_crossed
-from residnet.judge.verdict.selection import Blocks
+from residnet.judge.verdict.selection import Blocks, log_errors
 
 FOLDS = Blocks(np.full(3, 1.0 / 3.0), "stretches")
 LOGS = Blocks(np.full(2, 0.5), "stretches")
@@ -45,26 +45,25 @@ def test_a_baseline_s_error_over_the_folds_is_multiplied_by_the_ratio_of_errors(
     }
     found = with_crossed(own, LOGS, CROSSED, fitted)
     assert found is not None
-    shares, blocks = found
-    errors = {name: float(one.sum()) for name, one in shares.items()}
     expected = {"zero": 0.9, "hull": 0.6, "net": 0.45, "force": 0.9, "alone": 0.54, "mean": 0.375}
     # by the hull, which errs about as much: little is left of the error of zero
     expected["good"] = 0.72
-    np.testing.assert_allclose([errors[name] for name in expected], [*expected.values()])
+    np.testing.assert_allclose([found.errors[name] for name in expected], [*expected.values()])
     # a model that is its baseline everywhere has no spread against it
     same = with_crossed({**own, "net": own["hull"]}, LOGS, CROSSED, fitted)
     assert same is not None
-    assert blocks.standard_error(same[0]["net"], same[0]["hull"]) == 0.0
-    # of the spread over folds, a share as large as the errors differ remains; that of the ratio
-    # is scaled from the validation logs to the folds
-    folds = FOLDS.standard_error(0.75 * CROSSED.shares["hull"], CROSSED.shares["hull"])
-    ratio = 0.6 / 0.2 * LOGS.standard_error(own["net"], 0.75 * own["hull"])
-    spread = blocks.standard_error(shares["net"], shares["hull"])
-    np.testing.assert_allclose(spread, np.hypot(folds, ratio))
+    assert same.blocks.standard_error(same.scores["net"], same.scores["hull"]) == 0.0
+    # the logarithm of the ratio is that of the validation logs, and so is its spread
+    net, hull = found.scores["net"], found.scores["hull"]
+    here = log_errors(own, LOGS.weights)
+    np.testing.assert_allclose((net - hull).sum(), (here["net"] - here["hull"]).sum())
+    spread = LOGS.standard_error(here["net"], here["hull"])
+    np.testing.assert_allclose(found.blocks.standard_error(net, hull), spread)
+    np.testing.assert_array_equal(hull[3:], 0.0)
     # where the baseline errs nowhere on the validation logs there is no ratio
     perfect = with_crossed({**own, "hull": np.zeros(2)}, LOGS, CROSSED, fitted)
     assert perfect is not None
-    np.testing.assert_allclose(perfect[0]["net"].sum(), 0.75)
+    np.testing.assert_allclose(perfect.errors["net"], 0.6)
     assert with_crossed(own, LOGS, CROSSED, {**fitted, "other": model("other")}) is None
 
 
@@ -75,7 +74,8 @@ def test_a_model_that_was_judged_over_the_folds_itself_needs_no_baseline() -> No
     fitted = {"hull": model("hull"), "force": model("force", of="hull")}
     found = with_crossed(own, LOGS, crossed, fitted)
     assert found is not None
-    np.testing.assert_allclose(found[0]["force"], [*force, 0.0, 0.0])
+    np.testing.assert_allclose(found.errors["force"], force.sum())
+    np.testing.assert_array_equal(found.scores["force"][3:], 0.0)
 
 
 def test_a_network_is_no_better_than_its_folds_for_standing_on_a_poor_baseline() -> None:
@@ -93,8 +93,9 @@ def test_a_network_is_no_better_than_its_folds_for_standing_on_a_poor_baseline()
     own = {name: np.full(2, 0.5 * e) for name, e in here.items()}
     found = with_crossed(own, LOGS, crossed, fitted)
     assert found is not None
-    error = {name: float(one.sum()) for name, one in found[0].items()}
-    assert error["hull_net"] < error["hull"] < error["linear_net"] < error["linear"]
+    score = {name: float(one.sum()) for name, one in found.scores.items()}
+    for e in (found.errors, score):
+        assert e["hull_net"] < e["hull"] < e["linear_net"] < e["linear"]
 
 
 def test_errors_over_other_windows_are_not_joined() -> None:

@@ -8,7 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from residnet.judge.verdict.selection import Blocks, Contender, Selection, choose, difference
+from residnet.judge.verdict.selection import (
+    Blocks,
+    Contender,
+    Selection,
+    choose,
+    difference,
+    log_errors,
+)
 
 EVEN = Blocks(np.full(5, 0.2), "logs")
 JITTER = np.array([1.0, -1.0, 2.0, -2.0, 0.0])
@@ -24,10 +31,10 @@ def contender(
     diverged: int = 0,
     faults: tuple[str, ...] = (),
 ) -> Contender:
-    """A model whose error differs from log to log by `spread` times (1, -1, 2, -2, 0)."""
+    """A model whose log error differs from log to log by `spread` times (1, -1, 2, -2, 0)."""
     told = (f"{diverged} of its 7 validation windows diverged (T30)",) if diverged else ()
-    shares = (error + spread * JITTER) / 5
-    return Contender(name, family, parameters, shares, diverged, (*told, *faults))
+    scores = (math.log(error) + spread * JITTER) / 5
+    return Contender(name, family, parameters, error, scores, diverged, (*told, *faults))
 
 
 ZERO = contender("zero", "zero", 1.0, parameters=0)
@@ -39,12 +46,12 @@ def chosen(*models: Contender) -> Selection:
 
 def test_the_standard_error_is_that_of_paired_differences() -> None:
     one, other = contender("a", "baseline", 0.5, spread=0.1), contender("b", "baseline", 0.4)
-    differences = 0.1 + 0.1 * JITTER
-    expected = differences.std(ddof=1) / np.sqrt(5)
-    assert EVEN.standard_error(one.shares, other.shares) == pytest.approx(expected)
+    expected = (0.1 * JITTER).std(ddof=1) / np.sqrt(5)
+    assert EVEN.standard_error(one.scores, other.scores) == pytest.approx(expected)
+    assert difference(one, other, EVEN) == pytest.approx((math.log(0.5 / 0.4), expected))
     # what both have in common is no spread of the difference
     common = contender("c", "baseline", 0.4, spread=0.1)
-    assert EVEN.standard_error(one.shares, common.shares) == pytest.approx(0.0, abs=1e-12)
+    assert EVEN.standard_error(one.scores, common.scores) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_diverging_model_is_not_selected_while_a_steady_one_is_there() -> None:
@@ -68,12 +75,14 @@ def test_no_unsound_model_is_selected_while_a_sound_one_is_there(fault: str) -> 
 
 @pytest.mark.parametrize(("spread", "expected"), [(0.1, "baseline"), (0.05, "mlp")])
 def test_the_simplest_within_one_standard_error_is_selected(spread: float, expected: str) -> None:
-    # the standard error is 0.71 times the spread, the difference 0.05
+    # the standard error is 0.71 times the spread, the ratio exp(0.05)
     found = chosen(
-        contender("mlp", "network", 0.45), contender("baseline", "baseline", 0.5, spread=spread)
+        contender("mlp", "network", 0.5 * math.exp(-0.05)),
+        contender("baseline", "baseline", 0.5, spread=spread),
     )
     assert found.selected == expected
-    assert ("within one standard error (0.071)" in found.reason) is (expected == "baseline")
+    said = "baseline is the simplest sound model within one standard error (7.1 %) of the best one"
+    assert found.reason.startswith(said) is (expected == "baseline")
     assert found.reason.endswith(".")
 
 
@@ -105,7 +114,7 @@ def test_where_none_is_sound_a_steady_one_that_beats_zero_is_taken() -> None:
     lost = contender("mlp", "network", 0.1, diverged=1)
     found = chosen(worse, better, lost)
     assert found.selected == "ridge"
-    assert found.reason.startswith("No model is sound; ridge has the least validation error")
+    assert found.reason.startswith("No model is sound; ridge errs least")
     assert chosen(lost).selected == "zero"
     assert chosen(contender("baseline", "baseline", 1.3, faults=wrong)).selected == "zero"
 
@@ -123,10 +132,11 @@ def test_ensembles_are_compared_among_themselves() -> None:
 def test_the_file_says_of_each_model_what_decided() -> None:
     lead = contender("baseline", "baseline", 0.5, spread=0.1)
     content = chosen(lead, contender("mlp", "network", 0.7, diverged=2)).content()
-    assert (content["schema"], content["selected"]) == ("residnet.selection/1", "baseline")
+    assert (content["schema"], content["selected"]) == ("residnet.selection/2", "baseline")
     assert content["blocks"] == {"of": "logs", "count": 5}
     rows = {row["model"]: row for row in content["models"]}
-    assert rows["mlp"]["difference"] == pytest.approx(0.2)
+    assert rows["mlp"]["nrmse_mean"] == 0.7
+    assert rows["mlp"]["ratio"] == pytest.approx(0.7 / 0.5)
     assert rows["mlp"]["standard_error"] == pytest.approx(0.1 * JITTER.std(ddof=1) / np.sqrt(5))
     assert (rows["mlp"]["sound"], rows["mlp"]["diverged"]) == (False, 2)
     assert rows["zero"]["sound"] is True
@@ -149,49 +159,81 @@ def test_the_more_precise_of_two_comparisons_counts() -> None:
     both = EVEN.beside(EVEN)
 
     def judged(name: str, folds: float, spread: float, alone: float, family: str) -> Contender:
-        direct = (alone + 0.001 * JITTER) / 5
-        over_folds = (folds + spread * JITTER) / 5
+        jitter = JITTER if family == "network" else JITTER[::-1]
+        direct = (math.log(alone) + 0.005 * jitter) / 5
+        over_folds = (math.log(folds) + spread * JITTER) / 5
         rest = np.zeros(5) if family == "refitted baseline" else direct - over_folds[::-1]
-        return Contender(name, family, 10, np.concatenate((over_folds, rest)), direct=direct)
+        rest = rest - rest.mean()
+        scores = np.concatenate((over_folds, rest))
+        return Contender(name, family, 10, folds, scores, direct=direct)
 
-    hull = judged("hull", 0.2, 0.01, 0.2, "refitted baseline")
-    network = judged("network", 0.8, 0.3, 0.25, "network")
-    assert difference(network, hull, both)[0] == pytest.approx(0.05)
-    assert difference(network, hull, both)[1] < 0.01
+    hull = judged("hull", 0.2, 0.05, 0.2, "refitted baseline")
+    network = judged("network", 0.8, 0.4, 0.25, "network")
+    assert difference(network, hull, both)[0] == pytest.approx(math.log(0.25 / 0.2))
+    assert 0.0 < difference(network, hull, both)[1] < 0.01
     found = choose((ZERO_OF_FOLDS, hull, network), both)
     assert (found.selected, found.tied) == ("hull", ("hull",))
     # the other way round neither a simpler hull nor zero stands in a good network's way
-    good = judged("network", 0.8, 0.3, 0.1, "network")
+    good = judged("network", 0.8, 0.4, 0.1, "network")
     assert choose((ZERO_OF_FOLDS, hull, good), both).selected == "network"
     # two baselines are compared over the folds, which are more logs
-    linear = judged("linear", 0.3, 0.02, 0.1, "refitted baseline")
-    assert difference(linear, hull, both)[0] == pytest.approx(0.1)
+    linear = judged("linear", 0.3, 0.05, 0.1, "refitted baseline")
+    assert difference(linear, hull, both)[0] == pytest.approx(math.log(0.3 / 0.2))
 
 
 def test_stretches_of_one_validation_log_do_not_overrule_folds() -> None:
     """A patrol vessel with five minutes of logs: a line in each channel stood before the hull."""
     both = EVEN.beside(replace(EVEN, of="stretches"))
 
-    def judged(name: str, folds: float, alone: float, family: str, gain: float) -> Contender:
-        over_folds, direct = (folds + 0.02 * JITTER) / 5, (alone + 0.001 * JITTER) / 5
-        return Contender(
-            name, family, 10, np.concatenate((over_folds, np.full(5, gain / 5))), direct=direct
-        )
+    def judged(name: str, folds: float, alone: float, family: str) -> Contender:
+        over_folds = (math.log(folds) + 0.05 * JITTER) / 5
+        jitter = JITTER if family == "network" else JITTER[::-1]
+        direct = (math.log(alone) + 0.005 * jitter) / 5
+        rest = np.zeros(5) if family == "refitted baseline" else 0.002 * JITTER
+        scores = np.concatenate((over_folds, rest))
+        return Contender(name, family, 10, folds, scores, direct=direct)
 
-    linear = judged("baseline", 0.53, 0.38, "refitted baseline", 0.0)
-    hull = judged("hull", 0.32, 0.47, "refitted baseline", 0.0)
-    network = judged("hull_network", 0.32, 0.46, "network", -0.01)
-    assert difference(network, linear, both)[0] == pytest.approx(-0.22)
+    linear = judged("baseline", 0.53, 0.38, "refitted baseline")
+    hull = judged("hull", 0.32, 0.47, "refitted baseline")
+    network = judged("hull_network", 0.31, 0.46, "network")
+    assert difference(network, linear, both)[0] == pytest.approx(math.log(0.31 / 0.53))
     found = choose((ZERO_OF_FOLDS, linear, hull, network), both)
     assert found.selected == "hull_network"
     # five whole logs or more may
-    assert difference(network, linear, EVEN.beside(EVEN))[0] == pytest.approx(0.08)
+    assert difference(network, linear, EVEN.beside(EVEN))[0] == pytest.approx(math.log(0.46 / 0.38))
 
 
 ZERO_OF_FOLDS = Contender(
     "zero",
     "zero",
     0,
-    np.concatenate(((0.8 + 0.3 * JITTER) / 5, np.zeros(5))),
-    direct=np.full(5, 0.16),
+    0.8,
+    np.concatenate(((math.log(0.8) + 0.4 * JITTER) / 5, np.zeros(5))),
+    direct=np.full(5, math.log(0.8) / 5),
 )
+
+
+def test_one_bad_stretch_decides_nothing() -> None:
+    """The numbers are the errors over folds of five minutes of a model tanker: a line stood before
+    a hull that erred less in seven of eight stretches, and on other logs half as much.
+    """
+    line = np.array([0.37, 2.68, 1.44, 3.27, 0.40, 1.48, 0.80, 1.63]) / 8
+    hull = np.array([0.26, 2.15, 0.99, 1.06, 0.17, 3.71, 0.19, 0.84]) / 8
+    eight = Blocks(np.full(8, 0.125), "stretches")
+    assert hull.sum() < line.sum() < hull.sum() + eight.standard_error(line, hull)
+    scores = log_errors({"baseline": line, "hull": hull}, eight.weights)
+    models = [
+        Contender(name, "refitted baseline", size, float(shares.sum()), scores[name])
+        for name, shares, size in (("baseline", line, 18), ("hull", hull, 40))
+    ]
+    assert choose(models, eight).selected == "hull"
+
+
+def test_blocks_in_which_all_are_nearly_right_count_little() -> None:
+    weights = np.full(4, 0.25)
+    one, other = np.array([0.4, 0.4, 0.4, 1e-9]), np.array([0.3, 0.3, 0.3, 1e-4])
+    scores = log_errors({"one": weights * one, "other": weights * other}, weights)
+    apart = scores["one"] - scores["other"]
+    assert apart.sum() > 0.0
+    assert abs(apart[3]) < 0.02 * apart[0]
+    assert np.isfinite(log_errors({"none": np.zeros(4)}, weights)["none"]).all()

@@ -67,7 +67,7 @@ class Models(Mapping[str, Model]):
 
     @property
     def selected(self) -> str:
-        """Name of the simplest sound model within one standard error of the best."""
+        """Name of the simplest sound model that validation does not tell from the best."""
         return self.selection.selected
 
     @cached_property
@@ -288,7 +288,7 @@ def metrics(
 
 
 def select(models: Models) -> Model:
-    """Return the simplest sound model that is within one standard error of the best.
+    """Return the simplest sound model that validation does not tell from the best.
 
     Free runs over the validation logs decide; `models.selection.reason` says why.
 

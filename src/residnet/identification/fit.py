@@ -91,7 +91,7 @@ def _add_tied(
     # a mean of accelerations has no place for a force that one member estimates for itself
     tied = [n for n in _apart(chosen) if identified.models[n].spec.disturbance is None]
     if len(tied) < 2:
-        say("  tied: no model comes within one standard error of the best; there is no mean")
+        say("  tied: no model is as good as the best; there is no mean")
         return
     model = fitter.ensemble(TIED, [identified.models[name] for name in tied])
     identified.models[TIED] = model
@@ -104,6 +104,6 @@ def _apart(chosen: Selection) -> list[str]:
 
     A training that gained nothing ends where it began, and would count twice in a mean.
     """
-    errors = {e.name: e.shares.tobytes() for e in chosen.contenders}
+    errors = {e.name: e.scores.tobytes() for e in chosen.contenders}
     first = {errors[name]: name for name in reversed(chosen.tied)}
     return [name for name in chosen.tied if first[errors[name]] == name]

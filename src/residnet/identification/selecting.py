@@ -19,7 +19,14 @@ from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import FreeRun
 from residnet.judge.verdict.course_stability import SteadyRun, contradiction, steady_runs
 from residnet.judge.verdict.sanity import BOUNDED, DAMPING, STABILITY, Finding, check_model
-from residnet.judge.verdict.selection import Contender, Selection, blocks_of, choose, shares
+from residnet.judge.verdict.selection import (
+    Contender,
+    Selection,
+    blocks_of,
+    choose,
+    log_errors,
+    shares,
+)
 from residnet.judge.verdict.soundness import TrainingPoints, runaway, training_points, wrong_damping
 
 _CHECKED = ("train", "validation")
@@ -110,10 +117,12 @@ def select(
         name: shares(run, name, validation.logs, scales, labels, len(blocks.weights))
         for name in models
     }
-    own = parts
     more = None if crossed is None else with_crossed(parts, blocks, crossed, models)
-    if more is not None:
-        parts, blocks = more
+    if more is None:
+        errors = {name: float(one.sum()) for name, one in parts.items()}
+        scores = log_errors(parts, blocks.weights)
+    else:
+        errors, scores, blocks = more.errors, more.scores, more.blocks
     contenders = []
     for entry in models.values():
         lost = [
@@ -132,10 +141,11 @@ def select(
                 entry.name,
                 family(entry),
                 parameter_count(entry.model),
-                parts[entry.name],
+                errors[entry.name],
+                scores[entry.name],
                 sum(diverged for _, _, diverged, _ in lost),
                 tuple(faults),
-                None if more is None else own[entry.name],
+                None if more is None else more.direct[entry.name],
             )
         )
     return choose(contenders, blocks)

@@ -11,7 +11,7 @@ from residnet.data.prepare import Prepared
 from residnet.identification.models import FittedModel
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import FreeRun
-from residnet.judge.verdict.selection import Blocks, blocks_of, shares
+from residnet.judge.verdict.selection import Blocks, blocks_of, log_errors, shares
 
 _MADE_GOOD = 0.5
 """Share of its baseline's error below which a model is no longer judged by that baseline."""
@@ -51,13 +51,32 @@ class Crossed:
         return Crossed(self.blocks, {**self.shares, **other.shares}, self.starts)
 
 
+@dataclass(frozen=True)
+class Judged:
+    """How models err over folds of the logs and on the validation logs.
+
+    Attributes:
+        errors: mean NRMSE over the folds, by model.
+        scores: what the blocks of folds [F] and of validation logs [B] contribute to the mean
+            logarithm of the error, [F + B] by model. The latter add up to zero: they say how
+            uncertain the ratio to another model is.
+        direct: what the blocks of the validation logs alone contribute, [B] by model.
+        blocks: of folds, with those of the validation logs behind them.
+    """
+
+    errors: dict[str, float]
+    scores: dict[str, np.ndarray]
+    direct: dict[str, np.ndarray]
+    blocks: Blocks
+
+
 def with_crossed(
     own: Mapping[str, np.ndarray],
     blocks: Blocks,
     crossed: Crossed,
     fitted: Mapping[str, FittedModel],
-) -> tuple[dict[str, np.ndarray], Blocks] | None:
-    """Return shares and blocks of all models over folds and validation logs; None where they lack.
+) -> Judged | None:
+    """Return errors of all models over folds and validation logs; None where they lack.
 
     A baseline is judged over all folds, and so is one with an unknown force. What else stands on
     it is too expensive to be fitted for each fold: it is judged by its baseline's error over the
@@ -77,7 +96,9 @@ def with_crossed(
         fitted: the models.
     """
     known = [name for name in crossed.shares if name in own]
-    out = {}
+    here = log_errors(own, blocks.weights)
+    there = log_errors({name: crossed.shares[name] for name in known}, crossed.blocks.weights)
+    out = Judged({}, {}, here, crossed.blocks.beside(blocks))
     for name, entry in fitted.items():
         others = [
             _root(fitted[member], fitted, crossed) for member in entry.notes.get("members", (name,))
@@ -86,10 +107,19 @@ def with_crossed(
             return None
         if own[name].sum() < _MADE_GOOD * np.mean([own[other].sum() for other in others]):
             others = [_nearest(name, known, own)]
-        over_folds = np.mean([crossed.shares[other] for other in others], axis=0)
-        beside = np.mean([own[other] for other in others], axis=0)
-        out[name] = _transferred(over_folds, own[name], beside)
-    return out, crossed.blocks.beside(blocks)
+        over_folds = float(np.mean([crossed.shares[other].sum() for other in others]))
+        beside = float(np.mean([own[other].sum() for other in others]))
+        ratio = float(own[name].sum()) / beside if beside > 0.0 else 1.0
+        out.errors[name] = ratio * over_folds
+        rest = here[name] - np.mean([here[other] for other in others], axis=0)
+        out.scores[name] = np.concatenate(
+            (
+                np.mean([there[other] for other in others], axis=0)
+                + crossed.blocks.weights * rest.sum(),
+                rest - blocks.weights * rest.sum(),
+            )
+        )
+    return out
 
 
 def _nearest(name: str, known: Sequence[str], own: Mapping[str, np.ndarray]) -> str:
@@ -101,24 +131,6 @@ def _nearest(name: str, known: Sequence[str], own: Mapping[str, np.ndarray]) -> 
         return abs(float(np.diff(np.log(list(pair)))[0]))
 
     return min(known, key=apart)
-
-
-def _transferred(over_folds: np.ndarray, own: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """Return the shares of a model over folds [F] and, adding up to zero, validation blocks [B].
-
-    The latter are how its error follows the ratio, linearised: they say how uncertain that is.
-
-    Args:
-        over_folds: shares of the other model, [F].
-        own: its shares over the validation logs, [B].
-        beside: those of the other model there, [B].
-    """
-    base = float(beside.sum())
-    if base <= 0.0:
-        return np.concatenate((over_folds, own - beside))
-    ratio = float(own.sum()) / base
-    spread = float(over_folds.sum()) / base * (own - ratio * beside)
-    return np.concatenate((ratio * over_folds, spread))
 
 
 def _root(entry: FittedModel, fitted: Mapping[str, FittedModel], crossed: Crossed) -> str:

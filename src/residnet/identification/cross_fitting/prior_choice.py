@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,7 +24,7 @@ from residnet.identification.settings import FitSettings
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, Prediction, free_run
 from residnet.judge.protocol import Window, Windows, overlapping
-from residnet.judge.verdict.selection import Blocks, blocks_of
+from residnet.judge.verdict.selection import Blocks, blocks_of, log_errors
 from residnet.training.refit import refit
 from residnet.training.refit_config import RefitConfig
 
@@ -59,8 +60,8 @@ class PriorChoice:
 
     Attributes:
         prior: None where least squares stay as they are.
-        table: for fit.json: prior, free-run error over the held-out windows, the difference to the
-            best with its standard error, windows that diverged.
+        table: for fit.json: prior, free-run error over the held-out windows, its ratio to the best
+            one's, the standard error of that ratio's logarithm, windows that diverged.
         crossed: errors over the folds by `taken` and `zero`.
         folds: with the models of the chosen prior.
     """
@@ -79,10 +80,11 @@ def choose_prior(
     logs: Sequence[Prepared],
     limit: np.ndarray,
 ) -> PriorChoice:
-    """Return the strongest prior that is within one paired standard error of the best.
+    """Return the strongest prior whose free runs are as good as the best ones.
 
-    Fewer divergences, by more than one standard error, come before less error. A refit that fails
-    in a fold counts there as if every window had diverged.
+    Errors are compared as those of models are, see `residnet.judge.verdict.selection`. Fewer
+    divergences, by more than one standard error, come before less error. A refit that fails in a
+    fold counts there as if every window had diverged.
 
     Args:
         name: of the baseline.
@@ -265,19 +267,20 @@ def _chosen(
 ) -> PriorChoice:
     crossed = Crossed.of(run, logs, evaluation)
     blocks, labels = crossed.blocks, blocks_of(run)[1]
-    parts = {p: crossed.shares[_key(p)] for p in priors}
+    scores = log_errors(crossed.shares, blocks.weights)
+    parts = {p: scores[_key(p)] for p in priors}
     lost = {p: sum(one.diverged for one in run.predictions[_key(p)]) for p in priors}
     steady = _steady(run, blocks, labels, priors)
     best = min(steady, key=lambda p: float(parts[p].sum()))
     apart = {p: float((parts[p] - parts[best]).sum()) for p in priors}
     spread = {p: blocks.standard_error(parts[p], parts[best]) for p in priors}
     # they stand in the order of their strength; least squares must be better than all refits
-    taken = next(p for p in steady if apart[p] <= spread[p])
+    taken = next(p for p in steady if apart[p] <= blocks.alike * spread[p])
     table = [
         {
             "prior": p,
-            "error": float(parts[p].sum()),
-            "difference": apart[p],
+            "error": float(crossed.shares[_key(p)].sum()),
+            "ratio": math.exp(apart[p]),
             "standard_error": spread[p],
             "diverged": lost[p],
             "windows": len(run.windows),

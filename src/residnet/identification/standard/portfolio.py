@@ -18,7 +18,7 @@ from residnet.physics.symmetry import mirrored_channels
 PARTS = ("baseline", "baselines", "refit", "heads", "base_of", "forces", "ensembles", "training")
 """Keys of a fit that the recipe stands in place of."""
 TIED = "tied"
-"""Name of the mean of the models within one standard error of the best."""
+"""Name of the mean of the models that are as good as the best, within their standard error."""
 _FULL = "full_hull"
 _FROZEN, _TOGETHER = "hull_network", "hull_network_calibrated"
 

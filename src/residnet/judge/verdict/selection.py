@@ -1,4 +1,9 @@
-"""The choice of one model among fitted ones: the simplest sound one that is as good as the best."""
+"""The choice of one model among fitted ones: the simplest sound one that is as good as the best.
+
+Models are compared by the ratio of their errors, block by block: the logarithms of errors are
+averaged. In a mean of the errors themselves one bad stretch outweighs all others, and its standard
+error grows with it, so that few logs would tell nothing.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +18,16 @@ from residnet.core.layout import VELOCITIES, YAW_RATE
 from residnet.data.prepare import Prepared
 from residnet.judge.freerun import FreeRun
 
-SCHEMA = "residnet.selection/1"
+SCHEMA = "residnet.selection/2"
 FAMILIES = ("zero", "baseline", "refitted baseline", "closed-form head", "network", "ensemble")
 """What a model is, the simplest first."""
 
 _LOGS = 5
 _BLOCKS = 8
+_ALIKE = {"logs": 1.0, "stretches": 0.5}
+"""Standard errors within which models are alike. Stretches of a few logs resemble each other."""
+_SMALL = 0.1
+"""Share of the least mean error below which the error of a block hardly counts."""
 
 
 @dataclass(frozen=True)
@@ -29,24 +38,27 @@ class Contender:
         name: of the model.
         family: one of `FAMILIES`.
         parameters: number of its fitted parameters.
-        shares: what each block of the validation data contributes to its mean NRMSE, [B].
+        error: its mean NRMSE over the validation windows.
+        scores: what each block of the validation data contributes to the mean logarithm of its
+            error, [B]; see `log_errors`.
         diverged: number of its validation windows that diverged, over all protocols.
         faults: sentences on what makes it unsound, divergences among them; empty for a sound model.
-        direct: shares over the validation logs alone, where `shares` are of folds too; else None.
+        direct: scores over the validation logs alone, where `scores` are of folds too; else None.
     """
 
     name: str
     family: str
     parameters: int
-    shares: np.ndarray
+    error: float
+    scores: np.ndarray
     diverged: int = 0
     faults: tuple[str, ...] = ()
     direct: np.ndarray | None = None
 
     @property
-    def error(self) -> float:
-        """The mean NRMSE over the validation windows."""
-        return float(self.shares.sum())
+    def score(self) -> float:
+        """The mean logarithm of its error over the blocks."""
+        return float(self.scores.sum())
 
     @property
     def sound(self) -> bool:
@@ -66,7 +78,7 @@ class Blocks:
     Attributes:
         weights: share of each block in the mean over windows, [B]; their sum is 1.
         of: `logs` where a block is all windows of a log, else `stretches` of logs.
-        further: blocks of other data, over which a second part of the shares was taken.
+        further: blocks of other data, over which a second part of the scores was taken.
     """
 
     weights: np.ndarray
@@ -78,14 +90,23 @@ class Blocks:
         """Number of blocks, those of other data too."""
         return len(self.weights) + (0 if self.further is None else self.further.count)
 
+    @property
+    def alike(self) -> float:
+        """Number of standard errors within which two models are alike."""
+        return _ALIKE[self.of]
+
     def beside(self, further: Blocks) -> Blocks:
         """Return the blocks with those of other data behind them."""
         return replace(self, further=further)
 
     def standard_error(self, one: np.ndarray, other: np.ndarray) -> float:
-        """Return the standard error of the difference of two mean errors from their shares [B].
+        """Return the standard error of the difference of two means.
 
         A single block adds nothing, since it does not tell of the spread.
+
+        Args:
+            one: what each block contributes to the first mean, [B].
+            other: the same of the second, [B].
         """
         count = len(self.weights)
         beyond = (
@@ -99,19 +120,24 @@ class Blocks:
 
 
 def difference(one: Contender, other: Contender, blocks: Blocks) -> tuple[float, float]:
-    """Return by how much one model errs more than another, and the standard error of that.
+    """Return the mean logarithm of the ratio of two models' errors, and its standard error.
+
+    Both are shares: 0.1 is about 10 %.
 
     Over folds a network is judged by way of another model, in proportion. Where two networks are
     judged by models that differ much from log to log, this tells less than the validation logs
     alone, and where it does, these speak. Stretches of fewer than five logs do not: they resemble
     each other, and tell nothing of how logs differ.
     """
-    told = one.error - other.error, blocks.standard_error(one.shares, other.shares)
+    told = (
+        float((one.scores - other.scores).sum()),
+        blocks.standard_error(one.scores, other.scores),
+    )
     further = blocks.further
     if further is None or further.of != "logs" or one.direct is None or other.direct is None:
         return told
     count = len(blocks.weights)
-    if np.array_equal(one.shares[count:], other.shares[count:]):
+    if np.array_equal(one.scores[count:], other.scores[count:]):
         return told
     alone = float((one.direct - other.direct).sum())
     spread = further.standard_error(one.direct, other.direct)
@@ -121,7 +147,7 @@ def difference(one: Contender, other: Contender, blocks: Blocks) -> tuple[float,
 def least(entries: Iterable[Contender], blocks: Blocks) -> Contender | None:
     """Return the model that errs least, each compared with the best so far; None of none."""
     best: Contender | None = None
-    for entry in sorted(entries, key=lambda entry: entry.error):
+    for entry in sorted(entries, key=lambda entry: entry.score):
         if best is None or difference(entry, best, blocks)[0] < 0.0:
             best = entry
     return best
@@ -147,7 +173,7 @@ class Selection:
 
     @property
     def tied(self) -> tuple[str, ...]:
-        """Names of the sound single models within one standard error of the best, `zero` aside."""
+        """Names of the sound single models that are as good as the best, `zero` aside."""
         single = [e for e in self.contenders if e.family not in ("ensemble", "zero") and e.sound]
         best = least(single, self.blocks)
         return tuple(
@@ -156,7 +182,7 @@ class Selection:
 
     def _within(self, entry: Contender, best: Contender) -> bool:
         apart, spread = difference(entry, best, self.blocks)
-        return apart <= spread
+        return apart <= self.blocks.alike * spread
 
     def content(self) -> dict[str, Any]:
         """Return the contents of selection.json."""
@@ -173,7 +199,7 @@ class Selection:
                     "family": entry.family,
                     "parameters": entry.parameters,
                     "nrmse_mean": entry.error,
-                    "difference": difference(entry, lead, self.blocks)[0],
+                    "ratio": math.exp(difference(entry, lead, self.blocks)[0]),
                     "standard_error": difference(entry, lead, self.blocks)[1],
                     "diverged": entry.diverged,
                     "sound": entry.sound,
@@ -188,10 +214,11 @@ def choose(contenders: Iterable[Contender], blocks: Blocks) -> Selection:
     """Choose a single model and an ensemble.
 
     Among the sound models the simplest is chosen whose error is within one standard error of the
-    least (Breiman and others 1984, Classification and Regression Trees, section 3.4.3; paired
-    here, since all models run over the same windows). Where none but `zero` is sound, the least
-    error among the models without a diverged window is taken, if it is below the error of `zero`
-    by more than one standard error; else `zero`.
+    least (Breiman and others 1984, Classification and Regression Trees, section 3.4.3; paired here,
+    since all models run over the same windows). Of fewer than five logs half a standard error is
+    taken: their stretches resemble each other, and a whole one took lines for hulls. Where none but
+    `zero` is sound, the least error among the models without a diverged window is taken, if it is
+    below the error of `zero` by more than as much; else `zero`.
 
     Args:
         contenders: `zero` and at least one other.
@@ -206,7 +233,7 @@ def choose(contenders: Iterable[Contender], blocks: Blocks) -> Selection:
     else:
         chosen, reason = _least_bad(single, blocks)
     best = min(
-        ensembles, key=lambda entry: (not entry.sound, entry.diverged, entry.error), default=None
+        ensembles, key=lambda entry: (not entry.sound, entry.diverged, entry.score), default=None
     )
     return Selection(chosen.name, None if best is None else best.name, reason, everyone, blocks)
 
@@ -214,31 +241,32 @@ def choose(contenders: Iterable[Contender], blocks: Blocks) -> Selection:
 def _simplest(
     sound: Sequence[Contender], unsound: Sequence[Contender], blocks: Blocks
 ) -> tuple[Contender, str]:
-    """Return the simplest sound model within one standard error of the best, and why."""
+    """Return the simplest sound model that is as good as the best, and why."""
     best = least(sound, blocks)
     assert best is not None
-    for chosen in sorted(sound, key=lambda entry: (*entry.simplicity, entry.error)):
-        apart, within = difference(chosen, best, blocks)
-        if apart <= within:
+    said = "one standard error" if blocks.alike == 1.0 else "half a standard error"
+    for chosen in sorted(sound, key=lambda entry: (*entry.simplicity, entry.score)):
+        apart, spread = difference(chosen, best, blocks)
+        if apart <= (within := blocks.alike * spread):
             break
     if chosen is best:
         # folds may say less where baselines differ; then the validation logs have decided
         what = (
             "errs least of the sound models over the same validation logs"
-            if any(entry.error < best.error for entry in sound)
-            else "has the least validation error of the sound models"
+            if any(entry.score < best.score for entry in sound)
+            else "errs least of the sound models"
         )
-        reason = f"{chosen.name} {what} ({chosen.error:.3g})"
+        reason = f"{chosen.name} {what} (mean validation error {chosen.error:.3g})"
         simpler = [e for e in sound if e.simplicity < best.simplicity]
         if simpler:
-            reason += ", and no simpler one comes within one standard error of it"
+            reason += f", and no simpler one comes within {said} of it"
     else:
         reason = (
-            f"{chosen.name} is the simplest sound model whose validation error ({chosen.error:.3g})"
-            f" is within one standard error ({within:.2g}) of the least, that of {best.name}"
-            f" ({best.error:.3g})"
+            f"{chosen.name} is the simplest sound model within {said} ({100.0 * within:.2g} %)"
+            f" of the best one, {best.name} (mean validation errors {chosen.error:.3g} and"
+            f" {best.error:.3g})"
         )
-    better = [entry for entry in unsound if entry.error < chosen.error]
+    better = [entry for entry in unsound if entry.score < chosen.score]
     if better:
         named = ", ".join(f"{entry.name} ({entry.faults[0]})" for entry in better)
         reason += f"; not considered, for they are unsound: {named}"
@@ -249,18 +277,17 @@ def _least_bad(single: Sequence[Contender], blocks: Blocks) -> tuple[Contender, 
     """Return what is taken where no model but `zero` is sound, and why."""
     zero = next(entry for entry in single if entry.family == "zero")
     steady = [e for e in single if e.family != "zero" and not e.diverged]
-    best = min(steady, key=lambda entry: entry.error, default=None)
-    if best is not None and zero.error - best.error > blocks.standard_error(
-        best.shares, zero.shares
-    ):
-        return best, (
-            f"No model is sound; {best.name} has the least validation error ({best.error:.3g}) of"
-            f" those that did not diverge, and is unsound too: {'; '.join(best.faults)}."
-        )
+    best = min(steady, key=lambda entry: entry.score, default=None)
+    if best is not None:
+        apart, spread = difference(zero, best, blocks)
+        if apart > blocks.alike * spread:
+            return best, (
+                f"No model is sound; {best.name} errs least of those that did not diverge (mean"
+                f" validation error {best.error:.3g}), and is unsound too:"
+                f" {'; '.join(best.faults)}."
+            )
     worse = (
-        "every other one diverged"
-        if best is None
-        else "none that did not diverge beats it by more than one standard error"
+        "every other one diverged" if best is None else "none that did not diverge clearly beats it"
     )
     return zero, f"No model but zero is sound, and {worse}: zero is taken, which predicts nothing."
 
@@ -329,3 +356,18 @@ def shares(
         sample = (square / divisor).sum(1) / (len(scale) * len(run.windows))
         out += np.bincount(label, sample, count)
     return out
+
+
+def log_errors(shares: Mapping[str, np.ndarray], weights: np.ndarray) -> dict[str, np.ndarray]:
+    """Return what each block contributes to the mean logarithm of a model's error, [B] by model.
+
+    A tenth of the least mean error is added to each error, so that no block counts much where all
+    models are nearly right.
+
+    Args:
+        shares: what each block contributes to the mean NRMSE, [B] by model.
+        weights: of the blocks, [B].
+    """
+    least = min((float(one.sum()) for one in shares.values()), default=0.0)
+    small = max(_SMALL * least, float(np.finfo(float).tiny))
+    return {name: weights * np.log(one / weights + small) for name, one in shares.items()}

@@ -15,8 +15,8 @@ def section(run: RunFiles) -> Section | None:
         return None
     about = (
         "A head adds to the accelerations of a baseline what that leaves. Further baselines and"
-        " ensembles stand alone. The simplest sound model within one standard error of the least"
-        " validation error is selected."
+        " ensembles stand alone. The simplest sound model is selected that validation does not tell"
+        " from the best one."
     )
     return Section("Residual heads and further models", [Text(about, quiet=True), table])
 

@@ -213,8 +213,7 @@ def cautions(run: RunFiles, findings: Sequence[Finding]) -> list[str]:
     ]
     if lead is not None and lead == run.baseline and run.heads:
         out.append(
-            "The baseline was selected: on validation data no sound model is better by more than"
-            " one standard error."
+            "The baseline was selected: on validation data no sound model is clearly better."
         )
     # the first sentence; the figures stand in the section on sanity
     failed = [finding for finding in findings if finding.ok is False and finding.model == lead]
