@@ -83,7 +83,7 @@ def test_defaults_come_from_the_logs(data: residnet.Data) -> None:
     assert data.evaluation.selection == "T30"
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_fifteen_lines(trials: Path) -> None:
     """The example fits, runs freely and draws, as a stranger would start it."""
     lines = EXAMPLE.read_text().split('"""')[2].strip().splitlines()
@@ -178,7 +178,7 @@ def cli_rows(config: dict[str, Any], folder: Path, patch: pytest.MonkeyPatch) ->
     return RunFolder(folder / "run")
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_a_fit_by_function_mapping_and_command_line_is_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -239,7 +239,7 @@ def test_a_simulation_by_function_mapping_and_command_line_is_one(
     assert rows[0]["indices"]["first_overshoot"] == pytest.approx(overshoot, rel=1e-12)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_logs_alone_are_fitted_by_the_recipe(logs: list[residnet.Log]) -> None:
     models = residnet.fit([_coarse(log) for log in logs[:6]], effort=0.01)
     assert models.settings.recipe == "standard"

@@ -3,4 +3,4 @@
 source "$(dirname "${BASH_SOURCE[0]}")/../_venv.sh"
 install_residnet "[dev]"
 export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
-exec .venv/bin/python -m pytest -q -n 2 -m whole_runs "$@"
+exec .venv/bin/python -m pytest -q -n 2 -m long "$@"

@@ -83,7 +83,7 @@ def test_its_parts_pass_the_contracts_and_the_broken_one_is_caught(
     assert done.stdout.startswith("head crowded: the answer for a row depends on the other rows")
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_its_head_runs_by_name_from_yaml(site: Path, tmp_path: Path) -> None:
     """Fit, export in a format of the package, and what is listed."""
     config: dict[str, Any] = {

@@ -16,7 +16,7 @@ import pytest
 PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "first_hour.md"
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_the_tutorial_ends_with_the_numbers_that_it_prints(tmp_path: Path) -> None:
     text = PAGE.read_text()
     lines = [

@@ -138,7 +138,7 @@ def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
     assert bool((late < (flight.acting - flight.command).square().mean(0)).all())
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) -> None:
     found = study(
         config(

@@ -24,7 +24,7 @@ SOURCE = Path(__file__).parents[2] / "examples" / "autopilot_cpp"
 GAIN, TIME, SPEED, DT, HEADING = 3.47, 3.94, 3.2, 0.02, math.radians(30)
 
 pytestmark = [
-    pytest.mark.whole_runs,
+    pytest.mark.long,
     pytest.mark.skipif(shutil.which("cmake") is None, reason="cmake is not installed"),
     pytest.mark.skipif(
         shutil.which("c++") is None and shutil.which("g++") is None,

@@ -67,7 +67,7 @@ def flown(
     return headings, commands, flags
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_it_settles_with_delay_noise_and_bias(module: Any) -> None:
     headings, commands, flags = flown(module, 16.0)
     assert not any(flags)
@@ -76,7 +76,7 @@ def test_it_settles_with_delay_noise_and_bias(module: Any) -> None:
     assert max(map(abs, commands)) <= 5 * DEG * 1.0001
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_it_flags_a_gap_and_takes_up_the_course_after_it(module: Any) -> None:
     """The vessel turns on for two seconds without measurements; afterwards the push is no worse
     than before and the heading comes back.

@@ -65,7 +65,7 @@ def identified(settings: FitSettings, logs: PreparedSplits, store: MemoryStore) 
     return fit(logs, settings, store=store)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_python_and_command_line_give_the_same_metrics(
     identified: Identified,
     settings: FitSettings,

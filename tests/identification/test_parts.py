@@ -57,7 +57,7 @@ def everything_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts, "_LONG_REFIT", 1)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 @pytest.mark.usefixtures("everything_long")
 def test_side_by_side_gives_the_same_models(logs: PreparedSplits) -> None:
     settings = _settings()
@@ -79,7 +79,7 @@ def test_side_by_side_gives_the_same_models(logs: PreparedSplits) -> None:
     assert {"training wide", "training narrow"} <= {event.stage for event in heard}
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 @pytest.mark.usefixtures("everything_long")
 def test_a_part_that_fails_in_its_process_ends_the_fit_with_its_message(
     logs: PreparedSplits,

@@ -82,7 +82,7 @@ def identified(logs: PreparedSplits) -> Identified:
     return fit(logs, settings())
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_a_portfolio_stands_in_place_of_the_parts(identified: Identified) -> None:
     assert list(identified)[:2] == ["zero", "baseline"]
     assert set(NAMES) <= set(identified)
@@ -92,14 +92,14 @@ def test_a_portfolio_stands_in_place_of_the_parts(identified: Identified) -> Non
     assert all(np.isfinite(model.notes.get("validation", 0.0)) for model in identified.values())
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_networks_are_kept_only_where_they_gain(identified: Identified) -> None:
     for name, base in (("hull_network", "hull"), ("hull_network_calibrated", "hull_network")):
         gained, start = identified[name].notes, identified[base].notes
         assert gained["validation"] <= start["validation"] + 1e-4
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_the_selected_model_and_the_tied_ones_are_sound(
     identified: Identified, logs: PreparedSplits
 ) -> None:

@@ -20,7 +20,7 @@ from residnet.tasks.autopilot.stored import stored_policy
 from residnet.tasks.autopilot.task import AutopilotConfig
 from residnet.tasks.autopilot.tuned import tuned_before
 
-pytestmark = pytest.mark.whole_runs
+pytestmark = pytest.mark.long
 
 STATED = {"dt": "0.1 s", "duration": "6 s", "hold": "0 s", "delay": ["0 s", "0.3 s"]}
 TRAINING = {

@@ -266,7 +266,7 @@ IDENTIFIED: dict[str, Any] = {
 }
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_a_policy_that_learned_on_an_identified_model_steers_the_vessel(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -304,7 +304,7 @@ def test_a_policy_that_learned_on_an_identified_model_steers_the_vessel(
     assert about["turning"]["K"] != pytest.approx(3.47, rel=1e-6)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_wind_and_sea_are_flown_by_vessels_that_feel_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -196,7 +196,7 @@ def trial_logs() -> list[Log]:
     return simulate(flown, data)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_measured_csv_end_to_end(
     csv_logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,7 +17,7 @@ import yaml
 from read_page import plain
 from tiny import call
 
-pytestmark = pytest.mark.whole_runs
+pytestmark = pytest.mark.long
 
 AUTOPILOT: dict[str, Any] = {
     "task": "autopilot",

@@ -28,7 +28,7 @@ CONFIG: dict[str, Any] = {
 }
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_currents_are_found_and_models_fitted_without_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,7 +20,7 @@ from tiny import TINY, call
 from residnet.dynamics.store import load_model
 from residnet.report.figures.files import read_figures
 
-pytestmark = pytest.mark.whole_runs
+pytestmark = pytest.mark.long
 
 FEATURES = ["u", "v", "r", "tau_x", "tau_n"]
 

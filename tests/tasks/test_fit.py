@@ -91,7 +91,7 @@ def test_truth_and_heads_beat_the_baseline(tiny_run: Path) -> None:
     assert sum(row["diverged"] for row in rows(tiny_run)) == 0
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_same_seed_same_metrics(
     tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,7 +99,7 @@ def test_same_seed_same_metrics(
     assert rows(tmp_path / "again") == rows(tiny_run)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_another_seed_other_head(
     tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,7 +112,7 @@ def test_another_seed_other_head(
     assert changed == {"lstm", "mean"}
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_killed_and_resumed(
     tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -138,7 +138,7 @@ def test_killed_and_resumed(
     assert rows(out) == rows(tiny_run)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_models_read_back_give_the_same_rows(
     tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,7 +150,7 @@ def test_models_read_back_give_the_same_rows(
     assert rows(out) == rows(tiny_run)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_evaluate_on_the_training_logs_gives_the_numbers_of_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

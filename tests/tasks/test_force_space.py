@@ -17,7 +17,7 @@ from residnet.core.config import load_config
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.tasks.fit import FitConfig
 
-pytestmark = pytest.mark.whole_runs
+pytestmark = pytest.mark.long
 
 FERRY: dict[str, Any] = {
     "task": "fit",

@@ -11,7 +11,7 @@ import yaml
 from tiny import TINY, call
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_in_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Baseline and heads carry the solution whose validation free run is best, and fit.json says
     what was tried.

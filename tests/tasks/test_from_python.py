@@ -221,7 +221,7 @@ def assert_equal(found: dict[str, Any], expected: dict[str, Any], where: str) ->
             assert found[key] == value, f"{where} {key}"
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 @pytest.mark.parametrize("task", TASKS)
 def test_python_and_command_line_are_one(
     task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

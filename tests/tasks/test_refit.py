@@ -62,7 +62,7 @@ def new_logs(folder: Path, weaker: float) -> list[Any]:
     return words
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_a_refit_leaves_the_old_run_alone_and_can_be_exported_and_evaluated(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -97,7 +97,7 @@ def test_a_refit_leaves_the_old_run_alone_and_can_be_exported_and_evaluated(
     assert "give another folder for --refit" in capsys.readouterr().err
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_clean_logs_are_not_refitted(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -80,7 +80,7 @@ def test_inspect_reads_them(
     assert "coherence 1.000" in text
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(
     trials: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -35,7 +35,7 @@ def study(tiny_config: Path, tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_all_variants_and_seeds_in_one_table(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -162,7 +162,7 @@ def test_a_wrong_sweep_is_one_line(
     assert text.count("\n") == 1
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_processes_end_with_a_killed_sweep_and_the_rest_follows(
     sweep: Path, tmp_path: Path
 ) -> None:
@@ -198,7 +198,7 @@ def _alive(process: int) -> bool:
     return state != "Z"
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_the_same_sweep_runs_through_ray(
     sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

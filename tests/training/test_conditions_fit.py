@@ -48,7 +48,7 @@ def trained(units: int, rate: float) -> tuple[ObservedPolicy, dict[str, object]]
     return policy, notes
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_training_lowers_the_cost_of_flights_that_it_does_not_see() -> None:
     policy, notes = trained(4, 0.05)
     assert notes["best_validation"] < 0.97 * notes["start_validation"]  # type: ignore[operator]
@@ -58,7 +58,7 @@ def test_training_lowers_the_cost_of_flights_that_it_does_not_see() -> None:
     assert torch.equal(again.constants, policy.constants)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_a_start_that_training_only_spoils_is_kept() -> None:
     policy, notes = trained(4, 30.0)
     assert notes["best_validation"] == notes["start_validation"]

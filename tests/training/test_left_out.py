@@ -17,7 +17,7 @@ from residnet.training.refit import refit
 from residnet.training.refit_config import RefitConfig
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 @pytest.mark.parametrize("offsets", [None, OffsetsConfig(r=0.01)], ids=["none", "offsets"])
 def test_one_step_goes_where_a_refit_without_the_logs_goes(offsets: OffsetsConfig | None) -> None:
     logs = trials()[:4]

@@ -129,7 +129,7 @@ def test_a_gpu_trains_to_the_same_losses() -> None:
     assert losses["cuda"] == pytest.approx(losses["cpu"], rel=1e-6)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 @pytest.mark.parametrize("robust", [0.0, 0.3])
 def test_two_processes_train_as_one(robust: float, tmp_path: Path) -> None:
     """The losses of the first 50 steps in float64, batches of odd size, two gloo processes."""

@@ -100,7 +100,7 @@ def test_without_offsets_looking_for_them_costs_nothing() -> None:
     assert none.offsets.value.shape == (LOGS, 0)
 
 
-@pytest.mark.whole_runs
+@pytest.mark.long
 def test_standard_errors_are_those_of_repeated_trials() -> None:
     """Five sets of trials: errors in units of their standard errors are of the size of one."""
     ratios = []
