@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal, final
 
 import torch
@@ -28,6 +28,7 @@ from residnet.physics.mmg import (
     Prior,
     usual_priors,
 )
+from residnet.regression.least_squares import descend
 from residnet.regression.solutions import Coefficient, Solution
 
 _MOST_SAMPLES = 4000
@@ -35,9 +36,9 @@ _MOST_SAMPLES = 4000
 _STEP = 1e-4
 """Step of a difference quotient, in prior standard deviations."""
 _MOST_STEPS = 20
-"""Most steps of Gauss-Newton."""
-_CONVERGED = 1e-6
-"""Largest squared step, in prior standard deviations, at which Gauss-Newton ends."""
+"""Most steps of the search."""
+_GAIN = 1e-9
+"""Share of the logarithm of the likelihood that a step must gain for another one."""
 # what can only be seen in the accelerations of one axis is listed under it
 _AXIS = {"X": "u_dot", "R": "u_dot", "t": "u_dot", "Y": "v_dot", "N": "r_dot"}
 
@@ -205,34 +206,42 @@ class MMGConfig(IdentifiedConfig):
             FitError: where the accelerations at the prior means are not finite.
         """
         assert isinstance(baseline, MMGBaseline)
-        chosen = _thinned(of_manoeuvres(samples, self.manoeuvres))
+        picked = of_manoeuvres(samples, self.manoeuvres)
+        chosen, count = _thinned(picked), len(picked) / self.correlation
         free, (mean, precision) = baseline.free_indices(), baseline.prior()
-        count = len(of_manoeuvres(samples, self.manoeuvres)) / self.correlation
-        baseline.theta[free] = mean
-        for _ in range(_MOST_STEPS):
-            left = chosen.target - baseline(chosen.z)
-            if not torch.isfinite(left).all():
-                raise FitError(
-                    "the MMG model's accelerations are not finite along the training logs; check"
-                    " hull, propeller and rudder, and units"
-                )
-            weight = 1.0 / left.square().mean(0)
+
+        def error(theta: Tensor) -> Tensor:
+            baseline.theta[free] = theta
+            return chosen.target - baseline(chosen.z)
+
+        def cost(theta: Tensor) -> float:
+            likelihood = 0.5 * count * error(theta).square().mean(0).log().sum()
+            return float(likelihood + 0.5 * (precision * (theta - mean).square()).sum())
+
+        def equations(theta: Tensor) -> tuple[Tensor, Tensor]:
+            left = error(theta)
+            weight = count / len(chosen) / left.square().mean(0)
             slopes = baseline.sensitivity(chosen.z)
-            hessian = count * torch.einsum("bip,biq,i->pq", slopes, slopes, weight) / len(
-                chosen
-            ) + torch.diag(precision)
-            gradient = count * torch.einsum("bip,bi,i->p", slopes, left, weight) / len(
-                chosen
-            ) + precision * (mean - baseline.theta[free])
-            step = torch.linalg.solve(hessian, gradient)
-            baseline.theta[free] += step
-            if float((step.square() * precision).max()) < _CONVERGED:
-                break
-        errors = torch.linalg.inv(hessian).diagonal().sqrt()
-        return [
-            Solution(
-                {},
-                {"theta": baseline.theta.detach().clone()},
-                tuple(baseline.updated_table((), errors)),
+            hessian = torch.einsum("bip,biq,i->pq", slopes, slopes, weight) + torch.diag(precision)
+            gradient = torch.einsum("bip,bi,i->p", slopes, left, weight)
+            return hessian, gradient + precision * (mean - theta)
+
+        def near(theta: Tensor) -> tuple[float, Callable[[float], tuple[float, Tensor]]]:
+            hessian, gradient = equations(theta)
+
+            def trial(damping: float) -> tuple[float, Tensor]:
+                damped = hessian + damping * torch.diag(hessian.diagonal())
+                moved = theta + torch.linalg.solve(damped, gradient)
+                return cost(moved), moved
+
+            return cost(theta), trial
+
+        if not torch.isfinite(error(mean)).all():
+            raise FitError(
+                "the MMG model's accelerations are not finite along the training logs; check"
+                " hull, propeller and rudder, and units"
             )
-        ]
+        found = descend(mean, near, _MOST_STEPS, gain=_GAIN, damping=0.0).point
+        errors = torch.linalg.inv(equations(found)[0]).diagonal().sqrt()
+        theta = baseline.theta.detach().clone()
+        return [Solution({}, {"theta": theta}, tuple(baseline.updated_table((), errors)))]

@@ -1,9 +1,11 @@
-"""Linear least squares with standard errors that hold for correlated residuals."""
+"""Least squares: linear, with standard errors that hold for correlated residuals, and damped."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from typing import final
+from dataclasses import dataclass
+from typing import Generic, TypeVar, final
 
 import torch
 from torch import Tensor
@@ -21,6 +23,10 @@ _ROUNDING = 10
 """What rounding leaves of a zero eigenvalue, in units of columns times machine precision."""
 _TINY = 1e-300
 """Least eigenvalue that a condition number is divided by."""
+LEAST_DAMPING = 1e-8
+"""Damping that changes no digit of a step that matters."""
+
+Point = TypeVar("Point")
 
 
 @final
@@ -216,3 +222,47 @@ def _sum(x: Regressors, of: Callable[[slice, Tensor], Tensor]) -> Tensor:
     for rows, part in parts:
         total = total + of(rows, part)
     return total
+
+@dataclass(frozen=True)
+class Descent(Generic[Point]):
+    """Where a descent ended, and how many steps it took."""
+
+    point: Point
+    steps: int
+
+
+def descend(
+    begin: Point,
+    near: Callable[[Point], tuple[float, Callable[[float], tuple[float, Point]]]],
+    iterations: int,
+    *,
+    gain: float,
+    damping: float = 1e-3,
+    attempts: int = 8,
+) -> Descent[Point]:
+    """Descend to a minimum by Levenberg's and Marquardt's method.
+
+    Args:
+        begin: where the descent begins, whatever a point is.
+        near: linearises the problem at a point. It gives the cost there, and what a step with a
+            damping leads to: the cost at its end, and the point itself.
+        iterations: most steps.
+        gain: share of the cost that a step must gain for another one.
+        damping: of the first step, in units of the Hessian's diagonal; a tenth after a step that
+            gains, ten times after one that does not. 0 for Gauss-Newton as long as that gains.
+        attempts: dampings tried before a point counts as the minimum.
+    """
+    point, steps = begin, 0
+    while steps < iterations:
+        cost, trial = near(point)
+        for _ in range(attempts):
+            reached, moved = trial(damping)
+            if math.isfinite(reached) and reached < cost:
+                break
+            damping = max(10.0 * damping, LEAST_DAMPING)
+        else:
+            break
+        point, steps, damping = moved, steps + 1, max(damping / 10.0, min(damping, LEAST_DAMPING))
+        if cost - reached < gain * abs(cost):
+            break
+    return Descent(point, steps)
