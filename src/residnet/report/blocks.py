@@ -7,11 +7,13 @@ The same objects serve the page (`residnet.report.page.write_page`) and the term
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeAlias
+
+from residnet.report.format import fixed
 
 if TYPE_CHECKING:
     from residnet.report.interactive.explorer import Explorer
@@ -266,6 +268,73 @@ class Table:
             ]
             out.append("  ".join(parts))
         return "\n".join(line.rstrip() for line in out)
+
+
+Column: TypeAlias = tuple[Any, ...]
+"""Of a table: its title, what it shows of a row, how, and a factor; all but the first two may lack.
+
+What it shows is a key, with dots for keys inside, or a function of the row. It is shown by so many
+decimals (an int) or by a function of the value that returns text; without either, a cell stands as
+it is, and anything else is written as words.
+"""
+
+
+def table_of(
+    rows: Iterable[Any],
+    columns: Sequence[Column],
+    *,
+    groups: Sequence[tuple[str, int]] = (),
+    caption: str = "",
+    selected: Callable[[Any], bool] = lambda row: False,
+    rule: Callable[[Any], Any] | None = None,
+) -> Table:
+    """Return a table with a row for each of the given ones.
+
+    Args:
+        rows: mappings, or anything that the columns' functions take.
+        columns: the first is that of the labels.
+        groups: titles that span several columns, see `Table`.
+        caption: a sentence above the table.
+        selected: whether a row is set off as the one that was chosen.
+        rule: a line is drawn above a row for which this is another than for the row before.
+
+    Example:
+        table_of(rows, [("model", "model"), ("time [s]", "time.mean", 2), ("rms", "rms", 1, DEG)])
+    """
+    table = Table([title for title, *_ in columns], groups=groups, caption=caption)
+    last: Any = None
+    for row in rows:
+        label, *cells = [_cell(row, *rest) for _, *rest in columns]
+        group = rule(row) if rule else None
+        table.add(label.text, cells, rule=group != last, selected=selected(row))
+        last = group
+    return table
+
+
+def _cell(
+    row: Any,
+    what: str | Callable[[Any], Any],
+    how: int | Callable[[Any], str | Cell] | None = None,
+    factor: float = 1.0,
+) -> Cell:
+    value = what(row) if callable(what) else _at(row, what)
+    if how is None:
+        return value if isinstance(value, Cell) else Cell(str(value), mark="text")
+    if value is not None and factor != 1.0:
+        value = factor * value
+    shown = fixed(value, how) if isinstance(how, int) else how(value)
+    return shown if isinstance(shown, Cell) else Cell(shown)
+
+
+def _at(row: Any, keys: str) -> Any:
+    for key in keys.split("."):
+        row = row.get(key) if isinstance(row, Mapping) else None
+    return row
+
+
+def bad_where(text: object, bad: object) -> Cell:
+    """Return a cell that is set off where something is wrong."""
+    return Cell(str(text), mark="bad" if bad else "")
 
 
 def _narrowest(texts: Iterable[str]) -> float:

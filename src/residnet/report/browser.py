@@ -1,0 +1,293 @@
+"""Figures drawn with Bokeh: the parts of a page, and the data of their cases for its own script."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from residnet.report.figure import INK, Case, Figure, packed
+
+if TYPE_CHECKING:
+    from bokeh.models import ColumnDataSource
+    from bokeh.plotting import figure as Canvas
+
+_FONT = "12px"
+_RANDOM = re.compile(
+    r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b|(?<=\")p\d{4,}(?=\")"
+)
+"""Names that Bokeh gives to the parts of a page and to its models."""
+HEIGHT = "height of a cell"
+"""Name of the column of a surface's heights; of their logarithms on a page where they are so."""
+_DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
+_MARKERS = {"o": "circle", "s": "square", "x": "x", "^": "triangle"}
+_MOST_PANELS = 60
+"""Most panels of the figures of one page, which a browser has to draw."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What a page holds of its interactive figures.
+
+    Attributes:
+        parts: HTML of the panels of each figure by its key.
+        cases: the figure's cases as JSON, curves in base 64, by its key.
+        script: that draws all panels.
+        library: BokehJS itself, so that the page loads nothing.
+    """
+
+    parts: dict[str, list[str]]
+    cases: dict[str, str]
+    script: str
+    library: str
+
+
+def draw(figures: Sequence[Figure]) -> Drawn | None:
+    """Draw as many figures as a page has room for; None where there are none."""
+    sums = np.cumsum([len(figure.panels) for figure in figures])
+    afforded = [one for one, panels in zip(figures, sums, strict=True) if panels <= _MOST_PANELS]
+    afforded = afforded or list(figures[:1])
+    if not afforded:
+        return None
+    from bokeh.embed import components
+    from bokeh.model import Model
+    from bokeh.resources import Resources
+
+    canvases: dict[str, Model] = {
+        f"{one.key}-{number}": canvas
+        for one in afforded
+        for number, canvas in enumerate(_panels(one))
+    }
+    script, given = components(canvases)
+    # random names are counted, so that the same run has the same page
+    names: dict[str, str] = {}
+    script, *divisions = [
+        _RANDOM.sub(lambda found: names.setdefault(found[0], f"bokeh-{len(names)}"), text)
+        for text in (script, *given.values())
+    ]
+    parts = dict(zip(given, divisions, strict=True))
+    library = Resources(mode="inline", components=["bokeh"], minified=True).render_js()
+    return Drawn(
+        {
+            one.key: [parts[f"{one.key}-{number}"] for number in range(len(one.panels))]
+            for one in afforded
+        },
+        {one.key: _cases(one) for one in afforded},
+        script,
+        library,
+    )
+
+
+def _panels(figure: Figure) -> list[Canvas]:
+    """Return the panels; those of curves share their horizontal axis and a cursor."""
+    from bokeh.models import ColumnDataSource, CrosshairTool
+    from bokeh.models.annotations import Span
+
+    groups: dict[str, Any] = {}
+    cursor = Span(dimension="height", line_dash="dotted", line_width=1)
+    out = []
+    for number, panel in enumerate(figure.panels):
+        # the page's own script fills in the first case: its values are there once
+        source = ColumnDataSource({name: [] for name in _columns(figure, figure.cases[0], number)})
+        own = panel.kind != "curves"
+        shared = (
+            _range(panel.x_limits)
+            if own
+            else groups.setdefault(panel.group, _range(panel.x_limits))
+        )
+        canvas = _canvas(figure, number, shared, source)
+        if not own:
+            canvas.add_tools(CrosshairTool(dimensions="height", overlay=cursor))
+        out.append(canvas)
+    return out
+
+
+def _range(limits: Sequence[float]) -> Any:
+    """Return what an axis shows: given limits, else all that is switched on."""
+    from bokeh.models import DataRange1d, Range1d
+
+    return Range1d(start=limits[0], end=limits[1]) if limits else DataRange1d(only_visible=True)
+
+
+def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource) -> Canvas:
+    from bokeh.models import BasicTicker, BoxZoomTool, FixedTicker, HoverTool, NoOverlap
+    from bokeh.models.annotations import Title
+    from bokeh.plotting import figure as new_canvas
+
+    panel, surface = figure.panels[number], figure.surface
+    canvas = new_canvas(
+        name=f"{figure.key}-{number}",
+        title=Title(text=panel.words, text_font_size=_FONT),
+        height=380 if panel.kind == "map" else panel.height,
+        sizing_mode="stretch_width",
+        toolbar_location=None,
+        tools=[],
+        # so that time axes stand under each other
+        min_border_left=68,
+        min_border_right=12,
+        output_backend="canvas",
+        x_range=x_range,
+        y_range=_range(panel.y_limits),
+        match_aspect=panel.kind == "map",
+        x_axis_type="log" if panel.x_log else "linear",
+        y_axis_type="log" if panel.y_log else "linear",
+    )
+    # the page scrolls under a finger; dragging zooms only after a button was pressed
+    canvas.stylesheets = [":host .bk-events { touch-action: pan-y pinch-zoom; }"]
+    over = [_mark(figure, name, source, panel.kind == "surface") for name in figure.names(number)]
+    canvas.renderers.extend(over)
+    if panel.kind == "surface" and surface is not None:
+        canvas.add_layout(_colors(surface.log, over), "right")
+        canvas.yaxis.axis_label = panel.y_label or None
+    # where places bear names, the name alone says what a mark is
+    told = panel.kind == "curves" and not panel.y_names
+    tips: Any = [("$name", "@$name{0.000 a}")] if told else [("", "$name")]
+    if panel.kind == "surface" and surface is not None:
+        height = f"@{{{HEIGHT}}}{{0.000 a}}"
+        tips = [(panel.x_label, "$x{0}"), (panel.y_label, "$y{0}"), (surface.height, height)]
+    hover = HoverTool(
+        renderers=[
+            one for one in over if figure.looks[one.name].kind in ("line", "points", "cells")
+        ],
+        mode="vline" if told else "mouse",
+        tooltips=tips,
+        point_policy="follow_mouse",
+    )
+    canvas.add_tools(hover, BoxZoomTool(match_aspect=panel.kind == "map"))
+    canvas.toolbar.active_drag = None
+    canvas.xaxis.axis_label = panel.x_label or None
+    for axis in canvas.axis:
+        axis.major_label_text_font_size = _FONT
+        axis.axis_label_text_font_size = _FONT
+        axis.axis_label_text_font_style = "normal"
+    for axis, names, log, count in (
+        (canvas.yaxis, panel.y_names, panel.y_log, 4),
+        (canvas.xaxis, panel.x_names, panel.x_log, 5),
+    ):
+        if names:
+            axis.ticker = FixedTicker(ticks=[float(place) for place in names])
+            axis.major_label_overrides = {float(place): text for place, text in names.items()}
+        elif not log:
+            axis.ticker = BasicTicker(desired_num_ticks=count)
+    if panel.x_names and max(map(len, panel.x_names.values())) > 4:
+        # long names stand upright, and on a phone those that have room
+        canvas.xaxis.major_label_orientation = "vertical"
+        canvas.xaxis.major_label_policy = NoOverlap(min_distance=2)
+    if not panel.x_names and not panel.x_log and figure.counts(number):
+        canvas.xaxis.ticker = BasicTicker(desired_num_ticks=5, min_interval=1.0)
+    return canvas
+
+
+def _colors(log: bool, over: Sequence[Any]) -> Any:
+    """Return the bar that tells what the colours of a surface mean."""
+    from bokeh.models import BasicTicker, LogTicker
+    from bokeh.models.annotations import ColorBar
+
+    return ColorBar(
+        color_mapper=next(one for one in over if one.name == "surface").glyph.fill_color.transform,
+        ticker=LogTicker(mantissas=[1, 3]) if log else BasicTicker(),
+        width=12,
+        padding=4,
+        background_fill_color=None,
+        major_label_text_font_size=_FONT,
+    )
+
+
+def _mark(figure: Figure, name: str, source: ColumnDataSource, on_cells: bool) -> Any:
+    """Return the renderer of what bears a name, added to nothing yet."""
+    from bokeh import models
+    from bokeh.models.renderers import GlyphRenderer
+    from bokeh.palettes import Viridis256
+
+    look, surface = figure.looks[name], figure.surface
+    color, x = "#808080" if look.color == INK else look.color, f"x of {name}"
+    # what is faint on paper stays to be seen on a screen
+    alpha = max(look.alpha, 0.25)
+    fill = {"fill_color": color, "fill_alpha": alpha, "line_color": None}
+    line = {
+        "line_color": color,
+        "line_alpha": alpha,
+        "line_dash": _DASHES.get(look.dash, look.dash),
+        "line_width": min(max(1.2 * look.width, 0.8), 2.4),
+    }
+    glyph: Any
+    if look.kind == "cells" and surface is not None:
+        mapper = models.LogColorMapper if surface.log else models.LinearColorMapper
+        low, high = surface.limits
+        shade: Any = {"field": HEIGHT, "transform": mapper(palette=Viridis256, low=low, high=high)}
+        width, height = surface.size
+        glyph = models.Rect(
+            x=x, y=name, width=width, height=height, fill_color=shade, line_color=None
+        )
+    elif look.kind == "points":
+        marker: dict[str, Any] = {"marker": _MARKERS[look.marker], "size": max(look.size, 4)}
+        if on_cells:
+            # a mark stands out from cells of any colour
+            marker |= {"size": 10, "fill_color": color, "line_color": "white", "line_width": 2}
+        elif look.hollow or look.marker == "x":
+            marker |= {"fill_color": None, "line_color": color}
+        else:
+            marker |= {"fill_color": color, "line_color": None, "fill_alpha": alpha}
+        glyph = models.Scatter(x=x, y=name, **marker)
+    elif look.kind == "fill":
+        glyph = models.Patch(x=x, y=name, **fill)
+    elif look.kind == "strip":
+        glyph = models.VStrip(x0=x, x1=name, **fill)
+    elif look.kind == "across":
+        glyph = models.HSpan(y=name, **line)
+    elif look.kind == "upright":
+        glyph = models.VSpan(x=x, **line)
+    else:
+        glyph = models.Line(x=x, y=name, **line)
+    return GlyphRenderer(data_source=source, glyph=glyph, name=name, visible=look.shown)
+
+
+def _columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarray]:
+    """Return the columns of a panel's source; shorter curves are filled with gaps."""
+    curves = case.curves[panel]
+    longest = max((len(x) for x, _ in curves.values()), default=0)
+    columns = {}
+    for name in figure.names(panel):
+        x, y = curves.get(name, (np.empty(0), np.empty(0)))
+        columns |= {f"x of {name}": x, name: y}
+    if figure.surface is not None and panel == 0:
+        columns[HEIGHT] = np.log10(case.heights) if figure.surface.log else case.heights
+    for name, values in columns.items():
+        columns[name] = np.full(longest, np.nan)
+        columns[name][: len(values)] = values
+    return columns
+
+
+def _cases(figure: Figure) -> str:
+    """Return the cases as JSON that may stand in a page's script."""
+    surface = figure.surface
+    content = {
+        "looks": {
+            name: {"color": look.color, "shown": look.shown} for name, look in figure.looks.items()
+        },
+        "panels": len(figure.panels),
+        "surface": surface
+        and {
+            "name": "surface",
+            "section": "section",
+            "heights": HEIGHT,
+            "size": surface.size,
+            "logarithmic": surface.log,
+        },
+        "cases": [
+            {
+                "title": case.title,
+                "note": case.note,
+                "chosen": case.chosen,
+                "panels": [
+                    packed(_columns(figure, case, number)) for number in range(len(figure.panels))
+                ],
+            }
+            for case in figure.cases
+        ],
+    }
+    return json.dumps(content, separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
