@@ -33,7 +33,7 @@ LAYERS = [
     {"crash", "run_log"},
     {"door", "terminal"},
     {"commands"},
-    {"cli", "__main__", "face", "testing"},
+    {"cli", "__main__", "api", "testing"},
 ]
 ALLOWED = {("__main__", "cli")}
 RANK = {package: rank for rank, packages in enumerate(LAYERS) for package in packages}

@@ -38,8 +38,8 @@ from tiny_tasks import TINY_TASKS, boat, measured, resolved
 
 # imported before the forks, which then begin at once
 import residnet
-import residnet.face.models
-import residnet.face.tasks
+import residnet.api.models
+import residnet.api.tasks
 import residnet.report.figures.style
 import residnet.tasks.fit.external
 import residnet.tasks.fit.running
@@ -227,7 +227,7 @@ def _verbs(run: Path, config: Path, logs: Path) -> dict[str, Callable[[], object
         for name in (None, "mlp", "ridge"):
             model = residnet.load(run, name)
             model.rollout([0, 0, 0, 1, 0, 0], [[6.0, 0.1]] * 5)
-        result = residnet.face.tasks.Result(run, None)
+        result = residnet.api.tasks.Result(run, None)
         _ = result.metrics, result.verdict, repr(result)
         for file in result.files:
             result.read(file)

@@ -16,52 +16,52 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from residnet.api.data import Data, prepare
+    from residnet.api.drafting import draft
+    from residnet.api.fitting import Models, fit, metrics, select
+    from residnet.api.logs import inspect, read_logs
+    from residnet.api.models import Model, export_model, load, save
+    from residnet.api.monitoring import Monitor
+    from residnet.api.parts import available, baseline, head
+    from residnet.api.runs import FreeRuns, free_run
+    from residnet.api.simulation import Trials, manoeuvre, simulate, vessel
+    from residnet.api.tasks import Result, autopilot, run
     from residnet.core.errors import ResidnetError
     from residnet.core.log import Log
     from residnet.core.progress import Progress
     from residnet.core.version import __version__
-    from residnet.face.data import Data, prepare
-    from residnet.face.drafting import draft
-    from residnet.face.fitting import Models, fit, metrics, select
-    from residnet.face.logs import inspect, read_logs
-    from residnet.face.models import Model, export_model, load, save
-    from residnet.face.monitoring import Monitor
-    from residnet.face.parts import available, baseline, head
-    from residnet.face.runs import FreeRuns, free_run
-    from residnet.face.simulation import Trials, manoeuvre, simulate, vessel
-    from residnet.face.tasks import Result, autopilot, run
 
 _HOME = {
     "__version__": "core.version",
-    "Data": "face.data",
-    "FreeRuns": "face.runs",
+    "Data": "api.data",
+    "FreeRuns": "api.runs",
     "Log": "core.log",
-    "Model": "face.models",
-    "Models": "face.fitting",
-    "Monitor": "face.monitoring",
+    "Model": "api.models",
+    "Models": "api.fitting",
+    "Monitor": "api.monitoring",
     "Progress": "core.progress",
     "ResidnetError": "core.errors",
-    "Result": "face.tasks",
-    "Trials": "face.simulation",
-    "autopilot": "face.tasks",
-    "available": "face.parts",
-    "baseline": "face.parts",
-    "draft": "face.drafting",
-    "export_model": "face.models",
-    "fit": "face.fitting",
-    "free_run": "face.runs",
-    "head": "face.parts",
-    "inspect": "face.logs",
-    "load": "face.models",
-    "manoeuvre": "face.simulation",
-    "metrics": "face.fitting",
-    "prepare": "face.data",
-    "read_logs": "face.logs",
-    "run": "face.tasks",
-    "save": "face.models",
-    "select": "face.fitting",
-    "simulate": "face.simulation",
-    "vessel": "face.simulation",
+    "Result": "api.tasks",
+    "Trials": "api.simulation",
+    "autopilot": "api.tasks",
+    "available": "api.parts",
+    "baseline": "api.parts",
+    "draft": "api.drafting",
+    "export_model": "api.models",
+    "fit": "api.fitting",
+    "free_run": "api.runs",
+    "head": "api.parts",
+    "inspect": "api.logs",
+    "load": "api.models",
+    "manoeuvre": "api.simulation",
+    "metrics": "api.fitting",
+    "prepare": "api.data",
+    "read_logs": "api.logs",
+    "run": "api.tasks",
+    "save": "api.models",
+    "select": "api.fitting",
+    "simulate": "api.simulation",
+    "vessel": "api.simulation",
 }
 
 __all__ = [

@@ -264,7 +264,7 @@ def test_a_run_without_a_folder_leaves_nothing_behind() -> None:
 
 
 def test_every_task_is_compared() -> None:
-    """`fit` and `simulate` are compared with the face's functions too, in test_face.py."""
+    """`fit` and `simulate` are compared with the functions of `api` too, in test_api.py."""
     names = set(residnet.available("tasks")["name"])
     # the measured ferry needs data that are not part of a checkout
     assert names - set(TASKS) == {"fit", "simulate", "force_residual"}

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from residnet.api.data import Data, prepare
+from residnet.api.logs import read_logs
+from residnet.api.values import described
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.data.division import divided
 from residnet.data.drafting.questions import Marks
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.split import SPLITS
-from residnet.face.data import Data, prepare
-from residnet.face.logs import read_logs
-from residnet.face.values import described
 from residnet.tasks.drafting import recipe
 from residnet.tasks.drafting.inputs import driving
 

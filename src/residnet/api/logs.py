@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from residnet.api.values import PartGiven, PathGiven, described, hearing, part, path, plain
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
@@ -14,7 +15,6 @@ from residnet.core.progress import ProgressCallback, report, say
 from residnet.data.parts import log_names
 from residnet.data.readers import LogReader, ReaderConfig
 from residnet.data.readers.detect import format_of, reader_for
-from residnet.face.values import PartGiven, PathGiven, described, hearing, part, path, plain
 from residnet.tasks.log_files import log_files
 
 if TYPE_CHECKING:

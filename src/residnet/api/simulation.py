@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, final
 
+from residnet.api.values import PartGiven, described, hearing, part, plain
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.progress import ProgressCallback
 from residnet.data.simulated.flying import Flight
-from residnet.face.values import PartGiven, described, hearing, part, plain
 from residnet.judge.index_table import index_rows
 from residnet.manoeuvres import Manoeuvre, ManoeuvreConfig
 from residnet.physics.vessel import load_vessel

@@ -8,11 +8,11 @@ from typing import Any, final
 
 import numpy as np
 
+from residnet.api.data import Data
+from residnet.api.models import Model, require_model
+from residnet.api.values import described
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
-from residnet.face.data import Data
-from residnet.face.models import Model, require_model
-from residnet.face.values import described
 from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
 from residnet.identification.monitoring.refitting import Refit, recursive_refit, refitted
 from residnet.identification.monitoring.watcher import Watcher

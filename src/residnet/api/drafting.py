@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from residnet.api.values import PathGiven, hearing, path
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback
 from residnet.data.drafting.questions import Question
-from residnet.face.values import PathGiven, hearing, path
 from residnet.tasks.drafting.draft import Draft, drafted
 
 RECIPES = ("standard",)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from residnet.api.values import PathGiven, described, path
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json
 from residnet.core.names import STATE
@@ -20,7 +21,6 @@ from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.scripted import scripted
 from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.export import exporter
-from residnet.face.values import PathGiven, described, path
 from residnet.identification.models import FittedModel
 from residnet.judge.bands.band import Band
 from residnet.judge.bands.file import read_bands

@@ -1,4 +1,4 @@
-"""The Python face: lazy, the numbers of the command line, and its errors in one line."""
+"""The Python interface: lazy, the numbers of the command line, and its errors in one line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EXAMPLE = Path(__file__).parents[1] / "examples" / "fifteen_lines.py"
 
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("face") / "trials"
+    folder = tmp_path_factory.mktemp("api") / "trials"
     write_trials(folder, duration=40.0)
     return folder
 

@@ -9,13 +9,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
+from residnet.api.models import Model, load
+from residnet.api.values import PathGiven, described, hearing, path, plain
 from residnet.core.config import load_config, validate
 from residnet.core.errors import UsageError
 from residnet.core.files import read_table
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback
-from residnet.face.models import Model, load
-from residnet.face.values import PathGiven, described, hearing, path, plain
 from residnet.judge.tables import metrics_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task

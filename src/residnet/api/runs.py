@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from residnet.api.data import Data
+from residnet.api.models import Model, require_model
+from residnet.api.values import described, hearing
 from residnet.core.errors import UsageError
 from residnet.core.names import STATE, nearest
 from residnet.core.progress import ProgressCallback
 from residnet.data.prepare import Prepared
-from residnet.face.data import Data
-from residnet.face.models import Model, require_model
-from residnet.face.values import described, hearing
 from residnet.identification.evaluation import Evaluation, candidates, evaluate
 from residnet.identification.prepared import velocity_limit
 from residnet.judge.tables import metrics_table

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from residnet.api.logs import LogsGiven, read_logs
+from residnet.api.values import described, hearing, plain
 from residnet.core.arrays import paged
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
@@ -21,8 +23,6 @@ from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.data.sources import read_logs as read_splits
 from residnet.data.split import SPLITS, check_leaks
-from residnet.face.logs import LogsGiven, read_logs
-from residnet.face.values import described, hearing, plain
 from residnet.judge.config import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
 

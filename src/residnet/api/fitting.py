@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any, final
 
 import torch
 
+from residnet.api.data import Data
+from residnet.api.logs import LogsGiven
+from residnet.api.models import Model
+from residnet.api.preparing import prepared_alone
+from residnet.api.runs import FreeRuns, free_run
+from residnet.api.values import PartGiven, described, hearing, named_parts, part, plain
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.core.processes import spread
 from residnet.core.progress import ProgressCallback
-from residnet.face.data import Data
-from residnet.face.logs import LogsGiven
-from residnet.face.models import Model
-from residnet.face.preparing import prepared_alone
-from residnet.face.runs import FreeRuns, free_run
-from residnet.face.values import PartGiven, described, hearing, named_parts, part, plain
 from residnet.identification.currents import through_currents
 from residnet.identification.fit import fit as identify
 from residnet.identification.identified import Identified
