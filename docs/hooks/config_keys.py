@@ -21,6 +21,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from residnet.core.config import Quantity
+from residnet.core.registry import Kinds, kinds
 from residnet.physics.vessel import VesselConfig
 from residnet.tasks.union import TaskConfig
 
@@ -57,8 +58,15 @@ def parts(annotation: object) -> tuple[Any, ...]:
     """Return what an annotation is made of: members of a union, elements of a list, and so on."""
     if typing.get_origin(annotation) is Literal:
         return ()
+    if typing.get_origin(annotation) is typing.Annotated and marked(annotation.__metadata__):
+        return tuple(kinds(annotation).values())
     aliased = getattr(annotation, "__value__", None)
     return (aliased,) if aliased is not None else typing.get_args(annotation)
+
+
+def marked(metadata: typing.Sequence[object]) -> Kinds | None:
+    """Return the kinds that an annotation takes; None where it is no choice of kinds."""
+    return next((item for item in metadata if isinstance(item, Kinds)), None)
 
 
 def config_classes() -> list[type[BaseModel]]:
@@ -70,7 +78,9 @@ def config_classes() -> list[type[BaseModel]]:
             if annotation not in found:
                 found[annotation] = None
                 for field in annotation.model_fields.values():
-                    visit(field.annotation)
+                    mark = marked(field.metadata)
+                    kind = field.annotation
+                    visit(kind if mark is None else typing.Annotated[kind, mark])
         else:
             for part in parts(annotation):
                 visit(part)
@@ -125,6 +135,9 @@ def described_type(annotation: Any, metadata: typing.Sequence[object] = ()) -> s
     arguments = typing.get_args(annotation)
     if (aliased := getattr(annotation, "__value__", None)) is not None:
         return described_type(aliased)
+    if (mark := marked(metadata)) is not None:
+        of_kind = kinds(typing.Annotated[annotation, mark])
+        return " or ".join(described_type(member) for member in of_kind.values())
     if origin is typing.Annotated:
         return described_type(arguments[0], arguments[1:])
     if origin is Literal:

@@ -23,7 +23,7 @@ from selection import scattered
 
 from residnet.core.config import validate
 from residnet.core.log import Log
-from residnet.core.resources import config_folder
+from residnet.core.files import config_folder
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.identification.currents import through_currents

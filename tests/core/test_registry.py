@@ -83,13 +83,13 @@ def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> N
 )
 def test_faults_of_kinds(installed: Path, target: str, fault: str) -> None:
     declare(installed / "site", "residnet.heads", odd=target)
-    assert fault in registry.broken_kinds(HeadConfig)["odd"].fault
+    assert fault in dict(registry.listed(HeadConfig))["odd"]
 
 
 def test_no_package_takes_a_name_away(installed: Path) -> None:
     declare(installed / "site", "residnet.heads", plsr="residnet_sample.slow_water:SlowWaterConfig")
     assert isinstance(validate({"kind": "plsr"}, HeadConfig, "here"), PlsrConfig)
-    assert "residnet has a kind of that name" in registry.broken_kinds(HeadConfig)["plsr"].fault
+    assert "residnet has a kind of that name" in dict(registry.listed(HeadConfig))["plsr"]
 
 
 def test_faults_of_formats_and_vessels(installed: Path) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from residnet.core.files import config_folder
 from residnet.core.log import Log
-from residnet.core.resources import config_folder
 from residnet.tasks.import_logs import ImportConfig
 from residnet.tasks.loading import load_task
 

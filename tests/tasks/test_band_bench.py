@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from residnet.core.resources import shipped_configs
+from residnet.core.files import shipped_configs
 from residnet.tasks.fit.config import FitTaskSettings
 from residnet.tasks.loading import load_task
 

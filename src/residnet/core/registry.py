@@ -1,4 +1,4 @@
-"""Parts of other installed packages: found through entry points, used by name as the built-in ones.
+"""Kinds of parts by name: built-in ones, and those of other installed packages by entry points.
 
 A package declares its part in its own pyproject.toml, for example
 
@@ -6,29 +6,26 @@ A package declares its part in its own pyproject.toml, for example
     tide = "my_package.heads:TideConfig"
 
 and `kind: tide` works in YAML, in Python and in `residnet list heads`. A part that cannot be loaded
-is kept with its fault: it says so where it is used, and disturbs nothing else.
+is kept with its fault: it says so where it is used, and disturbs nothing else. A kind is imported
+when a config names it.
 """
 
 from __future__ import annotations
 
+import ast
 import functools
+import importlib
 import importlib.metadata
 import inspect
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    create_model,
-    model_validator,
-)
-from pydantic_core import CoreSchema
+from pydantic import BaseModel, GetCoreSchemaHandler, ValidationInfo
+from pydantic_core import CoreSchema, core_schema, to_json
 
+import residnet
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import nearest
 
@@ -60,10 +57,6 @@ class ThirdParty:
     part: Any = None
     fault: str = ""
 
-    def broken(self, fault: str) -> ThirdParty:
-        """Return the same entry point with a fault instead of its part."""
-        return ThirdParty(self.name, self.package, None, fault)
-
     @property
     def complaint(self) -> str:
         """One line that says which part of which package cannot be used, and why."""
@@ -71,6 +64,11 @@ class ThirdParty:
             f"'{self.name}' of the package {self.package} cannot be used: {self.fault}; repair or"
             " uninstall that package"
         )
+
+    def checked(self, check: Callable[[], str]) -> ThirdParty:
+        """Return the entry point, with a fault instead of its part where `check` returns one."""
+        fault = self.fault or check()
+        return ThirdParty(self.name, self.package, None, fault) if fault else self
 
 
 _loading: list[str] = []
@@ -113,93 +111,108 @@ def forget() -> None:
     third_party.cache_clear()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Kinds:
-    """Marks a union of configs that other packages may add kinds to.
+    """Marks a config field that takes one of several kinds, those of other packages included.
 
-    `HeadConfig = Annotated[PlsrConfig | LstmConfig, Kinds("residnet.heads", FeatureConfig)]` takes
-    the built-in kinds and those of the entry points; the entry points are read when the first
-    config is validated.
+    `TaskConfig = Annotated[Task, Kinds("residnet.tasks", Task, {"fit": "residnet.tasks.fit:Fit"},
+    key="task")]`. A kind's module is imported when a config names the kind.
 
     Attributes:
         group: of the entry points.
         base: class that the configs of other packages must extend.
+        builtin: residnet's own kinds, each as `module:Class`; where there are none, the annotation
+            is a union of their classes.
         key: field that tells the kinds apart.
     """
 
     group: str
     base: type[BaseModel]
+    builtin: Mapping[str, Any] = field(default_factory=dict)
     key: str = "kind"
+
+    def of(self, annotation: Any) -> Kinds:
+        """Return the same kinds with the built-in ones of the annotation that is marked."""
+        if self.builtin:
+            return self
+        members = (annotation,) if inspect.isclass(annotation) else get_args(annotation)
+        return replace(self, builtin={str(kind_of(member, self.key)): member for member in members})
+
+    def others(self) -> list[ThirdParty]:
+        """Return the kinds of other packages, each checked against what a kind has to be."""
+        taken = dict.fromkeys(self.builtin, "residnet")
+        out = []
+        for found in third_party(self.group):
+            out.append(found.checked(functools.partial(self._fault, found, taken.get(found.name))))
+            taken.setdefault(found.name, found.package)
+        return out
+
+    def _fault(self, found: ThirdParty, taken_by: str | None) -> str:
+        if taken_by is not None:
+            return f"{taken_by} has a {self.key} of that name already"
+        fault = _no_subclass(found.part, self.base)
+        if not fault and kind_of(found.part, self.key) != found.name:
+            return f"{found.part.__name__} has no field `{self.key}: Literal['{found.name}']`"
+        return fault
+
+    def names(self) -> list[str]:
+        """Return the names of all kinds, broken ones included."""
+        return list(dict.fromkeys([*self.builtin, *(part.name for part in self.others())]))
+
+    def find(self, name: str) -> type[Any] | ThirdParty:
+        """Return the config class of one kind; a broken one of another package as it is kept."""
+        if name in self.builtin:
+            found: type[Any] = _imported(self.builtin[name])
+            return found
+        # a second part of the same name could never be told from the first
+        other = next(part for part in self.others() if part.name == name)
+        return other if other.fault else other.part
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        """Return the schema of the built-in kinds and those of the entry points."""
-        return handler.generate_schema(self.union(source))
+        """Return the schema of a union that is told apart by `key` and imports what is named."""
+        kinds = self.of(source)
+        return core_schema.tagged_union_schema(
+            {
+                name: core_schema.with_info_plain_validator_function(
+                    functools.partial(kinds._validated, name)
+                )
+                for name in kinds.names()
+            },
+            discriminator=self.key,
+            from_attributes=True,
+        )
 
-    def union(self, builtin: Any) -> Any:
-        """Return the discriminated union of all kinds; a broken one raises its fault when used."""
-        every = {str(kind_of(member, self.key)): member for member in _members(builtin)}
-        for part in self.others(builtin):
-            # a second part of the same name could never be told from the first
-            every.setdefault(part.name, _stand_in(part, self.key) if part.fault else part.part)
-        # a union that is put together at run time has no other spelling
-        return Annotated[Union[tuple(every.values())], Field(discriminator=self.key)]  # noqa: UP007
-
-    def others(self, builtin: Any) -> list[ThirdParty]:
-        """Return the kinds of other packages, each checked against what a kind has to be."""
-        taken = {str(kind_of(member, self.key)): "residnet" for member in _members(builtin)}
-        out = []
-        for found in third_party(self.group):
-            fault = found.fault or self._fault(found, taken)
-            out.append(found.broken(fault) if fault else found)
-            taken.setdefault(found.name, found.package)
-        return out
-
-    def _fault(self, found: ThirdParty, taken: Mapping[str, str]) -> str:
-        part = found.part
-        if found.name in taken:
-            return f"{taken[found.name]} has a {self.key} of that name already"
-        if not (inspect.isclass(part) and issubclass(part, self.base)):
-            return f"its entry point is no subclass of {self.base.__module__}.{self.base.__name__}"
-        if inspect.isabstract(part):
-            return f"{part.__name__} lacks {_missing(part)}"
-        if kind_of(part, self.key) != found.name:
-            return f"{part.__name__} has no field `{self.key}: Literal['{found.name}']`"
-        return ""
+    def _validated(self, name: str, value: Any, info: ValidationInfo) -> Any:
+        found = self.find(name)
+        if isinstance(found, ThirdParty):
+            raise ValueError(found.complaint)
+        if isinstance(value, found):
+            return value
+        if info.mode == "json":
+            # what is strict in JSON is stricter in Python: no list is a tuple there
+            return found.model_validate_json(to_json(value), strict=True, context=info.context)
+        return found.model_validate(value, context=info.context)
 
 
-def _members(union: Any) -> tuple[Any, ...]:
-    return (union,) if inspect.isclass(union) else get_args(union)
+def _imported(place: Any) -> Any:
+    if not isinstance(place, str):
+        return place
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)
 
 
 def kind_of(config: type[BaseModel], key: str = "kind") -> str | None:
     """Return the value of the field that tells a config class from others; None without one."""
-    field = config.model_fields.get(key)
-    if field is None or get_origin(field.annotation) is not Literal:
+    found = config.model_fields.get(key)
+    if found is None or get_origin(found.annotation) is not Literal:
         return None
-    return str(get_args(field.annotation)[0])
-
-
-def _stand_in(part: ThirdParty, key: str) -> type[BaseModel]:
-    """Return a config class that answers for a broken part: it refuses with the part's fault."""
-
-    def refuse(cls: type[BaseModel], data: Any) -> Any:
-        raise ValueError(part.complaint)
-
-    fields: dict[str, Any] = {key: (Literal[part.name], part.name)}
-    validators: dict[str, Any] = {"refuse": model_validator(mode="before")(refuse)}
-    made: type[BaseModel] = create_model(
-        "Broken",
-        __config__=ConfigDict(extra="allow"),
-        __validators__=validators,
-        **fields,
-    )
-    return made
+    return str(get_args(found.annotation)[0])
 
 
 def marker(union: Any) -> Kinds:
-    """Return the marker of a union of kinds.
+    """Return the kinds that a field of this type takes.
 
     Raises:
         UsageError: where other packages cannot add to the union.
@@ -207,25 +220,45 @@ def marker(union: Any) -> Kinds:
     found = next((part for part in get_args(union)[1:] if isinstance(part, Kinds)), None)
     if found is None:
         raise UsageError(f"{union} is no union of kinds that other packages may add to")
-    return found
+    return found.of(get_args(union)[0])
 
 
 def kinds(union: Any) -> dict[str, Any]:
-    """Return the config classes of a union by kind: built-in ones, then those of other packages.
+    """Return the config classes by kind, all imported: built-in ones, then those of other packages.
 
     Args:
         union: for example `residnet.heads.HeadConfig`.
     """
-    mark, builtin = marker(union), _members(get_args(union)[0])
-    found = {str(kind_of(member, mark.key)): member for member in builtin}
-    others = mark.others(get_args(union)[0])
-    return found | {part.name: part.part for part in others if not part.fault}
-
-
-def broken_kinds(union: Any) -> dict[str, ThirdParty]:
-    """Return the parts of other packages that cannot be used, by name."""
     mark = marker(union)
-    return {part.name: part for part in mark.others(get_args(union)[0]) if part.fault}
+    found = {name: mark.find(name) for name in mark.names()}
+    return {name: part for name, part in found.items() if not isinstance(part, ThirdParty)}
+
+
+def listed(union: Any) -> list[tuple[str, str]]:
+    """Return name and first line of every kind; residnet's own ones are read, not imported."""
+    mark = marker(union)
+    out = [(name, _first_line(place)) for name, place in mark.builtin.items()]
+    return out + [
+        (part.name, broken_line(part) if part.fault else _first_line(part.part))
+        for part in mark.others()
+    ]
+
+
+def broken_line(part: ThirdParty) -> str:
+    """Return what a list says about a part that cannot be used."""
+    return f"(cannot be used: {part.fault}; from {part.package})"
+
+
+def _first_line(place: Any) -> str:
+    if not isinstance(place, str):
+        return (place.__doc__ or "").strip().splitlines()[0]
+    module, _, name = place.partition(":")
+    at = Path(residnet.__file__).parent.joinpath(*module.split(".")[1:])
+    file = at / "__init__.py" if at.is_dir() else at.with_suffix(".py")
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ClassDef) and node.name == name:
+            return (ast.get_docstring(node) or "").partition("\n")[0]
+    return _first_line(_imported(place))
 
 
 def objects(group: str, builtin: Mapping[str, Any], base: type[Any]) -> dict[str, Any]:
@@ -241,25 +274,25 @@ def objects(group: str, builtin: Mapping[str, Any], base: type[Any]) -> dict[str
     """
     out: dict[str, Any] = dict(builtin)
     for found in third_party(group):
-        fault = found.fault or _object_fault(found, base)
         if found.name not in out:
-            out[found.name] = found.broken(fault) if fault else found.part()
+            checked = found.checked(functools.partial(_object_fault, found, base))
+            out[found.name] = checked if checked.fault else found.part()
     return out
 
 
 def _object_fault(found: ThirdParty, base: type[Any]) -> str:
-    part = found.part
+    fault = _no_subclass(found.part, base)
+    if not fault and found.part.__dict__.get("name") != found.name:
+        return f"{found.part.__name__} has no attribute `name = '{found.name}'`"
+    return fault
+
+
+def _no_subclass(part: Any, base: type[Any]) -> str:
     if not (inspect.isclass(part) and issubclass(part, base)):
         return f"its entry point is no subclass of {base.__module__}.{base.__name__}"
     if inspect.isabstract(part):
-        return f"{part.__name__} lacks {_missing(part)}"
-    if part.__dict__.get("name") != found.name:
-        return f"{part.__name__} has no attribute `name = '{found.name}'`"
+        return f"{part.__name__} lacks {', '.join(sorted(part.__abstractmethods__))}"
     return ""
-
-
-def _missing(part: Any) -> str:
-    return ", ".join(sorted(part.__abstractmethods__))
 
 
 def usable(parts: Mapping[str, Any], name: str, what: str) -> Any:
@@ -287,7 +320,8 @@ def folders(group: str) -> dict[str, Path | ThirdParty]:
         if found.fault:
             out[found.name] = found
         elif not inspect.ismodule(found.part) or file is None:
-            out[found.name] = found.broken("its entry point is no package with files beside it")
+            fault = "its entry point is no package with files beside it"
+            out[found.name] = replace(found, part=None, fault=fault)
         else:
             out[found.name] = Path(file).parent
     return out

@@ -10,9 +10,9 @@ from pydantic import ValidationInfo, field_validator, model_validator
 
 from residnet.core.config import Config, load_mapping
 from residnet.core.errors import ConfigError
+from residnet.core.files import config_folder
 from residnet.core.names import nearest
 from residnet.core.registry import ThirdParty, folders
-from residnet.core.resources import config_folder
 from residnet.physics.parameters import Length, above_zero
 from residnet.physics.plant import Plant
 

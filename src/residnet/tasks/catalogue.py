@@ -7,8 +7,8 @@ from typing import Any
 from residnet.baselines import BaselineConfig
 from residnet.core.config import load_mapping
 from residnet.core.errors import ResidnetError
-from residnet.core.registry import ThirdParty, broken_kinds, kinds
-from residnet.core.resources import shipped_configs
+from residnet.core.files import shipped_configs
+from residnet.core.registry import ThirdParty, broken_line, listed
 from residnet.data.readers import ReaderConfig
 from residnet.export import exporters
 from residnet.heads import HeadConfig
@@ -45,9 +45,7 @@ def catalogue(what: str) -> list[tuple[str, str]]:
         "tasks": TaskConfig,
         "baselines": BaselineConfig,
     }
-    union = unions[what]
-    known = [(name, _first_line(config)) for name, config in kinds(union).items()]
-    return known + [_broken(part) for part in broken_kinds(union).values()]
+    return listed(unions[what])
 
 
 def _description(vessel: str) -> str:
@@ -58,9 +56,5 @@ def _description(vessel: str) -> str:
         return f"(cannot be used: {error})"
 
 
-def _first_line(config: type[Any]) -> str:
-    return (config.__doc__ or "").strip().splitlines()[0]
-
-
 def _broken(part: ThirdParty) -> tuple[str, str]:
-    return part.name, f"(cannot be used: {part.fault}; from {part.package})"
+    return part.name, broken_line(part)

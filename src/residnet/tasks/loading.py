@@ -7,8 +7,8 @@ from pathlib import Path
 
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
+from residnet.core.files import shipped_configs
 from residnet.core.names import nearest
-from residnet.core.resources import shipped_configs
 from residnet.runs.task import Task
 from residnet.tasks.union import TaskConfig
 

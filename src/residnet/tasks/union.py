@@ -1,15 +1,35 @@
-"""All kinds of run, those of other packages included."""
+"""All kinds of run, those of other packages included; each is imported when a config names it."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from residnet.core.config import Config
 from residnet.core.registry import Kinds
-from residnet.tasks.sweep.task import SweepTaskConfig
-from residnet.tasks.sweepable import SingleTask
+from residnet.runs.task import Task
+
+_DOCUMENTS = "residnet.documents"
+SINGLE = {
+    "fit": "residnet.tasks.fit.task:FitConfig",
+    "import": "residnet.tasks.import_logs:ImportConfig",
+    "simulate": "residnet.tasks.simulate:SimulateConfig",
+    "study": "residnet.tasks.study:StudyConfig",
+    "actuators": "residnet.tasks.actuators:ActuatorsTaskConfig",
+    "autopilot": "residnet.tasks.autopilot.task:AutopilotConfig",
+    "course": "residnet.tasks.course.task:CourseTaskConfig",
+    "ferry_study": f"{_DOCUMENTS}.jervan2020.ferry.task:FerryStudyConfig",
+    "force_residual": f"{_DOCUMENTS}.jervan2020.measured.task:ForceResidualConfig",
+    "breeding": f"{_DOCUMENTS}.halvorsen2019.breeding.task:BreedingTaskConfig",
+    "sea_trial": f"{_DOCUMENTS}.halvorsen2019.sea_trial.task:SeaTrialTaskConfig",
+}
+"""All but the sweep, which varies any of these."""
 
 TaskConfig = Annotated[
-    SingleTask | SweepTaskConfig,
-    Kinds("residnet.tasks", Config, key="task"),
+    Task,
+    Kinds(
+        "residnet.tasks",
+        Task,
+        {**SINGLE, "sweep": "residnet.tasks.sweep.task:SweepTaskConfig"},
+        key="task",
+    ),
 ]
+SweepableConfig = Annotated[Task, Kinds("residnet.tasks", Task, SINGLE, key="task")]

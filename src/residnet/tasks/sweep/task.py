@@ -17,7 +17,7 @@ from residnet.tasks.sweep.journal import require_optuna
 from residnet.tasks.sweep.results import write_results
 from residnet.tasks.sweep.running import run_trials
 from residnet.tasks.sweep.trial import trial_task
-from residnet.tasks.sweepable import SweepableConfig
+from residnet.tasks.union import SweepableConfig
 
 
 @final

@@ -13,7 +13,7 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
 from residnet.tasks.sweep.config import SweepConfig
 from residnet.tasks.sweep.journal import open_study
-from residnet.tasks.sweepable import SweepableConfig
+from residnet.tasks.union import SweepableConfig
 
 
 class Ended(NamedTuple):

@@ -1,0 +1,21 @@
+"""Config keys and kinds that had another name once: an old one is refused with the new one named.
+
+Keys of the table are ends of dotted key paths, `*` for any one key; a kind that was renamed has
+`=<old kind>` behind the path of its discriminator. Values are what to write instead.
+"""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+
+RENAMED: dict[str, str] = {}
+"""For example `"free_run.lead": "warmup"`, `"baseline.kind=fossen": "hull"`."""
+
+
+def renamed(path: tuple[str | int, ...], value: str | None = None) -> str:
+    """Return `; it is 'new' now` for an old key, or an old value of it; empty where it is none."""
+    written = ".".join(map(str, path)) + ("" if value is None else f"={value}")
+    for old, new in RENAMED.items():
+        if fnmatchcase(f".{written}", f"*.{old}"):
+            return f"; it is '{new}' now"
+    return ""
