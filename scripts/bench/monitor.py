@@ -22,8 +22,8 @@ import yaml
 from selection import scattered
 
 from residnet.core.config import validate
-from residnet.core.log import Log
 from residnet.core.files import config_folder
+from residnet.core.log import Log
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.identification.currents import through_currents
