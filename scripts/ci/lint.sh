@@ -1,7 +1,6 @@
 #!/usr/bin/env bash
-# Lint and types.
+# Style of everything, and types of the package; scripts/ci/long.sh checks the types of the tests.
 source "$(dirname "${BASH_SOURCE[0]}")/../_venv.sh"
 install_residnet "[dev]"
 .venv/bin/ruff check src tests scripts docs examples
 .venv/bin/mypy
-.venv/bin/mypy --config-file scripts/ci/mypy_tests.ini tests

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
-import subprocess
 import sys
 import tempfile
 import threading
@@ -365,24 +365,30 @@ class Result:
 
 
 def carry_out(name: str, runs: Path) -> Result:
-    """Run one config in its short form, and look for its report and finished mark."""
+    """Run one config in its short form, and look for its report and finished mark.
+
+    The run is a fork of this process, which has the libraries loaded: ten seconds less each.
+    """
     short = SHORT[name]
     if short.data and not (Path(os.environ.get("RESIDNET_DATA", "")) / short.data).is_dir():
         return Result(name, "skipped", 0.0, f"no RESIDNET_DATA/{short.data}")
+    runs.mkdir(parents=True, exist_ok=True)
     folder = runs / name.replace("/", "_")
-    command = [sys.executable, "-m", "residnet.cli", "run", str(CONFIGS / f"{name}.yaml")]
-    command += ["--out", str(folder)]
+    command = ["residnet", "run", str(CONFIGS / f"{name}.yaml"), "--out", str(folder)]
     for override in short.overrides:
         command += ["-s", override.replace("{runs}", str(runs))]
+    said = folder.with_suffix(".txt")
     started = time.monotonic()
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
-    except subprocess.TimeoutExpired:
-        return Result(name, "FAILED", time.monotonic() - started, f"not done after {LIMIT} s")
+    process = multiprocessing.get_context("fork").Process(target=_command, args=(command, said))
+    process.start()
+    process.join(LIMIT)
     seconds = time.monotonic() - started
-    last = (done.stderr.strip().splitlines() or [""])[-1]
-    if done.returncode != 0:
-        return Result(name, "FAILED", seconds, f"exit {done.returncode}: {last}")
+    if process.is_alive():
+        process.kill()
+        return Result(name, "FAILED", seconds, f"not done after {LIMIT} s")
+    if process.exitcode:
+        last = (said.read_text().strip().splitlines() or [""])[-1]
+        return Result(name, "FAILED", seconds, f"exit {process.exitcode}: {last}")
     summary = json.loads((folder / "summary.json").read_text())
     for wrong, words in (
         (not summary["finished"], "summary.json does not say finished"),
@@ -392,6 +398,17 @@ def carry_out(name: str, runs: Path) -> Result:
         if wrong:
             return Result(name, "FAILED", seconds, words)
     return Result(name, "ok", seconds)
+
+
+def _command(command: list[str], said: Path) -> None:
+    """Carry out a command line in this process, its output in a file."""
+    from residnet.__main__ import main
+
+    with said.open("w") as stream:
+        for output in (sys.stdout, sys.stderr):
+            os.dup2(stream.fileno(), output.fileno())
+        sys.argv = command
+        main()
 
 
 def carry_out_all(names: list[str], runs: Path, jobs: int) -> list[Result]:
@@ -433,6 +450,10 @@ def main() -> int:
     for name in stale:
         print(f"FAILED   the row '{name}' names no config")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    import lightning  # noqa: F401  (every run that trains loads it; forks have it already)
+
+    import residnet.tasks.union  # noqa: F401
+
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as temporary:
         runs = given.out or Path(temporary)
