@@ -4,6 +4,7 @@ derivatives.
 
 from __future__ import annotations
 
+import lightning as L
 import numpy as np
 import pytest
 import torch
@@ -11,6 +12,7 @@ import torch
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE
+from residnet.data.module import RowsDataModule, Windows, WindowsDataModule, WindowStage
 from residnet.data.prepare import Prepared
 from residnet.data.windows import WindowBatches, WindowStore
 
@@ -166,3 +168,61 @@ def test_batches_draw_without_replacement_as_far_as_the_starts_last() -> None:
     counts = torch.bincount(twice - 100)
     assert set(counts.tolist()) == {2, 3}
     assert len(set(twice[:90].tolist())) == len(set(twice[90:180].tolist())) == 90
+
+
+class Counting(L.LightningModule):
+    """Keeps what it is given, and is trained by it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen: list[tuple[Windows, ...]] = []
+
+    def training_step(self, batch: tuple[Windows, ...], number: int) -> torch.Tensor:
+        self.seen.append(batch)
+        return (batch[0].smooth.mean() - self.weight).square()
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def fitted(data: L.LightningDataModule, epochs: int) -> Counting:
+    module = Counting()
+    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar"), False)
+    L.Trainer(
+        max_epochs=epochs, accelerator="cpu", enable_model_summary=False, **quiet
+    ).fit(module, data)  # fmt: skip
+    return module
+
+
+def test_a_data_module_gives_whole_windows_stage_by_stage() -> None:
+    stages = [WindowStage(3, 4), WindowStage(5, 6, history=2, begun=2, lead=3)]
+    data = WindowsDataModule(STORE, stages, 2, seed=9, stage=lambda epoch: min(epoch, 1))
+    seen = fitted(data, 3).seen
+    assert [[part.y.shape[:2] for part in batch] for batch in seen] == [
+        *[[(4, 3)]] * 2,
+        *[[(4, 5), (2, 5)]] * 4,
+    ]
+    anywhere, begun = seen[-1]
+    assert (anywhere.past_y.shape[1], begun.past_y.shape[1]) == (2, 3)
+    assert begun.depth.tolist() == [3, 3]
+    starts = WindowBatches(STORE.starts(5), 4, 2).epoch(9, 2)[1]
+    for row, start in enumerate(starts.tolist()):
+        whole = slice(start, start + 5)
+        for part in ("y", "smooth", "nu_dot", "w", "recorded", "usable", "good"):
+            assert torch.equal(getattr(anywhere, part)[row], getattr(STORE, part)[whole])
+    past, w_past = STORE.history(starts, 2)
+    assert torch.equal(anywhere.past_y, past)
+    assert torch.equal(anywhere.past_w, w_past)
+
+
+def test_every_epoch_goes_through_all_rows_in_an_order_of_its_own() -> None:
+    data = RowsDataModule((torch.arange(10), -torch.arange(10)), 4, seed=3)
+    first, second = (list(data.batches(epoch)) for epoch in (0, 1))
+    assert [len(rows) for rows, _ in first] == [4, 4, 2]
+    assert len(list(data.train_dataloader())) == data.steps == 3
+    rows = [torch.cat([part for part, _ in batches]) for batches in (first, second)]
+    assert all(torch.equal(-part, other) for part, other in first)
+    assert torch.equal(rows[0].sort().values, torch.arange(10))
+    assert not torch.equal(*rows)
+    assert torch.equal(rows[0], torch.cat([part for part, _ in data.batches(0)]))
