@@ -201,9 +201,10 @@ class WindowsDataModule(EpochDataModule):
     def windows(self, starts: Tensor, length: int, history: int) -> Windows:
         """Return the windows of `length` samples from rows [B] of the store on."""
         store = self.store
-        parts = (store.y, store.smooth, store.nu_dot, store.w, store.recorded)
-        taken = (store.take(part, starts, length) for part in (*parts, store.usable, store.good))
-        return Windows(*taken, *store.history(starts, history), store.depth[starts])
+        names = ("y", "smooth", "nu_dot", "w", "recorded", "usable", "good")
+        taken = {name: store.take(getattr(store, name), starts, length) for name in names}
+        past_y, past_w = store.history(starts, history)
+        return Windows(**taken, past_y=past_y, past_w=past_w, depth=store.depth[starts])
 
 
 @final
