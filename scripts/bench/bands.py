@@ -22,7 +22,7 @@ import torch
 from residnet.core.files import read_table
 from residnet.core.layout import POSITION
 from residnet.core.names import STATE
-from residnet.identification.bands.fold_models import fold_numbers
+from residnet.identification.bands import fold_numbers
 from residnet.identification.fit import fit
 from residnet.identification.prepared import prepare_logs
 from residnet.judge.bands.band import Band, covered, interval_score, worst

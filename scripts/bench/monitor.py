@@ -26,13 +26,10 @@ from residnet.core.files import config_folder
 from residnet.core.log import Log
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.simulated.trials import SimulatedTrials, simulate
-from residnet.identification.currents import through_currents
 from residnet.identification.fit import fit
 from residnet.identification.models import FittedModel
-from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
-from residnet.identification.monitoring.watcher import Watcher
-from residnet.identification.monitoring.windows import pieces
-from residnet.identification.prepared import prepare_logs
+from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher, pieces
+from residnet.identification.prepared import prepare_logs, through_currents
 from residnet.identification.settings import FitSettings
 
 STEP = 0.1

@@ -31,9 +31,7 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.gear import InputShare
 from residnet.identification.fit import fit
 from residnet.identification.models import FittedModel
-from residnet.identification.planning.candidates import TrialLimits, candidates
-from residnet.identification.planning.information import moments, spread
-from residnet.identification.planning.plan import Aim, plan
+from residnet.identification.planning import Aim, TrialLimits, candidates, moments, plan, spread
 from residnet.identification.prepared import prepare_logs, velocity_limit
 from residnet.identification.settings import FitSettings
 from residnet.physics.vessel import load_vessel

@@ -10,7 +10,7 @@ from residnet.core.errors import FitError
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.identification.bands.fold_models import FoldModels
+from residnet.identification.bands import FoldModels
 from residnet.identification.fit import fit
 from residnet.identification.models import FittedModel
 from residnet.identification.prepared import prepare_logs

@@ -16,8 +16,8 @@ from residnet.data.sources import read_logs
 from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import RidgeConfig
-from residnet.identification.fading import reach_in_free_runs
 from residnet.identification.fit import fit
+from residnet.identification.fitter import reach_in_free_runs
 from residnet.identification.prepared import prepare_logs
 from residnet.identification.settings import FitSettings
 from residnet.training.module import Score

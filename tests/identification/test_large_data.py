@@ -19,9 +19,8 @@ from residnet.core.log import Log
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.data.windows import WindowStore
-from residnet.identification.currents import through_currents
 from residnet.identification.fit import fit
-from residnet.identification.prepared import prepare_logs, shortened
+from residnet.identification.prepared import prepare_logs, shortened, through_currents
 from residnet.identification.settings import FitSettings
 from residnet.regression.estimator import Estimator
 from residnet.regression.least_squares import LeastSquares

@@ -15,7 +15,7 @@ from residnet.core.processes import free_cores, spread
 from residnet.core.progress import Progress, listen
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import read_logs
-from residnet.identification import parts
+from residnet.identification import fit as parts
 from residnet.identification.fit import fit
 from residnet.identification.fitter import Fitter
 from residnet.identification.models import NoStore
@@ -33,7 +33,7 @@ _TRAINING: dict[str, Any] = {
 def _settings(**training: Any) -> FitSettings:
     content = {
         **{key: copy.deepcopy(TINY[key]) for key in _KEYS},
-        "refit": {"baseline": {"horizon": 2.0, "prior": [1e-2, 1e-4], "iterations": 2}},
+        "refit": {"baseline": {"horizon": 2.0, "iterations": 2}},
         "heads": {
             "wide": {"kind": "mlp", "hidden": [5]},
             "narrow": {"kind": "mlp", "hidden": [2]},
@@ -54,7 +54,6 @@ def logs() -> PreparedSplits:
 @pytest.fixture
 def everything_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts, "_LONG_TRAINING", 1)
-    monkeypatch.setattr(parts, "_LONG_REFIT", 1)
 
 
 @pytest.mark.long
@@ -72,9 +71,6 @@ def test_side_by_side_gives_the_same_models(logs: PreparedSplits) -> None:
             assert torch.equal(value, other[key]), (name, key)
         notes = {key: value for key, value in model.notes.items() if key != "seconds"}
         assert {key: beside[name].notes[key] for key in notes} == notes, name
-    assert alone.crossed is not None
-    assert beside.crossed is not None
-    assert alone.crossed.shares.keys() == beside.crossed.shares.keys()
     # what the processes report reaches who listens to this one
     assert {"training wide", "training narrow"} <= {event.stage for event in heard}
 
@@ -94,24 +90,13 @@ def test_what_ends_soon_stays_in_this_process(
 ) -> None:
     settings = _settings()
     fitter = Fitter(logs, settings, NoStore())
-    wanted = parts.parts_of(settings)
-    assert [(part.name, part.needs) for part in wanted] == [
-        ("baseline", ()),
-        ("wide", ("baseline",)),
-        ("narrow", ("baseline",)),
-        ("ridge", ("baseline",)),
-    ]
     with spread(8):
-        assert parts.side_by_side(fitter, wanted) == 1
+        assert parts.side_by_side(fitter) == 1
         monkeypatch.setattr(parts, "_LONG_TRAINING", 1)
-        assert parts.side_by_side(fitter, wanted) == 2
-        monkeypatch.setattr(parts, "_LONG_REFIT", 1)
-        assert parts.side_by_side(fitter, wanted) == 3
-    with spread(2):
-        assert parts.side_by_side(fitter, wanted) == 2
+        assert parts.side_by_side(fitter) == 2
     # a program of the user's own need not be made for processes
     assert free_cores() == 1
-    assert parts.side_by_side(fitter, wanted) == 1
+    assert parts.side_by_side(fitter) == 1
     with spread(8):
         gpu = _settings(device="cuda")
-        assert parts.side_by_side(Fitter(logs, gpu, NoStore()), wanted) == 1
+        assert parts.side_by_side(Fitter(logs, gpu, NoStore())) == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from residnet.identification.references import references
+from residnet.identification.models import references
 
 ROLES = {
     "zero": "zero",

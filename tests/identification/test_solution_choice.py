@@ -8,7 +8,7 @@ import torch
 from residnet.baselines import RegressorsConfig
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import ZeroHead
-from residnet.identification.solution_choice import choose_solution
+from residnet.identification.fitter import choose_solution
 from residnet.physics.signals import SignalsConfig
 from residnet.regression.solutions import Solution
 from residnet.training.module import Score

@@ -13,11 +13,15 @@ from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.data.windows import WindowStore
 from residnet.identification.fit import fit
-from residnet.identification.goodness import goodness_rows
-from residnet.identification.identified import Identified
+from residnet.identification.identified import (
+    Identified,
+    goodness_rows,
+    residual_table,
+    teacher_forced,
+    term_table,
+)
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
-from residnet.identification.teacher_forced import residual_table, teacher_forced, term_table
 
 SETTINGS = {
     "prepare": {**TINY["prepare"], "hold": "mean"},  # type: ignore[dict-item]

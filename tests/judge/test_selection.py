@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,77 +139,6 @@ def test_the_file_says_of_each_model_what_decided() -> None:
     assert rows["mlp"]["standard_error"] == pytest.approx(0.1 * JITTER.std(ddof=1) / np.sqrt(5))
     assert (rows["mlp"]["sound"], rows["mlp"]["diverged"]) == (False, 2)
     assert rows["zero"]["sound"] is True
-
-
-def test_blocks_of_other_data_add_to_the_variance() -> None:
-    """The blocks of folds and those of validation logs are independent of each other."""
-    random = np.random.default_rng(3)
-    one, other = random.random(5), random.random(4)
-    quarters = Blocks(np.full(4, 0.25), "stretches")
-    both = EVEN.beside(quarters)
-    apart = [EVEN.standard_error(one, np.zeros(5)), quarters.standard_error(other, np.zeros(4))]
-    found = both.standard_error(np.concatenate((one, other)), np.zeros(9))
-    assert found == pytest.approx(math.hypot(*apart))
-    assert both.count == 9
-
-
-def test_the_more_precise_of_two_comparisons_counts() -> None:
-    """A network alone is judged by way of `zero` over folds, which differs much between logs."""
-    both = EVEN.beside(EVEN)
-
-    def judged(name: str, folds: float, spread: float, alone: float, family: str) -> Contender:
-        jitter = JITTER if family == "network" else JITTER[::-1]
-        direct = (math.log(alone) + 0.005 * jitter) / 5
-        over_folds = (math.log(folds) + spread * JITTER) / 5
-        rest = np.zeros(5) if family == "refitted baseline" else direct - over_folds[::-1]
-        rest = rest - rest.mean()
-        scores = np.concatenate((over_folds, rest))
-        return Contender(name, family, 10, folds, scores, direct=direct)
-
-    hull = judged("hull", 0.2, 0.05, 0.2, "refitted baseline")
-    network = judged("network", 0.8, 0.4, 0.25, "network")
-    assert difference(network, hull, both)[0] == pytest.approx(math.log(0.25 / 0.2))
-    assert 0.0 < difference(network, hull, both)[1] < 0.01
-    found = choose((ZERO_OF_FOLDS, hull, network), both)
-    assert (found.selected, found.tied) == ("hull", ("hull",))
-    # the other way round neither a simpler hull nor zero stands in a good network's way
-    good = judged("network", 0.8, 0.4, 0.1, "network")
-    assert choose((ZERO_OF_FOLDS, hull, good), both).selected == "network"
-    # two baselines are compared over the folds, which are more logs
-    linear = judged("linear", 0.3, 0.05, 0.1, "refitted baseline")
-    assert difference(linear, hull, both)[0] == pytest.approx(math.log(0.3 / 0.2))
-
-
-def test_stretches_of_one_validation_log_do_not_overrule_folds() -> None:
-    """A patrol vessel with five minutes of logs: a line in each channel stood before the hull."""
-    both = EVEN.beside(replace(EVEN, of="stretches"))
-
-    def judged(name: str, folds: float, alone: float, family: str) -> Contender:
-        over_folds = (math.log(folds) + 0.05 * JITTER) / 5
-        jitter = JITTER if family == "network" else JITTER[::-1]
-        direct = (math.log(alone) + 0.005 * jitter) / 5
-        rest = np.zeros(5) if family == "refitted baseline" else 0.002 * JITTER
-        scores = np.concatenate((over_folds, rest))
-        return Contender(name, family, 10, folds, scores, direct=direct)
-
-    linear = judged("baseline", 0.53, 0.38, "refitted baseline")
-    hull = judged("hull", 0.32, 0.47, "refitted baseline")
-    network = judged("hull_network", 0.31, 0.46, "network")
-    assert difference(network, linear, both)[0] == pytest.approx(math.log(0.31 / 0.53))
-    found = choose((ZERO_OF_FOLDS, linear, hull, network), both)
-    assert found.selected == "hull_network"
-    # five whole logs or more may
-    assert difference(network, linear, EVEN.beside(EVEN))[0] == pytest.approx(math.log(0.46 / 0.38))
-
-
-ZERO_OF_FOLDS = Contender(
-    "zero",
-    "zero",
-    0,
-    0.8,
-    np.concatenate(((math.log(0.8) + 0.4 * JITTER) / 5, np.zeros(5))),
-    direct=np.full(5, math.log(0.8) / 5),
-)
 
 
 def test_one_bad_stretch_decides_nothing() -> None:

@@ -11,7 +11,6 @@ from kinds import of_kind
 from made_system import LINEAR, SCALES, model_of, trials
 
 from residnet.baselines import RegressorsConfig
-from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import UsageError
 from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
@@ -38,7 +37,6 @@ SETTINGS: dict[str, Any] = {
     "multi_step": [{"horizon": 0.5, "epochs": 4, "batch": 7}],
     "start_noise": 0.1,
     "beginnings": {"share": 0.3, "initial": 0.3},
-    "refit_baseline": True,
     "average": 0.9,
 }
 
@@ -58,21 +56,15 @@ def training(head: Any, dtype: torch.dtype, **settings: Any) -> tuple[HeadTraini
         residual = known.with_target(known.target - model.baseline(known.z))
     model.head.calibrate(residual)
     config = TrainingConfig.model_validate({**SETTINGS, **settings})
-    free = of_kind(model.baseline, RegressorBaseline).free_indices().numel()
-    covariance = 1e-4 * torch.eye(free, dtype=torch.float64)
     store = WindowStore.gather(logs, dtype)
-    module = HeadTraining(
-        model.to(dtype), store, config, SCALES.to(dtype), validated, 0, covariance
-    )
+    module = HeadTraining(model.to(dtype), store, config, SCALES.to(dtype), validated, 0)
     return module, residual
 
 
 def losses_of(module: HeadTraining, residual: Any, folder: Path | None = None) -> list[float]:
     """Train; returns the loss of each epoch."""
-    count = of_kind(module.model.baseline, RegressorBaseline).free_indices().numel()
-    covariance = 1e-4 * torch.eye(count, dtype=torch.float64)
     model, store, config = module.model, module.store, of_kind(module.settings, TrainingConfig)
-    notes = train("net", model, residual, store, config, SCALES, validated, 0, folder, covariance)
+    notes = train("net", model, residual, store, config, SCALES, validated, 0, folder)
     return [row["loss"] for row in notes["curve"]]
 
 

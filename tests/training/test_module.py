@@ -81,15 +81,8 @@ def trained(
 ) -> tuple[HybridDynamics, dict[str, Any]]:
     model, residual, store = prepared(logs)
     settings = TrainingConfig.model_validate({"steps": 3, "one_step": ONE_STEP, **config})
-    spread = coefficient_spread(model)
-    notes = train("mlp", model, residual, store, settings, SCALES, validate, 0, folder, spread)
+    notes = train("mlp", model, residual, store, settings, SCALES, validate, 0, folder)
     return model, notes
-
-
-def coefficient_spread(model: HybridDynamics) -> Tensor:
-    """A covariance in which every coefficient is known to a hundredth."""
-    count = model.baseline.free_indices().numel()  # type: ignore[operator]
-    return 1e-4 * torch.eye(count, dtype=torch.float64)
 
 
 def same(one: dict[str, Tensor], two: dict[str, Tensor]) -> bool:
@@ -101,8 +94,7 @@ def untrained(logs: Sequence[Prepared], head: Any = None, **config: Any) -> Head
     model, residual, store = prepared(logs, head)
     model.head.calibrate(residual)
     settings = TrainingConfig.model_validate({"steps": 3, "one_step": ONE_STEP, **config})
-    spread = coefficient_spread(model)
-    return HeadTraining(model.float(), store, settings, SCALES.float(), Scripted([1.0]), 0, spread)
+    return HeadTraining(model.float(), store, settings, SCALES.float(), Scripted([1.0]), 0)
 
 
 def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
@@ -236,19 +228,6 @@ def test_the_average_is_the_recursion_written_out(
     )
 
 
-@pytest.mark.parametrize(("moves", "refit"), [(False, False), (True, True)])
-def test_the_baseline_moves_only_where_it_may(
-    logs: list[Prepared], tmp_path: Path, moves: bool, refit: bool
-) -> None:
-    validate = Scripted([4.0, 3.0, 2.0, 1.0])
-    trained(logs, tmp_path, validate, multi_step=[HALF_SECOND], refit_baseline=refit)
-    theta = [seen["baseline.theta"] for seen in validate.seen]
-    assert torch.equal(theta[0], theta[1]), "one-step epochs leave the baseline alone"
-    assert torch.equal(theta[1], theta[3]) == (not moves)
-    # nine batches at a hundredth's learning rate: a few standard errors at most
-    assert float((theta[3] - theta[1]).abs().max()) < 0.05
-
-
 def test_learning_rates_fall_along_a_cosine_in_each_stage(
     logs: list[Prepared], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,7 +253,7 @@ def test_learning_rates_fall_along_a_cosine_in_each_stage(
 
 
 def test_weight_decay_acts_on_matrices_of_the_head_only(logs: list[Prepared]) -> None:
-    module = untrained(logs, weight_decay=0.3, refit_baseline=True)
+    module = untrained(logs, weight_decay=0.3)
     decayed = {
         id(p): group["weight_decay"]
         for group in module.configure_optimizers().param_groups
@@ -282,8 +261,6 @@ def test_weight_decay_acts_on_matrices_of_the_head_only(logs: list[Prepared]) ->
     }
     for name, parameter in module.model.head.named_parameters(prefix="head"):
         assert decayed[id(parameter)] == (0.3 if name.endswith("weight") else 0.0), name
-    assert module.calibration is not None
-    assert id(module.calibration.moved) in decayed, "coefficients move as standard errors"
     assert id(module.model.baseline.theta) not in decayed
 
 

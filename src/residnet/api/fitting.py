@@ -19,10 +19,9 @@ from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.core.processes import spread
 from residnet.core.progress import ProgressCallback
-from residnet.identification.currents import through_currents
 from residnet.identification.fit import fit as identify
 from residnet.identification.identified import Identified
-from residnet.identification.prepared import require_window
+from residnet.identification.prepared import require_window, through_currents
 from residnet.identification.settings import FitSettings
 from residnet.judge.bands.config import BandsConfig
 from residnet.judge.tables import metrics_table

@@ -13,10 +13,15 @@ from residnet.api.models import Model, require_model
 from residnet.api.values import described
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
-from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
-from residnet.identification.monitoring.refitting import Refit, recursive_refit, refitted
-from residnet.identification.monitoring.watcher import Watcher
-from residnet.identification.monitoring.windows import past_of, pieces
+from residnet.identification.monitoring import (
+    MonitorConfig,
+    Verdict,
+    Watch,
+    Watcher,
+    past_of,
+    pieces,
+)
+from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
 
 
 @final
@@ -30,7 +35,7 @@ class Monitor:
     Args:
         model: of the vessel as it was.
         clean: data of the unchanged vessel, as they were fitted.
-        settings: of `residnet.identification.monitoring.monitor.MonitorConfig`: `window`,
+        settings: of `residnet.identification.monitoring.MonitorConfig`: `window`,
             `stretch`, `false_alarm`, `group` in s.
 
     Raises:

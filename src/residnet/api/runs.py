@@ -15,7 +15,7 @@ from residnet.core.errors import UsageError
 from residnet.core.names import STATE, nearest
 from residnet.core.progress import ProgressCallback
 from residnet.data.prepare import Prepared
-from residnet.identification.evaluation import Evaluation, candidates, evaluate
+from residnet.identification.identified import Evaluation, candidates, evaluate
 from residnet.identification.prepared import velocity_limit
 from residnet.judge.tables import metrics_table
 

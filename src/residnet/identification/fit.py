@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from multiprocessing import get_context
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
 
+import torch
+from torch import Tensor
+
+from residnet.core.arrays import paged
+from residnet.core.arrays.heap import keep_freed_memory
 from residnet.core.errors import DataError, FitError, MissingPackageError
-from residnet.core.progress import say
+from residnet.core.processes import free_cores, processes
+from residnet.core.progress import Progress, listen, listener, report, say
 from residnet.data.prepare import Prepared
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec, restored
+from residnet.heads import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
-from residnet.identification.bands.calibrating import calibrate_bands
+from residnet.identification.bands import calibrate_bands
 from residnet.identification.fitter import Fitter
 from residnet.identification.identified import Identified
-from residnet.identification.models import FitStore, NoStore
-from residnet.identification.parts import fit_parts, said
+from residnet.identification.models import FitStore, FittedModel, NoStore
+from residnet.identification.recipe import TIED
 from residnet.identification.settings import FitSettings
-from residnet.identification.standard import TIED
-from residnet.judge.verdict.selection import Selection
+from residnet.training.config import TrainingConfig
+
+Logs = Mapping[str, Sequence[Prepared]]
+_LONG_TRAINING = 20_000
+"""Steps of windows that a training runs through, from which it is worth a process of its own."""
 
 
-def fit(
-    logs: Mapping[str, Sequence[Prepared]], settings: FitSettings, *, store: FitStore | None = None
-) -> Identified:
+def fit(logs: Logs, settings: FitSettings, *, store: FitStore | None = None) -> Identified:
     """Fit the baselines, then heads on what each leaves, then ensembles.
 
     Args:
@@ -36,19 +50,23 @@ def fit(
     given, fitter = settings, Fitter(logs, settings, store or NoStore())
     settings = fitter.settings
     models = {"zero": fitter.zero()}
-    fit_parts(fitter, logs, given, models, _optional)
+    for name in settings.all_baselines:
+        with _optional(settings, name):
+            models[name] = fitter.baseline(name)
+            say(f"  {name}: {_said(models[name])}")
+    _fit_heads(fitter, logs, given, models)
     for name, force in settings.forces.items():
         if force.of in models:
             models[name] = fitter.with_force(name, models[force.of], force)
-            say(f"  {name}: {said(models[name])}")
+            say(f"  {name}: {_said(models[name])}")
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
-        say(f"  {name}: {said(models[name])}")
+        say(f"  {name}: {_said(models[name])}")
     for name, gate in settings.gates.items():
         if gate.of in models:
             models[name] = fitter.gated(name, models[gate.of], gate)
-            say(f"  {name}: {said(models[name])}")
-    identified = Identified(settings, models, fitter.limit, fitter.train, fitter.crossed)
+            say(f"  {name}: {_said(models[name])}")
+    identified = Identified(settings, models, fitter.limit, fitter.train)
     if settings.recipe is not None:
         _add_tied(identified, fitter, logs)
     if settings.bands is not None:
@@ -64,10 +82,6 @@ def _optional(settings: FitSettings, name: str) -> Iterator[None]:
 
     The recipe does without what the logs do not determine, except its first model. A head of kind
     `genetic` can be `optional`.
-
-    Raises:
-        FitError: of a model that was asked for by name, or of the recipe's first.
-        MissingPackageError: of a head that is not optional.
     """
     head = settings.heads.get(name)
     try:
@@ -82,28 +96,151 @@ def _optional(settings: FitSettings, name: str) -> Iterator[None]:
         say(f"  {name} is left out: {error}")
 
 
-def _add_tied(
-    identified: Identified, fitter: Fitter, logs: Mapping[str, Sequence[Prepared]]
-) -> None:
+def _said(fitted: FittedModel) -> str:
+    diverged = fitted.notes.get("validation_diverged", 0)
+    lost = f" ({diverged} windows DIVERGED)" if diverged else ""
+    return f"validation free-run error {fitted.notes['validation']:.4f}{lost}"
+
+
+def _add_tied(identified: Identified, fitter: Fitter, logs: Logs) -> None:
     """Add the mean of the models that validation data cannot tell from the best."""
     judged = identified.evaluate_splits({split: logs[split] for split in ("train", "validation")})
     chosen = identified.select(judged)
+    # a training that gained nothing ends where it began, and would count twice in a mean
+    errors = {e.name: e.scores.tobytes() for e in chosen.contenders}
+    first = {errors[name]: name for name in reversed(chosen.tied)}
     # a mean of accelerations has no place for a force that one member estimates for itself
-    tied = [n for n in _apart(chosen) if identified.models[n].spec.disturbance is None]
+    tied = [
+        name
+        for name in chosen.tied
+        if first[errors[name]] == name and identified.models[name].spec.disturbance is None
+    ]
     if len(tied) < 2:
-        say("  tied: no model is as good as the best; there is no mean")
+        say(f"  {TIED}: no model is as good as the best; there is no mean")
         return
     model = fitter.ensemble(TIED, [identified.models[name] for name in tied])
     identified.models[TIED] = model
     identified.findings.update(identified.findings_of([model]))
-    say(f"  {TIED}: {said(model)} (mean of {', '.join(tied)})")
+    say(f"  {TIED}: {_said(model)} (mean of {', '.join(tied)})")
 
 
-def _apart(chosen: Selection) -> list[str]:
-    """Return the tied models without those that err as another one does, to the last digit.
+def _fit_heads(
+    fitter: Fitter, logs: Logs, given: FitSettings, models: dict[str, FittedModel]
+) -> None:
+    """Fit the heads whose baseline is there, long trainings in processes of their own."""
+    settings, threads = fitter.settings, torch.get_num_threads()
+    heads = [name for name in settings.heads if settings.baseline_name_of(name) in models]
+    places = side_by_side(fitter)
+    begin = (dict(logs), given, fitter.store.training_folder, threads)
+    with _heard() if places > 1 else nullcontext() as wire:
+        pooled = processes(places, _begin, (*begin, wire)) if places > 1 else nullcontext()
+        with pooled as pool:
+            there: dict[str, Any] = {}
+            for name in heads:
+                base = models[settings.baseline_name_of(name)]
+                if pool and is_long(fitter, name) and fitter.store.finished(name) is None:
+                    there[name] = pool.submit(_fit_there, name, _sent(base))
+            for name in heads:
+                say(f"  fitting {name}")
+                with _optional(settings, name):
+                    if name in there:
+                        models[name] = _opened(there[name].result())
+                        fitter.store.keep(models[name])
+                    else:
+                        models[name] = fitter.head(name, models[settings.baseline_name_of(name)])
+                    seconds = models[name].notes["seconds"]
+                    say(f"  {name}: {_said(models[name])} after {seconds:.1f} s")
 
-    A training that gained nothing ends where it began, and would count twice in a mean.
+
+def side_by_side(fitter: Fitter) -> int:
+    """Return how many heads are to be fitted at a time.
+
+    Only what takes longer than a process needs to start is worth one. Large logs lie in files that
+    processes do not share, and a GPU and trainings in several processes are shared out already.
     """
-    errors = {e.name: e.scores.tobytes() for e in chosen.contenders}
-    first = {errors[name]: name for name in reversed(chosen.tied)}
-    return [name for name in chosen.tied if first[errors[name]] == name]
+    settings = fitter.settings
+    trainings = [settings.training.get(name, TrainingConfig()) for name in settings.heads]
+    elsewhere = any(t.processes > 1 or t.device != "cpu" for t in trainings)
+    if elsewhere or len(fitter.samples) > paged.LARGE:
+        return 1
+    long = sum(is_long(fitter, name) for name in settings.heads)
+    return max(min(free_cores() // torch.get_num_threads(), long), 1)
+
+
+def is_long(fitter: Fitter, name: str) -> bool:
+    """Return whether a head is trained through so many steps that a process pays."""
+    settings = fitter.settings
+    if isinstance(settings.heads[name].build(fitter.signals.names), ClosedFormHead):
+        return False
+    training = settings.training.get(name, TrainingConfig())
+    first = training.one_step
+    stages = [(first.epochs, first.window), *((s.epochs, s.horizon) for s in training.multi_step)]
+    steps = sum(epochs * length for epochs, length in stages) / settings.prepare.grid.step
+    return training.steps * steps >= _LONG_TRAINING
+
+
+_Sent = tuple[ModelSpec, dict[str, Any], Tensor | None, dict[str, Tensor]]
+"""A fitted model as it goes from one process to another: numbers in place of modules."""
+
+
+def _sent(fitted: FittedModel) -> _Sent:
+    return fitted.spec, fitted.notes, fitted.covariance, fitted.model.state_dict()
+
+
+def _opened(sent: _Sent) -> FittedModel:
+    spec, notes, covariance, state = sent
+    model = restored(spec, state)
+    assert isinstance(model, HybridDynamics)
+    return FittedModel(spec, model, notes, covariance)
+
+
+class _Trainings(NoStore):
+    """Keeps no model, but the checkpoints of trainings."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self.training_folder = folder
+
+
+_work: Callable[[str, _Sent], _Sent]
+"""Fits a head on a baseline, in a process that `_begin` has prepared."""
+
+
+def _begin(logs: Logs, settings: FitSettings, folder: Path | None, threads: int, wire: Any) -> None:
+    global _work
+    keep_freed_memory()
+    torch.set_num_threads(threads)
+    made: list[Fitter] = []
+
+    def work(name: str, base: _Sent) -> _Sent:
+        with listen(wire.put):
+            if not made:
+                made.append(Fitter(logs, settings, _Trainings(folder)))
+            return _sent(made[0].head(name, _opened(base)))
+
+    _work = work
+
+
+def _fit_there(name: str, base: _Sent) -> _Sent:
+    return _work(name, base)
+
+
+@contextmanager
+def _heard() -> Iterator[Any]:
+    """Hold a queue whose reports of progress reach who listens to this process."""
+    callback, over = listener(), Event()
+    wire: Any = get_context("spawn").SimpleQueue()
+
+    def hand_on() -> None:
+        with listen(callback):
+            while not over.wait(0.0 if not wire.empty() else 0.1) or not wire.empty():
+                while not wire.empty():
+                    one: Progress = wire.get()
+                    report(one.stage, one.done, one.total, one.message, one.score)
+
+    thread = Thread(target=hand_on, daemon=True)
+    thread.start()
+    try:
+        yield wire
+    finally:
+        over.set()
+        thread.join(1.0)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import nn
 
 from residnet.baselines import BaselineConfig, Coefficient, ParametricBaseline, StillConfig
+from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, samples
@@ -20,40 +23,216 @@ from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
-from residnet.heads import ClosedFormHead
-from residnet.identification.cross_fitting.crossed import Crossed
-from residnet.identification.cross_fitting.prior_choice import (
-    TAKEN,
-    JudgedFold,
-    PriorChoice,
-    choose_prior,
-    judged_over,
-)
-from residnet.identification.fading import reach_in_free_runs
-from residnet.identification.models import FitStore, FittedModel
-from residnet.identification.prepared import velocity_limit
-from residnet.identification.residuals import least_squares_covariance, residual_samples
+from residnet.heads import ClosedFormHead, ZeroHead
+from residnet.heads.base import ResidualHead
+from residnet.identification.models import FitStore, FittedModel, NoStore
+from residnet.identification.prepared import PreparedSplits, velocity_limit
+from residnet.identification.recipe import Facts
 from residnet.identification.settings import FitSettings, ForceConfig, GateConfig
-from residnet.identification.settling import settled
-from residnet.identification.solution_choice import choose_solution
-from residnet.identification.validation import ValidationScore
+from residnet.judge.config import EvaluationConfig
+from residnet.judge.freerun import Candidate, FreeRun, free_run
+from residnet.judge.metrics import window_errors
+from residnet.judge.protocol import all_windows, overlapping
+from residnet.regression.solutions import Solution
 from residnet.training.config import TrainingConfig
-from residnet.training.refit import refit
+from residnet.training.module import Score
+from residnet.training.refit import free_run_starts, refit
+from residnet.training.stage_windows import stage_windows
 
 
-@dataclass(frozen=True)
-class FittedPart:
-    """A baseline or a head, with what folds of the logs say of it.
+def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
+    """Return samples whose target is what the model's baseline leaves.
 
-    Attributes:
-        model: as it was kept.
-        crossed: its errors over parts of the logs that it was fitted without; None for none.
-        folds: these parts; empty for none.
+    That is an acceleration (document 003 (19)) or a force (document 002 (3.20)), as the model's
+    head wants it.
+
+    Args:
+        model: with its baseline filled in.
+        known: samples whose target is the measured acceleration.
+    """
+    with torch.no_grad():
+        explained = paged.rows(len(known), 3)
+        for rows in paged.row_pieces(len(known)):
+            explained[rows] = model.baseline(known.z[rows])
+            paged.forget()
+        return model.head.residual_target(known, explained)
+
+
+class ValidationScore:
+    """The free-run score of a model on the validation logs; the windows are laid out once.
+
+    Args:
+        logs: of the validation split.
+        config: its `selection` protocol and scales are used.
+        step: of the grid in s.
+        limit: of |u, v, r| [3] beyond which a free run has diverged.
+        dense: windows overlap, so that few logs tell more.
+
+    Raises:
+        DataError: where no log holds a window of the protocol.
     """
 
-    model: FittedModel
-    crossed: Crossed | None = None
-    folds: tuple[JudgedFold, ...] = ()
+    def __init__(
+        self,
+        logs: Sequence[Prepared],
+        config: EvaluationConfig,
+        step: float,
+        limit: np.ndarray,
+        *,
+        dense: bool = False,
+    ) -> None:
+        self.logs = logs
+        self.step = step
+        self.limit = limit
+        self.scales = config.scales.array()
+        protocol = config.protocols[config.selection]
+        self.windows = all_windows(
+            overlapping(protocol) if dense else protocol, logs, step, config.selection
+        )
+
+    def __call__(self, model: HybridDynamics) -> Score:
+        """Return the divergences and the mean nrmse of the validation windows, run in float32."""
+        candidate = Candidate("validated", "head", model)
+        predictions = free_run(
+            [candidate], self.windows, self.logs, self.step, self.limit, dtype=torch.float32
+        )
+        errors = window_errors(FreeRun("", "", self.windows, predictions), "validated", self.logs)
+        diverged = sum(prediction.diverged for prediction in predictions["validated"])
+        return Score(diverged, float((errors["rmse"].mean(0) / self.scales).mean()))
+
+
+def choose_solution(
+    model: HybridDynamics,
+    part: nn.Module,
+    solutions: Sequence[Solution],
+    score: Callable[[HybridDynamics], Score],
+) -> tuple[Solution, dict[str, Any]]:
+    """Fill a part of the model with the solution whose free run is best.
+
+    What lies around the best is tried for as long as it gains.
+
+    Args:
+        model: the model that runs.
+        part: its baseline or head, which the solutions belong to.
+        solutions: at least one; a single one is taken as it is.
+        score: of a model's free runs on validation data; fewer divergences come before less error.
+
+    Returns:
+        The solution, and for fit.json the free-run error of each; empty where there was nothing to
+        choose.
+    """
+    tried: list[tuple[Solution, Score]] = []
+
+    def attempt(batch: Sequence[Solution]) -> None:
+        for solution in batch:
+            part.load_state_dict(solution.state, strict=False)
+            tried.append((solution, score(model)))
+
+    attempt(solutions if len(solutions) > 1 else ())
+    centre = _best_with_neighbours(tried)
+    while centre is not None and centre[0].neighbours is not None:
+        choices = [solution.choice for solution, _ in tried]
+        attempt([solution for solution in centre[0].neighbours() if solution.choice not in choices])
+        better = _best_with_neighbours(tried)
+        if better is centre:
+            break
+        centre = better
+    best = min(tried, key=_score)[0] if tried else solutions[0]
+    part.load_state_dict(best.state, strict=False)
+    scores = [
+        {**solution.choice, "validation": found.error, "diverged": found.diverged}
+        for solution, found in tried
+    ]
+    return best, {"free_run_choice": scores} if scores else {}
+
+
+def _score(tried: tuple[Solution, Score]) -> Score:
+    return tried[1]
+
+
+def _best_with_neighbours(
+    tried: Sequence[tuple[Solution, Score]],
+) -> tuple[Solution, Score] | None:
+    """The best of those that have neighbours; one that has none, such as no residual at all, does
+    not end the search.
+    """
+    return min((pair for pair in tried if pair[0].neighbours is not None), key=_score, default=None)
+
+
+_BOXES = (0.05, 0.15, 0.25)
+"""Quantiles at whose inner boxes fades are judged: what lies outside stands for the unseen."""
+_KEPT = 0.5
+"""Share of the best fade's gain on the baseline at which one that reaches farther is taken.
+
+Inner boxes are left at small distances. Outside all data the distances are larger, and a fade that
+loses little here loses more there.
+"""
+_LEAST = 1e-9
+
+
+def reach_in_free_runs(
+    model: HybridDynamics,
+    samples: Samples,
+    fades: Sequence[float],
+    validate: Callable[[HybridDynamics], Score],
+) -> dict[str, float]:
+    """Let each axis reach at least as far as free runs beyond inner boxes of the range allow.
+
+    Tried are the fades that the gate has, and for each of `fades` the same with no axis below it.
+    The last of these that keeps half of the best one's gain on the baseline is taken. Where none
+    gains, or where more free runs diverge than of the baseline, all axes fade at once.
+
+    Args:
+        model: with a gate whose fades are set; they are changed.
+        samples: of the logs that `validate` runs over.
+        fades: distances, in half widths of the range, at which half of the residual is left.
+        validate: returns how a model does in free runs.
+
+    Returns:
+        The mean error over the boxes of each fade, in that of the baseline; `inf` where more free
+        runs diverged.
+    """
+    assert isinstance(model.head, GatedHead)
+    own = model.head.fade.clone()
+    lengths = sorted(fades)
+    tried = [torch.full_like(own, lengths[0]), *(own.clamp(min=fade) for fade in lengths)]
+    boxes = [model.head.inner_box(samples.z, quantile) for quantile in _BOXES]
+    none = validate(_with(model, ZeroHead()))
+    error: list[float] = []
+    for i, fade in enumerate(tried):
+        if i > 1 and torch.equal(fade, tried[i - 1]):
+            error.append(error[-1])
+            continue
+        scores = [validate(_with(model, model.head.within(*box, fade))) for box in boxes]
+        sound = max(score.diverged for score in scores) <= none.diverged
+        mean = sum(score.error for score in scores) / len(scores)
+        error.append(mean / none.error if sound else math.inf)
+    best = 1.0 - min(error)
+    worth = [i for i, left in enumerate(error) if 1.0 - left >= _KEPT * best > 0]
+    model.head.fade.copy_(tried[worth[-1] if worth else 0])
+    names = ["at once", *(f"at least {fade:g}" for fade in lengths)]
+    return dict(zip(names, error, strict=True))
+
+
+def _with(model: HybridDynamics, head: ResidualHead) -> HybridDynamics:
+    """Return the model with another head."""
+    return HybridDynamics(model.signals, model.baseline, head, model.dt, model.integrator)
+
+
+def settled(settings: FitSettings, samples: Samples, logs: Sequence[Prepared]) -> FitSettings:
+    """Return settings whose parts are those of the recipe for these logs.
+
+    Settings without a recipe are returned as they are.
+
+    Args:
+        settings: of the fit.
+        samples: of the training logs.
+        logs: for training.
+    """
+    if settings.recipe is None:
+        return settings
+    step = settings.prepare.grid.step
+    return settings.with_parts(Facts.of(samples, logs, settings.evaluation, step))
 
 
 class Fitter:
@@ -70,7 +249,6 @@ class Fitter:
     ) -> None:
         self.store = store
         self.train = logs["train"]
-        self.known = [*logs["train"], *logs["validation"]]
         self.signals = settings.signals.build()
         self.low, self.high = envelope(self.train)
         self.limit = velocity_limit(self.low, self.high, settings.evaluation.divergence)
@@ -78,8 +256,6 @@ class Fitter:
         self.held_back = samples(logs["validation"], self.signals)
         self.settings = settled(settings, self.samples, self.train)
         self.scales = torch.from_numpy(settings.evaluation.scales.array())
-        self.crossed: Crossed | None = None
-        self.folds: dict[str, tuple[JudgedFold, ...]] = {}
         self.validate = ValidationScore(
             logs["validation"],
             settings.evaluation,
@@ -118,7 +294,7 @@ class Fitter:
         spec = self.spec("zero", "zero", StillConfig())
         return self._kept(FittedModel(spec, spec.build(), {}))
 
-    def baseline(self, name: str = "baseline") -> FittedPart:
+    def baseline(self, name: str = "baseline") -> FittedModel:
         """Identify a baseline; refit it through rollouts where the settings ask for it."""
         spec = self.spec(name, "baseline", self.settings.all_baselines[name])
         model = spec.build()
@@ -133,44 +309,22 @@ class Fitter:
             **tried,
             "least_squares": self.validate(model).error,
         }
-        choice = None
         if name in self.settings.refit:
-            table, covariance, choice = self._refit(name, model, table, notes)
+            table, covariance = self._refit(name, model, table, notes)
         notes["coefficients"] = [_coefficient_row(entry) for entry in table]
         notes |= self._validated(model)
         notes["seconds"] = round(time.perf_counter() - started, 1)
-        kept = self._kept(FittedModel(spec, model, notes, covariance))
-        if choice is None:
-            return FittedPart(kept)
-        own = choice.crossed.renamed({TAKEN: name, "zero": "zero"})
-        return FittedPart(kept, own, choice.folds)
-
-    def adopt(self, part: FittedPart) -> None:
-        """Take up what folds of the logs say of a baseline."""
-        if part.crossed is not None:
-            own = part.crossed
-            self.crossed = own if self.crossed is None else self.crossed.joined(own)
-            self.folds[part.model.name] = part.folds
+        return self._kept(FittedModel(spec, model, notes, covariance))
 
     def _refit(
         self, name: str, model: HybridDynamics, table: list[Coefficient], notes: dict[str, Any]
-    ) -> tuple[list[Coefficient], torch.Tensor | None, PriorChoice | None]:
-        """Move a baseline's coefficients through rollouts.
-
-        Returns their new table, their covariance and the choice of a prior, and adds to the notes.
-        """
-        config, choice = self.settings.refit[name], None
-        if len(config.priors) > 1:
-            spec = self.spec(name, "baseline", self.settings.all_baselines[name])
-            choice = choose_prior(name, spec, config, self.settings, self.known, self.limit)
-            notes["prior_choice"] = choice.table
-            if choice.prior is None:
-                return table, None, choice
-            config = config.with_prior(choice.prior)
+    ) -> tuple[list[Coefficient], torch.Tensor]:
+        """Move coefficients through rollouts, to their new table and covariance."""
+        config = self.settings.refit[name]
         store = WindowStore.gather(self.train, torch.float64)
         refitted = refit(model, self.samples, store, config, self.scales)
         assert isinstance(model.baseline, ParametricBaseline)
-        notes["prior"] = config.priors[0]
+        notes["prior"] = config.prior
         names = model.baseline.free_names()
         notes["open"] = [
             name for name, lies in zip(names, refitted.open.tolist(), strict=True) if lies
@@ -180,17 +334,14 @@ class Fitter:
         if refitted.offsets.axes:
             notes["offsets"] = refitted.offsets.table([log.log.name for log in self.train])
         table = model.baseline.updated_table(table, refitted.errors)
-        return table, refitted.covariance, choice
+        return table, refitted.covariance
 
-    def head(
-        self, name: str, baseline: FittedModel, begin: FittedModel | None = None
-    ) -> FittedModel:
+    def head(self, name: str, baseline: FittedModel) -> FittedModel:
         """Fit one head on top of a baseline, or take it from the store where it is finished there.
 
         Args:
             name: of the head in the settings.
             baseline: the fitted model that the head stands on.
-            begin: whose weights its training starts from; None for random ones.
 
         Raises:
             FitError: where the data do not determine the head.
@@ -215,9 +366,7 @@ class Fitter:
                 raise FitError(f"head {name}: {error}") from None
             notes = solution.choice | solution.notes | tried
         else:
-            if begin is not None:
-                model.head.load_state_dict(copy.deepcopy(begin.model.head.state_dict()))
-            notes = self._train(name, model, residual, seed, baseline.covariance)
+            notes = self._train(name, model, residual, seed)
         notes |= {
             "baseline": self.settings.baseline_name_of(name),
             "seconds": round(time.perf_counter() - started, 1),
@@ -240,10 +389,6 @@ class Fitter:
             model.load_state_dict(base.model.state_dict())
             tried.append((self.validate(model), spec, model))
         _, spec, model = min(tried, key=lambda one: one[0])
-        if base.name in self.folds and self.crossed is not None:
-            # the few validation logs have chosen the time constants; all logs judge the model
-            over_folds = judged_over(name, self.folds[base.name], spec, self.settings, self.limit)
-            self.crossed = self.crossed.joined(over_folds) or self.crossed
         notes: dict[str, Any] = {
             **{key: base.notes[key] for key in ("refit", "baseline") if key in base.notes},
             "of": base.name,
@@ -296,32 +441,15 @@ class Fitter:
         return self._kept(FittedModel(spec, model, notes))
 
     def _train(
-        self,
-        name: str,
-        model: HybridDynamics,
-        residual: Samples,
-        seed: int,
-        covariance: Tensor | None,
+        self, name: str, model: HybridDynamics, residual: Samples, seed: int
     ) -> dict[str, Any]:
         from residnet.training.trainer import train
 
         settings = self.settings.training.get(name, TrainingConfig())
         dtype = torch.float64 if settings.double else torch.float32
         windows, folder = WindowStore.gather(self.train, dtype), self.store.training_folder
-        spread = covariance
-        if settings.refit_baseline and spread is None:
-            spread = least_squares_covariance(model.baseline, self.samples)
         return train(
-            name,
-            model,
-            residual,
-            windows,
-            settings,
-            self.scales,
-            self.validate,
-            seed,
-            folder,
-            spread,
+            name, model, residual, windows, settings, self.scales, self.validate, seed, folder
         )
 
     def _validated(self, model: HybridDynamics) -> dict[str, Any]:
@@ -346,3 +474,34 @@ def _coefficient_row(entry: Coefficient) -> dict[str, Any]:
         "value": entry.value,
         "standard_error": entry.error,
     }
+
+
+def require_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
+    """Check that prepared logs hold the manoeuvres, folds and windows that a fit asks for.
+
+    The fit itself calls the same functions, so that it refuses with the same lines.
+
+    Returns:
+        What would fit the parts, nothing fitted yet.
+
+    Raises:
+        DataError: where a split holds no sample, or no window of a protocol or of a training.
+        FitError: where manoeuvres are missing that a baseline is fitted on, are too few for the
+            folds of a head, or too short for a refit.
+    """
+    fitter = Fitter(logs, settings, NoStore())
+    step, windows = settings.prepare.grid.step, WindowStore.gather(fitter.train)
+    for baseline in settings.all_baselines.values():
+        baseline.require_samples(fitter.samples)
+    for moved in settings.refit.values():
+        free_run_starts(windows, moved, step)
+    for name, config in settings.heads.items():
+        head = config.build(fitter.signals.names)
+        if isinstance(head, ClosedFormHead):
+            try:
+                head.require_samples(fitter.samples)
+            except FitError as error:
+                raise FitError(f"head {name}: {error}") from None
+        else:
+            stage_windows(settings.training.get(name, TrainingConfig()), windows, step)
+    return fitter

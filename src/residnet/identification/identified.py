@@ -1,25 +1,323 @@
-"""What a fit comes to: its models by name, and what they are judged by."""
+"""The judged fit: free runs of all models, the choice among them, what they leave of the logs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import copy
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from residnet.data.prepare import Prepared
+from residnet.core.arrays import paged
+from residnet.core.errors import UsageError
+from residnet.core.names import ACCELERATION
+from residnet.core.stretches import stretches
+from residnet.data.prepare import Prepared, channels
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
-from residnet.identification.cross_fitting.crossed import Crossed
-from residnet.identification.evaluation import Evaluation, candidates, evaluate_splits
-from residnet.identification.models import FittedModel
-from residnet.identification.selecting import examine, select
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.heads import ClosedFormHead
+from residnet.heads.base import EquationHead
+from residnet.identification.models import FittedModel, references
 from residnet.identification.settings import FitSettings
-from residnet.judge.freerun import FreeRun, free_run
+from residnet.judge.bands.band import Bands
+from residnet.judge.config import EvaluationConfig
+from residnet.judge.freerun import Candidate, FreeRun, free_run
+from residnet.judge.goodness import OneStep, table
+from residnet.judge.limits import limits
+from residnet.judge.metrics import rows
 from residnet.judge.protocol import all_windows, overlapping
-from residnet.judge.verdict.sanity import Finding
-from residnet.judge.verdict.selection import Selection
+from residnet.judge.tables import metrics_table
+from residnet.judge.verdict.course_stability import SteadyRun, contradiction, steady_runs
+from residnet.judge.verdict.sanity import BOUNDED, DAMPING, STABILITY, Finding, check_model
+from residnet.judge.verdict.selection import (
+    Contender,
+    Selection,
+    blocks_of,
+    choose,
+    log_errors,
+    shares,
+)
+from residnet.judge.verdict.soundness import TrainingPoints, runaway, training_points, wrong_damping
+from residnet.physics.vessel import load_vessel
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The free runs of models over the logs of one split.
+
+    Attributes:
+        split: train, validation, test or external.
+        logs: of the split, in the order that the windows count them in.
+        runs: free runs by protocol; protocols without a window are left out.
+        rows: of metrics.json, without `selected`.
+        limits: contents of limits.json by protocol.
+        bands: that the models were judged with, by model and protocol.
+    """
+
+    split: str
+    logs: Sequence[Prepared]
+    runs: list[FreeRun]
+    rows: list[dict[str, Any]]
+    limits: dict[str, Any]
+    bands: Bands = field(default_factory=dict)
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """The rows as a table, see `residnet.judge.tables.metrics_table`."""
+        return metrics_table(self.rows)
+
+
+def evaluate(
+    models: Sequence[Candidate],
+    logs: Sequence[Prepared],
+    config: EvaluationConfig,
+    step: float,
+    limit: np.ndarray,
+) -> Evaluation:
+    """Free-run models over all protocols of one split.
+
+    Args:
+        models: to be judged, see `candidates`.
+        logs: of one split, at least one.
+        config: protocols, scales and groups.
+        step: of the grid in s.
+        limit: of |u, v, r| [3] beyond which a free run has diverged.
+    """
+    return evaluate_splits(models, {logs[0].split: logs}, config, step, limit)[logs[0].split]
+
+
+def evaluate_splits(
+    models: Sequence[Candidate],
+    splits: Mapping[str, Sequence[Prepared]],
+    config: EvaluationConfig,
+    step: float,
+    limit: np.ndarray,
+) -> dict[str, Evaluation]:
+    """Free-run models over all protocols of several splits, all windows of a model side by side.
+
+    Args:
+        models: to be judged, see `candidates`.
+        splits: their logs, at least one each.
+        config: protocols, scales and groups.
+        step: of the grid in s.
+        limit: of |u, v, r| [3] beyond which a free run has diverged.
+    """
+    laid = {
+        (split, name): [
+            window
+            for number, log in enumerate(logs)
+            for window in protocol.windows(log, number, step)
+        ]
+        for split, logs in splits.items()
+        for name, protocol in config.protocols.items()
+    }
+    everywhere = [log for logs in splits.values() for log in logs]
+    before = dict(zip(splits, np.cumsum([0, *map(len, splits.values())]).tolist(), strict=False))
+    together = [
+        replace(window, log=window.log + before[split])
+        for (split, _), windows in laid.items()
+        for window in windows
+    ]
+    predictions = free_run(models, together, everywhere, step, limit)
+    bands = {model.name: model.bands for model in models}
+    scales = config.scales.named()
+    found = {split: Evaluation(split, logs, [], [], {}, bands) for split, logs in splits.items()}
+    begin = 0
+    for (split, name), windows in laid.items():
+        if not windows:
+            continue
+        end = begin + len(windows)
+        own = {model: part[begin:end] for model, part in predictions.items()}
+        begin, out, logs = end, found[split], splits[split]
+        run = FreeRun(name, split, windows, own)
+        out.runs.append(run)
+        out.rows.extend(rows(run, models, logs, scales, config.groups))
+        out.limits[name] = limits(run, models, logs, scales, step)
+    return found
+
+
+def candidates(
+    fitted: Iterable[FittedModel], data: MeasuredLogs | SimulatedTrials | None = None
+) -> list[Candidate]:
+    """Return the models to judge, each with the one that it is compared with.
+
+    Args:
+        fitted: models of one fit.
+        data: where the logs came from; simulated trials add the plant that made them as `truth`.
+    """
+    models = {entry.name: entry for entry in fitted}
+    compared_with = references(
+        {name: entry.spec.role for name, entry in models.items()},
+        {name: entry.notes for name, entry in models.items()},
+    )
+    out = [
+        Candidate(
+            name,
+            entry.spec.role,
+            entry.model,
+            reference=compared_with.get(name),
+            ranges=entry.spec.ranges,
+            bands=entry.bands,
+        )
+        for name, entry in models.items()
+    ]
+    truth = _truth(data) if isinstance(data, SimulatedTrials) else None
+    return out if truth is None else [*out, truth]
+
+
+def _truth(data: SimulatedTrials) -> Candidate | None:
+    """The plant that made the logs; None where a log does not show all of its state."""
+    plant = load_vessel(data.vessel).build()
+    if any(name.startswith("_") for name in plant.state):
+        # no log shows what is under way in a delay line, so that the plant could not start from one
+        return None
+    commands = plant.inputs[: plant.commands]
+    model = TracedPlantDynamics(plant, data.step, data.substeps)
+    unknown = len(plant.inputs) - len(commands)
+    return Candidate("truth", "truth", model, plant.state, commands, unknown, "baseline")
+
+
+_CHECKED = ("train", "validation")
+"""Splits whose windows may not diverge; what the test data show comes too late for a choice."""
+
+
+def examine(
+    fitted: Iterable[FittedModel], train: Sequence[Prepared], config: EvaluationConfig, step: float
+) -> dict[str, list[Finding]]:
+    """Check the models of a fit for physical sanity, `zero` left out.
+
+    Args:
+        fitted: models of one fit.
+        train: the logs that fitted them; what a model does where they have been makes it unsound.
+        config: whose `divergence` says when a model runs away.
+        step: of the grid in s.
+    """
+    points, steady = training_points(train), steady_runs(train, step)
+    threads = torch.get_num_threads()
+    # products this small only lose time to a second thread
+    torch.set_num_threads(1)
+    try:
+        return {
+            entry.name: _examined(entry, points, steady, config.divergence)
+            for entry in fitted
+            if entry.spec.role != "zero"
+        }
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _examined(
+    entry: FittedModel, points: TrainingPoints, steady: Sequence[SteadyRun], divergence: float
+) -> list[Finding]:
+    """All findings of a model; those that make it unsound say so first."""
+    # a copy: the checks run in float64, and must not round what others hold
+    model = copy.deepcopy(entry.model).to(torch.float64).eval()
+    found = check_model(entry.spec, model, divergence=divergence)
+    faults = {
+        DAMPING: wrong_damping(model, points),
+        STABILITY: contradiction(model, steady),
+        BOUNDED: runaway(entry.spec, model, points, divergence),
+    }
+    return [
+        replace(finding, ok=False, text=f"unsound: {fault}. {finding.text}", fault=fault)
+        if (fault := faults.get(finding.check))
+        else finding
+        for finding in found
+    ]
+
+
+def select(
+    fitted: Iterable[FittedModel],
+    judged: Mapping[str, Evaluation],
+    findings: Mapping[str, Sequence[Finding]],
+    config: EvaluationConfig,
+    deciding: FreeRun | None = None,
+) -> Selection:
+    """Choose among the models of a fit by their free runs over the validation logs.
+
+    Args:
+        fitted: models to choose from, `zero` among them.
+        judged: their free runs by split; `validation` is needed, `train` shows divergences too.
+        findings: of the checks for physical sanity, by model.
+        config: its `selection` protocol decides.
+        deciding: free runs over the validation logs that decide in its place.
+
+    Raises:
+        UsageError: where the validation logs have not been judged.
+    """
+    validation = judged.get("validation")
+    runs = [] if validation is None else validation.runs
+    run = deciding or next((run for run in runs if run.protocol == config.selection), None)
+    if validation is None or run is None:
+        raise UsageError(
+            f"select: no free runs over validation logs by protocol '{config.selection}'; evaluate"
+            " the validation split first"
+        )
+    blocks, labels = blocks_of(run)
+    counted = {split: judged[split].runs for split in _CHECKED if split in judged}
+    if deciding is not None:
+        counted["validation"] = [*counted["validation"], deciding]
+    scales = config.scales.named()
+    models = {entry.name: entry for entry in fitted}
+    parts = {
+        name: shares(run, name, validation.logs, scales, labels, len(blocks.weights))
+        for name in models
+    }
+    scores = log_errors(parts, blocks.weights)
+    contenders = []
+    for entry in models.values():
+        lost = [
+            (split, free.protocol, diverged, len(free.windows))
+            for split, runs in counted.items()
+            for free in runs
+            if (diverged := sum(p.diverged for p in free.predictions[entry.name]))
+        ]
+        faults = [
+            f"{diverged} of its {count} {split} windows diverged ({protocol})"
+            for split, protocol, diverged, count in lost
+        ]
+        faults += [finding.fault for finding in findings.get(entry.name, ()) if finding.fault]
+        contenders.append(
+            Contender(
+                entry.name,
+                family(entry),
+                parameter_count(entry.model),
+                float(parts[entry.name].sum()),
+                scores[entry.name],
+                sum(diverged for _, _, diverged, _ in lost),
+                tuple(faults),
+            )
+        )
+    return choose(contenders, blocks)
+
+
+def family(entry: FittedModel) -> str:
+    """Return what a model is, in the words of `residnet.judge.selection.FAMILIES`."""
+    if entry.spec.role != "head":
+        refitted = entry.spec.role == "baseline" and "refit" in entry.notes
+        return "refitted baseline" if refitted else str(entry.spec.role)
+    return "closed-form head" if isinstance(entry.model.head, ClosedFormHead) else "network"
+
+
+def parameter_count(model: HybridDynamics) -> int:
+    """Return the number of fitted parameters of baseline and head together."""
+    of_head = (
+        sum(model.head.parameter_count())
+        if isinstance(model.head, ClosedFormHead)
+        else sum(parameter.numel() for parameter in model.head.parameters())
+    )
+    # two time constants of an observer of the unknown force
+    of_force = 0 if model.disturbance is None else 2
+    return round(sum(model.baseline.parameter_count()) + of_head + of_force)
 
 
 @dataclass(frozen=True)
@@ -31,14 +329,12 @@ class Identified(Mapping[str, FittedModel]):
         models: by name.
         limit: of |u, v, r| [3] beyond which a free run has diverged.
         train: the logs that fitted them.
-        crossed: errors of the baselines over folds of the logs; None where none were needed.
     """
 
     settings: FitSettings
     models: dict[str, FittedModel]
     limit: np.ndarray
     train: Sequence[Prepared]
-    crossed: Crossed | None = None
 
     def evaluate(
         self, logs: Sequence[Prepared], data: MeasuredLogs | SimulatedTrials | None = None
@@ -97,7 +393,6 @@ class Identified(Mapping[str, FittedModel]):
             self.findings,
             self.settings.evaluation,
             self._overlapping(judged.get("validation")),
-            None if self.settings.recipe is None else self.crossed,
         )
 
     def _overlapping(self, validation: Evaluation | None) -> FreeRun | None:
@@ -121,3 +416,182 @@ class Identified(Mapping[str, FittedModel]):
 
     def __len__(self) -> int:
         return len(self.models)
+
+
+@dataclass(frozen=True)
+class TeacherForced:
+    """What a model computes along the measured states of a log, its memory empty at first.
+
+    Attributes:
+        z: channels that baseline and head see [T, nz].
+        baseline: accelerations of the baseline [T, 3].
+        predicted: accelerations of baseline and head together [T, 3].
+    """
+
+    z: Tensor
+    baseline: np.ndarray
+    predicted: np.ndarray
+
+
+def teacher_forced(model: HybridDynamics, log: Prepared) -> TeacherForced:
+    """Run a model along a log without letting it move the vessel.
+
+    Args:
+        model: brought to float64.
+        log: gaps are filled with 0; what is predicted there means nothing.
+    """
+    model = model.to(torch.float64)
+    z = channels(log, model.signals)
+    with torch.no_grad():
+        baseline = model.baseline(z).numpy()
+        predicted = model.one_step(z[None])[0].numpy()
+    return TeacherForced(z, baseline, predicted)
+
+
+def residual_table(
+    fitted: Iterable[FittedModel], logs: Sequence[Prepared], most: int = 1500
+) -> pd.DataFrame:
+    """Return residual targets against what each head predicts along the measured states.
+
+    Every head runs teacher-forced over each log.
+
+    Args:
+        fitted: models; those without a head are left out.
+        logs: of one split.
+        most: about how many samples of each model and axis are kept, evenly spaced.
+
+    Returns:
+        Columns model, axis, target, predicted (accelerations, SI); no row where there is no head.
+    """
+    import pandas as pd
+
+    parts = []
+    for entry in fitted:
+        if entry.spec.role != "head":
+            continue
+        pairs = []
+        for log in logs:
+            run = teacher_forced(entry.model, log)
+            residuals = (log.nu_dot - run.baseline, run.predicted - run.baseline)
+            pairs.append(np.stack(residuals, axis=-1)[log.good])
+        joined = np.concatenate(pairs)
+        joined = joined[:: max(len(joined) // most, 1)]
+        for axis, name in enumerate(ACCELERATION):
+            columns = {
+                "model": entry.name,
+                "axis": name,
+                "target": joined[:, axis, 0],
+                "predicted": joined[:, axis, 1],
+            }
+            parts.append(pd.DataFrame(columns))
+    names = ["model", "axis", "target", "predicted"]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=names)
+
+
+def term_table(fitted: Iterable[FittedModel], logs: Sequence[Prepared]) -> pd.DataFrame:
+    """Return the terms of every head that is an equation along the longest log.
+
+    Args:
+        fitted: models; heads that are no equation are left out.
+        logs: of one split, at least one.
+
+    Returns:
+        Columns model, log, axis, term, t (s), value (the term times its coefficient). The term
+        `target` is what the baseline leaves of the measured acceleration, NaN where there is none.
+    """
+    import pandas as pd
+
+    log = max(logs, key=len)
+    parts = []
+    for entry in fitted:
+        head = entry.model.head if entry.spec.role == "head" else None
+        if not isinstance(head, EquationHead):
+            continue
+        run = teacher_forced(entry.model, log)
+        target = np.where(log.good[:, None], log.nu_dot - run.baseline, np.nan)
+        for axis, name in enumerate(ACCELERATION):
+            for term, value in {
+                "target": target[:, axis],
+                **head.contributions(run.z, axis),
+            }.items():
+                columns = {
+                    "model": entry.name,
+                    "log": log.log.name,
+                    "axis": name,
+                    "term": term,
+                    "t": log.log.t - log.log.t[0],
+                    "value": value,
+                }
+                parts.append(pd.DataFrame(columns))
+    names = ["model", "log", "axis", "term", "t", "value"]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=names)
+
+
+SPLITS = ("train", "test")
+
+
+def goodness_rows(
+    fitted: Iterable[FittedModel], logs: Mapping[str, Sequence[Prepared]], step: float
+) -> dict[str, list[dict[str, Any]]]:
+    """Return statistics of what each model leaves of the measured accelerations, by split.
+
+    Of very many logs as many are taken, evenly spread, as have 200,000 samples.
+
+    Args:
+        fitted: models of one fit.
+        logs: by split; training and test logs are used.
+        step: of the grid in s.
+    """
+    models = {entry.name: entry for entry in fitted}
+    compared_with = references(
+        {name: entry.spec.role for name, entry in models.items()},
+        {name: entry.notes for name, entry in models.items()},
+    )
+    splits = {}
+    for split in SPLITS:
+        taken = _some(logs[split])
+        measured = [piece for log in taken for piece in measured_stretches(log)]
+        predictions = [
+            OneStep(
+                name,
+                entry.spec.role,
+                _parameter_counts(entry.model),
+                [part for log in taken for part in _residuals(entry.model, log)],
+                compared_with.get(name),
+            )
+            for name, entry in models.items()
+        ]
+        splits[split] = table(predictions, measured, step) if measured else []
+    return splits
+
+
+def _some(logs: Sequence[Prepared]) -> Sequence[Prepared]:
+    """Return the logs, or evenly spread ones of 200,000 samples where there are more."""
+    every = -(-sum(len(log) for log in logs) // paged.LARGE)
+    return logs[:: max(every, 1)]
+
+
+def measured_stretches(log: Prepared) -> list[np.ndarray]:
+    """Return the measured accelerations [T, 3] of each stretch that may be learned from."""
+    return [log.nu_dot[begin:end] for begin, end in zip(*stretches(log.good), strict=True)]
+
+
+def _parameter_counts(model: HybridDynamics) -> list[float]:
+    """Fitted parameters of each axis, baseline and head together."""
+    return [
+        of_baseline + of_head
+        for of_baseline, of_head in zip(
+            model.baseline.parameter_count(), model.head.parameter_count(), strict=True
+        )
+    ]
+
+
+def _residuals(model: HybridDynamics, log: Prepared) -> list[np.ndarray]:
+    """Measured minus predicted acceleration [T, 3] of each stretch; a head runs along the whole
+    log, as its memory needs.
+    """
+    predicted = teacher_forced(model, log).predicted
+    return [
+        log.nu_dot[begin:end] - predicted[begin:end]
+        for begin, end in zip(*stretches(log.good), strict=True)
+    ]

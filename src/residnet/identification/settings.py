@@ -25,7 +25,7 @@ from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.disturbance import DisturbanceConfig
 from residnet.heads import ForceHead, HeadConfig
-from residnet.identification.standard import PARTS, TIED, Facts, portfolio
+from residnet.identification.recipe import PARTS, TIED, Facts, portfolio
 from residnet.judge.bands.config import BandsConfig
 from residnet.judge.config import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
@@ -128,7 +128,7 @@ class FitSettings(Parts):
         bands: how far free runs may be off, calibrated over logs that were left out; null for none.
         recipe: `standard` fits a portfolio in place of `baseline`, `baselines`, `refit`, `heads`,
             `base_of`, `ensembles` and `training`: a linear model and a hull, both refitted, a
-            network on each, hull and network calibrated together, and a network alone; their terms,
+            network on each, and a network alone; their terms,
             sizes and trainings follow from the logs. The mean of the models that validation data
             cannot tell from the best is named `tied`. Null for parts of your own.
         effort: how long the recipe trains its networks: 1 for usual, less for a quick look.
@@ -189,7 +189,6 @@ class FitSettings(Parts):
         require_known("training", self.training, self.heads, "head")
         require_known("base_of", self.base_of, self.heads, "head")
         require_known("base_of", self.base_of.values(), ("zero", *baselines), "baseline")
-        self._trainings_begin()
         require_known("refit", self.refit, baselines, "baseline")
         require_known("forces", (force.of for force in self.forces.values()), single, "model")
         members = (name for names in self.ensembles.values() for name in names)
@@ -198,21 +197,6 @@ class FitSettings(Parts):
         require_known("gates", (gate.of for gate in self.gates.values()), residuals, "residual")
         self._parts_fit_together()
         return self
-
-    def _trainings_begin(self) -> None:
-        """Check that trainings start from heads that are fitted before and are alike."""
-        before: list[str] = []
-        for name, head in self.heads.items():
-            begin = self.training[name].begin_with if name in self.training else None
-            key = f"training.{name}.begin_with"
-            if begin is not None:
-                require_known(key, (begin,), before, "head before it")
-                same = self.baseline_name_of(begin) == self.baseline_name_of(name)
-                if self.heads[begin] != head or not same:
-                    raise ValueError(
-                        f"{key}: '{begin}' has other settings or stands on another baseline"
-                    )
-            before.append(name)
 
     def _parts_fit_together(self) -> None:
         """Build every part once, so that what does not fit together is refused before any work."""
@@ -228,13 +212,6 @@ class FitSettings(Parts):
                 head.set_mass(baseline.mass())
             except ConfigError as error:
                 raise ValueError(f"heads.{key}: {error}") from None
-        for name, training in self.training.items():
-            moved = self.baseline_of(name).build(names)
-            if training.refit_baseline and not isinstance(moved, ParametricBaseline):
-                raise ValueError(
-                    f"training.{name}.refit_baseline: the baseline of '{name}' has no coefficients"
-                    " that may move; leave it out"
-                )
         for name, gate in self.gates.items():
             built = self.heads[gate.of].build(names) if gate.of in self.heads else None
             if isinstance(built, ForceHead):

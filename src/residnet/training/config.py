@@ -91,13 +91,8 @@ class TrainingConfig(MachineConfig):
         weight_decay: of AdamW, on matrices only.
         average: decay of the exponential average of the weights that is validated and kept; 0 for
             none.
-        refit_baseline: let free-run stages move the baseline's coefficients too, along the
-            directions and by the steps that its refit leaves open; the model that the training
-            starts from stays a candidate.
         from_baseline: the network's output starts at zero, so that the training starts from its
             baseline, which stays a candidate: weights are kept only where they gain.
-        begin_with: head on the same baseline, of the same settings, whose weights the training
-            starts from; null for random ones.
         patience: stop when this many validations in a row bring no better free run, once the last
             stage has begun.
         validate_every: epochs between validations.
@@ -113,9 +108,7 @@ class TrainingConfig(MachineConfig):
     gradient_clip: float = Field(default=1.0, gt=0)
     weight_decay: float = Field(default=0.0, ge=0)
     average: float = Field(default=0.0, ge=0, lt=1)
-    refit_baseline: bool = False
     from_baseline: bool = False
-    begin_with: str | None = None
     patience: int = Field(default=20, ge=1)
     validate_every: int = Field(default=1, ge=1)
 

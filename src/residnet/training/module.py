@@ -9,21 +9,16 @@ from typing import Any, NamedTuple, final
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from residnet.core.layout import POSE, VELOCITIES
 from residnet.data.windows import WindowBatches, WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.scripted import MANY, FreeRun, scripted
-from residnet.training.calibration import PACE, Calibration
 from residnet.training.config import TrainingConfig
 from residnet.training.epochs import EpochTraining
 from residnet.training.losses import one_step_loss, rollout_loss
 from residnet.training.stage_windows import stage_windows, stages
-
-_BACK = 1e-3
-"""Weight decay of coefficients, in units of their standard errors."""
 
 
 class Score(NamedTuple):
@@ -45,10 +40,7 @@ Validate = Callable[[HybridDynamics], Score]
 
 @final
 class HeadTraining(EpochTraining):
-    """A training of `model.head` that keeps the weights which validate best in free run.
-
-    The baseline moves too, where the config says so.
-    """
+    """A training of `model.head` that keeps the weights which validate best in free run."""
 
     def __init__(
         self,
@@ -58,15 +50,9 @@ class HeadTraining(EpochTraining):
         scales: Tensor,
         validate: Validate,
         seed: int,
-        covariance: Tensor | None = None,
     ) -> None:
         super().__init__(config, seed)
         self.model = model
-        self.calibration = (
-            Calibration(model, covariance)
-            if config.refit_baseline and covariance is not None
-            else None
-        )
         self.average = copy.deepcopy(model).requires_grad_(False) if config.average > 0 else None
         self.rollout = Rollout(model)
         self._compiled: FreeRun | None = None
@@ -87,10 +73,6 @@ class HeadTraining(EpochTraining):
             {"params": [p for p in head if p.ndim > 1], "weight_decay": self.settings.weight_decay},
             {"params": [p for p in head if p.ndim <= 1], "weight_decay": 0.0},
         ]
-        if self.calibration is not None:
-            # where the data say nothing, a coefficient goes back to where its refit put it
-            moved = list(self.calibration.parameters())
-            groups.append({"params": moved, "weight_decay": _BACK, "pace": PACE})
         return torch.optim.AdamW(groups, lr=1e-3)
 
     def on_fit_start(self) -> None:
@@ -99,8 +81,7 @@ class HeadTraining(EpochTraining):
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             self.rank, self.world = self.global_rank, torch.distributed.get_world_size()
         self.store, self.scales = self.store.to(self.device), self.scales.to(self.device)
-        begun = self.settings.from_baseline or self.settings.begin_with is not None
-        if begun and self.epoch == 0:
+        if self.settings.from_baseline and self.epoch == 0:
             self.validate_start()
             self.best_diverged = self.diverged
 
@@ -113,7 +94,7 @@ class HeadTraining(EpochTraining):
         rate = schedule.learning_rate * (1 - progress * (1 - schedule.final))
         self.model.baseline.requires_grad_(False)
         for group in self.trainer.optimizers[0].param_groups:
-            group["lr"] = rate * group.get("pace", 1.0)
+            group["lr"] = rate
 
     def training_step(self, starts: Tensor, batch_index: int) -> Tensor:
         """Return the loss of one batch of windows."""
@@ -199,23 +180,13 @@ class HeadTraining(EpochTraining):
 
     def _free_run(self) -> FreeRun:
         """Return the free run of the model as the training has it now."""
-        if self.calibration is None:
-            if self._compiled is None:
-                # not before: by now the model is on its device and in training
-                self._compiled = scripted(self.rollout, MANY)
-            return self._compiled
-        moved = {"model.baseline.theta": self.calibration()}
-
-        def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            out: tuple[Tensor, Tensor, Tensor] = functional_call(self.rollout, moved, (x0, w, s))
-            return out
-
-        return run
+        if self._compiled is None:
+            # not before: by now the model is on its device and in training
+            self._compiled = scripted(self.rollout, MANY)
+        return self._compiled
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Put moved coefficients into the model, and move the averaged weights."""
-        if self.calibration is not None:
-            self.calibration.place(self.model)
+        """Move the averaged weights."""
         if self.average is None:
             return
         # a short memory at first, or the average would remember the untrained start

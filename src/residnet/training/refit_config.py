@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.training.offsets import OffsetsConfig
-
-Prior = Annotated[float, Field(ge=0)]
 
 
 class RefitConfig(Config):
@@ -18,11 +14,7 @@ class RefitConfig(Config):
     Attributes:
         horizon: length of the free runs in s.
         every: time between their starts in s.
-        prior: weight of the least-squares solution, as a share of its own information; of several
-            the strongest is taken whose free runs over folds of the logs are within one standard
-            error of the best, the least-squares solution itself being one of the candidates.
-        folds: number of parts that the training and validation logs are divided into where there
-            are several priors: whole logs, or stretches where there are fewer logs than folds.
+        prior: weight of the least-squares solution, as a share of its own information.
         asymmetric: shrinks terms that a mirror-symmetric vessel cannot have towards zero; 0 for no
             such knowledge.
         robust: windows whose error (in units of the scales) is far above this count by their error
@@ -38,19 +30,12 @@ class RefitConfig(Config):
 
     horizon: Seconds = Field(default=20.0, gt=0)
     every: Seconds = Field(default=10.0, gt=0)
-    prior: Prior | Annotated[tuple[Prior, ...], Field(min_length=2)] = 1e-2
-    folds: int = Field(default=4, ge=2)
+    prior: float = Field(default=1e-2, ge=0)
     asymmetric: float = Field(default=0.0, ge=0)
     robust: float = Field(default=0.05, gt=0)
     correlation: Seconds = Field(default=10.0, gt=0)
     offsets: OffsetsConfig | None = None
     iterations: int = Field(default=10, ge=1, le=10_000)
-
-    @property
-    def priors(self) -> tuple[float, ...]:
-        """The strengths of the prior to choose from, the strongest first."""
-        given = self.prior if isinstance(self.prior, tuple) else (self.prior,)
-        return tuple(sorted(given, reverse=True))
 
     def with_prior(self, prior: float) -> RefitConfig:
         """Return the same settings with one strength of the prior."""

@@ -126,7 +126,7 @@ def problem_of(
         nu,
         weight,
         active,
-        config.priors[0] * information + own,
+        config.prior * information + own,
         own,
         baseline.theta.detach().flatten()[active].clone(),
         config.asymmetric * baseline.asymmetry(samples),

@@ -25,7 +25,6 @@ def train(
     validate: Validate,
     seed: int,
     folder: Path | None,
-    covariance: torch.Tensor | None = None,
 ) -> dict[str, Any]:
     """Train the head of a model and leave the weights that validated best in it (float32).
 
@@ -40,7 +39,6 @@ def train(
         seed: of weights and batches.
         folder: for checkpoints (`checkpoints/<name>/last.ckpt` is resumed from where it exists) and
             the TensorBoard log; None for neither.
-        covariance: of the baseline's coefficients [P, P], for a training that moves them too.
 
     Returns:
         Notes about the training: the curve by epoch, the best score, the number of parameters.
@@ -48,9 +46,7 @@ def train(
     Raises:
         FitError: where training never gave a finite free run.
     """
-    if config.begin_with is None:
-        # weights that are there already belong to the scales that they were trained with
-        model.head.calibrate(samples)
+    model.head.calibrate(samples)
     if config.from_baseline:
         model.head.silence()
     dtype = torch.float64 if config.double else torch.float32
@@ -58,7 +54,7 @@ def train(
     # losses and scores are those of velocities
     model.positions = False
     try:
-        module = HeadTraining(model.to(dtype), store, config, scale, validate, seed, covariance)
+        module = HeadTraining(model.to(dtype), store, config, scale, validate, seed)
         return run_epochs(name, module, model, model.head, folder, config)
     finally:
         model.to(torch.float32)

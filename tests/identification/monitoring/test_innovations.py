@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from residnet.identification.monitoring.innovations import weighed
+from residnet.identification.monitoring import weighed
 
 WINDOWS, CHANGES, VALUES = 6, 3, 40
 BELIEF = np.diag([1.0, 1.0, 1.0])

@@ -12,11 +12,16 @@ from residnet.core.errors import DataError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
-from residnet.identification.monitoring.changes import Change, ChangedDynamics
-from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
-from residnet.identification.monitoring.refitting import recursive_refit
-from residnet.identification.monitoring.watcher import Watcher
-from residnet.identification.monitoring.windows import Piece
+from residnet.identification.monitoring import (
+    Change,
+    ChangedDynamics,
+    MonitorConfig,
+    Piece,
+    Verdict,
+    Watch,
+    Watcher,
+)
+from residnet.identification.recursive_refit import recursive_refit
 from residnet.testing.examples import STEP, example_model, example_spec
 
 SECONDS, WINDOW = 60, 100

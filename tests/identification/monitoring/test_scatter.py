@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from residnet.identification.monitoring.scatter import Group, scattered
+from residnet.identification.monitoring import Group, scattered
 
 CAUSES = 3
 ALIKE = np.array([[1.0, 0.8, 0.0], [0.8, 1.0, 0.0], [0.0, 0.0, 1.0]])

@@ -14,9 +14,16 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.gear import InputShare
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.models import FittedModel
-from residnet.identification.planning.candidates import TrialLimits, shares_of
-from residnet.identification.planning.information import after, spread, volume_gain
-from residnet.identification.planning.plan import Aim, Plan, plan
+from residnet.identification.planning import (
+    Aim,
+    Plan,
+    TrialLimits,
+    after,
+    plan,
+    shares_of,
+    spread,
+    volume_gain,
+)
 from residnet.manoeuvres import ConstantInput
 from residnet.physics.signals import SignalsConfig
 from residnet.training.free_runs.covariance import LeftOpen, left_open

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,6 @@ class Contender:
             error, [B]; see `log_errors`.
         diverged: number of its validation windows that diverged, over all protocols.
         faults: sentences on what makes it unsound, divergences among them; empty for a sound model.
-        direct: scores over the validation logs alone, where `scores` are of folds too; else None.
     """
 
     name: str
@@ -53,7 +52,6 @@ class Contender:
     scores: np.ndarray
     diverged: int = 0
     faults: tuple[str, ...] = ()
-    direct: np.ndarray | None = None
 
     @property
     def score(self) -> float:
@@ -78,26 +76,20 @@ class Blocks:
     Attributes:
         weights: share of each block in the mean over windows, [B]; their sum is 1.
         of: `logs` where a block is all windows of a log, else `stretches` of logs.
-        further: blocks of other data, over which a second part of the scores was taken.
     """
 
     weights: np.ndarray
     of: str
-    further: Blocks | None = None
 
     @property
     def count(self) -> int:
-        """Number of blocks, those of other data too."""
-        return len(self.weights) + (0 if self.further is None else self.further.count)
+        """Number of blocks."""
+        return len(self.weights)
 
     @property
     def alike(self) -> float:
         """Number of standard errors within which two models are alike."""
         return _ALIKE[self.of]
-
-    def beside(self, further: Blocks) -> Blocks:
-        """Return the blocks with those of other data behind them."""
-        return replace(self, further=further)
 
     def standard_error(self, one: np.ndarray, other: np.ndarray) -> float:
         """Return the standard error of the difference of two means.
@@ -108,49 +100,20 @@ class Blocks:
             one: what each block contributes to the first mean, [B].
             other: the same of the second, [B].
         """
-        count = len(self.weights)
-        beyond = (
-            0.0 if self.further is None else self.further.standard_error(one[count:], other[count:])
-        )
-        if count < 2:
-            return beyond
-        apart = one[:count] - other[:count]
+        if self.count < 2:
+            return 0.0
+        apart = one - other
         rest = apart - self.weights * apart.sum()
-        return math.hypot(math.sqrt(count / (count - 1) * float(rest @ rest)), beyond)
+        return math.sqrt(self.count / (self.count - 1) * float(rest @ rest))
 
 
 def difference(one: Contender, other: Contender, blocks: Blocks) -> tuple[float, float]:
     """Return the mean logarithm of the ratio of two models' errors, and its standard error.
 
     Both are shares: 0.1 is about 10 %.
-
-    Over folds a network is judged by way of another model, in proportion. Where two networks are
-    judged by models that differ much from log to log, this tells less than the validation logs
-    alone, and where it does, these speak. Stretches of fewer than five logs do not: they resemble
-    each other, and tell nothing of how logs differ.
     """
-    told = (
-        float((one.scores - other.scores).sum()),
-        blocks.standard_error(one.scores, other.scores),
-    )
-    further = blocks.further
-    if further is None or further.of != "logs" or one.direct is None or other.direct is None:
-        return told
-    count = len(blocks.weights)
-    if np.array_equal(one.scores[count:], other.scores[count:]):
-        return told
-    alone = float((one.direct - other.direct).sum())
-    spread = further.standard_error(one.direct, other.direct)
-    return (alone, spread) if 0.0 < spread < told[1] else told
-
-
-def least(entries: Iterable[Contender], blocks: Blocks) -> Contender | None:
-    """Return the model that errs least, each compared with the best so far; None of none."""
-    best: Contender | None = None
-    for entry in sorted(entries, key=lambda entry: entry.score):
-        if best is None or difference(entry, best, blocks)[0] < 0.0:
-            best = entry
-    return best
+    apart = float((one.scores - other.scores).sum())
+    return apart, blocks.standard_error(one.scores, other.scores)
 
 
 @dataclass(frozen=True)
@@ -175,7 +138,7 @@ class Selection:
     def tied(self) -> tuple[str, ...]:
         """Names of the sound single models that are as good as the best, `zero` aside."""
         single = [e for e in self.contenders if e.family not in ("ensemble", "zero") and e.sound]
-        best = least(single, self.blocks)
+        best = min(single, key=lambda entry: entry.score, default=None)
         return tuple(
             entry.name for entry in single if best is not None and self._within(entry, best)
         )
@@ -242,21 +205,17 @@ def _simplest(
     sound: Sequence[Contender], unsound: Sequence[Contender], blocks: Blocks
 ) -> tuple[Contender, str]:
     """Return the simplest sound model that is as good as the best, and why."""
-    best = least(sound, blocks)
-    assert best is not None
+    best = min(sound, key=lambda entry: entry.score)
     said = "one standard error" if blocks.alike == 1.0 else "half a standard error"
     for chosen in sorted(sound, key=lambda entry: (*entry.simplicity, entry.score)):
         apart, spread = difference(chosen, best, blocks)
         if apart <= (within := blocks.alike * spread):
             break
     if chosen is best:
-        # folds may say less where baselines differ; then the validation logs have decided
-        what = (
-            "errs least of the sound models over the same validation logs"
-            if any(entry.score < best.score for entry in sound)
-            else "errs least of the sound models"
+        reason = (
+            f"{chosen.name} errs least of the sound models (mean validation error"
+            f" {chosen.error:.3g})"
         )
-        reason = f"{chosen.name} {what} (mean validation error {chosen.error:.3g})"
         simpler = [e for e in sound if e.simplicity < best.simplicity]
         if simpler:
             reason += f", and no simpler one comes within {said} of it"

@@ -16,7 +16,7 @@ from residnet.data.prepare import prepare
 from residnet.data.readers import CanonicalConfig
 from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.simulated.trials import SimulatedTrials
-from residnet.identification.evaluation import candidates, evaluate
+from residnet.identification.identified import candidates, evaluate
 from residnet.identification.prepared import require_window, velocity_limit
 from residnet.judge.rollout_files import write_rollouts
 from residnet.runs.folder import RunFolder

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 from residnet.data.simulated.trials import SimulatedTrials, stand_ins
 from residnet.data.sources import MeasuredLogs, Splits, input_files, read_logs
+from residnet.identification.fitter import require_fit
 from residnet.identification.models import FittedModel
 from residnet.identification.prepared import PreparedSplits, prepare_logs
-from residnet.identification.requirements import require_fit
 from residnet.tasks.fit.booklet import require_flyable
 from residnet.tasks.fit.config import FitTaskSettings
 

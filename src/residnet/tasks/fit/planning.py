@@ -17,10 +17,8 @@ from residnet.core.files import whole
 from residnet.core.names import nearest
 from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
-from residnet.identification.currents import through_currents
-from residnet.identification.planning.candidates import TrialLimits, shares_of
-from residnet.identification.planning.plan import Aim, Plan, Trial, plan
-from residnet.identification.prepared import prepare_logs, velocity_limit
+from residnet.identification.planning import Aim, Plan, Trial, TrialLimits, plan, shares_of
+from residnet.identification.prepared import prepare_logs, through_currents, velocity_limit
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.tasks.fit.config import FitTaskSettings
@@ -120,7 +118,7 @@ def plan_trials(
     logs, _ = through_currents(prepare_logs(take_logs(config), config), config)
     fitted, train = store.load(name), logs["train"]
     refit = config.refit[name]
-    refit = refit.with_prior(float(fitted.notes.get("prior", refit.priors[0])))
+    refit = refit.with_prior(float(fitted.notes.get("prior", refit.prior)))
     scales = config.evaluation.scales.array()
     open_ = left_open(
         fitted.model.double(),

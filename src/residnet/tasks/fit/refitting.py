@@ -15,10 +15,10 @@ from residnet.core.config import dump_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.progress import say
 from residnet.data.prepare import Prepared
-from residnet.identification.evaluation import candidates, evaluate
+from residnet.identification.identified import candidates, evaluate
 from residnet.identification.models import FittedModel
-from residnet.identification.monitoring.refitting import Moved, Refit, recursive_refit, refitted
 from residnet.identification.prepared import require_window, velocity_limit
+from residnet.identification.recursive_refit import Moved, Refit, recursive_refit, refitted
 from residnet.judge.metrics import find
 from residnet.judge.rollout_files import write_rollouts
 from residnet.runs.folder import RunFolder

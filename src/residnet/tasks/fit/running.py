@@ -7,12 +7,9 @@ from functools import partial
 
 from residnet.core.errors import DataError
 from residnet.core.progress import say
-from residnet.identification.currents import through_currents
 from residnet.identification.fit import fit
-from residnet.identification.goodness import goodness_rows
-from residnet.identification.identified import Identified
-from residnet.identification.prepared import PreparedSplits, prepare_logs
-from residnet.identification.teacher_forced import residual_table, term_table
+from residnet.identification.identified import Identified, goodness_rows, residual_table, term_table
+from residnet.identification.prepared import PreparedSplits, prepare_logs, through_currents
 from residnet.judge.bands.file import bands_content
 from residnet.judge.goodness import content
 from residnet.judge.rollout_files import write_rollouts

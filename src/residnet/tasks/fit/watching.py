@@ -15,9 +15,15 @@ from residnet.core.names import nearest
 from residnet.data.parts import data_files
 from residnet.data.prepare import Prepared, prepare
 from residnet.identification.models import FittedModel
-from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
-from residnet.identification.monitoring.watcher import Watcher
-from residnet.identification.monitoring.windows import Piece, past_of, pieces
+from residnet.identification.monitoring import (
+    MonitorConfig,
+    Piece,
+    Verdict,
+    Watch,
+    Watcher,
+    past_of,
+    pieces,
+)
 from residnet.identification.prepared import prepare_logs
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore

@@ -1,16 +1,20 @@
-"""The next trials: candidates flown by the model, and chosen by what they would tell."""
+"""Which manoeuvre to run next: what each would tell about the parameters of a refitted baseline."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from residnet.core.errors import DataError
+from residnet.baselines import ParametricBaseline
+from residnet.core.config import Config, Metres, MetresPerSecond, Seconds
+from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import POSITION, SURGE, SWAY
 from residnet.core.names import STATE
 from residnet.data.simulated.environment import Disturbance
@@ -18,12 +22,178 @@ from residnet.data.simulated.flying import Craft, Flight, Sea, fly
 from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.actuated import ActuatedDynamics
 from residnet.dynamics.gear import GivenGear, InputShare, commanded
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
 from residnet.identification.models import FittedModel
-from residnet.identification.planning.candidates import TrialLimits, candidates
-from residnet.identification.planning.information import after, moments, spread, volume_gain
-from residnet.manoeuvres import Helm, Manoeuvre
+from residnet.manoeuvres import (
+    AccelerationDeceleration,
+    Helm,
+    Manoeuvre,
+    MultiSine,
+    ThreeTwoOneOne,
+    TurningCircle,
+    Zigzag,
+)
 from residnet.training.free_runs.covariance import LeftOpen
 from residnet.training.refit_config import RefitConfig
+from residnet.training.sensitivities import step_sensitivities
+
+
+@torch.no_grad()
+def moments(
+    model: HybridDynamics, runs: Sequence[tuple[Tensor, Tensor]], horizon: int, scales: Tensor
+) -> Tensor:
+    """Return the sums over each run's samples of squared sensitivities of u, v, r, [R, P, P].
+
+    They are in scales. Each run is cut into free runs of `horizon` steps, each from its own
+    measured state, as a refit takes it; what is left at the end does not count.
+
+    Args:
+        model: a baseline without a head.
+        runs: states [T + 1, 6] and inputs held over each step [T, m] of R runs.
+        horizon: steps of the free runs of a refit.
+        scales: of the velocities [3].
+    """
+    baseline = model.baseline
+    assert isinstance(baseline, ParametricBaseline)
+    places = [
+        (run, k * horizon) for run, (_, w) in enumerate(runs) for k in range(len(w) // horizon)
+    ]
+    size = int(baseline.free_indices().numel())
+    out = torch.zeros(len(runs), size, size, dtype=scales.dtype)
+    if not places:
+        return out
+    number = torch.tensor([run for run, _ in places])
+    x = torch.stack([runs[run][0][start : start + horizon] for run, start in places])
+    w = torch.stack([runs[run][1][start : start + horizon] for run, start in places])
+    s = torch.zeros(len(places), 4, size, dtype=scales.dtype)
+    for k in range(horizon):
+        s = step_sensitivities(model, baseline, x[:, k], model.signals.prepare(w[:, k]), s)
+        seen = s[:, 1:] / scales[:, None]
+        out.index_add_(0, number, seen.transpose(1, 2) @ seen)
+    return out
+
+
+def after(covariance: Tensor, information: Tensor) -> Tensor:
+    """Return the covariance [P, P] once data of some information [P, P] are in.
+
+    Parameters that have no covariance stay as they are.
+    """
+    eye = torch.eye(len(covariance), dtype=covariance.dtype)
+    left: Tensor = covariance @ torch.linalg.inv(eye + information @ covariance)
+    return left
+
+
+def volume_gain(covariance: Tensor, information: Tensor) -> float:
+    """Return by how much the logarithm of the ellipsoid's volume shrinks (D-optimality)."""
+    eye = torch.eye(len(covariance), dtype=covariance.dtype)
+    return 0.5 * float(torch.linalg.slogdet(eye + information @ covariance)[1])
+
+
+def spread(covariance: Tensor, goal: Tensor) -> float:
+    """Return the root mean square uncertainty of what a goal [P, P] weighs (A-optimality)."""
+    return float((goal * covariance).sum().clamp(min=0.0).sqrt())
+
+
+_SIDES = {"port": 1.0, "stbd": -1.0, "starboard": -1.0, "left": 1.0, "right": -1.0}
+"""Which way more of a side's thrust turns the vessel."""
+
+
+class TrialLimits(Config):
+    """What a trial may use.
+
+    Attributes:
+        time: that each candidate lasts, in s.
+        area: largest distance from the start, in m; none where not given.
+        speed: largest speed in m/s; none where not given.
+        rudder: largest share of full steer.
+        count: number of trials to choose.
+    """
+
+    time: Seconds = Field(default=120.0, gt=0)
+    area: Metres | None = Field(default=None, gt=0)
+    speed: MetresPerSecond | None = Field(default=None, gt=0)
+    rudder: float = Field(default=1.0, gt=0, le=1)
+    count: int = Field(default=3, ge=1)
+
+
+def candidates(limits: TrialLimits) -> list[Manoeuvre]:
+    """Return zigzags, turns, 3-2-1-1, multi-sines and speed changes at several drives."""
+    out: list[Manoeuvre] = []
+    time, full = limits.time, limits.rudder
+    for drive in (0.4, 0.7, 1.0):
+        per = f"{round(100 * drive)}"
+        for angle in (10.0, 20.0):
+            for share in (0.5, 1.0):
+                name = f"zigzag_{angle:.0f}_steer_{round(100 * share * full)}_drive_{per}"
+                out.append(
+                    Zigzag(
+                        name=name,
+                        drive=drive,
+                        steer=share * full,
+                        heading=math.radians(angle),
+                        start=0.1 * time,
+                        duration=time,
+                    )
+                )
+        for side in (1.0, -1.0):
+            name = f"turn_{'starboard' if side > 0 else 'port'}_drive_{per}"
+            out.append(
+                TurningCircle(
+                    name=name, drive=drive, steer=side * full, start=0.1 * time, duration=time
+                )
+            )
+        for unit in (0.02, 0.05):
+            out.append(
+                ThreeTwoOneOne(
+                    name=f"3211_{unit * time:.0f}s_drive_{per}",
+                    drive=drive,
+                    steer=full,
+                    unit=unit * time,
+                    start=0.05 * time,
+                    duration=time,
+                )
+            )
+        out.append(
+            MultiSine(
+                name=f"multi_sine_drive_{per}",
+                drive=0.5 * drive,
+                drive_amplitude=0.5 * drive,
+                steer_amplitude=full,
+                band=(2.0 / time, 20.0 / time),
+                duration=time,
+            )
+        )
+    levels = (1.0, 0.0, 0.6, 0.2)
+    times = tuple(0.25 * time * k for k in range(4))
+    out.append(
+        AccelerationDeceleration(name="speed_changes", times=times, levels=levels, duration=time)
+    )
+    return out
+
+
+def shares_of(spec: ModelSpec) -> Mapping[str, InputShare]:
+    """Return how the inputs of a model follow drive and steer, within what its data have seen.
+
+    Raises:
+        UsageError: where no input can be told to steer.
+    """
+    units, ranges, out = spec.signals.units(), spec.ranges, {}
+    for name in spec.signals.inputs:
+        most = max(map(abs, ranges[name]))
+        side = next((sign for word, sign in _SIDES.items() if word in name.split("_")), 0.0)
+        if units.get(name) == "rad" or name == "tau_n":
+            out[name] = InputShare(steer=most, limit=most)
+        elif side:
+            out[name] = InputShare(drive=0.6 * most, steer=0.6 * side * most, limit=most)
+        else:
+            out[name] = InputShare(drive=most, limit=most)
+    if not any(share.steer for share in out.values()):
+        raise UsageError(
+            f"model {spec.name}: none of {', '.join(spec.signals.inputs)} is known to steer; say"
+            " how inputs follow drive and steer in the run's `booklet.inputs`"
+        )
+    return out
 
 
 @dataclass(frozen=True)

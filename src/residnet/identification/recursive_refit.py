@@ -24,10 +24,18 @@ from residnet.core.errors import UsageError
 from residnet.core.layout import VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.identification.models import FittedModel
-from residnet.identification.monitoring.changes import Change, ChangedDynamics
-from residnet.identification.monitoring.innovations import BELIEVED, apart_from, weighed
-from residnet.identification.monitoring.monitor import Verdict, Watch
-from residnet.identification.monitoring.windows import Piece, innovations, parted
+from residnet.identification.monitoring import (
+    BELIEVED,
+    Change,
+    ChangedDynamics,
+    Piece,
+    Verdict,
+    Watch,
+    apart_from,
+    innovations,
+    parted,
+    weighed,
+)
 
 _MOST = 3
 """Changes that a refit puts into a model at most."""

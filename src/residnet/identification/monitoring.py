@@ -1,0 +1,1005 @@
+"""The monitor: score tests on the innovations of short free runs, against those of clean logs.
+
+Windows are free-run as a whole and in parts, each from its measured start. What the model has
+always got wrong is taken out of their innovations, which are then whitened by their covariance over
+clean logs. For each cause the score test asks whether a small change of that kind explains the last
+minutes, once wind and current have taken what they can. How much clean logs differ in the sizes
+that they ask for sets its scale. The scores of all causes together say how well each alone explains
+them.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import final
+
+import numpy as np
+import torch
+from pydantic import Field
+from scipy.stats import t as student
+from torch import Tensor
+
+from residnet.core.config import Config, Seconds
+from residnet.core.errors import DataError
+from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE
+from residnet.data.prepare import Prepared
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.scripted import scripted
+from residnet.dynamics.store import ModelSpec
+from residnet.physics.signals import SignalsConfig
+
+_AXES = ("surge", "sway", "yaw")
+_TAKEN = (0.1, 1.0, 1.0)
+"""Share of the velocity of surge, sway and yaw whose absence shows what damps it."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A small change of a vessel, of its commands, of its surroundings or of a sensor.
+
+    Attributes:
+        name: short, for tables.
+        words: what it is, completing "the logs look as if ...".
+        unit: of its size.
+        size: that its effect is computed with.
+        heavier: added to the inertia of all axes, as a share.
+        damping: axis (0 surge, 1 sway, 2 yaw) whose damping changes; None for none.
+        damped: added to the damping of that axis, as a share of what the model has.
+        push: acceleration to north and east, m/s^2.
+        gain: added to the gain of inputs, by their number.
+        offset: added to inputs, by their number.
+        sensor: what a sensor adds: `gyro_scale`, `gyro_offset`, `speed_scale`, `lag`, or
+            `current_north`, `current_east` for water that moves; empty for none.
+    """
+
+    name: str
+    words: str
+    unit: str
+    size: float
+    heavier: float = 0.0
+    damping: int | None = None
+    damped: float = 0.0
+    push: tuple[float, float] = (0.0, 0.0)
+    gain: Mapping[int, float] = field(default_factory=dict)
+    offset: Mapping[int, float] = field(default_factory=dict)
+    sensor: str = ""
+
+    def of_size(self, size: float) -> Change:
+        """Return the same change of another size, in its unit."""
+        k = size / self.size
+        return replace(
+            self,
+            size=size,
+            heavier=k * self.heavier,
+            damped=k * self.damped,
+            push=(k * self.push[0], k * self.push[1]),
+            gain={place: k * value for place, value in self.gain.items()},
+            offset={place: k * value for place, value in self.offset.items()},
+        )
+
+
+def causes(signals: SignalsConfig) -> list[Change]:
+    """Return the changes that a monitor looks for, given the inputs of a model."""
+    units = signals.units()
+    out = [Change("mass", "the vessel has become heavier", "share", 0.02, heavier=0.02)]
+    for axis, name in enumerate(_AXES):
+        words = f"the damping in {name} has grown"
+        out.append(Change(f"damping {name}", words, "share", 0.02, damping=axis, damped=0.02))
+    for place, name in enumerate(signals.inputs):
+        words = f"{name} has grown stronger than it was"
+        out.append(Change(f"gain {name}", words, "share", 0.02, gain={place: 0.02}))
+        if units.get(name) == "rad":
+            words = f"{name} has an offset"
+            out.append(Change(f"offset {name}", words, "rad", 0.01, offset={place: 0.01}))
+    return [
+        *out,
+        Change("gyro scale", "the gyro shows too much", "share", 0.02, sensor="gyro_scale"),
+        Change("gyro offset", "the gyro has an offset", "rad/s", 0.001, sensor="gyro_offset"),
+        Change("speed scale", "u and v are shown too large", "share", 0.02, sensor="speed_scale"),
+        Change("lag", "u, v and r come late", "s", 0.1, sensor="lag"),
+    ]
+
+
+def surroundings() -> list[Change]:
+    """Return what wind and current do, which is no change of the vessel."""
+    return [
+        Change("current north", "", "m/s", 0.05, sensor="current_north"),
+        Change("current east", "", "m/s", 0.05, sensor="current_east"),
+        Change("push north", "", "m/s^2", 0.005, push=(0.005, 0.0)),
+        Change("push east", "", "m/s^2", 0.005, push=(0.0, 0.005)),
+    ]
+
+
+def shown(sensor: str, x: Tensor, rate: Tensor, size: float) -> Tensor:
+    """Return what a sensor adds to states [..., 6] whose velocities change by `rate` [..., 3]."""
+    out = torch.zeros_like(x)
+    if sensor == "gyro_scale":
+        out[..., YAW_RATE] = size * x[..., YAW_RATE]
+    elif sensor == "gyro_offset":
+        out[..., YAW_RATE] = size
+    elif sensor == "speed_scale":
+        out[..., SURGE : SWAY + 1] = size * x[..., SURGE : SWAY + 1]
+    elif sensor == "lag":
+        out[..., VELOCITIES] = -size * rate
+    elif sensor in ("current_north", "current_east"):
+        cos, sin = torch.cos(x[..., HEADING]), torch.sin(x[..., HEADING])
+        north = sensor == "current_north"
+        out[..., SURGE] = size * (cos if north else sin)
+        out[..., SWAY] = size * (-sin if north else cos)
+    return out
+
+
+@final
+class ChangedDynamics(Dynamics):
+    """A model with a change of its own for every block of rows.
+
+    Args:
+        model: as it was fitted.
+        changes: C of them; rows [C * B] are blocks of B.
+        rows: B.
+        inputs: number of the model's inputs.
+    """
+
+    def __init__(
+        self, model: HybridDynamics, changes: Sequence[Change], rows: int, inputs: int
+    ) -> None:
+        super().__init__(model.dt, model.integrator)
+        self.model = model
+        self.n_state = model.n_state
+
+        def each(values: Sequence[Sequence[float]]) -> Tensor:
+            table = torch.tensor(values, dtype=torch.float64)
+            return table.repeat_interleave(rows, dim=0)
+
+        span = range(inputs)
+        self.inertia = each([[1.0 + change.heavier] for change in changes])
+        damped = [k for k, change in enumerate(changes) if change.damping is not None]
+        self.damps = len(damped) > 0
+        self.damped_rows = torch.tensor(damped).repeat_interleave(rows) * rows + torch.arange(
+            rows
+        ).repeat(len(damped))
+        self.damping = torch.tensor(
+            [changes[k].damping or 0 for k in damped], dtype=torch.long
+        ).repeat_interleave(rows)
+        self.damped = torch.tensor(
+            [changes[k].damped for k in damped], dtype=torch.float64
+        ).repeat_interleave(rows)
+        self.push = each([change.push for change in changes])
+        self.gain = each([[1.0 + change.gain.get(i, 0.0) for i in span] for change in changes])
+        self.offset = each([[change.offset.get(i, 0.0) for i in span] for change in changes])
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return the rate of the unchanged model; the change acts on whole steps."""
+        return self.model.rate(x, p, rho)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return state and memory one step later, with the changed acceleration."""
+        w = w * self.gain + self.offset
+        after, memory = self.model.step(x, w, s)
+        nu = x[:, VELOCITIES]
+        gained = after[:, VELOCITIES] - nu
+        if self.damps:
+            gained = gained - self._slowed(x, w, s, gained)
+        cos, sin = torch.cos(x[:, HEADING]), torch.sin(x[:, HEADING])
+        north, east = self.push[:, 0], self.push[:, 1]
+        push = torch.stack(
+            (cos * north + sin * east, cos * east - sin * north, torch.zeros_like(north)), dim=1
+        )
+        moved = nu + gained / self.inertia + self.dt * push
+        changed = after.clone()
+        changed[:, VELOCITIES] = moved
+        # the heading follows what the yaw rate has gained over the step
+        changed[:, HEADING] = after[:, HEADING] + 0.5 * self.dt * (moved[:, 2] - after[:, YAW_RATE])
+        return changed, memory
+
+    def _slowed(self, x: Tensor, w: Tensor, s: Tensor, gained: Tensor) -> Tensor:
+        """Return what changed damping takes from the velocities gained over a step [B, 3].
+
+        What damps a velocity is what the step lacks without it; of surge only a part is taken away,
+        for models that hold near a service speed alone.
+        """
+        rows, axis = self.damped_rows, self.damping
+        taken = torch.tensor(_TAKEN, dtype=x.dtype)[axis]
+        share = torch.ones(len(rows), 3, dtype=x.dtype)
+        share[torch.arange(len(rows)), axis] = 1.0 - taken
+        still = x[rows].clone()
+        still[:, VELOCITIES] = still[:, VELOCITIES] * share
+        alone = self.model.step(still, w[rows], s[rows])[0][:, VELOCITIES] - still[:, VELOCITIES]
+        place = torch.arange(len(rows))
+        out = torch.zeros_like(gained)
+        out[rows, axis] = self.damped * (alone[place, axis] - gained[rows, axis]) / taken
+        return out
+
+
+SEEN = ("u", "v", "r", "heading")
+"""What innovations are taken of."""
+_PAST = 5.0
+"""Time in s before a window that warms a memory up."""
+_BLOCKS = 5
+"""Parts of a window whose means count."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A measured window of K steps.
+
+    Attributes:
+        y: states [K + 1, 6].
+        w: inputs held over each step [K, m].
+        past_y: states before it that warm a memory up [P, 6].
+        past_w: inputs before it [P, m].
+    """
+
+    y: np.ndarray
+    w: np.ndarray
+    past_y: np.ndarray
+    past_w: np.ndarray
+
+
+def innovations(
+    model: HybridDynamics, pieces: Sequence[Piece], changes: Sequence[Change]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return innovations [B, n] and what a unit of each change adds to them [B, C, n].
+
+    Args:
+        model: float64, in evaluation mode.
+        pieces: B windows of one length, with pasts of one length.
+        changes: C of them.
+    """
+    y = torch.from_numpy(np.stack([piece.y for piece in pieces]))
+    w = torch.from_numpy(np.stack([piece.w for piece in pieces]))
+    none = Change("none", "", "", 1.0)
+    all_changes = [none, *changes]
+    rows, steps, count = len(pieces), w.shape[1], len(all_changes)
+    blocks = min(_BLOCKS, steps)
+    mean = torch.zeros(blocks, steps, dtype=torch.float64)
+    edges = np.linspace(0, steps, blocks + 1).round().astype(int)
+    for block, (first, last) in enumerate(pairwise(edges.tolist())):
+        mean[block, first:last] = 1.0 / (last - first)
+    with torch.no_grad():
+        memory = model.warmup(
+            torch.from_numpy(np.stack([piece.past_y for piece in pieces])),
+            torch.from_numpy(np.stack([piece.past_w for piece in pieces])),
+        )
+        begin = (y[:, 1] - y[:, 0])[:, VELOCITIES] / model.dt
+        x0 = torch.cat(
+            [y[:, 0] + shown(one.sensor, y[:, 0], begin, one.size) for one in all_changes]
+        )
+        changed = ChangedDynamics(model, all_changes, rows, w.shape[2])
+        path, _, _ = scripted(Rollout(changed), steps)(
+            x0, w.repeat(count, 1, 1), memory.repeat(count, 1)
+        )
+    path = path.reshape(count, rows, steps + 1, -1)
+    # what a sensor shows is taken of the prediction: noise of the measurement is in the error too
+    rate = mean @ path[0].diff(dim=1)[..., VELOCITIES] / model.dt
+    path = mean @ path[:, :, 1:]
+    error = _seen(mean @ y[:, 1:] - path[0])
+    effects = [
+        _seen(
+            path[number + 1] - path[0]
+            if not change.sensor
+            else shown(change.sensor, path[0], rate, change.size) - (path[number + 1] - path[0])
+        )
+        / change.size
+        for number, change in enumerate(changes)
+    ]
+    if not effects:
+        return error.numpy(), np.zeros((len(error), 0, error.shape[1]))
+    return error.numpy(), torch.stack(effects, dim=1).numpy()
+
+
+def parted(piece: Piece, parts: int) -> list[Piece]:
+    """Return the equal parts of a window, each with what went before it; a rest is left out."""
+    past, steps = len(piece.past_y), len(piece.w) // parts
+    y = np.concatenate((piece.past_y, piece.y))
+    w = np.concatenate((piece.past_w, piece.w))
+    return [
+        Piece(
+            y[past + k : past + k + steps + 1],
+            w[past + k : past + k + steps],
+            y[k : past + k],
+            w[k : past + k],
+        )
+        for k in range(0, parts * steps, steps)
+    ]
+
+
+def _seen(states: Tensor) -> Tensor:
+    """Return differences of states [B, k, 6] as innovations [B, 4 k]."""
+    chosen = torch.cat((states[..., VELOCITIES], states[..., HEADING : HEADING + 1]), dim=-1)
+    return chosen.flatten(1)
+
+
+def pieces(log: Prepared, steps: int, past: int) -> list[Piece]:
+    """Return the windows of a log, back to back, whose samples can all be trusted.
+
+    Args:
+        log: prepared as those of the fit.
+        steps: length of a window.
+        past: samples before a window that warm a memory up; the first windows go without.
+    """
+    out, start = [], past
+    while start + steps < len(log):
+        rows = slice(start - past, start + steps + 1)
+        trusted = log.usable[rows] & (log.piece[rows] == log.piece[start]) & (log.piece[start] >= 0)
+        if not trusted.all():
+            # the next window begins behind the last sample that is not to be trusted
+            start = rows.start + int(np.flatnonzero(~trusted)[-1]) + 1 + past
+            continue
+        out.append(
+            Piece(
+                log.y[start : start + steps + 1],
+                log.w[start : start + steps],
+                log.y[start - past : start],
+                log.w[start - past : start],
+            )
+        )
+        start += steps
+    return out
+
+
+def past_of(model: HybridDynamics) -> int:
+    """Return the samples before a window that warm a model's memory up; 0 where it has none."""
+    return round(_PAST / model.dt) if model.n_state else 0
+
+
+_SHRINK = 0.1
+"""Share of the diagonal in the covariance of innovations."""
+BELIEVED = 15.0
+"""Standard deviation of what a model has always got wrong, in the causes' own small sizes."""
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Scores [Q] and information [Q, Q] of a number of windows, and squares of innovations [n]."""
+
+    score: np.ndarray
+    information: np.ndarray
+    squares: np.ndarray
+    count: int
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(
+            self.score + other.score,
+            self.information + other.information,
+            self.squares + other.squares,
+            self.count + other.count,
+        )
+
+
+def weighed(
+    found: Sequence[tuple[np.ndarray, np.ndarray]],
+    whiten: Sequence[np.ndarray],
+    belief: np.ndarray,
+) -> Sums:
+    """Return the sums over windows that were looked at as a whole, then in parts.
+
+    A window that no change of a size thought possible explains tells of a manoeuvre that the model
+    does not know. It counts by the inverse of what it leaves unexplained.
+
+    Args:
+        found: innovations [B, parts n] and effects [B, C, parts n] for each look.
+        whiten: matrix [n, n] of each look.
+        belief: precision of the sizes of the changes [C, C].
+    """
+    looks, number = [], 0
+    for (error, effects), matrix in zip(found, whiten, strict=True):
+        size, (windows, count, values) = len(matrix), effects.shape
+        e = (error.reshape(windows, -1, size) @ matrix.T).reshape(windows, values)
+        a = (effects.reshape(windows, count, -1, size) @ matrix.T).reshape(effects.shape)
+        looks.append((np.einsum("bqn,bn->bq", a, e), a @ a.swapaxes(1, 2), e**2))
+        number += values
+    score = np.sum([one for one, _, _ in looks], axis=0)
+    information = np.sum([one for _, one, _ in looks], axis=0)
+    squares = np.sum([one.sum(axis=1) for _, _, one in looks], axis=0)
+    own = np.linalg.solve(information + belief, score[..., None])[..., 0]
+    left = (squares - (score * own).sum(axis=1)) / number
+    weight = 1.0 / np.maximum(left, 1.0)
+    return Sums(
+        weight @ score,
+        np.tensordot(weight, information, 1),
+        looks[0][2].sum(axis=0),
+        len(looks[0][2]),
+    )
+
+
+def apart_from(sums: Sums, count: int, belief: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return scores [Q] and information [Q, Q] once what follows has taken what it can explain.
+
+    Args:
+        sums: of Q changes, then of what surrounds the vessel.
+        count: Q.
+        belief: precision of the sizes of what surrounds the vessel.
+    """
+    matrix = sums.information
+    own = np.linalg.solve(matrix[count:, count:] + belief, matrix[count:, :count])
+    score = sums.score[:count] - own.T @ sums.score[count:]
+    information = matrix[:count, :count] - matrix[:count, count:] @ own
+    return score, information + 1e-300 * np.eye(count)
+
+
+def always_wrong(error: np.ndarray, effects: np.ndarray, causes: Sequence[Change]) -> np.ndarray:
+    """Return what a model has always got wrong: a size [Q, 4] of each cause for each channel.
+
+    Channels may disagree: a model whose form is wrong has no single set of sizes that mends it.
+
+    Args:
+        error: innovations [B, n] of clean logs.
+        effects: of a unit of each change [B, C, n], the causes first.
+        causes: Q of them.
+    """
+    count, channels = len(causes), len(SEEN)
+    # sensors are taken to be right: how they are wrong looks like the motion itself
+    believed = np.array([0.0 if one.sensor else one.size * BELIEVED for one in causes])
+    out = np.zeros((count, channels))
+    for channel in range(channels):
+        e = error[:, channel::channels].ravel()
+        a = effects[:, :count, channel::channels].swapaxes(1, 2).reshape(len(e), count) * believed
+        matrix = a.T @ a + np.mean(e**2) * np.eye(count)
+        out[:, channel] = believed * np.linalg.solve(matrix, a.T @ e)
+    return out
+
+
+def run_away(
+    error: np.ndarray, effects: np.ndarray, causes: Sequence[Change], limit: np.ndarray
+) -> np.ndarray:
+    """Return which windows [B] tell nothing, because the free run or a changed one ran away.
+
+    Args:
+        error: innovations [B, n].
+        effects: of a unit of each change [B, C, n].
+        causes: the C changes.
+        limit: largest innovation of each channel [4] that a vessel can have.
+    """
+    most = np.tile(limit, error.shape[1] // len(limit))
+    size = np.array([change.size for change in causes])[:, None]
+    # comparisons with what is no number are false
+    sound = (np.abs(error) <= most).all(axis=1)
+    return np.asarray(~(sound & (np.abs(effects * size) <= most).all(axis=(1, 2))))
+
+
+def whitening(error: np.ndarray, parts: int) -> np.ndarray:
+    """Return the matrix [n, n] that makes innovations [B, parts n] of clean logs uncorrelated."""
+    # windows that ran away were made nothing of
+    error = error[(error != 0.0).any(axis=1)]
+    error = error.reshape(len(error) * parts, -1)
+    second = error.T @ error / len(error)
+    covariance = (1.0 - _SHRINK) * second + _SHRINK * np.diag(np.diag(second))
+    found: np.ndarray = np.linalg.inv(np.linalg.cholesky(covariance + 1e-18 * np.eye(len(second))))
+    return found
+
+
+_NOISE = np.geomspace(1.0, 30.0, 25)
+"""Variances of the noise, in those of white innovations, that are tried."""
+_APART = np.concatenate(([0.0], np.geomspace(1e-4, 1e3, 40)))
+"""Variances of sizes, in what a group of middling information tells, that are tried."""
+_LEFT_OPEN = 1.0
+"""Twice the logarithm of the likelihood by which a larger scatter may fall short of the likeliest.
+
+That is one standard error: clean logs have fitted the model too, and look better than others.
+"""
+_NOTHING = 1e-12
+_AT_ODDS = 1.345
+"""Standard deviations by which a log may differ from the others before it counts for less.
+
+It is the usual constant: where errors are normal, 95 % of what they say is kept.
+"""
+_ROUNDS = 8
+"""Of reweighting."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Scores of a group of windows, what surrounds the vessel taken out.
+
+    Attributes:
+        log: number of the log that they are of.
+        score: of each cause [Q].
+        information: about them [Q, Q].
+    """
+
+    log: int
+    score: np.ndarray
+    information: np.ndarray
+
+    @property
+    def own(self) -> np.ndarray:
+        """Information about each cause alone [Q], never zero."""
+        return np.diag(self.information) + _NOTHING
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """What clean groups say about the scatter of scores.
+
+    Attributes:
+        noise: variance of each score in units of its information [Q].
+        apart: variance of the sizes that groups ask for [Q].
+        shared: part of it that is common to the groups of one log [Q].
+        known: variance of the mean size of all clean logs [Q].
+        correlation: of the scores of different causes [Q, Q].
+        count: of the groups that told all this.
+    """
+
+    noise: np.ndarray
+    apart: np.ndarray
+    shared: np.ndarray
+    known: np.ndarray
+    correlation: np.ndarray
+    count: int = 10**9
+
+    def variance(self, own: np.ndarray) -> np.ndarray:
+        """Return the variance of scores [..., Q] whose information is `own` [..., Q]."""
+        return np.asarray(self.noise * own + self.apart * own**2)
+
+    @property
+    def inflation(self) -> float:
+        """How much larger variances are than they seem, their matrix being an estimate itself.
+
+        Weights from few groups are not the best ones, and flatter what they weigh (R. N. Kackar and
+        D. A. Harville, 1984, for the effect; the factors are those of Wishart matrices).
+        """
+        size = len(self.noise)
+        left = max(self.count - size - 1, 1)
+        return max((self.count - 1) / left, 1.0) * self.count / (left + 1)
+
+    def together(self, groups: Sequence[Group]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the size of each cause alone [Q], its error, and how much it explains.
+
+        The scores of all causes tell better than each for itself which it is, and that there is
+        one. What a cause explains is the square that it takes off all scores. All causes are
+        compared on the same scores: neither how well logs agree on the size of one, nor how surely
+        clean logs asked for none of it, says that another one is more likely.
+        """
+        told, weight = [], []
+        for log in dict.fromkeys(group.log for group in groups):
+            part, sure = 0.0, 0.0
+            alike: list[np.ndarray] = []
+            for group in groups:
+                if group.log == log:
+                    variance = self.variance(group.own)
+                    deviation = np.sqrt(variance)
+                    covariance = self.correlation * np.outer(deviation, deviation)
+                    weighed = np.linalg.solve(covariance, group.information)
+                    part = part + weighed.T @ group.score
+                    sure = sure + np.einsum("pq,pq->q", group.information, weighed)
+                    alike.append(self.shared * group.own**2 / variance)
+            # groups of one log say in part the same
+            again = 1.0 + (len(alike) - 1) * np.mean(alike, axis=0)
+            told.append(part / again)
+            weight.append(sure / again + _NOTHING)
+        size, agreed = _agreed(np.stack(told), np.stack(weight))
+        explained = np.sum(told, axis=0) ** 2 / np.sum(weight, axis=0) / self.inflation
+        return size, np.sqrt((1.0 / agreed + self.known) * self.inflation), explained
+
+
+def _agreed(told: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the size [Q] on which logs agree, and the weight behind it (P. J. Huber, 1964).
+
+    A vessel that has changed shows it in all logs. One that is at odds with the others, as a rare
+    manoeuvre may be, counts by how far it is and not by the square of that.
+
+    Args:
+        told: sizes times weights of the logs [K, Q].
+        weight: inverse variances of the sizes [K, Q].
+    """
+    each, root = told / weight, np.sqrt(weight)
+    trusted = np.ones_like(weight)
+    size = told.sum(axis=0) / weight.sum(axis=0)
+    for _ in range(_ROUNDS):
+        apart = np.abs(each - size) * root
+        trusted = np.minimum(1.0, _AT_ODDS / np.maximum(apart, 1e-9))
+        size = (trusted * told).sum(axis=0) / (trusted * weight).sum(axis=0)
+    return size, (trusted * weight).sum(axis=0)
+
+
+def scattered(groups: Sequence[Group]) -> Scatter:
+    """Return how the scores of groups of clean windows scatter about zero."""
+    score = np.stack([group.score for group in groups])
+    own = np.stack([group.own for group in groups])
+    count, size = score.shape
+    noise, apart = np.empty(size), np.empty(size)
+    for cause in range(size):
+        noise[cause], apart[cause] = _likeliest(score[:, cause], own[:, cause])
+    alone = Scatter(noise, apart, 0.0 * apart, 0.0 * apart, np.eye(size))
+    deviation = np.sqrt(alone.variance(own))
+    unit = score / deviation
+    second = unit.T @ unit / count
+    root = np.sqrt(np.diag(second)) + _NOTHING
+    # few groups say little about how scores scatter together
+    kept = count / (count + size)
+    correlation = kept * second / np.outer(root, root) + (1.0 - kept) * np.eye(size)
+    np.fill_diagonal(correlation, 1.0)
+    shared = _shared(groups, alone)
+    whole = Scatter(noise, apart, shared, 0.0 * apart, correlation)
+    return Scatter(noise, apart, shared, 1.0 / _told(groups, whole)[1], correlation, count)
+
+
+def _told(groups: Sequence[Group], scatter: Scatter) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighed sum of sizes [Q] and the sum of weights, the inverse variance."""
+    told, weight = np.zeros(len(scatter.noise)), np.full(len(scatter.noise), _NOTHING)
+    for log in dict.fromkeys(group.log for group in groups):
+        part, sure = 0.0, 0.0
+        for group in groups:
+            if group.log == log:
+                alone = scatter.variance(group.own) - scatter.shared * group.own**2
+                part = part + group.own * group.score / alone
+                sure = sure + group.own**2 / alone
+        told += part / (1.0 + scatter.shared * sure)
+        weight += sure / (1.0 + scatter.shared * sure)
+    return told, weight
+
+
+def _likeliest(score: np.ndarray, own: np.ndarray) -> tuple[float, float]:
+    """Return the variances of noise and sizes that scores [G] ask for, one standard error above."""
+    apart = _APART / np.median(own)
+    variance = (
+        _NOISE[:, None, None] * own[None, None, :] + apart[None, :, None] * own[None, None, :] ** 2
+    )
+    scatter = np.log(variance).sum(axis=2)
+    unlikely = scatter + (score**2 / variance).sum(axis=2)
+    # few logs leave open how much others scatter
+    possible = unlikely <= unlikely.min() + _LEFT_OPEN
+    i, j = np.unravel_index(int(np.where(possible, scatter, -np.inf).argmax()), unlikely.shape)
+    return float(_NOISE[i]), float(apart[j])
+
+
+def _shared(groups: Sequence[Group], scatter: Scatter) -> np.ndarray:
+    """Return the variance of sizes [Q] that the groups of one log share.
+
+    Where no clean log holds two groups nothing tells, and all is taken to be shared.
+    """
+    told, weight = np.zeros(len(scatter.noise)), np.zeros(len(scatter.noise))
+    for i, one in enumerate(groups):
+        for other in groups[:i]:
+            if other.log == one.log:
+                variance = scatter.variance(one.own) * scatter.variance(other.own)
+                product = one.own * other.own
+                told += product * one.score * other.score / variance
+                weight += product**2 / variance
+    if not weight.any():
+        return scatter.apart
+    return np.clip(told / np.maximum(weight, 1e-300), 0.0, scatter.apart)
+
+
+_OVERLAP = 3.0
+"""Independent looks that a sliding stretch gives while it slides by its own length."""
+_FOLDS = 5
+"""Parts of the clean windows whose scores are scaled by what the others say."""
+_FEWEST = 5
+"""Groups of clean windows below which nothing can be said about false alarms."""
+_PARTS = 5
+"""Parts that a window is also looked at in, each from its own measured start."""
+_LEAST_PART = 10
+"""Steps of a part below which windows are looked at as a whole only."""
+_FAR, _TURN = 3.0, 2.0 * np.pi
+"""Innovation beyond which a free run ran away: in largest clean velocities; turns of heading."""
+_MOST_LOST = 0.5
+"""Share of clean windows that may run away."""
+_CURRENT, _PUSH = 0.5, 0.05
+"""Standard deviations of a current in m/s and of a push in m/s^2 that are thought possible."""
+
+
+class MonitorConfig(Config):
+    """Settings of a monitor.
+
+    Attributes:
+        window: length of the free runs whose ends are compared, in s.
+        stretch: time that is looked back over, in s.
+        false_alarm: mean time between false alarms, in s.
+        group: length of the stretches of clean logs whose scatter sets the scale, in s.
+    """
+
+    window: Seconds = Field(default=10.0, gt=0)
+    stretch: Seconds = Field(default=300.0, gt=0)
+    false_alarm: Seconds = Field(default=36_000.0, gt=0)
+    group: Seconds = Field(default=60.0, gt=0)
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A cause, how well it explains the last minutes, and how large it would be.
+
+    Attributes:
+        change: the cause.
+        score: of its test by the scores of all causes, in standard deviations of clean logs.
+        size: of the change, in its unit.
+        error: standard error of the size.
+        explains: square that it alone takes off the scores of all causes.
+    """
+
+    change: Change
+    score: float
+    size: float
+    error: float
+    explains: float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a monitor says after a window.
+
+    Attributes:
+        alarm: whether the largest score exceeds the threshold; of a watcher also where it has not
+            fallen clearly below it since it did.
+        threshold: of the scores.
+        suspects: causes, the one that explains most first.
+        innovation: root mean square of the whitened innovations of each channel; 1 on clean logs.
+    """
+
+    alarm: bool
+    threshold: float
+    suspects: Sequence[Suspect]
+    innovation: dict[str, float]
+
+    @property
+    def largest(self) -> float:
+        """The largest score of any cause."""
+        return max(suspect.score for suspect in self.suspects)
+
+
+_Innovations = tuple[np.ndarray, np.ndarray]
+
+
+class Watch:
+    """What is known of clean logs, and the tests against it.
+
+    Args:
+        spec: of the model.
+        model: that is watched.
+        clean: windows of clean logs, those of one log together; all of one length.
+        config: settings.
+
+    Raises:
+        DataError: where the clean logs are too few.
+    """
+
+    def __init__(
+        self,
+        spec: ModelSpec,
+        model: HybridDynamics,
+        clean: Sequence[Sequence[Piece]],
+        config: MonitorConfig,
+    ) -> None:
+        self.model = model.to(torch.float64).eval()
+        self.config = config
+        self.dt = spec.dt
+        self.causes = causes(spec.signals)
+        self.others = surroundings()
+        outside = [_CURRENT**-2] * 2 + [_PUSH**-2] * 2
+        self.belief = np.diag(outside)
+        self.possible = np.diag([*((BELIEVED * one.size) ** -2 for one in self.causes), *outside])
+        cut = [(k, part) for k, log in enumerate(clean) for part in self.groups(log)]
+        groups, of = [group for _, group in cut], np.array([log for log, _ in cut])
+        if len(groups) < _FEWEST:
+            raise DataError(
+                f"the clean logs hold {len(groups)} stretches of {config.group:g} s; a monitor"
+                f" needs at least {_FEWEST} to know how innovations scatter"
+            )
+        fastest = np.max(
+            [np.abs(p.y[:, VELOCITIES]).max(axis=0) for log in clean for p in log], axis=0
+        )
+        self.limit = _FAR * np.append(fastest, _TURN)
+        self.parts = [1, _PARTS] if round(config.window / spec.dt) >= _LEAST_PART * _PARTS else [1]
+        found = [[self.innovations(group, parts) for parts in self.parts] for group in groups]
+        lost = np.concatenate([(group[0][0] == 0.0).all(axis=1) for group in found])
+        if lost.mean() > _MOST_LOST:
+            raise DataError(
+                f"model {spec.name}: free runs of {config.window:g} s run away in {lost.sum()} of"
+                f" {len(lost)} clean windows; watch with another model, or with a shorter window"
+            )
+        self.always = self._wrong(found)
+        self.whiten = [
+            whitening(
+                np.concatenate([group[i][0] - self.expected(group[i][1], i) for group in found]),
+                parts,
+            )
+            for i, parts in enumerate(self.parts)
+        ]
+        known = self.always
+        # groups of one log are alike
+        fold = (of if len(set(of)) >= _FOLDS else np.arange(len(found))) % _FOLDS
+        self.bias = self._bias([self._sums(group) for group in found])
+        apart: list[Group] = []
+        self.by_fold: list[tuple[list[np.ndarray], np.ndarray]] = []
+        # scores scatter more where others say what is always wrong, as they do in service
+        for k in range(_FOLDS):
+            self.always = self._wrong(
+                [one for one, own in zip(found, fold, strict=True) if own != k]
+            )
+            others = [self._sums(one) for one in found]
+            bias = self._bias([one for one, own in zip(others, fold, strict=True) if own != k])
+            self.by_fold.append((self.always, bias))
+            for i in np.flatnonzero(fold == k):
+                apart.append(self._group(int(of[i]), others[i], bias))
+        self.always = known
+        self.scatter = scattered(apart)
+        looks = config.false_alarm / config.stretch * _OVERLAP * len(self.causes)
+        self.threshold = float(student.isf(0.5 / looks, len(apart) - 1))
+
+    def _wrong(self, found: Sequence[Sequence[_Innovations]]) -> list[np.ndarray]:
+        """Return what the model has always got wrong, by innovations of groups of clean windows."""
+        return [
+            always_wrong(
+                np.concatenate([group[i][0] for group in found]),
+                np.concatenate([group[i][1] for group in found]),
+                self.causes,
+            )
+            for i in range(len(self.parts))
+        ]
+
+    def _bias(self, groups: Sequence[Sums]) -> np.ndarray:
+        """Return the sizes [Q] of all causes together that clean logs ask for."""
+        parts = [self._alone(group) for group in groups]
+        matrix = np.sum([part[1] for part in parts], axis=0)
+        believed = np.diag([change.size**-2 / BELIEVED**2 for change in self.causes])
+        # two causes that are wrong alike, such as damping and gain, must not look like one of them
+        score = np.sum([part[0] for part in parts], axis=0)
+        return np.asarray(np.linalg.solve(matrix + believed, score))
+
+    @property
+    def changes(self) -> list[Change]:
+        """The causes, then what surrounds the vessel."""
+        return [*self.causes, *self.others]
+
+    def groups(self, log: Sequence[Piece]) -> list[Sequence[Piece]]:
+        """Return the windows of a log in groups whose wind and current are taken to be constant."""
+        each = max(round(self.config.group / self.config.window), 1)
+        return [log[i : i + each] for i in range(0, len(log), each)]
+
+    def over(self, model: HybridDynamics) -> Watch:
+        """Return the same watch over another model, judged by what clean logs were of this one."""
+        out = copy.copy(self)
+        out.model = model
+        return out
+
+    def sums(self, pieces: Sequence[Piece]) -> list[Sums]:
+        """Return the scores of each of several windows."""
+        found = [self.innovations(pieces, parts) for parts in self.parts]
+        return [
+            self._sums([(error[i : i + 1], effects[i : i + 1]) for error, effects in found])
+            for i in range(len(pieces))
+        ]
+
+    def innovations(self, pieces: Sequence[Piece], parts: int) -> _Innovations:
+        """Return innovations [B, parts n] and effects [B, C, parts n] of windows cut into parts."""
+        cut = [part for piece in pieces for part in parted(piece, parts)]
+        error, effects = innovations(self.model, cut, self.changes)
+        count = len(pieces)
+        by_change = effects.reshape(count, parts, len(self.changes), -1).swapaxes(1, 2)
+        error, effects = error.reshape(count, -1), by_change.reshape(count, len(self.changes), -1)
+        lost = run_away(error, effects, self.changes, self.limit)
+        error[lost], effects[lost] = 0.0, 0.0
+        return error, effects
+
+    def expected(self, effects: np.ndarray, i: int, always: np.ndarray | None = None) -> np.ndarray:
+        """Return what innovations [B, n] are of clean logs, by their effects [B, C, n].
+
+        Args:
+            effects: of a unit of each change.
+            i: number of the look: whole windows, or their parts.
+            always: what the model has always got wrong [Q, 4]; by all clean logs where None.
+        """
+        wrong = self.always[i] if always is None else always
+        share = np.tile(wrong, effects.shape[2] // len(SEEN))
+        return np.asarray((effects[:, : len(self.causes)] * share).sum(axis=1))
+
+    def _sums(self, found: Sequence[_Innovations]) -> Sums:
+        """Return the sums of the same windows as a whole and in parts."""
+        left = [
+            (error - self.expected(effects, i), effects) for i, (error, effects) in enumerate(found)
+        ]
+        return weighed(left, self.whiten, self.possible)
+
+    def _alone(self, sums: Sums) -> tuple[np.ndarray, np.ndarray]:
+        """Return scores and information of the causes once the surroundings have had their part."""
+        return apart_from(sums, len(self.causes), self.belief)
+
+    def _group(self, log: int, sums: Sums, bias: np.ndarray) -> Group:
+        """Return scores and information of a group, what clean logs always ask for taken out."""
+        score, information = self._alone(sums)
+        return Group(log, score - information @ bias, information)
+
+    def judge(self, logs: Sequence[int], sums: Sequence[Sums]) -> Verdict:
+        """Return the verdict on groups of windows; wind and current are their own in each.
+
+        Args:
+            logs: number of the log that each group is of.
+            sums: of the groups.
+        """
+        groups = [self._group(log, one, self.bias) for log, one in zip(logs, sums, strict=True)]
+        size, error, explains = self.scatter.together(groups)
+        suspects = [
+            Suspect(change, float(abs(a) / b), float(a), float(b), float(c))
+            for change, a, b, c in zip(self.causes, size, error, explains, strict=True)
+        ]
+        alarm = max(suspect.score for suspect in suspects) > self.threshold
+        suspects.sort(key=lambda suspect: -suspect.explains)
+        count = sum(one.count for one in sums)
+        squares = np.sum([one.squares for one in sums], axis=0) / count
+        by_channel = squares.reshape(-1, len(SEEN)).mean(axis=0)
+        innovation = dict(zip(SEEN, np.sqrt(by_channel).tolist(), strict=True))
+        return Verdict(alarm, self.threshold, suspects, innovation)
+
+
+_DEADBAND = 1.0
+"""Standard deviations by which scores fall below the threshold before an alarm ends."""
+
+
+class Watcher:
+    """A watch that goes along with measurements, sample by sample.
+
+    A score that wavers about the threshold is one alarm: it ends where all scores lie clearly below
+    the threshold.
+
+    Args:
+        watch: over a model.
+        past: samples before a window that warm a memory up.
+    """
+
+    def __init__(self, watch: Watch, past: int) -> None:
+        self.watch = watch
+        self.past = past
+        self.steps = round(watch.config.window / watch.dt)
+        self.size = max(round(watch.config.group / watch.config.window), 1)
+        self.windows = max(round(watch.config.stretch / watch.config.window), 1)
+        self.recent: deque[tuple[int, Sums]] = deque()
+        self.log = 0
+        self.closed = True
+        self.alarmed = False
+        self.y: list[np.ndarray] = []
+        self.w: list[np.ndarray] = []
+
+    def step(self, y: np.ndarray, w: np.ndarray) -> Verdict | None:
+        """Take one sample: measured state [6], and the inputs [m] held over the step after it.
+
+        Returns:
+            The verdict where a window is complete, else None. A sample that is no measurement ends
+            the window that it lies in.
+        """
+        if not (np.isfinite(y).all() and np.isfinite(w).all()):
+            self.restart()
+            return None
+        self.y.append(np.asarray(y, dtype=float))
+        self.w.append(np.asarray(w, dtype=float))
+        if len(self.y) < self.past + self.steps + 1:
+            return None
+        known, given = np.stack(self.y), np.stack(self.w)
+        piece = Piece(
+            known[self.past :],
+            given[self.past : -1],
+            known[: self.past],
+            given[: self.past],
+        )
+        # the next window begins where this one ends
+        keep = self.past + 1
+        self.y, self.w = self.y[-keep:], self.w[-keep:]
+        return self.take(self.watch.sums([piece])[0])
+
+    def restart(self) -> None:
+        """Begin a new log, whose wind and current are its own."""
+        self.y, self.w = [], []
+        self.log += 1
+        self.closed = True
+
+    def take(self, sums: Sums) -> Verdict:
+        """Take the scores of a window, and return the verdict on the last stretch."""
+        if self.closed or self.recent[-1][1].count >= self.size:
+            self.recent.append((self.log, sums))
+        else:
+            self.recent[-1] = (self.log, self.recent[-1][1] + sums)
+        self.closed = False
+        counts = [group.count for _, group in self.recent]
+        while sum(counts) - counts[0] >= self.windows:
+            self.recent.popleft()
+            counts.pop(0)
+        verdict = self.watch.judge([log for log, _ in self.recent], [one for _, one in self.recent])
+        lasts = self.alarmed and verdict.largest > verdict.threshold - _DEADBAND
+        self.alarmed = verdict.alarm or lasts
+        return replace(verdict, alarm=self.alarmed)

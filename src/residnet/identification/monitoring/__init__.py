@@ -1,1 +1,0 @@
-"""A watch over a model in service: has the vessel changed, or have its data?"""

@@ -1,1 +1,0 @@
-"""Which manoeuvre to run next: what each would tell about the parameters of a refitted baseline."""

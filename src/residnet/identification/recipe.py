@@ -1,0 +1,369 @@
+"""The standard recipe: a portfolio of models whose settings follow from logs and protocols."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from residnet.core.names import VELOCITY
+from residnet.core.samples import Samples
+from residnet.core.stretches import stretches
+from residnet.data.prepare import Prepared
+from residnet.judge.config import EvaluationConfig
+from residnet.judge.protocol import Windows
+from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
+from residnet.physics.symmetry import mirrored_channels, wrong_parity
+
+_STILL = 1e-3
+"""Spread of a channel, as a share of its size, below which it tells nothing."""
+_ASTERN = 0.01
+"""Share of the samples from which a propeller that turns astern counts."""
+_ROOM = 0.6
+"""Share of a usual stretch that a free run may take, so that it can start at several places."""
+_USUAL = 60.0
+"""Length of a free run in s where no log says how long it is."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the portfolio of a fit depends on.
+
+    Attributes:
+        names: channels that models see.
+        moving: inputs, forces and wind channels that vary in the training logs.
+        astern: inputs that take both signs there.
+        step: of the grid, s.
+        length: of the free runs that choose between models, s.
+        history: measured past that a free run may look back on, s.
+        stretch: half of the training samples lie in uninterrupted stretches at least so long, s.
+        samples: of the training logs.
+    """
+
+    names: tuple[str, ...]
+    moving: tuple[str, ...]
+    astern: tuple[str, ...]
+    step: float
+    length: float
+    history: float
+    stretch: float
+    samples: int
+
+    @classmethod
+    def supposed(cls, names: tuple[str, ...], step: float = 0.1) -> Facts:
+        """Return facts before any log is read: every channel moves, ahead only."""
+        return cls(names, _acting(names), (), step, _USUAL, 0.1 * _USUAL, math.inf, 10_000)
+
+    @classmethod
+    def of(
+        cls,
+        samples: Samples,
+        logs: Sequence[Prepared],
+        evaluation: EvaluationConfig,
+        step: float,
+    ) -> Facts:
+        """Return what training logs and the protocol that chooses say.
+
+        Args:
+            samples: of the training logs.
+            logs: for training.
+            evaluation: protocols.
+            step: of the grid, s.
+        """
+        z, names = samples.z, samples.names
+        spread, size = z.std(0, correction=0), z.abs().amax(0)
+        moving = [
+            name
+            for name in _acting(names)
+            if spread[names.index(name)] > _STILL * size[names.index(name)]
+        ]
+        astern = [name for name in moving if _both_signs(z[:, names.index(name)])]
+        length, history = _free_run(logs, evaluation, step)
+        stretch = _stretch(logs) * step
+        return cls(
+            names, tuple(moving), tuple(astern), step, length, history, stretch, len(samples)
+        )
+
+    @property
+    def longest(self) -> float:
+        """Length of the longest free runs that there is a use and enough room for, s."""
+        return min(self.length, _ROOM * self.stretch)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Channels that drive the vessel and vary; forces where the model makes them."""
+        return tuple(name for name in self.moving if name not in WIND_CHANNELS)
+
+    @property
+    def wind(self) -> bool:
+        """Whether the true wind is known."""
+        return any(name in WIND_CHANNELS for name in self.moving)
+
+
+def _acting(names: Sequence[str]) -> tuple[str, ...]:
+    forces = "tau_x" in names
+    return tuple(
+        name
+        for name in names
+        if name not in VELOCITY and (not forces or name in FORCE_CHANNELS or name in WIND_CHANNELS)
+    )
+
+
+def _stretch(logs: Sequence[Prepared]) -> float:
+    """Return the number of samples of stretches in which half of all samples lie, or longer."""
+    lengths = np.concatenate(
+        [np.diff(np.stack(stretches(log.piece)), axis=0).flatten() for log in logs]
+    )
+    falling = np.sort(lengths)[::-1]
+    return float(falling[np.searchsorted(np.cumsum(falling), 0.5 * falling.sum())])
+
+
+def _both_signs(values: torch.Tensor) -> bool:
+    ahead = float((values > 0).double().mean())
+    return min(ahead, float((values < 0).double().mean())) > _ASTERN
+
+
+def _free_run(
+    logs: Sequence[Prepared], evaluation: EvaluationConfig, step: float
+) -> tuple[float, float]:
+    """Return how long the free runs are that choose between models, and their measured past, s."""
+    protocol = evaluation.protocols[evaluation.selection]
+    if isinstance(protocol, Windows):
+        return protocol.length, protocol.history
+    found = [
+        window.stop - window.start
+        for number, log in enumerate(logs)
+        for window in protocol.windows(log, number, step)
+    ]
+    return (float(np.median(found)) * step if found else _USUAL), protocol.initial
+
+
+_HULL = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
+_WIND = (
+    "wind_u",
+    "wind_v",
+    "wind_u wind_mag",
+    "wind_v wind_mag",
+    "wind_u wind_v",
+    "wind_u wind_v^2 wind_mag^-1",
+    "wind_v wind_u^2 wind_mag^-1",
+)
+_FURTHER = ("u^2 v", "u^2 r", "v^2", "r^2")
+"""Terms that only long logs determine."""
+_LONG = 1200.0
+"""Length of the training logs in s from which they are taken in."""
+_MANY = 3
+"""Propellers from which a rudder is not told by the race of each."""
+
+
+def linear_terms(facts: Facts) -> list[str]:
+    """Return the terms of a model that is linear in velocities, inputs and wind."""
+    wind = ["wind_u", "wind_v"] if facts.wind else []
+    return ["1", *VELOCITY, *facts.inputs, *wind]
+
+
+def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
+    """Return the terms of a manoeuvring model: hull, propellers, rudders and wind.
+
+    A rudder is known by its name. Every other input is taken for a propeller: a force that is
+    linear and quadratic in it and falls with the inflow. Forces act as they are.
+
+    Short logs give each axis the terms that a mirror-symmetric vessel has there, and what a lone
+    propeller adds to them: half as many coefficients as all terms in all axes.
+    """
+    terms = _terms(facts)
+    if long(facts):
+        return terms
+    kept = ("1", *(f"{name}|{name}|" for name in facts.inputs))
+    return {
+        axis: [t for t in terms if t in kept or not wrong_parity(t, number, facts.names)]
+        for number, axis in enumerate(VELOCITY)
+    }
+
+
+def full_hull_terms(facts: Facts) -> list[str]:
+    """Return the terms of a hull with all that long logs determine."""
+    _, turning, driving = _acting_terms(facts)
+    more = ["wind_mag r", "wind_u r"] if facts.wind else []
+    more += [*_FURTHER, *(term for n in driving for term in (f"{n} v", f"{n} r"))]
+    return [*_terms(facts), *more, *(t for n in turning for t in _large_angles(n, driving))]
+
+
+def long(facts: Facts) -> bool:
+    """Return whether the training logs are long enough for a hull of many terms."""
+    return facts.samples * facts.step >= _LONG
+
+
+def _acting_terms(facts: Facts) -> tuple[list[str], list[str], list[str]]:
+    """Return the inputs that are forces, that turn the flow, and that drive."""
+    forces = [name for name in facts.inputs if name in FORCE_CHANNELS]
+    acting = [name for name in facts.inputs if name not in forces]
+    turning = [name for name in acting if _turns(name)]
+    return forces, turning, [name for name in acting if name not in turning]
+
+
+def _terms(facts: Facts) -> list[str]:
+    """Return the terms of all axes together."""
+    forces, turning, driving = _acting_terms(facts)
+    return [
+        *("1", *VELOCITY, *_HULL, *forces),
+        *(term for name in driving for term in _propeller(name, name in facts.astern)),
+        *(term for name in turning for term in _rudder(name, driving, facts.astern)),
+        *(_WIND if facts.wind else ()),
+    ]
+
+
+def _turns(name: str) -> bool:
+    plain = name.removeprefix("cmd_")
+    return plain.startswith(("delta", "rudder", "azimuth"))
+
+
+def _propeller(name: str, astern: bool) -> list[str]:
+    """Return the thrust of a propeller; one that turns astern differs from one ahead."""
+    back = [f"{name}^2", f"{name} u"] if astern else []
+    return [name, f"{name}|{name}|", f"|{name}| u", *back]
+
+
+def _rudder(name: str, driving: Sequence[str], astern: Sequence[str]) -> list[str]:
+    """Return the lift of a rudder in the inflow from speed and propellers."""
+    if len(driving) >= _MANY:
+        return [name, f"u|u| {name}"]
+    race = [f"{n}|{n}| {name}" for n in driving] + [f"u {n} {name}" for n in driving]
+    return [f"u|u| {name}", *race, *(f"{n}^2 {name}" for n in driving if n in astern)]
+
+
+def _large_angles(name: str, driving: Sequence[str]) -> list[str]:
+    """Return how the lift of a rudder flattens, and its drag."""
+    if len(driving) != 1:
+        return [name, f"u|u| {name}|{name}|", f"u|u| |{name}|"]
+    race = (f"{driving[0]}|{driving[0]}|", f"u {driving[0]}")
+    return [
+        name,
+        *(f"{flow} {name}|{name}|" for flow in race),
+        *(f"{flow} |{name}|" for flow in race),
+    ]
+
+
+_LONGEST = 300
+"""Steps of the longest rollouts that a network is trained through."""
+_REFIT = 200
+"""Steps of the free runs of a refit, where its share of the protocol's length is less."""
+_EPOCH = 25
+
+
+def refit_settings(facts: Facts) -> dict[str, Any]:
+    """Return the refit of a baseline: its prior weak where logs are long."""
+    horizon = min(facts.longest, max(0.2 * facts.length, _REFIT * facts.step))
+    return {
+        "horizon": readable(horizon),
+        "every": readable(0.5 * horizon),
+        "prior": 1e-2 if long(facts) else 1.0,
+        "asymmetric": 0.05,
+    }
+
+
+def hidden_size(facts: Facts) -> int:
+    """Return the number of hidden units that so many samples can fill."""
+    return 16 if facts.samples < 8_000 else 24 if facts.samples < 20_000 else 32
+
+
+def training_settings(facts: Facts, effort: float) -> dict[str, Any]:
+    """Return the training of a network in free run, over growing horizons."""
+    longest = min(facts.longest, _LONGEST * facts.step)
+    stages = [
+        {"horizon": readable(share * longest), "epochs": epochs, "batch": _batch(facts), **rates}
+        for share, epochs, rates in (
+            (0.25, 2, {"learning_rate": 3e-3}),
+            (0.5, 4, {"learning_rate": 3e-3, "final": 0.5}),
+            (1.0, 8, {"learning_rate": 1.5e-3, "final": 0.05}),
+        )
+    ]
+    return {
+        "history": readable(facts.history),
+        "one_step": {"epochs": 0},
+        "multi_step": stages,
+        "steps": max(1, round(_EPOCH * effort)),
+        "average": 0.98,
+        "start_noise": 0.03,
+        "weight_decay": 0.001,
+        "robust": 0.05,
+        "from_baseline": True,
+        "patience": 5,
+    }
+
+
+def readable(value: float) -> float:
+    """Return a number of at most three digits."""
+    return float(f"{value:.3g}")
+
+
+def _batch(facts: Facts) -> int:
+    return 128 if facts.samples < 20_000 else 256
+
+
+PARTS = ("baseline", "baselines", "refit", "heads", "base_of", "forces", "ensembles", "training")
+"""Keys of a fit that the recipe stands in place of."""
+TIED = "tied"
+"""Name of the mean of the models that are as good as the best, within their standard error."""
+_FULL = "full_hull"
+
+
+def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
+    """Return baselines, refits, heads and trainings by the names that the recipe gives them.
+
+    `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted; long logs
+    have a `full_hull` of more terms too, on which networks find little. A network stands on the
+    hull, one on the linear model, and one alone. Where the wind
+    is not measured, an unknown force is estimated from the measured past and added to the hull.
+
+    Args:
+        facts: of the logs; `Facts.supposed` before they are read.
+        effort: how long networks are trained, 1 for usual.
+    """
+    network = _network(facts)
+    # a residual needs its past less than a whole model does, and without an encoder every format
+    # of export has a place for it
+    alone = {**network, "encoder": True}
+    heads = {"hull_network": network, "linear_network": network, "network": alone}
+    training = training_settings(facts, effort)
+    hulls = {"hull": _regressors(1e-4, hull_terms(facts))}
+    if long(facts):
+        hulls[_FULL] = _regressors(1e-4, full_hull_terms(facts))
+    return {
+        "baseline": _regressors(1e-6, linear_terms(facts)),
+        "baselines": hulls,
+        "refit": dict.fromkeys(("baseline", *hulls), refit_settings(facts)),
+        "heads": heads,
+        "base_of": {"hull_network": "hull", "linear_network": "baseline", "network": "zero"},
+        # where the wind is measured it is no unknown force
+        "forces": {} if _knows_wind(facts) else {"hull_force": {"of": [*hulls][-1]}},
+        "ensembles": {},
+        "training": dict.fromkeys(heads, training),
+    }
+
+
+def _knows_wind(facts: Facts) -> bool:
+    return any(name in WIND_CHANNELS for name in facts.names)
+
+
+def _regressors(ridge: float, terms: list[str] | dict[str, list[str]]) -> dict[str, Any]:
+    """Return a model of regressors that neither feeds itself energy nor runs away."""
+    sound = {"dissipative": True, "bounded": True}
+    return {"kind": "regressors", "ridge": ridge, "terms": terms, **sound}
+
+
+def _network(facts: Facts) -> dict[str, Any]:
+    """Return a recurrent network that comes back from velocities that no log has."""
+    size = hidden_size(facts)
+    return {
+        "kind": "lstm",
+        "hidden_size": size,
+        "readout": size,
+        "restoring": True,
+        "margin": 0.0,
+        "mirror": mirrored_channels(facts.names) is not None,
+    }
