@@ -20,11 +20,14 @@ from pathlib import Path
 import torch
 
 from residnet.core.config import load_config
-from residnet.documents.jervan2020.ferry.config import FerryModelConfig
-from residnet.documents.jervan2020.ferry.flights import MotionNoise
-from residnet.documents.jervan2020.ferry.identification import identify
-from residnet.documents.jervan2020.ferry.study import Study, record_of, study
-from residnet.documents.jervan2020.ferry.task import FerryStudyConfig
+from residnet.documents.jervan2020.ferry import (
+    FerryModelConfig,
+    FerryStudyConfig,
+    Study,
+    identify,
+    record_of,
+    study,
+)
 from residnet.export.feed_forward import RequiredForce, export_feed_forward
 from residnet.physics.force_model import ForceModel
 from residnet.physics.fossen import FossenVessel
@@ -69,7 +72,7 @@ def flown(interval: float, random: torch.Generator, *, turned: bool) -> Study:
 
 def judge(found: Study, interval: float, random: torch.Generator) -> list[str]:
     """Return a line for each model that a random half identifies."""
-    record, base, lines = record_of(found.first, interval, MotionNoise()), believed(), []
+    record, base, lines = record_of(found.first, interval, None), believed(), []
     folds = torch.unique(record.fold)
     half = folds[torch.randperm(len(folds), generator=random)[: len(folds) // 2]]
     record = replace(record, train=torch.isin(record.fold, half))

@@ -14,8 +14,11 @@ from scipy.integrate import solve_ivp
 from tiny import call
 
 from residnet.core.config import load_config
-from residnet.documents.halvorsen2019.breeding.config import NoiseConfig, RecordConfig
-from residnet.documents.halvorsen2019.breeding.task import BreedingTaskConfig
+from residnet.documents.halvorsen2019.breeding import (
+    BreedingTaskConfig,
+    NoiseConfig,
+    RecordConfig,
+)
 
 STUDIES = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019"
 SMALL: dict[str, Any] = {

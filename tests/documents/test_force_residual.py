@@ -16,12 +16,16 @@ import yaml
 import residnet
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
-from residnet.documents.jervan2020.measured.config import ForceSettings
-from residnet.documents.jervan2020.measured.data import compare_accelerations, read_measured
-from residnet.documents.jervan2020.measured.report import sections, verdict
-from residnet.documents.jervan2020.measured.results import write_results
-from residnet.documents.jervan2020.measured.study import better, force_study
-from residnet.documents.jervan2020.measured.task import ForceResidualConfig
+from residnet.documents.jervan2020.measured import (
+    ForceResidualConfig,
+    better,
+    compare_accelerations,
+    force_study,
+    read_measured,
+    sections,
+    verdict,
+    write_results,
+)
 from residnet.physics.force_model import FERRY_TERMS
 from residnet.runs.folder import RunFolder
 
@@ -85,13 +89,15 @@ def log(
     pd.DataFrame({**columns, **spoil}).to_csv(folder / f"{name}.csv", index=False)
 
 
-def config(folder: Path, *overrides: str, models: dict[str, Any] | None = None) -> ForceSettings:
+def config(
+    folder: Path, *overrides: str, models: dict[str, Any] | None = None
+) -> ForceResidualConfig:
     content = yaml.safe_load(CONFIG.read_text())
     content["models"] = models or {"ridge": {"fit": {"kind": "ridge"}}}
     content["data"]["root"] = str(folder)
     file = folder / "config.yaml"
     file.write_text(yaml.safe_dump(content))
-    found: ForceSettings = load_config(file, list(overrides), ForceResidualConfig)
+    found: ForceResidualConfig = load_config(file, list(overrides), ForceResidualConfig)
     return found
 
 

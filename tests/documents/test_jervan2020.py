@@ -16,15 +16,21 @@ from residnet.baselines.believed import BelievedConfig
 from residnet.control.motion.anticipation import Derivatives, Lag, course, needed_force
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, FitError
-from residnet.documents.jervan2020.ferry.config import Half
-from residnet.documents.jervan2020.ferry.flights import MotionNoise
-from residnet.documents.jervan2020.ferry.identification import identify
-from residnet.documents.jervan2020.ferry.report import sections, verdict
-from residnet.documents.jervan2020.ferry.results import write_results
-from residnet.documents.jervan2020.ferry.study import Study, record_of, study
-from residnet.documents.jervan2020.ferry.task import FerryStudyConfig
-from residnet.documents.jervan2020.forward import forward_equations, missing_coefficients
-from residnet.documents.jervan2020.residual_model import constant_force
+from residnet.documents.jervan2020.ferry import (
+    FerryStudyConfig,
+    Study,
+    identify,
+    record_of,
+    sections,
+    study,
+    verdict,
+    write_results,
+)
+from residnet.documents.jervan2020.residual import (
+    constant_force,
+    forward_equations,
+    missing_coefficients,
+)
 from residnet.export.feed_forward import RequiredForce, export_feed_forward
 from residnet.physics.force_model import FERRY_TERMS, Correction, ForceModel
 from residnet.physics.fossen import FossenVessel
@@ -203,12 +209,11 @@ def test_exported_feed_forward_is_the_model(short: Study, tmp_path: Path) -> Non
     assert not outside.any()
 
 
-@pytest.mark.parametrize("half", ["first", "second"])
 def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
-    short: Study, tmp_path: Path, half: Half
+    short: Study, tmp_path: Path
 ) -> None:
     """Far from what identified it, a wild correction commands no more than 1.2 times the hull."""
-    record = record_of(short.first, 20.0, MotionNoise(), half)
+    record = record_of(short.first, 20.0, None)
     hull_force = ForceModel(hull("milliampere"))
     wild = Correction(
         FERRY_TERMS,
@@ -260,7 +265,7 @@ def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
 def test_one_segment_nan_and_too_few_samples_are_clear_errors(short: Study) -> None:
     wanted = config("operation").models["lag_ridge"].model_copy(update={"lag": False})
     base = ForceModel(hull("milliampere"))
-    record = record_of(short.first, 20.0, MotionNoise())
+    record = record_of(short.first, 20.0, None)
     with pytest.raises(FitError, match="one run or segment only"):
         identify(
             wanted, type(record)(**{**record.__dict__, "fold": torch.zeros_like(record.fold)}), base

@@ -13,9 +13,9 @@ import pytest
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.documents import study_sections
-from residnet.documents.moreno2019 import curves
-from residnet.report.blocks import Cell, Figure, Table, Text
-from residnet.report.run_reader import RunFiles
+from residnet.documents.moreno2019 import curves, errors_of_grid
+from residnet.report.blocks import Cell, Table, Text
+from residnet.report.figure import Figure
 from residnet.tasks.fit.task import FitConfig
 
 MODELS = (
@@ -111,11 +111,10 @@ def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
     )
     assert shown[1] == Cell("0.0700", "0.0700 to 0.0700; published 0.2249")
     assert isinstance(figure, Figure)
-    assert figure.path.stat().st_size > 10_000
+    assert figure.stills[0].stat().st_size > 10_000
 
 
-def test_the_curves_are_what_the_search_tried(tmp_path: Path) -> None:
-    run = made(tmp_path)
+def test_the_curves_are_what_the_search_tried() -> None:
     tried: list[dict[str, Any]] = [
         {"sigma": [width] * 3, "penalty": [penalty] * 3, "validation": width + penalty}
         for width in (1.0, 10.0)
@@ -126,18 +125,17 @@ def test_the_curves_are_what_the_search_tried(tmp_path: Path) -> None:
     choice = [entry | {"diverged": 0} for entry in (*tried, own_width, none)]
     errors = np.arange(1.0, 19.0).reshape(2, 3, 3)
     notes = {"free_run_choice": choice, "cross_validated_error": errors.tolist()}
-    (run / "models" / "rbf_joint").mkdir(parents=True)
-    (run / "models" / "rbf_joint" / "fit.json").write_text(json.dumps(notes))
-    grid = curves._grid(choice)
+    grid, one_step = errors_of_grid(notes)
     assert grid == {
         (entry["penalty"][0], entry["sigma"][0]): entry["validation"] for entry in tried
     }
-    one_step = curves._one_step(notes, grid)
     assert one_step[0.01, 1.0] == 1.0
     assert one_step[0.1, 10.0] == pytest.approx(np.mean([13 / 1, 14 / 2, 15 / 3]))
-    figures = curves.curves(RunFiles(run))
-    assert [figure.path.name for figure in figures] == ["5.png", "6.png"]
-    assert all(figure.path.stat().st_size > 5_000 for figure in figures)
+    over_penalty, over_width = curves(notes)
+    x, y = over_penalty.cases[0].curves[0]["sigma = 10"]
+    assert list(x) == [0.01, 0.1, 1.0]
+    assert y == pytest.approx(10.0 + x)
+    assert [figure.name for figure in (over_penalty, over_width)] == ["5", "6"]
 
 
 def test_a_run_without_a_model_of_the_study_says_which(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from sklearn.cross_decomposition import PLSRegression
 from sklearn.linear_model import LinearRegression, Ridge
 
 from residnet.core.errors import FitError
-from residnet.documents.jervan2020.regressions import Fit, Regression, RegressionConfig
+from residnet.documents.jervan2020.residual import Fit, Regression, RegressionConfig
 from residnet.regression.nipals import nipals
 from residnet.regression.pls_path import pls_path
 

@@ -1,26 +1,32 @@
-"""The experiments of the source documents: one package for each document.
+"""The experiments of the source documents, one or two files for each document.
 
 Where an experiment is a fit, `study` in its config adds the document's figures and tables to the
-report.
+report. What the documents print for their own vessels stands in published.yaml.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import importlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from residnet.documents.moreno2019.published import MODELS as MORENO2019
-from residnet.documents.woo2018.published import MODELS as WOO2018
-from residnet.report.blocks import Section
+if TYPE_CHECKING:
+    from residnet.report.blocks import Section
 
 StudyName = Literal["moreno2019", "woo2018"]
 
-STUDY_MODELS: dict[StudyName, tuple[str, ...]] = {"moreno2019": MORENO2019, "woo2018": WOO2018}
+STUDY_MODELS: dict[StudyName, tuple[str, ...]] = {
+    "moreno2019": (
+        *("baseline", "rbf_joint", "rbf_each", "p1_joint", "p1_each", "p2_joint", "p2_each"),
+        "symbolic",
+    ),
+    "woo2018": ("baseline", "nomoto", "nomoto_side_slip", "lstm_printed", "lstm_rate", "lstm"),
+}
 """Models that a fit must have for a document's study."""
 
 
-def study_sections(name: StudyName, run: Path) -> list[Section]:
+def study_sections(name: StudyName, run: Path) -> Sequence[Section]:
     """Draw a document's figures into a finished run and return its sections of the report.
 
     Args:
@@ -30,11 +36,23 @@ def study_sections(name: StudyName, run: Path) -> list[Section]:
     Raises:
         UsageError: where the run lacks a model or a manoeuvre of the study.
     """
-    from residnet.documents.moreno2019 import report as moreno2019
-    from residnet.documents.woo2018 import report as woo2018
+    from residnet.core.errors import UsageError
+    from residnet.report.run_reader import RunFiles
 
-    studies: dict[StudyName, Callable[[Path], list[Section]]] = {
-        "moreno2019": moreno2019.sections,
-        "woo2018": woo2018.sections,
-    }
-    return studies[name](run)
+    files = RunFiles(run)
+    wanted = STUDY_MODELS[name]
+    missing = [model for model in wanted if model not in files.kinds]
+    if missing:
+        raise UsageError(
+            f"{run}: study {name} needs the models {', '.join(wanted)}; '{missing[0]}' is absent"
+        )
+    found: Sequence[Section] = importlib.import_module(f"{__name__}.{name}").sections(files)
+    return found
+
+
+def published(document: str) -> dict[str, Any]:
+    """Return the figures that a document prints, from published.yaml."""
+    from residnet.core.config import load_mapping
+
+    found: dict[str, Any] = load_mapping(Path(__file__).with_name("published.yaml"))[document]
+    return found

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from residnet.report.blocks import Cell, Figure
-from residnet.report.figures.files import read_figures
+from residnet.report.blocks import Cell
+from residnet.report.figure import Figure, read_figures
 from residnet.report.format import minus, number
 
 
@@ -49,14 +49,11 @@ def notes_text(notes: Mapping[str, Any]) -> str:
 
 
 def pictures(run: Path, *beginnings: str) -> list[Figure]:
-    """Return the figures of a run whose file names begin with one of the given beginnings.
+    """Return the figures of a run whose names begin with one of the given beginnings.
 
     They stand in the order of the beginnings, then in that of their names.
     """
     stored = read_figures(run / "figures")
     return [
-        figure
-        for beginning in beginnings
-        for figure in stored
-        if figure.path.name.startswith(beginning)
+        figure for beginning in beginnings for figure in stored if figure.name.startswith(beginning)
     ]

@@ -16,10 +16,10 @@ SINGLE = {
     "actuators": "residnet.tasks.actuators:ActuatorsTaskConfig",
     "autopilot": "residnet.tasks.autopilot.task:AutopilotConfig",
     "course": "residnet.tasks.course.task:CourseTaskConfig",
-    "ferry_study": f"{_DOCUMENTS}.jervan2020.ferry.task:FerryStudyConfig",
-    "force_residual": f"{_DOCUMENTS}.jervan2020.measured.task:ForceResidualConfig",
-    "breeding": f"{_DOCUMENTS}.halvorsen2019.breeding.task:BreedingTaskConfig",
-    "sea_trial": f"{_DOCUMENTS}.halvorsen2019.sea_trial.task:SeaTrialTaskConfig",
+    "ferry_study": f"{_DOCUMENTS}.jervan2020.ferry:FerryStudyConfig",
+    "force_residual": f"{_DOCUMENTS}.jervan2020.measured:ForceResidualConfig",
+    "breeding": f"{_DOCUMENTS}.halvorsen2019.breeding:BreedingTaskConfig",
+    "sea_trial": f"{_DOCUMENTS}.halvorsen2019.sea_trial:SeaTrialTaskConfig",
 }
 """All but the sweep, which varies any of these."""
 

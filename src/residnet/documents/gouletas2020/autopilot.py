@@ -89,13 +89,11 @@ def load_predictive(
 def _untrained(
     config: PredictiveConfig, steering: Steering
 ) -> tuple[DocumentConfig, NetworkPredictor]:
-    """Return the control law and its perceptron with random weights."""
     law = DocumentConfig(horizon=config.horizon, candidates=config.candidates, weight=config.weight)
     return law, _spec(config, steering).build()
 
 
 def _spec(config: PredictiveConfig, steering: Steering) -> PredictorSpec:
-    """Return what the perceptron is built from."""
     return PredictorSpec(
         state=tuple(steering.vessel.state),
         candidates=config.candidates,

@@ -9,15 +9,14 @@ the table either).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError
-from residnet.core.names import nearest
-from residnet.documents.halvorsen2019.sea_trial.published import START_PARAMETERS
+from residnet.documents import published
 from residnet.physics.odin import OdinConfig
 from residnet.regression.equation_rows import correlation_time
 
@@ -63,8 +62,10 @@ PARAMETERS: dict[str, Entry] = {
     "Y_|v|v": Entry(-1e6, 0.0, 2e3),
     "N_|r|r": Entry(-1e7, 0.0, 3e3),
 }
-"""Bounds and sizes by name; the values before the fit stand in `START_PARAMETERS`."""
+"""Bounds and sizes by name; the values before the fit stand in published.yaml."""
 NAMES = tuple(PARAMETERS)
+LIMITS = np.array([(entry.low, entry.high) for entry in PARAMETERS.values()])
+SCALE = np.array([entry.scale for entry in PARAMETERS.values()])
 SUMS: dict[str, tuple[str, float, str]] = {
     "m - X_udot": ("X_udot", -1.0, ""),
     "m - Y_vdot": ("Y_vdot", -1.0, ""),
@@ -80,7 +81,6 @@ class StandardFitConfig(Config):
         mass: known mass in kg.
         weights: weights W_0, W_1, W_2 of the squared errors of u_dot, v_dot and r_dot; 1, 1, 10 in
             the document.
-        bounds: lowest and highest value by parameter in SI units, instead of the built-in ones.
         starts: number of starting points: the document's original values, and random ones around
             them within the bounds.
         seed: seed of the random starting points.
@@ -89,7 +89,6 @@ class StandardFitConfig(Config):
 
     mass: float = Field(default=4935.14, gt=0)
     weights: tuple[float, float, float] = (1.0, 1.0, 10.0)
-    bounds: dict[str, tuple[float, float]] = Field(default_factory=dict)
     starts: int = Field(default=4, ge=1, le=10_000)
     seed: int = Field(default=0, ge=0)
     thin: int = Field(default=2, ge=1)
@@ -98,30 +97,18 @@ class StandardFitConfig(Config):
     def _known(self) -> StandardFitConfig:
         if min(self.weights) <= 0:
             raise ValueError(f"weights: all must be positive, given {list(self.weights)}")
-        for name, (low, high) in self.bounds.items():
-            if name not in PARAMETERS:
-                raise ValueError(f"bounds: no parameter '{name}'{nearest(name, NAMES)}")
-            if low >= high:
-                raise ValueError(f"bounds.{name}: expected the lower first, given {[low, high]}")
         return self
-
-    def limits(self) -> np.ndarray:
-        """Return the bounds [14, 2]."""
-        return np.array(
-            [self.bounds.get(name, (entry.low, entry.high)) for name, entry in PARAMETERS.items()]
-        )
 
     def starting_points(self) -> list[np.ndarray]:
         """Return the values [14] that the searches start from, inside the bounds."""
-        random, limits = np.random.default_rng([self.seed, 14]), self.limits()
-        start = np.array([START_PARAMETERS[name] for name in NAMES])
-        scale = np.array([entry.scale for entry in PARAMETERS.values()])
-        inside = 1e-9 * (limits[:, 1] - limits[:, 0])
+        random = np.random.default_rng([self.seed, 14])
+        start = np.array([published("halvorsen2019")["start"][name] for name in NAMES])
+        inside = 1e-9 * (LIMITS[:, 1] - LIMITS[:, 0])
         points = [
             start,
-            *(start + scale * random.normal(size=len(start)) for _ in range(self.starts - 1)),
+            *(start + SCALE * random.normal(size=len(start)) for _ in range(self.starts - 1)),
         ]
-        return [np.clip(values, limits[:, 0] + inside, limits[:, 1] - inside) for values in points]
+        return [np.clip(values, LIMITS[:, 0] + inside, LIMITS[:, 1] - inside) for values in points]
 
 
 @dataclass(frozen=True)
@@ -147,6 +134,19 @@ class StandardFit:
     condition: float
     cost: tuple[float, ...]
     mass: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fit as study.json holds it."""
+        errors = [float(error) if np.isfinite(error) else None for error in self.errors]
+        return {
+            "values": dict(zip(NAMES, self.values.tolist(), strict=True)),
+            "standard_errors": dict(zip(NAMES, errors, strict=True)),
+            "sums": {name: list(pair) for name, pair in self.sums.items()},
+            "undetermined": self.undetermined,
+            "at_bound": self.bound,
+            "condition": self.condition,
+            "cost": self.cost,
+        }
 
     def accelerations(self, nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """Return nu_dot [N, 3] from velocities [N, 3] and forces [N, 3]."""
@@ -205,8 +205,7 @@ def fit(
             f"the standard model's {len(NAMES)} parameters need more than {len(nu)} samples; give a"
             " longer trial"
         )
-    root, limits = np.sqrt(config.weights), config.limits()
-    scale = np.array([entry.scale for entry in PARAMETERS.values()])
+    root, limits, scale = np.sqrt(config.weights), LIMITS, SCALE
 
     def weighted_errors(p: np.ndarray) -> np.ndarray:
         return np.asarray(
@@ -225,7 +224,7 @@ def fit(
     ]
     best = min(found, key=lambda answer: float(answer.cost))
     if not np.isfinite(best.cost):
-        raise FitError("the standard model's fit does not stay finite; narrow `bounds`")
+        raise FitError("the standard model's fit does not stay finite")
     values = best.x * scale
     near = np.minimum(values - limits[:, 0], limits[:, 1] - values) <= 1e-6 * scale
     free = ~near
@@ -237,7 +236,7 @@ def fit(
     return StandardFit(
         values=values,
         errors=errors,
-        sums=_inertias(best.x, scale, config.mass, information),
+        sums=_inertias(best.x, config.mass, information),
         undetermined=tuple(
             NAMES[i]
             for i in np.flatnonzero(np.abs(information.open).max(axis=1, initial=0.0) > _OPEN_SHARE)
@@ -250,13 +249,7 @@ def fit(
 
 
 class _Information(NamedTuple):
-    """What the data say of the scaled parameters.
-
-    Attributes:
-        covariance: covariance [14, 14].
-        open: directions that the data leave open [14, k].
-        condition: condition number without these directions.
-    """
+    """What the data say of scaled parameters, and the directions [14, k] that they leave open."""
 
     covariance: np.ndarray
     open: np.ndarray
@@ -286,29 +279,20 @@ def _information(jacobian: np.ndarray, errors: np.ndarray, free: np.ndarray) -> 
 
 
 def _inertias(
-    scaled: np.ndarray, scale: np.ndarray, mass: float, information: _Information
+    scaled: np.ndarray, mass: float, information: _Information
 ) -> dict[str, tuple[float, float]]:
-    """Return estimate and standard error of the inertias as the equations contain them.
-
-    Args:
-        scaled: estimated parameters [14] in units of `scale`.
-        scale: typical sizes of the parameters [14].
-        mass: known mass in kg.
-        information: what the data say of the scaled parameters.
-    """
     out = {}
     for name, (first, sign, second) in SUMS.items():
         along = np.zeros(len(NAMES))
-        along[NAMES.index(first)] = sign * scale[NAMES.index(first)]
+        along[NAMES.index(first)] = sign * SCALE[NAMES.index(first)]
         if second:
-            along[NAMES.index(second)] = -scale[NAMES.index(second)]
+            along[NAMES.index(second)] = -SCALE[NAMES.index(second)]
         estimate = float(along @ scaled) + (0.0 if second else mass)
         out[name] = (estimate, _standard_error(information, along))
     return out
 
 
 def _standard_error(information: _Information, along: np.ndarray) -> float:
-    """Return the standard error of a combination of scaled parameters; infinite if it is open."""
     if information.open.size:
         inside = np.linalg.norm(information.open.T @ along)
         if inside > _OPEN_COMBINATION * np.linalg.norm(along):

@@ -1,0 +1,951 @@
+"""Task `sea_trial`: models of Odin by phase, on a simulated sea trial (document 000, section 7.5).
+
+The log is interpolated to a uniform grid, filtered forward and backward by a Butterworth low-pass,
+and differentiated by differences (7.1). The standard model is compared with equations found from
+the data alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal, NamedTuple, final
+
+import numpy as np
+import torch
+from pydantic import Field, field_validator, model_validator
+
+from residnet.core.config import Config, Radians, Seconds, load_config
+from residnet.core.errors import ConfigError
+from residnet.core.files import read_json
+from residnet.core.layout import RANGE_INPUTS, RANGE_VELOCITIES
+from residnet.core.log import Log
+from residnet.core.names import ACCELERATION, VELOCITY, nearest
+from residnet.core.samples import Samples
+from residnet.core.stretches import stretches
+from residnet.data.simulated.environment import Disturbance
+from residnet.data.simulated.flying import Craft, Sea, fly
+from residnet.data.simulated.sensors import SensorNoise
+from residnet.documents import published
+from residnet.documents.cells import beside_published, listed, pictures
+from residnet.documents.halvorsen2019.standard_model import (
+    NAMES,
+    PARAMETERS,
+    SUMS,
+    StandardFit,
+    StandardFitConfig,
+    fit,
+    truth,
+)
+from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.heads.base import ClosedFormHead
+from residnet.heads.genetic import GeneticConfig
+from residnet.heads.symbolic import SymbolicConfig
+from residnet.judge.goodness import OneStep
+from residnet.judge.goodness import table as goodness_table
+from residnet.manoeuvres import AccelerationDeceleration, Helm, Manoeuvre, Zigzag
+from residnet.physics.froude import PHASES, froude_number, phase_of
+from residnet.physics.odin import AccelerationHull, OdinConfig
+from residnet.physics.vessel import load_vessel
+from residnet.report.blocks import Bullets, Cell, Section, Table, Text, table_of
+from residnet.report.figure import (
+    BLUE,
+    COLORS,
+    DASHED,
+    MEASURED,
+    SOLID,
+    ZERO,
+    Case,
+    Figure,
+    Look,
+    Panel,
+    names_of,
+    whiskers,
+    write_figure,
+)
+from residnet.report.format import DASH, DEG, interval, number
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import ComputingTask, MainFigure, Outcome
+
+CONTROLS, FORCES = ("cmd_n", "cmd_nozzle"), ("tau_x", "tau_y", "tau_n")
+CHANNELS = (*VELOCITY, *CONTROLS, *FORCES)
+ALL = "all"
+STANDARD, SEPARATE, PLANT = "standard", "separate", "plant"
+SETS = (*PHASES, ALL)
+"""Sets of samples that a model is fitted to and judged on."""
+Published = dict[str, tuple[float, float, float]]
+Results = Mapping[str, Any]
+FILE = "study.json"
+SET_NAMES = {
+    PHASES[0]: "displacement phase",
+    PHASES[1]: "semi-displacement phase",
+    PHASES[2]: "planing phase",
+    ALL: "all phases",
+}
+_LEAST_SAMPLES = 500
+"""Number of samples below which a phase is neither fitted nor judged."""
+_STANDARD_PARAMETERS = (4.0, 8.0, 8.0)
+"""Number of parameters of the standard model in surge, sway and yaw."""
+_EXCERPT = 60.0
+"""Length in s of the stretch of accelerations that is shown."""
+_SAME_COST = 1e-6
+"""Costs that differ by a smaller share count as the same minimum."""
+
+
+class ProgrammeConfig(Config):
+    """Zigzags at several speeds and a straight run in steps of speed, once on each course.
+
+    Attributes:
+        drives: motor speeds as shares of the largest one.
+        steers: nozzle angles as shares of the largest one; there is a zigzag for each speed and
+            angle.
+        heading: heading change in rad at which a zigzag is reversed.
+        zigzag: duration of a zigzag in s.
+        hold: time in s for which a speed of the straight run is held.
+        courses: courses in rad on which the programme is sailed; two opposite ones cancel a steady
+            drift, as in the document.
+    """
+
+    drives: tuple[float, ...] = Field(default=(0.35, 0.45, 0.55, 0.7, 0.85, 1.0), min_length=2)
+    steers: tuple[float, ...] = Field(default=(0.15, 0.35), min_length=1)
+    heading: Radians = Field(default=float(np.radians(20)), gt=0)
+    zigzag: Seconds = Field(default=80.0, gt=0)
+    hold: Seconds = Field(default=25.0, gt=0)
+    courses: tuple[Radians, ...] = Field(default=(0.0, float(np.pi)), min_length=1)
+
+    def manoeuvres(self) -> list[Manoeuvre]:
+        """Return the manoeuvres of one course in the order in which they are sailed."""
+        levels = (*self.drives, *reversed(self.drives[:-1]))
+        times = tuple(self.hold * i for i in range(len(levels)))
+        programme: list[Manoeuvre] = [
+            AccelerationDeceleration(times=times, levels=levels, duration=self.hold * len(levels))
+        ]
+        for drive in self.drives:
+            for place, steer in enumerate(self.steers):
+                first = "starboard" if place % 2 == 0 else "port"
+                programme.append(
+                    Zigzag.model_validate(
+                        {**self._zigzag(), "drive": drive, "steer": steer, "first": first}
+                    )
+                )
+        return programme
+
+    def _zigzag(self) -> dict[str, float]:
+        return {"heading": self.heading, "start": self.zigzag / 4, "duration": self.zigzag}
+
+
+class PreparationConfig(Config):
+    """How a log with uneven time steps becomes velocities and accelerations (section 7.3.1).
+
+    Attributes:
+        interval: shortest and longest time between two samples of the log, in s.
+        step: time step of the uniform grid in s.
+        cutoff: cut-off frequency of the Butterworth filter as a share of the Nyquist frequency
+            (correction H27).
+        order: order of the filter, which is run forward and backward.
+        filter_inputs: filter commands and forces as the velocities. The document filters the
+            velocities alone; its equations then learn the filter, too, and leave less of the
+            measured acceleration than the vessel's own equations.
+        margin: time in s that is cut off at both ends of a log, where the filter has one side only.
+        stretch: length in s of the stretches that train or validate as a whole.
+        validate_every: number of stretches of which the last one validates.
+    """
+
+    interval: tuple[Seconds, Seconds] = (0.03, 0.08)
+    step: Seconds = Field(default=0.05, gt=0)
+    cutoff: float = Field(default=0.1, gt=0, lt=1)
+    order: int = Field(default=2, ge=1, le=8)
+    filter_inputs: bool = True
+    margin: Seconds = Field(default=2.0, ge=0)
+    stretch: Seconds = Field(default=20.0, gt=0)
+    validate_every: int = Field(default=4, ge=2)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> PreparationConfig:
+        if not 0 < self.interval[0] <= self.interval[1]:
+            raise ValueError(
+                "interval: expected shortest and longest, both positive, given"
+                f" {list(self.interval)} s"
+            )
+        return self
+
+
+class SeaTrialConfig(Config):
+    """A simulated sea trial with one vessel.
+
+    Attributes:
+        vessel: vessel of kind `odin` with water jets, by name or file.
+        programme: manoeuvres that are sailed.
+        disturbance: waves and other forces.
+        noise: noise of the measured velocities.
+        preparation: how the logs become samples.
+        step: time step of the simulation in s; its motion is sampled unevenly.
+        seed: seed of the sea, the noise and the times of the samples.
+    """
+
+    vessel: str
+
+    programme: ProgrammeConfig = ProgrammeConfig()
+    disturbance: Disturbance = Disturbance()
+    noise: SensorNoise = SensorNoise(u=0.02, v=0.02, r=float(np.radians(0.1)))
+    preparation: PreparationConfig = PreparationConfig()
+    step: Seconds = Field(default=0.04, gt=0)
+    seed: int = Field(default=0, ge=0)
+
+    @field_validator("step")
+    @classmethod
+    def _fine(cls, step: float) -> float:
+        if step > 0.05:
+            raise ValueError(
+                f"step: the simulation must be finer than the log, at most 0.05 s, given {step:g} s"
+            )
+        return step
+
+    @model_validator(mode="after")
+    def _fits(self) -> SeaTrialConfig:
+        try:
+            self.disturbance.check(odin(self.vessel).build(), self.vessel)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+
+def odin(name: str) -> OdinConfig:
+    """Return a vessel whose accelerations are known as terms and which has water jets.
+
+    Raises:
+        ConfigError: where the vessel is of another kind.
+    """
+    vessel = load_vessel(name)
+    if not isinstance(vessel, OdinConfig) or vessel.build().actuators.commands != CONTROLS:
+        raise ConfigError(
+            f"vessel '{name}': the sea trial needs a vessel of kind 'odin' with water jets, such as"
+            " odin_jets"
+        )
+    return vessel
+
+
+class EquationConfig(Config):
+    """An equation of the accelerations that is found from the data alone.
+
+    Attributes:
+        inputs: inputs of the equation: `forces` of the water jets by their known thrust, or
+            `controls`, which are motor speed and nozzle angle.
+        head: how the equation is found.
+    """
+
+    inputs: Literal["forces", "controls"]
+    head: Annotated[SymbolicConfig | GeneticConfig, Field(discriminator="kind")]
+
+    @model_validator(mode="after")
+    def _inputs_only(self) -> EquationConfig:
+        if self.head.features:
+            raise ValueError("head.features: give `inputs` instead")
+        return self
+
+    def build(self) -> ClosedFormHead:
+        """Build the head for the channels of a trial.
+
+        Raises:
+            ConfigError: where its terms name a channel that is not among its inputs.
+        """
+        features = (*VELOCITY, *(FORCES if self.inputs == "forces" else CONTROLS))
+        return self.head.model_copy(update={"features": features}).build(CHANNELS)
+
+
+@final
+class SeaTrialTaskConfig(ComputingTask):
+    """Models of Odin fitted and judged by phase, on one simulated trial or several.
+
+    Attributes:
+        task: `sea_trial`.
+        trials: trials by name; published figures stand beside the first one.
+        standard: how the standard model is fitted.
+        equations: equations by name.
+        published: root mean square error (m/s^2, m/s^2, rad/s^2), C_p and adjusted R^2 that the
+            document prints (Tables 7.3, 7.4), by set of samples, model and acceleration.
+        published_absolute: mean absolute residual (m/s^2, m/s^2, rad/s^2) and the ends of its 95 %
+            interval that the document prints (Table 7.5), likewise.
+    """
+
+    task: Literal["sea_trial"]
+    trials: dict[str, SeaTrialConfig] = Field(min_length=1)
+    standard: StandardFitConfig = StandardFitConfig()
+    equations: dict[str, EquationConfig] = Field(default_factory=dict)
+    published: dict[str, dict[str, Published]] = Field(default_factory=dict)
+    published_absolute: dict[str, dict[str, Published]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _names(self) -> SeaTrialTaskConfig:
+        for name in self.equations:
+            if name in (STANDARD, SEPARATE, PLANT):
+                raise ValueError(f"equations: the name '{name}' is taken")
+        for key in ("published", "published_absolute"):
+            self._check_printed(key, getattr(self, key))
+        for name, equation in self.equations.items():
+            try:
+                equation.build()
+            except ConfigError as error:
+                raise ValueError(f"equations.{name}: {error}") from None
+        return self
+
+    def _check_printed(self, key: str, printed: dict[str, dict[str, Published]]) -> None:
+        for where, models in printed.items():
+            if where not in SETS:
+                raise ValueError(f"{key}: no set '{where}'{nearest(where, SETS)}")
+            for model in models:
+                if model not in (STANDARD, *self.equations):
+                    raise ValueError(
+                        f"{key}.{where}: no model"
+                        f" '{model}'{nearest(model, (STANDARD, *self.equations))}"
+                    )
+
+    def recorded_seed(self) -> int:
+        return next(iter(self.trials.values())).seed
+
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        found = {name: study(self, trial) for name, trial in self.trials.items()}
+        for name, one in found.items():
+            for figure in _drawings(name, one):
+                write_figure(folder.figures, figure)
+        results = {
+            "schema": "residnet.sea_trial/1",
+            "run": self.name,
+            "trials": {name: _content(self, one) for name, one in found.items()},
+        }
+        folder.write_json(folder.path / FILE, results)
+        return Outcome(_verdict(results), _main_figures(results))
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
+        settings, results = load_config(run.resolved, [], cls), read_json(run.path / FILE)
+        return [_section(settings, name, run) for name in results["trials"]]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The prepared samples of a trial, N in all.
+
+    Attributes:
+        samples: channels `CHANNELS` and measured accelerations; `group` numbers the stretches.
+        log: number of the log that a sample belongs to [N].
+        validates: samples that no model is fitted to [N] bool.
+        phase: number of the phase in `physics.froude.PHASES` [N].
+        step: time step in s.
+    """
+
+    samples: Samples
+    log: np.ndarray
+    validates: np.ndarray
+    phase: np.ndarray
+    step: float
+
+    def pieces(self, keep: np.ndarray) -> list[np.ndarray]:
+        """Return the indices of the kept samples, piece by piece without gaps.
+
+        Args:
+            keep: samples to keep [N] bool.
+        """
+        starts, stops = stretches(np.where(keep, self.samples.group.numpy(), -1))
+        return [
+            np.arange(start, stop)
+            for start, stop in zip(starts, stops, strict=True)
+            if stop - start > 1
+        ]
+
+
+def sail(config: SeaTrialConfig) -> Trial:
+    """Simulate the programme with the vessel and prepare its logs.
+
+    Raises:
+        ConfigError: where the vessel cannot feel the disturbance or is of another kind.
+        DataError: where the motion does not stay finite.
+    """
+    name = config.vessel
+    vessel, logs = odin(name), []
+    for place, course in enumerate(config.programme.courses):
+        plant = vessel.build()
+        config.disturbance.check(plant, name)
+        craft = Craft(
+            name,
+            TracedPlantDynamics(plant, config.step),
+            Helm.from_plant(plant),
+            plant.commands,
+            plant.approach(1),
+        )
+        sea = Sea(plant, _turned(config.disturbance, course), config.noise, config.seed + place)
+        logs += [
+            flight.log
+            for flight in fly(
+                craft, config.programme.manoeuvres(), sea, config.programme.zigzag, config.step
+            )
+        ]
+    return prepared(logs, vessel, config.preparation, config.seed)
+
+
+def _turned(disturbance: Disturbance, course: float) -> Disturbance:
+    if disturbance.waves is None:
+        return disturbance
+    return disturbance.model_copy(
+        update={
+            "waves": disturbance.waves.model_copy(
+                update={"direction": disturbance.waves.direction - course}
+            )
+        }
+    )
+
+
+def prepared(
+    logs: Sequence[Log], vessel: OdinConfig, config: PreparationConfig, seed: int
+) -> Trial:
+    """Interpolate, filter and differentiate logs.
+
+    Args:
+        logs: logs with the channels u, v, r, cmd_n and cmd_nozzle.
+        vessel: vessel that sailed them, whose jets turn commands into forces.
+        config: how the logs are prepared.
+        seed: seed of the times of the samples.
+    """
+    random, actuators = np.random.default_rng([seed, 11]), vessel.build().actuators
+    rows, rates, times, log_numbers, stretches = [], [], [], [], []
+    for place, given in enumerate(logs):
+        t, z = _even(given, config, random)
+        nu, command = torch.from_numpy(z[:, RANGE_VELOCITIES]), torch.from_numpy(z[:, RANGE_INPUTS])
+        force = actuators.force(torch.zeros(len(t), 0, dtype=torch.float64), command, nu).numpy()
+        inputs = np.concatenate((z[:, RANGE_INPUTS], force), axis=1)
+        velocity = _filtered(z[:, RANGE_VELOCITIES], config)
+        cut = round(config.margin / config.step)
+        kept = slice(cut, len(t) - 1 - cut)
+        rows.append(
+            np.concatenate(
+                (velocity, _filtered(inputs, config) if config.filter_inputs else inputs), axis=1
+            )[kept]
+        )
+        rates.append((np.diff(velocity, axis=0) / config.step)[kept])
+        times.append(t[kept])
+        log_numbers.append(np.full(len(times[-1]), place))
+        stretches.append((times[-1] // config.stretch).astype(int))
+    log, stretch = np.concatenate(log_numbers), np.concatenate(stretches)
+    group = np.concatenate(([0], np.cumsum((np.diff(log) != 0) | (np.diff(stretch) != 0))))
+    z, t = np.concatenate(rows), np.concatenate(times)
+    samples = Samples(
+        torch.from_numpy(z),
+        torch.from_numpy(np.concatenate(rates)),
+        torch.from_numpy(group),
+        torch.from_numpy(t),
+        ("made",) * (group[-1] + 1),
+        CHANNELS,
+    )
+    phase = phase_of(
+        froude_number(samples.z[:, 0], samples.z[:, 1], float(vessel.length.value))
+    ).numpy()
+    return Trial(
+        samples,
+        log,
+        (stretch + log) % config.validate_every == config.validate_every - 1,
+        phase,
+        config.step,
+    )
+
+
+def _even(
+    log: Log, config: PreparationConfig, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [T] and channels [T, 5] on the uniform grid, from samples at uneven times."""
+    end = float(log.t[-1])
+    at = np.cumsum(random.uniform(*config.interval, size=round(end / config.interval[0]) + 1))
+    taken = np.unique(np.searchsorted(log.t, at[at < end]))
+    t = np.arange(float(log.t[taken[0]]), float(log.t[taken[-1]]), config.step)
+    return t, np.stack(
+        [np.interp(t, log.t[taken], log.channels[name][taken]) for name in (*VELOCITY, *CONTROLS)],
+        axis=1,
+    )
+
+
+def _filtered(values: np.ndarray, config: PreparationConfig) -> np.ndarray:
+    from scipy.signal import butter, filtfilt
+
+    b, a = butter(config.order, config.cutoff)
+    out: np.ndarray = filtfilt(b, a, values, axis=0)
+    return out
+
+
+class Fitted(NamedTuple):
+    """A model that was fitted to one set of samples.
+
+    Attributes:
+        predicted: predicted accelerations at all samples [N, 3].
+        parameter_count: number of parameters in surge, sway and yaw.
+        equations: the equation of each axis as text; empty for other models.
+    """
+
+    predicted: np.ndarray
+    parameter_count: tuple[float, ...]
+    equations: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class PhaseStudy:
+    """What was found on one trial.
+
+    Attributes:
+        trial: the samples.
+        standard: fits of the standard model by set of samples.
+        truth: true parameters of the vessel, as far as the standard model has them.
+        models: models by name and by the set that they were fitted to.
+        rows: goodness of fit on the validation stretches, by set.
+    """
+
+    trial: Trial
+    standard: Mapping[str, StandardFit]
+    truth: Mapping[str, float]
+    models: Mapping[tuple[str, str], Fitted]
+    rows: Mapping[str, list[dict[str, Any]]]
+
+
+def study(settings: SeaTrialTaskConfig, config: SeaTrialConfig) -> PhaseStudy:
+    """Simulate one trial, and fit and judge every model on every set of samples.
+
+    Raises:
+        ResidnetError: where the trial cannot be sailed or a model is not determined.
+    """
+    trial = sail(config)
+    sets = {phase: trial.phase == place for place, phase in enumerate(PHASES)}
+    sets[ALL] = np.ones(len(trial.phase), dtype=bool)
+    sets = {
+        name: keep
+        for name, keep in sets.items()
+        if min((keep & ~trial.validates).sum(), (keep & trial.validates).sum()) >= _LEAST_SAMPLES
+    }
+    z, a = trial.samples.z.numpy(), trial.samples.target.numpy()
+    standard, models = {}, {}
+    for name, keep in sets.items():
+        train = keep & ~trial.validates
+        standard[name] = found = fit(
+            z[train, RANGE_VELOCITIES], z[train, 5:], a[train], settings.standard
+        )
+        predicted = found.accelerations(z[:, RANGE_VELOCITIES], z[:, 5:])
+        models[STANDARD, name] = Fitted(predicted, _STANDARD_PARAMETERS, {})
+        for equation, equation_config in settings.equations.items():
+            models[equation, name] = _fit_equation(equation_config, trial, train)
+    models |= _separate(models, sets, trial)
+    vessel = odin(config.vessel)
+    return PhaseStudy(
+        trial,
+        standard,
+        truth(vessel, settings.standard.mass),
+        models,
+        _judged(vessel, trial, sets, models),
+    )
+
+
+def _fit_equation(config: EquationConfig, trial: Trial, train: np.ndarray) -> Fitted:
+    """Find an equation from the training samples [N] bool, and evaluate it at all samples."""
+    head, samples = config.build(), trial.samples.where(torch.from_numpy(train))
+    head.calibrate(samples)
+    notes = head.solve(samples)
+    with torch.no_grad():
+        predicted = head(trial.samples.z, trial.samples.z[:, :0])[0].numpy()
+    return Fitted(
+        predicted,
+        tuple(head.parameter_count()),
+        {axis: equation["text"] for axis, equation in notes["equations"].items()},
+    )
+
+
+def _separate(
+    models: Mapping[tuple[str, str], Fitted], sets: Mapping[str, np.ndarray], trial: Trial
+) -> dict[tuple[str, str], Fitted]:
+    """Return for each model one that consists of the models fitted to the single phases.
+
+    Where a phase has no model, the one of all phases takes its place.
+    """
+    out = {}
+    for name in dict.fromkeys(model for model, _ in models):
+        predicted, parameter_count = models[name, ALL].predicted.copy(), np.zeros(3)
+        for place, phase in enumerate(PHASES):
+            if phase in sets:
+                predicted[trial.phase == place] = models[name, phase].predicted[
+                    trial.phase == place
+                ]
+                parameter_count += models[name, phase].parameter_count
+        out[name, SEPARATE] = Fitted(predicted, tuple(parameter_count), {})
+    return out
+
+
+def _judged(
+    vessel: OdinConfig,
+    trial: Trial,
+    sets: Mapping[str, np.ndarray],
+    models: Mapping[tuple[str, str], Fitted],
+) -> dict[str, list[dict[str, Any]]]:
+    """Return the goodness of fit on the validation stretches of each set.
+
+    The plant's own equations stand beside the models: they show what the sea and the preparation
+    leave unexplained.
+    """
+    z, a = trial.samples.z, trial.samples.target.numpy()
+    known = Fitted(
+        AccelerationHull(vessel.gains, vessel.terms)(z[:, RANGE_VELOCITIES], z[:, 5:]).numpy(),
+        (0.0, 0.0, 0.0),
+        {},
+    )
+    out = {}
+    for name, keep in sets.items():
+        pieces = trial.pieces(keep & trial.validates)
+        judged = {
+            key: model for key, model in models.items() if key[1] in (name, ALL, SEPARATE)
+        } | {(PLANT, PLANT): known}
+        steps = [
+            OneStep(
+                f"{model} on {on}",
+                "head",
+                fitted.parameter_count,
+                [(a - fitted.predicted)[piece] for piece in pieces],
+                f"{STANDARD} on {name}",
+            )
+            for (model, on), fitted in judged.items()
+        ]
+        keys = {f"{model} on {on}": (model, on) for model, on in judged}
+        out[name] = [
+            row | dict(zip(("model", "on"), keys[row["model"]], strict=True))
+            for row in goodness_table(steps, [a[p] for p in pieces], trial.step)
+        ]
+    return out
+
+
+def _content(settings: SeaTrialTaskConfig, study: PhaseStudy) -> dict[str, Any]:
+    trial, known, mass = study.trial, study.truth, settings.standard.mass
+    spread = trial.samples.target.numpy().std(axis=0)
+    return {
+        "samples": len(trial.phase),
+        "seconds": len(trial.phase) * trial.step,
+        "step": trial.step,
+        "logs": int(trial.log.max()) + 1,
+        "validation_share": float(trial.validates.mean()),
+        "acceleration_std": dict(zip(ACCELERATION, spread.tolist(), strict=True)),
+        "phases": {
+            phase: float((trial.phase == place).mean()) for place, phase in enumerate(PHASES)
+        },
+        "truth": dict(known),
+        "true_sums": {
+            name: sign * known[first] - known[second] if second else mass + sign * known[first]
+            for name, (first, sign, second) in SUMS.items()
+        },
+        "standard": {where: found.as_json() for where, found in study.standard.items()},
+        "equations": {
+            f"{model} on {on}": dict(fitted.equations)
+            for (model, on), fitted in study.models.items()
+            if fitted.equations
+        },
+        "rows": dict(study.rows),
+    }
+
+
+def _drawings(name: str, study: PhaseStudy) -> list[Figure]:
+    """Return Figures 7.1, 7.2 (one) and 7.8 to 7.14, and the parameters beside the true ones."""
+    return [
+        _trial_figure(name, study.trial),
+        _parameters_figure(name, study),
+        *(_excerpt(name, study, where) for where in study.standard),
+    ]
+
+
+def _trial_figure(name: str, trial: Trial) -> Figure:
+    z = trial.samples.z.numpy()
+    t = np.arange(len(z)) * trial.step / 60
+    rows = {
+        "u": ("u [m/s]", 1.0),
+        "v": ("v [m/s]", 1.0),
+        "r": ("r [deg/s]", DEG),
+        "cmd_n": ("motor [rpm]", 60.0),
+        "cmd_nozzle": ("nozzle [deg]", DEG),
+    }
+    starts, stops = stretches(trial.validates)
+    validation = (t[starts], t[stops - 1])
+    return Figure(
+        f"trial_{name}",
+        "Simulated sea trial",
+        "Zigzags and steps of speed; stretches that validate are grey.",
+        {
+            "validation": Look("validation", "#D9D9D9", kind="strip", order=0),
+            "line": Look("", BLUE, width=0.6),
+        },
+        [
+            Panel(label, "time, logs end to end [min]", height=150, group="t")
+            for label, _ in rows.values()
+        ],
+        [
+            Case(
+                "",
+                [
+                    {"validation": validation, "line": (t, factor * z[:, CHANNELS.index(channel)])}
+                    for channel, (_, factor) in rows.items()
+                ],
+            )
+        ],
+    )
+
+
+def _parameters_figure(name: str, study: PhaseStudy) -> Figure:
+    undetermined = next(iter(study.standard.values())).undetermined
+    shown = [i for i, name in enumerate(NAMES) if name not in undetermined]
+    scale = np.array([PARAMETERS[NAMES[i]].scale for i in shown])
+    known = np.array([study.truth[NAMES[i]] for i in shown])
+    looks, curves = {"zero": ZERO}, {"zero": (np.zeros(1), np.zeros(1))}
+    for place, (where, found) in enumerate(study.standard.items()):
+        error, spread = (found.values[shown] - known) / scale, 2 * found.errors[shown] / scale
+        at = np.arange(len(shown)) + 0.16 * (place - (len(study.standard) - 1) / 2)
+        looks[where] = Look(SET_NAMES[where], COLORS[place], kind="points", size=3)
+        looks[f"{where} errors"] = Look("", COLORS[place], width=1)
+        curves[where] = (at, error)
+        curves[f"{where} errors"] = whiskers(at, error - spread, error + spread)
+    return Figure(
+        f"parameters_{name}",
+        "Parameters of the standard model",
+        "Estimates less the true values, with two standard errors.",
+        looks,
+        [
+            Panel(
+                "estimate less truth, of a typical size",
+                height=350,
+                x_names=names_of(NAMES[i] for i in shown),
+            )
+        ],
+        [Case("", [curves])],
+    )
+
+
+def _excerpt(name: str, study: PhaseStudy, where: str) -> Figure:
+    trial = study.trial
+    keep = (
+        trial.validates if where == ALL else trial.validates & (trial.phase == PHASES.index(where))
+    )
+    nozzle = trial.samples.z.numpy()[:, CHANNELS.index("cmd_nozzle")]
+    # the stretch with the largest nozzle angles: straight runs show nothing of sway and yaw
+    piece = max(trial.pieces(keep), key=lambda indices: float(np.abs(nozzle[indices]).sum()))
+    piece = piece[: round(_EXCERPT / trial.step)]
+    t, paths = np.arange(len(piece)) * trial.step, {"measured": trial.samples.target.numpy()[piece]}
+    looks = {"measured": MEASURED}
+    other = next((key for key in study.models if key[0] != STANDARD and key[1] == where), None)
+    for key, look in (((STANDARD, where), DASHED), (other, SOLID)):
+        if key is not None:
+            label = f"{key[0]}, fitted on {SET_NAMES[where]}"
+            looks[label] = replace(look, label=label)
+            paths[label] = study.models[key].predicted[piece]
+    units = (("u' [m/s²]", 1.0), ("v' [m/s²]", 1.0), ("r' [deg/s²]", DEG))
+    return Figure(
+        f"{where}_{name}",
+        f"Validation, {SET_NAMES[where]}",
+        "Accelerations measured and predicted from measured velocities and inputs.",
+        looks,
+        [Panel(label, "time [s]", height=180, group="t") for label, _ in units],
+        [
+            Case(
+                "",
+                [
+                    {label: (t, factor * path[:, axis]) for label, path in paths.items()}
+                    for axis, (_, factor) in enumerate(units)
+                ],
+            )
+        ],
+    )
+
+
+def _verdict(results: Results) -> list[str]:
+    sentences = []
+    for name, trial in results["trials"].items():
+        where = next(iter(trial["rows"]))
+        best = _best(trial["rows"][where])
+        each = [f"{row['model']} for {axis} ({number(row['rmse'])})" for axis, row in best.items()]
+        sentences.append(
+            f"Trial {name}: on the validation stretches of the {SET_NAMES[where]}, the models with"
+            f" the least root mean square error are {listed(each)}."
+        )
+        open_names = trial["standard"][where]["undetermined"]
+        if open_names:
+            sentences.append(
+                f"Of the standard model, the data of trial {name} determine only combinations of"
+                f" {listed(open_names)}."
+            )
+    return sentences
+
+
+def _main_figures(results: Results) -> dict[str, MainFigure]:
+    units = dict(zip(ACCELERATION, ("m/s^2", "m/s^2", "rad/s^2"), strict=True))
+    out: dict[str, MainFigure] = {}
+    for name, trial in results["trials"].items():
+        where = next(iter(trial["rows"]))
+        rows = trial["rows"][where]
+        of_standard = [row for row in rows if row["model"] == STANDARD and row["on"] == where]
+        for row in (*_best(rows).values(), *of_standard):
+            key = f"{name}: rmse of {row['axis']}, {row['model']}"
+            out[key] = MainFigure(row["rmse"], units[row["axis"]])
+    return out
+
+
+def _best(rows: Sequence[Results]) -> dict[str, Results]:
+    axes = dict.fromkeys(row["axis"] for row in rows)
+    return {
+        axis: min(
+            (row for row in rows if row["axis"] == axis and row["model"] != PLANT),
+            key=lambda row: float(row["rmse"]),
+        )
+        for axis in axes
+    }
+
+
+def _section(settings: SeaTrialTaskConfig, name: str, run: RunFolder) -> Section:
+    trials = read_json(run.path / FILE)["trials"]
+    trial, first = trials[name], name == next(iter(trials))
+    printed = (settings.published, settings.published_absolute) if first else ({}, {})
+    blocks: list[Text | Section] = [Text(_about(trial))]
+    for where, rows in trial["rows"].items():
+        table = _goodness(where, rows, *(of.get(where, {}) for of in printed))
+        title = f"Validation, {SET_NAMES[where]}"
+        blocks.append(Section(title, [table, *pictures(run.path, f"{where}_{name}")]))
+    parameters = [_parameters(trial), Bullets(_notes(trial))]
+    parameters += pictures(run.path, f"parameters_{name}")
+    blocks.append(Section("Parameters of the standard model", parameters))
+    if trial["equations"]:
+        equations = [
+            (model.replace("_", "-"), text)
+            for model, texts in trial["equations"].items()
+            for text in texts.values()
+        ]
+        columns = [("model", lambda row: row[0]), ("equation", lambda row: row[1])]
+        blocks.append(Section("Equations", [table_of(equations, columns)]))
+    blocks.append(Section("The trial", pictures(run.path, f"trial_{name}"), folded=True))
+    return Section(f"Trial {name}: vessel {settings.trials[name].vessel}", blocks)
+
+
+def _about(trial: Results) -> str:
+    shares = listed(
+        [
+            f"{100 * share:.0f} % in the {SET_NAMES[phase]}"
+            for phase, share in trial["phases"].items()
+        ]
+    )
+    units = ("m/s^2", "m/s^2", "rad/s^2")
+    spread = listed(
+        [
+            f"{axis} {number(value)} {unit}"
+            for (axis, value), unit in zip(trial["acceleration_std"].items(), units, strict=True)
+        ]
+    )
+    return (
+        f"The trial lasts {trial['seconds'] / 60:.0f} minutes in {trial['logs']} logs, sampled at"
+        f" {1 / trial['step']:.0f} Hz: {shares}. The standard deviations of the accelerations are"
+        f" {spread}. {100 * trial['validation_share']:.0f} % of the stretches validate."
+    )
+
+
+def _goodness(
+    where: str,
+    rows: Sequence[Results],
+    printed: Mapping[str, Any],
+    absolute: Mapping[str, Any],
+) -> Table:
+    """Return the goodness of fit of all models on one set (Tables 7.3 to 7.5)."""
+
+    def of_document(row: Results, of: Mapping[str, Any]) -> Sequence[float | None]:
+        fitted_to = where if row["model"] == STANDARD else ALL
+        found = of.get(row["model"], {}).get(row["axis"]) if row["on"] == fitted_to else None
+        return found or (None, None, None)
+
+    def beside(key: str, place: int) -> Any:
+        return lambda row: beside_published(row[key], of_document(row, printed)[place], 3)
+
+    def as_printed(row: Results) -> Cell:
+        ends = list(of_document(row, absolute)[1:])
+        note = "" if ends[0] is None else f"published {interval(ends)}"
+        return Cell(interval(row["mae_ci95_independent"]), note)
+
+    return table_of(
+        rows,
+        [
+            ("model", "model"),
+            ("acceleration", "axis"),
+            (
+                "fitted to",
+                lambda row: DASH if row["model"] == PLANT else row["on"].replace("_", "-"),
+            ),
+            ("parameters", "parameters", 0),
+            ("RMSE", beside("rmse", 0)),
+            ("C_p", beside("cp", 1)),
+            ("adjusted R^2", beside("r2_adjusted", 2)),
+            (
+                "mean abs. residual",
+                lambda row: beside_published(row["mae"], of_document(row, absolute)[0], 3),
+            ),
+            ("95 %, blocks", "mae_ci95", interval),
+            ("95 %, as printed", as_printed),
+        ],
+        caption="Published figures are those of the real vessel. Intervals are of the mean absolute"
+        " residual; those by moving blocks account for its correlation in time (correction E8).",
+    )
+
+
+def _parameters(trial: Results) -> Table:
+    fits, printed = trial["standard"], published("halvorsen2019")
+    table = Table(
+        [
+            "parameter",
+            "true",
+            *(SET_NAMES[where] for where in fits),
+            "published before",
+            "published after",
+        ],
+        caption="SI units, with standard errors.",
+    )
+    for name in NAMES:
+        table.add(
+            name,
+            [
+                number(trial["truth"][name], 5),
+                *(_estimate(fit, name) for fit in fits.values()),
+                number(printed["start"][name], 5),
+                number(printed["fitted"].get(name), 4),
+            ],
+        )
+    for name in SUMS:
+        sums = [_with_error(*fit["sums"][name]) for fit in fits.values()]
+        table.add(name, [number(trial["true_sums"][name], 5), *sums, "", ""])
+    return table
+
+
+def _estimate(fit: Results, name: str) -> Cell:
+    value = fit["values"][name]
+    if name in fit["undetermined"]:
+        return Cell(number(value, 4), "not determined", mark="weak")
+    if name in fit["at_bound"]:
+        return Cell(number(value), "at its bound", mark="weak")
+    return _with_error(value, fit["standard_errors"][name])
+
+
+def _with_error(value: float, error: float | None) -> Cell:
+    if error == 0.0:
+        return Cell(number(value, 5), "at its bound", mark="weak")
+    return Cell(number(value, 5), f"± {number(error, 2)}")
+
+
+def _notes(trial: Results) -> list[str]:
+    notes = []
+    for where, found in trial["standard"].items():
+        costs = found["cost"]
+        same = sum(cost <= costs[0] * (1 + _SAME_COST) for cost in costs)
+        determined = (
+            f"only combinations of {listed(found['undetermined'])} are determined"
+            if found["undetermined"]
+            else "every parameter is determined"
+        )
+        notes.append(
+            f"In the {SET_NAMES[where]}, {determined}; the condition number of the rest is"
+            f" {number(found['condition'], 2)}. {same} of {len(costs)} starting points end at the"
+            " least error."
+        )
+    return [
+        *notes,
+        "The standard errors account for scatter and correlation of the residuals. They do not"
+        " account for what the filter, the waves or a wrong structure of the model shift.",
+    ]

@@ -1,1 +1,0 @@
-"""Chapter 4 of document 002: the ferry identified and flown in closed loop."""

@@ -1,0 +1,819 @@
+"""Residual forces of a known hull: how both studies of document 002 (Jervan 2020) identify them.
+
+The residual is the force that the hull does not explain: tau - F(nu_dot, nu) (3.19), (3.20). It is
+regressed on basis functions of the motion (chapters 3 and 4); a model runs forward in time by
+(3.22).
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.baselines.believed import BelievedConfig, HullEquations
+from residnet.control.motion.anticipation import Lag
+from residnet.core.config import Config
+from residnet.core.errors import FitError
+from residnet.core.frames import to_body
+from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
+from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.documents.cells import notes_text
+from residnet.judge.tracking import mse
+from residnet.physics.force_model import (
+    FERRY_TERMS,
+    MOTION,
+    Correction,
+    ForceModel,
+    augmented,
+    column_scale,
+)
+from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.terms import TermLibrary, parse_term
+from residnet.regression.elastic_net import ElasticNet
+from residnet.regression.estimator import Estimator, require_data
+from residnet.regression.least_squares import CentredLeastSquares
+from residnet.regression.pls_path import pls_path
+from residnet.regression.plsr import PLSR
+from residnet.regression.ridge import Ridge
+from residnet.regression.surface import Surface
+from residnet.regression.surface_plsr import SurfacePLSR
+from residnet.report import figure as drawing
+from residnet.report.blocks import Section, Table, Text
+from residnet.report.figure import (
+    BLUE,
+    GREY,
+    ORANGE,
+    PURPLE,
+    VERMILLION,
+    Case,
+    Figure,
+    Look,
+    Panel,
+    bars,
+    names_of,
+)
+from residnet.report.format import number
+from residnet.training.lag import LagFit, fit_lag, followed
+
+AXES = ("surge", "sway", "yaw")
+_FORCES = ("surge force", "sway force", "yaw moment")
+_PENALTIES = tuple(10.0**k for k in range(-10, 1))
+"""Ridge penalties tried where none is given, in units of a standardised column's energy."""
+_RANK_TOLERANCE = 1e-7
+"""Regressors with singular values below this share of the largest count as dependent."""
+_LEAST_EARTH_FORCE_SPREAD = 0.02
+"""Least root mean square that turning must leave of a unit force fixed in earth axes."""
+_COLOURS_SPAN = (6.3, 316.0)
+"""Shares in % of the first and the last colour of a surface."""
+ABOUT_COEFFICIENTS = (
+    "The force of a model is that of the believed hull plus the sum of coefficient times basis"
+    " function, in SI units. A weight is the magnitude of the coefficient of scaled variables: it"
+    " says how much a basis function matters."
+)
+MODEL_PICTURES = ("orders_", "surface_", "weights_")
+"""What the names of the figures of `model_figures` begin with."""
+
+
+@dataclass(frozen=True)
+class Regression:
+    """The data of a regression.
+
+    Attributes:
+        terms: names of the basis functions.
+        x: basis functions [N, J], float64.
+        y: residual forces [N, 3] in N, N, N m.
+        scale: what the columns are divided by [J].
+        fold: of each sample [N], from 0; samples that belong together (a segment, a run) share a
+            fold.
+        test: samples of the document's own choice of a model, which judges on them; None where a
+            model must not see them.
+    """
+
+    terms: tuple[str, ...]
+    x: Tensor
+    y: Tensor
+    scale: Tensor
+    fold: Tensor
+    test: tuple[Tensor, Tensor] | None = None
+
+    def __post_init__(self) -> None:
+        require_data(self.x, self.y, self.terms, _FORCES)
+        if len(self.x) <= len(self.terms):
+            raise FitError(
+                f"{len(self.x)} samples do not determine {len(self.terms)} basis functions; give"
+                " more data or fewer terms"
+            )
+
+    @property
+    def standardised(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """E [N, J], F [N, 3], mean of x, mean of y, std of y (3.3), (3.4), (4.8)."""
+        mean_x, mean_y, std_y = self.x.mean(0), self.y.mean(0), self.y.std(0)
+        return (self.x - mean_x) / self.scale, (self.y - mean_y) / std_y, mean_x, mean_y, std_y
+
+
+@dataclass(frozen=True)
+class OrderErrors:
+    """Mean square errors of a PLSR over its order: forces [A, 3] in N^2, N^2, (N m)^2.
+
+    Attributes:
+        left_out: over samples whose fold was left out; NaN without folds.
+        test: over the test half; NaN without one.
+    """
+
+    left_out: Tensor
+    test: Tensor
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Coefficients of y = intercept + x coefficients.
+
+    Attributes:
+        coefficients: Theta_post [J, 3], zero for basis functions that were removed.
+        intercept: of each axis [3].
+        pre: Theta_pre [J, 3], coefficients of the scaled variables (3.11).
+        notes: what was chosen.
+        surface: errors of all models that the choice was made from, where a surface analysis made
+            it.
+        orders: errors over the order of a PLSR.
+    """
+
+    coefficients: Tensor
+    intercept: Tensor
+    pre: Tensor
+    notes: dict[str, Any] = field(default_factory=dict)
+    surface: Surface | None = None
+    orders: OrderErrors | None = None
+
+    @classmethod
+    def from_pre(cls, data: Regression, pre: Tensor, notes: dict[str, Any]) -> Fit:
+        """Return the fit with coefficients of scaled variables.
+
+        Theta_post = diag(scale)^-1 Theta_pre diag(std y) (3.12), correction J15.
+        """
+        _, _, mean_x, mean_y, std_y = data.standardised
+        post = pre / data.scale[:, None] * std_y
+        return cls(post, mean_y - mean_x @ post, pre, notes)
+
+    def predict(self, x: Tensor) -> Tensor:
+        """Return the outputs [N, 3] at basis functions [N, J]."""
+        return x @ self.coefficients + self.intercept
+
+
+class RegressionKind(Config, ABC):
+    """A way to find coefficients."""
+
+    @abstractmethod
+    def fit(self, data: Regression) -> Fit:
+        """Return the coefficients that fit the regression's samples.
+
+        Raises:
+            FitError: where the data do not determine them.
+        """
+
+
+class _ScaledRegression(RegressionKind):
+    """An estimator that runs on scaled columns and outputs."""
+
+    @abstractmethod
+    def estimator(self) -> Estimator:
+        """Return the estimator; columns are scaled already."""
+
+    @abstractmethod
+    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
+        """Return what to report of a solution's choice and notes."""
+
+    def fixed(self) -> bool:
+        """Return whether nothing is left to choose, so that folds do not matter."""
+        return False
+
+    @final
+    def fit(self, data: Regression) -> Fit:
+        """Return the coefficients; see `RegressionKind.fit`."""
+        e, f, *_ = data.standardised
+        groups = None if self.fixed() else data.fold
+        first = self.estimator().fit(e, f, groups, names=data.terms, outputs=_FORCES)[0]
+        out = Fit.from_pre(data, first.coefficients, self.chosen(first.choice, first.notes))
+        return replace(out, orders=self.over_orders(data))
+
+    def over_orders(self, data: Regression) -> OrderErrors | None:
+        """Return the errors over all orders; None for an estimator without an order."""
+        return None
+
+
+@final
+class PlsrRegression(_ScaledRegression):
+    """PLSR of the three axes together.
+
+    Attributes:
+        order: number of latent variables; null takes the least error over left-out folds.
+        algorithm: `kernel`, from moments alone, or `nipals`, as the document prints it.
+    """
+
+    kind: Literal["plsr"]
+    order: int | None = Field(default=None, ge=1)
+    algorithm: Literal["kernel", "nipals"] = "kernel"
+
+    def estimator(self) -> Estimator:
+        return PLSR(self.order, max_order=None, folds=None, scale=False, algorithm=self.algorithm)
+
+    def fixed(self) -> bool:
+        return self.order is not None
+
+    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
+        if choice["order"] == 0:
+            raise FitError("PLSR: nothing in the residual varies with the basis functions")
+        return choice
+
+    def over_orders(self, data: Regression) -> OrderErrors:
+        """Return the errors over all orders (document 002 Figures 4.4, 4.22, 4.42, 5.7)."""
+        e, f, mean_x, mean_y, std_y = data.standardised
+        folds = data.fold.unique()
+        orders, left_out = e.shape[1], torch.full_like(f, torch.nan).repeat(e.shape[1], 1, 1)
+        if len(folds) > 1:
+            for fold in folds:
+                out = data.fold == fold
+                left_out[:, out] = _error_by_order(e[~out], f[~out], e[out], f[out], orders)
+        test = torch.full((orders, 3), torch.nan, dtype=f.dtype)
+        if data.test is not None and len(data.test[0]):
+            x, y = data.test
+            scaled = (x - mean_x) / data.scale, (y - mean_y) / std_y
+            test = _error_by_order(e, f, *scaled, orders).square().mean(1)
+        square = std_y.square()
+        return OrderErrors(left_out.square().mean(1) * square, test * square)
+
+
+def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor, orders: int) -> Tensor:
+    """Return the errors [A, N, 3] at x of a PLSR of f on e, for each order up to `orders`."""
+    mean_e, mean_f = e.mean(0), f.mean(0)
+    centred = e - mean_e
+    path = pls_path(centred.T @ centred, centred.T @ (f - mean_f), orders)
+    if len(path) < orders:
+        # what is left explains nothing: higher orders change no more
+        last = path[-1:] if len(path) else torch.zeros(1, e.shape[1], f.shape[1], dtype=e.dtype)
+        path = torch.cat((path, last.expand(orders - len(path), -1, -1)))
+    return y - mean_f - (x - mean_e) @ path
+
+
+@final
+class SurfaceRegression(RegressionKind):
+    """PLSR of each axis by itself, chosen by surface analysis (document 002 section 4.5.1).
+
+    Attributes:
+        choose: `test`, the document's own: the least error on the test half, which then also judges
+            it; `simplest`: cross-validation over the folds of the first half and the
+            one-standard-error rule; `least`: cross-validation and its bare minimum.
+    """
+
+    kind: Literal["surface"]
+    choose: Literal["test", "simplest", "least"] = "simplest"
+
+    def fit(self, data: Regression) -> Fit:
+        """Return the chosen model of each axis; see `RegressionKind.fit`."""
+        x, y, groups = data.x, data.y, data.fold
+        estimator = SurfacePLSR("simplest" if self.choose == "simplest" else "least")
+        if self.choose == "test":
+            if data.test is None:
+                raise FitError("surface: choose 'test' needs the test half")
+            x, y = torch.cat((x, data.test[0])), torch.cat((y, data.test[1]))
+            groups = (torch.arange(len(x)) >= len(data.x)).long()
+            estimator = SurfacePLSR("least", test=[1])
+        found = estimator.surface(x, y, groups, names=data.terms, outputs=_FORCES)
+        best = estimator.chosen(found, x, y, groups)
+        pre = best.coefficients * data.x.std(0)[:, None] / data.y.std(0)
+        return Fit(best.coefficients, best.intercept, pre, best.choice, found)
+
+
+@final
+class LeastSquaresRegression(_ScaledRegression):
+    """Ordinary least squares of the residual force on the basis functions."""
+
+    kind: Literal["ols"]
+
+    def estimator(self) -> Estimator:
+        return CentredLeastSquares()
+
+    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
+        return notes
+
+
+@final
+class RidgeRegression(_ScaledRegression):
+    """Ridge regression of the residual force on the basis functions.
+
+    Attributes:
+        penalty: in units of a scaled column's energy: alpha = penalty * samples in scikit-learn's
+            terms; null takes that of the least error over left-out folds.
+    """
+
+    kind: Literal["ridge"]
+    penalty: float | None = Field(default=None, gt=0)
+
+    def estimator(self) -> Estimator:
+        penalties = _PENALTIES if self.penalty is None else (self.penalty,)
+        return Ridge(penalties, folds=None, scale=False, shared=True)
+
+    def fixed(self) -> bool:
+        return self.penalty is not None
+
+    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
+        return {"penalty": choice["penalty"][0]}
+
+
+@final
+class ShrinkRegression(_ScaledRegression):
+    """LASSO or elastic net, cross-validated over the folds; each axis by itself.
+
+    Attributes:
+        kind: `lasso`, or `elastic_net`, whose penalty is partly quadratic.
+        l1_ratio: share of the absolute penalty in that of the elastic net.
+    """
+
+    kind: Literal["lasso", "elastic_net"]
+    l1_ratio: float = Field(default=0.5, gt=0, lt=1)
+
+    def estimator(self) -> Estimator:
+        return ElasticNet(1.0 if self.kind == "lasso" else self.l1_ratio)
+
+    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
+        return choice
+
+
+RegressionConfig = Annotated[
+    PlsrRegression
+    | SurfaceRegression
+    | LeastSquaresRegression
+    | RidgeRegression
+    | ShrinkRegression,
+    Field(discriminator="kind"),
+]
+
+
+class ResidualModelConfig(Config):
+    """A regression of a force residual on basis functions of nu_dot and nu.
+
+    Attributes:
+        fit: estimator of the coefficients, with its settings.
+        terms: basis functions, written as products of u_dot, v_dot, r_dot, u, v, r and their
+            absolute values; the 30 of (4.12) unless given.
+        lag: identify the thrusters' lag together with the coefficients, and explain the force that
+            follows the command through it.
+        earth: also identify a force that is constant in earth axes, such as that of wind.
+    """
+
+    fit: RegressionConfig
+    terms: tuple[str, ...] = FERRY_TERMS
+    lag: bool = False
+    earth: bool = False
+
+    def model_post_init(self, context: Any) -> None:
+        """Parse the terms, so that a wrong one is found when the config is read."""
+        for term in self.terms:
+            parse_term(term, MOTION)
+
+
+@dataclass(frozen=True)
+class Record:
+    """Motion and commanded force of one or several runs, on a uniform time grid of N samples.
+
+    Attributes:
+        t: time [N] in s.
+        pose: measured x, y, psi [N, 3] in m, m, rad.
+        nu: measured u, v, r [N, 3] in m/s, m/s, rad/s.
+        nu_dot: measured accelerations [N, 3] in m/s^2, m/s^2, rad/s^2.
+        command: commanded force at the samples [N, 3] in N, N, N m.
+        averaged: commanded force averaged over the controller's steps around a sample [N, 3].
+        fold: number of the segment that a sample belongs to [N].
+        train: samples to identify from [N] bool; the others test the model.
+        noise: standard deviations of the measured pose, nu and nu_dot, nine numbers.
+        runs: numbers of samples of the runs that stand one after another; empty for one run.
+    """
+
+    t: Tensor
+    pose: Tensor
+    nu: Tensor
+    nu_dot: Tensor
+    command: Tensor
+    averaged: Tensor
+    fold: Tensor
+    train: Tensor
+    noise: tuple[float, ...]
+    runs: tuple[int, ...] = ()
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval in s."""
+        return float(self.t[1] - self.t[0])
+
+    def smoothed(self) -> Record:
+        """Return the record with the most likely motion under the known noise of the sensors."""
+        from residnet.data.motion_smoother import smooth_motion
+
+        measured = torch.cat((self.pose, self.nu, self.nu_dot), dim=-1)
+        motion = torch.from_numpy(smooth_motion(measured.numpy(), self.noise, self.dt))
+        return replace(
+            self,
+            pose=motion[:, POSE],
+            nu=motion[:, VELOCITIES],
+            nu_dot=motion[:, ACCELERATIONS],
+        )
+
+
+def fit_model(
+    config: ResidualModelConfig, record: Record, base: ForceModel
+) -> tuple[ForceModel, Lag | None, Fit, dict[str, Any]]:
+    """Fit one model of the residual force of `base` on the training samples of a record.
+
+    Args:
+        config: basis functions and estimator.
+        record: motion and commanded force.
+        base: the known model, F_base(nu_dot, nu).
+
+    Returns:
+        The model F = F_base + correction, the thrusters' lag where it was fitted, the coefficients,
+        and what the estimator chose.
+
+    Raises:
+        FitError: where the data do not determine the model.
+    """
+    train = record.train
+    x = TermLibrary(config.terms, MOTION)(torch.cat((record.nu_dot, record.nu), dim=-1))
+    needed = base.at_heading(record.nu_dot, record.nu, record.pose[:, HEADING])
+    earth_axes = _earth_axes(record.pose[:, HEADING])
+    lag_fit: LagFit | None = None
+    force = record.command
+    if config.lag:
+        regressors = torch.cat((x, earth_axes[:, 0]), dim=-1) if config.earth else x
+        lag_fit = fit_lag(record.averaged, needed, regressors, record.dt, train, record.runs)
+        force = followed(record.averaged, lag_fit.lag, record.dt, record.runs)
+    y = force - needed
+    earth_force = torch.zeros(2, dtype=torch.float64)
+    if config.earth:
+        earth_force = constant_force(x[train], y[train], -earth_axes[train])
+        y = y + torch.einsum("nad,d->na", earth_axes, earth_force)
+    data = Regression(
+        config.terms,
+        x[train],
+        y[train],
+        column_scale(config.terms, torch.nan_to_num(x[train])),
+        torch.unique(record.fold[train], return_inverse=True)[1],
+        (x[~train], y[~train]),
+    )
+    fit = config.fit.fit(data)
+    model = base.extended(Correction(config.terms, fit.coefficients, fit.intercept), earth_force)
+    notes = dict(fit.notes)
+    if lag_fit is not None:
+        lag = lag_fit.lag
+        notes["lag"] = {
+            "frequency": lag.frequency,
+            "damping": lag.damping,
+            "delay": lag.delay,
+        }
+    if config.earth:
+        notes["earth"] = {"north": float(earth_force[0]), "east": float(earth_force[1])}
+    return model, lag_fit.lag if lag_fit is not None else None, fit, notes
+
+
+def _earth_axes(psi: Tensor) -> Tensor:
+    """Unit forces to north and to east in body axes [N, 3, 2], without a moment."""
+    one, zero = torch.ones(()), torch.zeros(())
+    nothing = torch.zeros_like(psi)
+    columns = [
+        torch.stack((*to_body(north, east, psi), nothing), dim=-1)
+        for north, east in ((one, zero), (zero, one))
+    ]
+    return torch.stack(columns, dim=-1)
+
+
+def remaining(model: ForceModel, lag: Lag | None, record: Record) -> Tensor:
+    """Return the residual [N, 3] that a model leaves along a record, in N, N, N m.
+
+    The model is compared with the command, or through its lag with the force that follows it.
+    """
+    force = (
+        record.command if lag is None else followed(record.averaged, lag, record.dt, record.runs)
+    )
+    residual: Tensor = model.residual(force, record.nu_dot, record.nu, record.pose[:, HEADING])
+    return residual
+
+
+def unseen_mse(model: ForceModel, lag: Lag | None, record: Record) -> list[float]:
+    """Return the mean square of a model's remaining residual on the test samples, by axis.
+
+    The residual is that of the measurements as logged, through the model's lag where it has one.
+    """
+    return mse(remaining(model, lag, record)[~record.train])
+
+
+def constant_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
+    """Return the force (north, east) [2] in N that is constant in earth axes.
+
+    The basis functions, whose coefficients differ from axis to axis, are projected out first.
+
+    Args:
+        x: basis functions [N, J].
+        y: residual [N, 3] in N, N, N m.
+        unit_forces: what a unit force to north and to east adds to the residual [N, 3, 2].
+
+    Raises:
+        FitError: where the vessel hardly turned, so that a constant in body axes explains as much.
+    """
+    centred = torch.cat(
+        (torch.ones_like(x[:, :1]), (x - x.mean(0)) / x.std(0).clamp(min=1e-300)), dim=-1
+    )
+    left, singular, _ = torch.linalg.svd(centred, full_matrices=False)
+    left = left[:, singular > _RANK_TOLERANCE * singular[0]]
+
+    def unexplained(part: Tensor) -> Tensor:
+        rest: Tensor = part - left @ (left.T @ part)
+        return rest
+
+    weight = unexplained(y).std(0).clamp(min=1e-9)
+    design = torch.cat(
+        [
+            torch.stack([unexplained(unit_forces[:, a, d]) for d in range(2)], dim=-1) / weight[a]
+            for a in range(2)
+        ]
+    )
+    target = torch.cat([unexplained(y[:, a]) / weight[a] for a in range(2)])
+    spread = float(torch.linalg.svdvals(design * weight[:2].mean())[-1]) / len(y) ** 0.5
+    if spread < _LEAST_EARTH_FORCE_SPREAD:
+        raise FitError(
+            "a force constant in earth axes does not show: the vessel kept its heading; give a run"
+            " that turns, or leave earth out"
+        )
+    solution: Tensor = torch.linalg.lstsq(design, target[:, None]).solution
+    return solution[:, 0]
+
+
+def forward_equations(believed: str, model: ForceModel, label: str) -> HullEquations:
+    """Return the accelerations of a force-space model as sums of terms.
+
+    They are nu_dot = (M + A)^-1 (tau - C nu - D nu - b), in the form that the baseline `believed`
+    takes.
+
+    Args:
+        believed: vessel of the known hull, by name or file.
+        model: the known hull and its residual eps = A nu_dot + b(nu).
+        label: name of the model in error messages.
+
+    Raises:
+        ConfigError: where a basis function is not affine in nu_dot.
+        FitError: where the augmented mass cannot be inverted safely.
+    """
+    hull_rows = BelievedConfig(vessel=believed).equations().rows()
+    known = list(dict.fromkeys(term for row in hull_rows for term in row))
+    hull = torch.tensor(
+        [[row.get(term, 0.0) for term in known] for row in hull_rows], dtype=torch.float64
+    )
+    mass, constant = model.hull.mass.clone(), torch.zeros(3, dtype=torch.float64)
+    total, extra = mass, dict[str, Tensor]()
+    for correction in model.corrections:
+        assert isinstance(correction, Correction)
+        terms, coefficients = correction.library.terms, correction.coefficients
+        total, rest = augmented(total, terms, coefficients, label)
+        constant = constant + correction.intercept
+        for j in rest:
+            extra[terms[j]] = (
+                extra.get(terms[j], torch.zeros(3, dtype=torch.float64)) + coefficients[j]
+            )
+    inverse = torch.linalg.inv(total)
+    rows = inverse @ mass @ hull
+    table = {term: rows[:, j] for j, term in enumerate(known)}
+    for term, force in {"1": constant, **extra}.items():
+        table[term] = table.get(term, torch.zeros(3, dtype=torch.float64)) - inverse @ force
+    by_axis = [
+        {term: float(value[axis]) for term, value in table.items() if float(value[axis]) != 0.0}
+        for axis in range(3)
+    ]
+    return HullEquations(u=by_axis[0], v=by_axis[1], r=by_axis[2])
+
+
+def missing_coefficients(true: str, believed: str) -> dict[str, list[float]]:
+    """Return the true coefficients of a residual by basis function: surge, sway, yaw.
+
+    They are those of the true hull less those of the believed one, where document 002 misprints the
+    cross terms (correction J19).
+    """
+    of_true, of_believed = (_force_coefficients(name) for name in (true, believed))
+    zero = torch.zeros(3, dtype=torch.float64)
+    out: dict[str, list[float]] = {}
+    for key in dict.fromkeys((*of_believed, *of_true)):
+        difference = of_true.get(key, zero) - of_believed.get(key, zero)
+        # equal coefficients differ by rounding alone
+        difference = torch.where(
+            difference.abs() > 1e-9 * (1 + of_true.get(key, zero).abs()), difference, zero
+        )
+        if bool(difference.any()):
+            out[key] = difference.tolist()
+    return out
+
+
+def _force_coefficients(vessel: str) -> dict[str, Tensor]:
+    """Return the coefficients [3] of F(nu_dot, nu) by basis function of document 002."""
+    names = {_factors(term): term for term in FERRY_TERMS}
+    rows = BelievedConfig(vessel=vessel).equations().rows()
+    columns = {
+        term: torch.tensor([row.get(term, 0.0) for row in rows], dtype=torch.float64)
+        for term in dict.fromkeys(t for row in rows for t in row)
+    }
+    mass = torch.linalg.inv(torch.stack([columns[name] for name in FORCE_CHANNELS], dim=1))
+    out = {name: mass[:, axis] for axis, name in enumerate(ACCELERATION)}
+    return out | {
+        names.get(_factors(term), term): -mass @ column
+        for term, column in columns.items()
+        if term not in FORCE_CHANNELS
+    }
+
+
+def _factors(term: str) -> tuple[Any, ...]:
+    return tuple(sorted(parse_term(term, MOTION)))
+
+
+def as_baseline_yaml(equations: HullEquations, label: str) -> str:
+    """Return the model as YAML lines for the `baseline` or `baselines` of a fit."""
+    lines = [
+        f"# {label}: accelerations from velocities and forces; needs the channels"
+        f" {', '.join((*VELOCITY, *FORCE_CHANNELS))}"
+    ]
+    lines += ["kind: believed", "vessel:"]
+    for axis, row in zip(VELOCITY, equations.rows(), strict=True):
+        lines.append(f"  {axis}: {json.dumps(row)}")
+    return "\n".join(lines) + "\n"
+
+
+def fit_as_json(terms: Sequence[str], fit: Fit) -> dict[str, Any]:
+    """Return a fitted model as it stands in the results: terms, coefficients and weights."""
+    return {
+        "terms": list(terms),
+        "coefficients": fit.coefficients.tolist(),
+        "intercept": fit.intercept.tolist(),
+        "weights": fit.pre.abs().tolist(),
+    }
+
+
+def coefficients_section(
+    name: str,
+    model: Mapping[str, Any],
+    notes: Mapping[str, Any],
+    others: Mapping[str, Mapping[str, Sequence[float]]],
+) -> Section:
+    """Return a folded section with the coefficients of one model.
+
+    Args:
+        name: name of the model.
+        model: its entry in the results (`fit_as_json`).
+        notes: what its estimator chose.
+        others: coefficients [3] by basis function to stand beside it, by what they are, such as
+            `true` and `published`.
+    """
+    others = {what: values for what, values in others.items() if values}
+    kept = {
+        term: row
+        for term, row in zip(model["terms"], model["coefficients"], strict=True)
+        if any(row)
+    }
+    rows = {"1": model["intercept"], **kept}
+    weights = dict(zip(model["terms"], model["weights"], strict=True))
+    groups = [(what, 3) for what in ("coefficient", "weight", *others)]
+    table = Table(["basis function", *AXES * len(groups)], groups=groups)
+    absent = (0.0, 0.0, 0.0)
+    for term in dict.fromkeys((*rows, *(term for values in others.values() for term in values))):
+        cells = [number(value, 4) for value in rows.get(term, absent)]
+        cells += [number(value, 3) for value in weights[term]] if term in weights else [""] * 3
+        for values in others.values():
+            cells += [number(value, 4) for value in values.get(term, absent)]
+        table.add(term, cells)
+    chosen = notes_text(notes)
+    return Section(
+        name,
+        [Text(f"Chosen by the estimator: {chosen}." if chosen else ""), table],
+        folded=True,
+    )
+
+
+def model_figures(
+    name: str, config: ResidualModelConfig, fit: Fit, unmodelled: Sequence[float]
+) -> list[Figure]:
+    """Return the weights of a model, and the errors that its order or surface was chosen from.
+
+    Figures 4.6, 4.20, 4.22 and 4.25 of the document.
+
+    Args:
+        name: name of the model.
+        config: its basis functions and estimator.
+        fit: its coefficients.
+        unmodelled: mean square of the believed model's residual by axis.
+    """
+    out = [_weights(name, config.terms, fit.pre)]
+    if fit.orders is not None:
+        curves = {"left-out segments": fit.orders.left_out, "test half": fit.orders.test}
+        out.append(_orders(name, curves, unmodelled, int(fit.notes["order"])))
+    if isinstance(config.fit, SurfaceRegression) and fit.surface is not None:
+        choices = {
+            "chosen": list(zip(fit.notes["order"], fit.notes["terms"], strict=True)),
+            "least": [fit.surface.least(axis) for axis in range(3)],
+        }
+        out.append(_surface(name, fit.surface.error, unmodelled, choices))
+    return out
+
+
+def _weights(name: str, terms: Sequence[str], pre: Tensor) -> Figure:
+    at = np.arange(len(terms))
+    return Figure(
+        f"weights_{name}",
+        f"Weights of the basis functions in {name}",
+        "Magnitude of the coefficients of scaled basis functions. It shows how much each one"
+        " weighs in the model.",
+        {"weights": Look("", BLUE, kind="fill")},
+        [
+            Panel(f"{axis}, scaled [-]", height=165, group="w", x_names=names_of(terms))
+            for axis in AXES
+        ],
+        [Case("", [{"weights": bars(at, pre[:, axis].abs().numpy())} for axis in range(3)])],
+    )
+
+
+def _orders(
+    name: str, curves: Mapping[str, Tensor], unmodelled: Sequence[float], chosen: int
+) -> Figure:
+    """Return the error that is left over the order of a PLSR.
+
+    Args:
+        name: name of the model.
+        curves: mean square error by order and axis [A, 3], by the samples that it is of.
+        unmodelled: mean square of the residual of each axis.
+        chosen: order of the model.
+    """
+    colors = dict(zip(curves, (BLUE, VERMILLION), strict=True))
+    looks = {label: Look(label, color) for label, color in colors.items()}
+    looks["chosen"] = Look("this model", GREY, "dashed", 1.0, kind="upright")
+    shown = []
+    for axis in range(3):
+        panel = {"chosen": (np.array([float(chosen)]), np.zeros(1))}
+        for label, error in curves.items():
+            share = error[:, axis].numpy() / unmodelled[axis]
+            if np.isfinite(share).any():
+                panel[label] = (np.arange(len(share)) + 1.0, share)
+        shown.append(panel)
+    return Figure(
+        f"orders_{name}",
+        "Error over the order of the PLSR",
+        "Share of the unmodelled residual's mean square that is left, by model order: on"
+        " segments that were left out of the fit one by one, and on the test half.",
+        looks,
+        [
+            Panel(f"{axis}, share of the MSE left", "model order", height=285, y_log=True)
+            for axis in AXES
+        ],
+        [Case("", shown)],
+        columns=3,
+    )
+
+
+def _surface(
+    name: str,
+    error: Tensor,
+    unmodelled: Sequence[float],
+    chosen: Mapping[str, Sequence[tuple[int, int]]],
+) -> Figure:
+    marks = (("x", VERMILLION), ("o", PURPLE), ("s", ORANGE))
+    looks = {"surface": Look("", kind="cells"), "section": Look("", BLUE)}
+    for label, (marker, color) in zip(chosen, marks, strict=False):
+        looks[label] = Look(
+            label, color, kind="points", marker=marker, size=7, hollow=True, order=5
+        )
+    cases = []
+    for axis, title in enumerate(AXES):
+        share = 100.0 * error[axis].numpy() / unmodelled[axis]
+        orders, counts = np.meshgrid(*map(np.arange, share.shape), indexing="ij")
+        curves = {"surface": (counts.ravel().astype(float), orders.ravel() + 1.0)}
+        for label, picks in chosen.items():
+            order, count = picks[axis]
+            curves[label] = (np.array([float(count)]), np.array([float(order)]))
+        best = [float(chosen["chosen"][axis][1]), float(chosen["chosen"][axis][0])]
+        cases.append(Case(title, [curves, {}, {}], heights=share.ravel(), chosen=best))
+    height = "share of the MSE that is left [%]"
+    return Figure(
+        f"surface_{name}",
+        "Surface analysis",
+        "Share of the unmodelled residual's mean square that is left, by model order and"
+        " number of basis functions. Marks show what each rule chose.",
+        looks,
+        [
+            Panel("model order", "basis functions", kind="surface", height=285),
+            Panel(height, "basis functions", y_log=True),
+            Panel(height, "model order", y_log=True),
+        ],
+        cases,
+        chooser="axis",
+        surface=drawing.Surface(height, _COLOURS_SPAN, (1.0, 1.0), log=True),
+    )
