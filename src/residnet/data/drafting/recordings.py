@@ -23,7 +23,7 @@ from residnet.data.drafting.words import MOTION, input_channel, words_of
 from residnet.data.readers.composing.compose import Plan
 from residnet.data.readers.composing.quantities import FieldMap
 from residnet.data.readers.detect import AutoConfig, recording_for
-from residnet.data.readers.messages.standard import standard_plan
+from residnet.data.readers.messages import standard_plan
 from residnet.data.readers.recording import Recording
 
 _COHERENT = 0.7

@@ -25,7 +25,7 @@ from residnet.data.readers.composing.quantities import (
 )
 from residnet.data.readers.composing.wanted import CLOCK_ONLY, EVERYTHING, Wanted
 from residnet.data.readers.files import digest
-from residnet.data.readers.messages.standard import standard_plan
+from residnet.data.readers.messages import standard_plan
 from residnet.data.readers.recording import Recording
 
 

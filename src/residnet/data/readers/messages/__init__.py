@@ -1,1 +1,0 @@
-"""Kinds of message that map themselves to channels."""
