@@ -12,9 +12,10 @@ from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.progress import ProgressCallback, report, say
+from residnet.data.drafting.reading import read_each
 from residnet.data.parts import log_names
 from residnet.data.readers import LogReader, ReaderConfig
-from residnet.data.readers.detect import format_of, reader_for
+from residnet.tasks.drafting.yaml_text import commented
 from residnet.tasks.log_files import log_files
 
 if TYPE_CHECKING:
@@ -36,9 +37,8 @@ def read_logs(
     """Read logs from files, patterns or folders.
 
     A table (csv, foreign Parquet) needs to be told what its columns are: by `channels`, or by a
-    `reader` as YAML has it. Without either, formats that describe themselves are read as they say,
-    and the columns of a table are taken by their names and the units in its header; the map that
-    was taken is reported to `progress`, and `inspect` shows what does not fit.
+    `reader` as YAML has it. Without either the reader is drafted as `draft` does it, by names,
+    headers, values and physics; it is reported to `progress`, with a comment at each guess.
 
     Args:
         source: a path, a pattern such as `trials/*.csv`, a folder, or a list of these.
@@ -65,12 +65,29 @@ def read_logs(
     with hearing(progress):
         files = _files(given)
         chosen = _reader(files[0], channels, time, manoeuvre, reader)
+        if chosen is None:
+            return _drafted(files)
         logs, names = [], log_names(files)
         for number, file in enumerate(files):
             report("reading logs", number, len(files))
-            logs.append(_read(file, chosen, number == 0).replace(name=names[file]))
+            logs.append(chosen.read(file).replace(name=names[file]))
         report("reading logs", len(files), len(files))
     return logs
+
+
+def _drafted(files: Sequence[Path]) -> list[Log]:
+    logs: dict[Path, Log] = {}
+    for draft in read_each(files):
+        for error in draft.left_out.values():
+            raise error
+        if "channels" in draft.reader:
+            say(f"{next(iter(draft.logs))}: channel map as guessed, to be checked")
+            content = {"data": {"reader": draft.reader}}
+            for line in commented(content, draft.marks.comments, ()).splitlines():
+                say(f"  {line}")
+        logs |= draft.logs
+    names = log_names(files)
+    return [logs[file].replace(name=names[file]) for file in files]
 
 
 def _listed(source: Any) -> list[Any]:
@@ -135,23 +152,6 @@ def _column(given: Any, name: str, unit: str | None = None) -> Any:
     if isinstance(given, Mapping):
         return given
     raise UsageError(f"read_logs: channels: {name}: expected (column, unit), {described(given)}")
-
-
-def _read(file: Path, reader: LogReader | None, first: bool) -> Log:
-    if reader is not None:
-        return reader.read(file)
-    if Log.recognises(file) or format_of(file) is not None:
-        return reader_for(file).read(file)
-    from residnet.data.drafting.header_map import draft_map
-
-    draft = draft_map(file)
-    if first:
-        say(f"{file}: channel map taken from the table's header, to be checked")
-        for line in draft.lines():
-            say(f"  {line}")
-    log = draft.reader().read(file)
-    found = [*draft.remarks, *log.meta.get("findings", ())]
-    return log.replace(meta={**log.meta, "findings": found})
 
 
 def inspect(

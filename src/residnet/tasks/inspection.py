@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core import progress
-from residnet.core.errors import ConfigError, DataError, UsageError
+from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageError
 from residnet.core.files import whole
 from residnet.core.log import Log
 from residnet.data.doctor import (
@@ -25,13 +25,13 @@ from residnet.data.doctor import (
 )
 from residnet.data.doctor.dates import date_findings
 from residnet.data.doctor.excitation import conditioning
-from residnet.data.drafting.header_map import draft_map
+from residnet.data.drafting.reading import DraftedLogs, read_each
 from residnet.data.masks import Mask
 from residnet.data.parts import log_names
 from residnet.data.readers.base import LogReader
 from residnet.data.readers.composing.composed import RecordingConfig
-from residnet.data.readers.detect import format_of, reader_for
 from residnet.data.sources import MeasuredLogs
+from residnet.tasks.drafting.yaml_text import commented
 from residnet.tasks.fit.task import FitConfig
 from residnet.tasks.import_logs import ImportConfig
 from residnet.tasks.loading import load_task
@@ -97,24 +97,24 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
     names = log_names(files)
     logs: list[Log] = []
     reports: list[Report] = []
-    drafts: dict[str, list[str]] = {}
     lines: list[str] = []
+    read, drafts = _read(files, setup.reader)
     for number, path in enumerate(files):
         progress.report("inspecting logs", number, len(files))
+        log = read[path]
         try:
-            log, draft = _read(path, setup)
+            if isinstance(log, ResidnetError):
+                raise DataError(str(log)) if len(files) > 1 else log
             log = log.replace(name=names[path])
-            report = inspect(log, setup.inputs, setup.masks).joined(date_findings(log, path))
+            found = inspect(log, setup.inputs, setup.masks).joined(date_findings(log, path))
         except DataError as error:
             if len(files) == 1:
                 raise
-            reports.append(
-                Report(names[path], (Finding("fatal", "unreadable", str(error)),), str(path))
-            )
+            unreadable = Finding("fatal", "unreadable", str(error))
+            reports.append(Report(names[path], (unreadable,), str(path)))
         else:
             logs.append(log)
-            reports.append(report)
-            drafts |= {"\n".join(draft): draft} if draft else {}
+            reports.append(found)
         lines += reports[-1].lines()
     known = setup.splits or {}
     splits = {
@@ -125,8 +125,11 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
         together = Report("together", (*together.findings, *_regressors(logs, setup.task)))
     progress.report("inspecting logs", len(files), len(files))
     lines += together.lines()
-    for draft in drafts.values():
-        lines += ["channel map as guessed, to check and paste under `data:` of a config:", *draft]
+    for draft in drafts:
+        if "channels" in draft.reader:
+            drafted = {"data": {"kind": "measured", "reader": draft.reader}}
+            lines += ["channel map as guessed, to check and paste into a config:"]
+            lines += commented(drafted, draft.marks.comments, ()).splitlines()
     content = inspection(reports, together)
     return Inspection("\n".join((*summary(content).lines, *lines)), content)
 
@@ -165,16 +168,22 @@ def reading(config: Path) -> Reading:
     )
 
 
-def _read(path: Path, setup: Reading) -> tuple[Log, list[str]]:
-    """Return the log in a file, and the lines of the channel map that was guessed for it."""
-    if setup.reader is not None:
-        return setup.reader.read(path), []
-    if Log.recognises(path) or format_of(path) is not None:
-        return reader_for(path).read(path), []
-    draft = draft_map(path)
-    log = draft.reader().read(path)
-    known = [*draft.remarks, *log.meta.get("findings", ())]
-    return log.replace(meta={**log.meta, "findings": known}), draft.lines()
+def _read(
+    files: Sequence[Path], reader: LogReader | None
+) -> tuple[dict[Path, Log | ResidnetError], list[DraftedLogs]]:
+    """Return file -> its log, or why there is none; and the readers that were drafted for them."""
+    out: dict[Path, Log | ResidnetError] = {}
+    if reader is None:
+        drafts = read_each(files)
+        for draft in drafts:
+            out |= {**draft.logs, **draft.left_out}
+        return out, drafts
+    for file in files:
+        try:
+            out[file] = reader.read(file)
+        except DataError as error:
+            out[file] = error
+    return out, []
 
 
 def _regressors(logs: Sequence[Log], task: Any) -> list[Finding]:

@@ -19,9 +19,6 @@ from residnet.data.readers.tables.pieces import excel_sheet, sheet_names
 if TYPE_CHECKING:
     import pandas as pd
 
-ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".xlsx", ".parquet", ".jsonl", ".ndjson")
-"""Endings of tables."""
-
 _ROWS = 20_000
 _BRACKETS = re.compile(r"[\[(]")
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.drafting.attitudes import (
     as_quaternion,
@@ -32,23 +31,12 @@ _LOOKED_AT = 24
 """Tables whose values are looked at; of the others only the header is."""
 
 
-@dataclass(frozen=True)
-class TableDraft:
-    """The reader of tables that are alike.
+def draft_tables(
+    files: Sequence[Path], marks: Marks
+) -> tuple[dict[str, Any], dict[Path, ResidnetError]]:
+    """Return the settings of a reader of tables, and file -> why it is not read.
 
-    Attributes:
-        content: settings of the reader.
-        files: that it reads.
-        left_out: file -> why it is not read.
-    """
-
-    content: dict[str, Any]
-    files: tuple[Path, ...]
-    left_out: dict[Path, str]
-
-
-def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
-    """Return the reader of tables, by names, units in the headers, values and physics.
+    They come from names, units in the headers, values and physics.
 
     Args:
         files: at least one table.
@@ -96,22 +84,21 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
         content["manoeuvre"] = "folder"
         marks.guess((*READER, "manoeuvre"), "the kind of manoeuvre is taken from the folder's name")
     _unused(first, names, clock, marks)
-    kept = tuple(path for path in files if path not in left_out)
-    return TableDraft({**content, "channels": channels}, kept, left_out)
+    return {**content, "channels": channels}, left_out
 
 
-def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, str]]:
+def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, ResidnetError]]:
     """Return the first rows of the tables, those of some with all that is looked at."""
     stride = max(1, len(files) // _LOOKED_AT)
     sheets: list[Sheet] = []
-    left_out: dict[Path, str] = {}
+    left_out: dict[Path, ResidnetError] = {}
     for number, path in enumerate(files):
         try:
             sheets.append(peek(path) if number % stride == 0 else peek(path, 50))
         except DataError as error:
-            left_out[path] = str(error)
+            left_out[path] = error
     if not sheets:
-        raise DataError(next(iter(left_out.values())))
+        raise next(iter(left_out.values()))
     kinds = {tuple(sorted(sheet.about.items())) for sheet in sheets if len(sheet.numbers) > 1}
     if not kinds:
         path, names = sheets[0].path, ", ".join(sheets[0].header[:12])
@@ -192,14 +179,16 @@ def _words(sheet: Sheet) -> list[str]:
     return [*sheet.header, *texts]
 
 
-def _raw(sheets: Sequence[Sheet], names: Mapping[str, str], left_out: dict[Path, str]) -> list[Raw]:
+def _raw(
+    sheets: Sequence[Sheet], names: Mapping[str, str], left_out: dict[Path, ResidnetError]
+) -> list[Raw]:
     """Return the columns of the tables that were looked at."""
     logs = []
     for sheet in sheets:
         try:
             clock = clock_of(sheet)
         except DataError as error:
-            left_out[sheet.path] = str(error)
+            left_out[sheet.path] = error
             continue
         columns = {
             channel: sheet.numbers[column]

@@ -25,6 +25,8 @@ from residnet.data.readers.recorders.ulog import UlogConfig
 from residnet.data.readers.recording import Recording
 from residnet.data.readers.tables.canonical import CanonicalConfig
 
+TABLES = (".csv", ".tsv", ".txt", ".dat", ".xlsx", ".parquet", ".jsonl", ".ndjson")
+"""Endings of tables, which do not say what their columns are."""
 _MCAP = b"\x89MCAP0\r\n"
 _SQLITE = b"SQLite format 3\x00"
 _MAT5 = b"MATLAB 5.0"
@@ -107,6 +109,20 @@ def format_of(path: Path) -> Format | None:
         (recording_format for recording_format in FORMATS if recording_format.fits(path, head)),
         None,
     )
+
+
+def kind_of(path: Path) -> str:
+    """Return the kind of a log: canonical, table, or the name of a format of recordings.
+
+    Raises:
+        UsageError: where there is nothing at `path`, or it is of no format that residnet knows.
+    """
+    if Log.recognises(path):
+        return "canonical"
+    recording = format_of(path)
+    if recording is None and path.suffix.lower() not in TABLES:
+        raise UsageError(f"{path}: is of no format that residnet knows")
+    return "table" if recording is None else recording.name
 
 
 def reader_for(path: Path) -> LogReader:

@@ -15,16 +15,18 @@ from residnet.core.progress import say
 from residnet.data.division import divided, without_copies
 from residnet.data.doctor import inspect
 from residnet.data.drafting.channels import CHANNELS
-from residnet.data.drafting.physics import Raw, turns_to
 from residnet.data.drafting.questions import Answer, Marks
+from residnet.data.drafting.reading import INPUTS, read_drafted
+from residnet.data.motion import MotionConfig, complete_motion
+from residnet.data.parts import logs_below
 from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers.tables.channel_map import QUATERNION
 from residnet.tasks.drafting import recipe
-from residnet.tasks.drafting.inputs import INPUTS, driving, lacks
-from residnet.tasks.drafting.logs import ReadLogs, found_logs, read_all
+from residnet.tasks.drafting.inputs import driving, lacks
 from residnet.tasks.drafting.yaml_text import commented
 from residnet.tasks.fit.task import FitConfig
 
+_UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
 _INSPECTED = 12
 """Logs that the data doctor looks at."""
 
@@ -80,7 +82,7 @@ def drafted(
         DataError: where no log can be used.
     """
     marks = Marks(answer)
-    read = read_all(found_logs(paths), marks)
+    read = _completed(_found(paths), marks)
     inputs = driving(list(read.whole.values()), marks)
     if not inputs:
         held = ", ".join(next(iter(read.whole.values())).channels)
@@ -96,43 +98,57 @@ def drafted(
             f"nothing among the inputs {lacking} the vessel; where a column that no channel takes"
             " does, name it under data.reader.channels",
         )
-    read = _rudder_side(read, inputs, marks)
     renamed, inputs = _plain_names(read, inputs, marks)
     return _assembled(renamed, inputs, folder, name, marks, standard)
 
 
-def _rudder_side(read: ReadLogs, inputs: Sequence[str], marks: Marks) -> ReadLogs:
-    """Turn the sign of rudders whose positive angles turn the vessel to port."""
-    channels = read.reader.get("channels", {})
-    for name in inputs:
-        if not name.removeprefix("cmd_").startswith("delta"):
-            continue
-        logs = [Raw(log.t, {name: log[name]}) for log in read.whole.values()]
-        rate = {i: log["r"] for i, log in enumerate(read.whole.values())}
-        slope, error = turns_to(logs, name, rate)
-        key = (*CHANNELS, name) if name in channels else INPUTS
-        if abs(slope) < 4.0 * error:
-            marks.guess(key, f"the logs do not tell to which side {name} turns the vessel")
-        elif slope < 0.0 and name in channels:
-            entry = channels[name]
-            entry["sign"] = -1 * int(entry.get("sign", 1))
-            text = f"positive values turned the vessel to port in the logs ({-slope / error:.0f}"
-            marks.guess(key, f"{text} standard errors): the sign is turned")
-            for logs_of in (read.logs, read.whole):
-                logs_of.update({path: _turned(log, name) for path, log in logs_of.items()})
-        elif slope < 0.0:
-            marks.guess(key, f"positive values of {name} turned the vessel to port in the logs")
-    return read
+@dataclass
+class _Logs:
+    """The logs of a draft.
+
+    Attributes:
+        reader: `data.reader` of the config.
+        logs: path -> log, in SI, as the reader gives it.
+        whole: path -> the same with the motion at every sample.
+        left_out: path -> why it is not used.
+    """
+
+    reader: dict[str, Any]
+    logs: dict[Path, Log]
+    whole: dict[Path, Log]
+    left_out: dict[Path, str]
 
 
-def _turned(log: Log, name: str) -> Log:
-    """Return a log with one channel of the other sign."""
-    return log.replace(channels={**log.channels, name: -log[name]})
+def _completed(paths: Sequence[Path], marks: Marks) -> _Logs:
+    read = read_drafted(paths, marks)
+    left_out = {path: str(error) for path, error in read.left_out.items()}
+    whole: dict[Path, Log] = {}
+    for path, log in read.logs.items():
+        try:
+            whole[path] = complete_motion(log, MotionConfig())
+        except ResidnetError as error:
+            left_out[path] = str(error)
+    if not whole:
+        # what the names of columns did not tell may be what is missing
+        untold = "; ".join(text for _, text in marks.notes if text.startswith(_UNTOLD))
+        reason = next(iter(left_out.values()))
+        raise DataError(f"{reason} ({untold})" if untold else reason)
+    return _Logs(read.reader, {path: read.logs[path] for path in whole}, whole, left_out)
 
 
-def _plain_names(
-    read: ReadLogs, inputs: Sequence[str], marks: Marks
-) -> tuple[ReadLogs, tuple[str, ...]]:
+def _found(paths: Sequence[Path]) -> list[Path]:
+    """Return the recordings and files of logs that paths name."""
+    out: dict[Path, None] = {}
+    for path in paths:
+        if not path.exists():
+            raise UsageError(f"{path}: no such file or folder")
+        out |= dict.fromkeys(logs_below(path) if path.is_dir() else [path])
+    if not out:
+        raise UsageError(f"{', '.join(map(str, paths))}: holds no log of a format that is known")
+    return list(out)
+
+
+def _plain_names(read: _Logs, inputs: Sequence[str], marks: Marks) -> tuple[_Logs, tuple[str, ...]]:
     """Rename chosen forces to tau_x, tau_y, tau_n, and drop channels that nothing uses."""
     new = {name: name for name in inputs}
     for name in inputs:
@@ -162,7 +178,7 @@ def _plain_names(
 
 
 def _assembled(
-    read: ReadLogs,
+    read: _Logs,
     inputs: tuple[str, ...],
     folder: Path,
     name: str,
@@ -246,9 +262,7 @@ def _findings(logs: Sequence[Log], inputs: Sequence[str], marks: Marks) -> set[s
     return codes
 
 
-def _usable(
-    read: ReadLogs, columns: Sequence[str], preparation: Mapping[str, Any]
-) -> dict[Path, Log]:
+def _usable(read: _Logs, columns: Sequence[str], preparation: Mapping[str, Any]) -> dict[Path, Log]:
     """Return the logs that can be prepared; the others are left out with the reason."""
     config = validate(dict(preparation), PrepareConfig, "draft")
     out: dict[Path, Log] = {}
@@ -273,7 +287,7 @@ def _usable(
 
 
 def _split(
-    read: ReadLogs, usable: Mapping[Path, Log], folder: Path, marks: Marks
+    read: _Logs, usable: Mapping[Path, Log], folder: Path, marks: Marks
 ) -> tuple[dict[str, Any], dict[str, list[Log]]]:
     """Return the split as a config has it, and its logs with their whole motion."""
     splits = divided(list(usable.values()))
@@ -331,7 +345,7 @@ def _long_enough(
     return split, splits
 
 
-def _head(read: ReadLogs, marks: Marks) -> list[str]:
+def _head(read: _Logs, marks: Marks) -> list[str]:
     lines = [
         "Drafted by `residnet new` from the logs alone. Lines with 'guess' say what the logs do not"
         " tell, and why this value was taken: read them before the results are trusted."

@@ -9,11 +9,11 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, STATE
 from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.reading import INPUTS
 from residnet.data.drafting.words import input_channel, state_channel, words_of
 from residnet.data.readers.tables.channel_map import QUATERNION
 from residnet.physics.environment.wind import WIND_INPUTS
 
-INPUTS = ("signals", "inputs")
 _PASSIVE = (
     *(*STATE, *ACCELERATION, "phi", "p", "latitude", "longitude", *QUATERNION),
     *(*WIND_INPUTS, "current_north", "current_east"),

@@ -147,6 +147,22 @@ def _with_last(pieces: Iterable[pd.DataFrame]) -> Iterator[tuple[pd.DataFrame, b
         yield waiting, True
 
 
+def column_names(path: Path) -> tuple[str, ...]:
+    """Return the columns of a Parquet file, or the first line of a text; empty for others."""
+    if path.suffix.lower() == ".parquet":
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        try:
+            return tuple(pq.read_schema(path).names)
+        except (pa.ArrowException, OSError):
+            return ()
+    if path.suffix.lower() in (".xlsx", ".jsonl", ".ndjson"):
+        return ()
+    with path.open("rb") as stream:
+        return (stream.readline(1 << 16).decode(errors="replace").strip(),)
+
+
 def read_parquet(path: Path, columns: Sequence[str]) -> Pieces:
     """Yield the wanted columns of a Parquet file piece by piece, with the share of the rows read.
 

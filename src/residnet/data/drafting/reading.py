@@ -1,0 +1,143 @@
+"""Logs of any format read without a config: their reader is drafted, and read them.
+
+`inspect`, `read_logs`, `fit`, `new` and `draft` come through here, so that each has the same map.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from residnet.core.config import validate
+from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.log import Log
+from residnet.core.progress import report
+from residnet.data.drafting.channels import CHANNELS
+from residnet.data.drafting.physics import Raw, turns_to
+from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.recordings import draft_recordings
+from residnet.data.drafting.tables import draft_tables
+from residnet.data.motion import MotionConfig, complete_motion
+from residnet.data.parts import log_names
+from residnet.data.readers import ReaderConfig
+from residnet.data.readers.detect import kind_of
+from residnet.data.readers.tables.pieces import column_names
+
+INPUTS = ("signals", "inputs")
+"""Key of a config's inputs."""
+
+
+@dataclass
+class DraftedLogs:
+    """Logs that one drafted reader reads.
+
+    Attributes:
+        reader: `data.reader` of a config.
+        logs: path -> log, in SI, as the reader gives it.
+        left_out: path -> why it cannot be read.
+        marks: what of the reader is not sure.
+    """
+
+    reader: dict[str, Any]
+    marks: Marks
+    logs: dict[Path, Log] = field(default_factory=dict)
+    left_out: dict[Path, ResidnetError] = field(default_factory=dict)
+
+
+def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -> DraftedLogs:
+    """Return the logs in files of one format, by a reader that is drafted from them.
+
+    Args:
+        paths: files and recordings.
+        marks: is told what is not sure.
+        gridded: recordings come on a uniform clock, and else on that of their positions.
+
+    Raises:
+        UsageError: where the files are of several formats.
+        DataError: where none can be used.
+    """
+    kinds = {path: kind_of(path) for path in paths}
+    if len(set(kinds.values())) > 1:
+        named = "; ".join(
+            f"{kind}: {', '.join(path.name for path in paths if kinds[path] == kind)[:120]}"
+            for kind in sorted(set(kinds.values()))
+        )
+        raise UsageError(
+            f"the logs are of several formats, and a fit reads one ({named}); give those of one"
+        )
+    kind, read = kinds[paths[0]], DraftedLogs({"kind": "canonical"}, marks)
+    if kind == "table":
+        read.reader, read.left_out = draft_tables(paths, marks)
+    elif kind != "canonical":
+        read.reader = draft_recordings(paths, marks)
+    settings = {key: value for key, value in read.reader.items() if gridded or key != "clock"}
+    reader, names = validate(settings, ReaderConfig, "draft").build(), log_names(paths)
+    for number, path in enumerate(paths):
+        report("reading logs", number, len(paths))
+        try:
+            if path not in read.left_out:
+                read.logs[path] = reader.read(path).replace(name=names[path])
+        except ResidnetError as error:
+            read.left_out[path] = error
+    report("reading logs", len(paths), len(paths))
+    if not read.logs:
+        raise next(iter(read.left_out.values()))
+    _turn_rudders(read)
+    return read
+
+
+def read_each(paths: Sequence[Path]) -> list[DraftedLogs]:
+    """Return logs of any formats, those with the same columns together.
+
+    Where none of those alike can be read, all of them are left out.
+    """
+    alike: dict[tuple[str, ...], list[Path]] = {}
+    for path in paths:
+        kind = kind_of(path)
+        names = column_names(path) if kind == "table" else ()
+        alike.setdefault((kind, *names), []).append(path)
+    out = []
+    for group in alike.values():
+        marks = Marks()
+        try:
+            out.append(read_drafted(group, marks, gridded=False))
+        except ResidnetError as error:
+            out.append(DraftedLogs({}, marks, left_out=dict.fromkeys(group, error)))
+    return out
+
+
+def _turn_rudders(read: DraftedLogs) -> None:
+    """Turn the sign of rudders whose positive angles turn the vessel to port."""
+    channels = read.reader.get("channels", {})
+    held = dict.fromkeys(name for log in read.logs.values() for name in log.channels)
+    names = [name for name in held if re.match(r"(cmd_)?delta(?!_rate)", name)]
+    moving = [moved for log in read.logs.values() if names and (moved := _turning(log))]
+    for name in names:
+        there = [log for log in moving if name in log.channels]
+        logs = [Raw(log.t, {name: log[name]}) for log in there]
+        slope, error = turns_to(logs, name, {i: log["r"] for i, log in enumerate(there)})
+        key = (*CHANNELS, name) if name in channels else INPUTS
+        if abs(slope) < 4.0 * error:
+            read.marks.guess(key, f"the logs do not tell to which side {name} turns the vessel")
+        elif slope < 0.0 and name in channels:
+            channels[name]["sign"] = -1 * int(channels[name].get("sign", 1))
+            text = f"positive values turned the vessel to port in the logs ({-slope / error:.0f}"
+            read.marks.guess(key, f"{text} standard errors): the sign is turned")
+            for path, log in read.logs.items():
+                if name in log.channels:
+                    turned = {**log.channels, name: -log[name]}
+                    read.logs[path] = log.replace(channels=turned)
+        elif slope < 0.0:
+            text = f"positive values of {name} turned the vessel to port in the logs"
+            read.marks.guess(key, text)
+
+
+def _turning(log: Log) -> Log | None:
+    """Return a log with its yaw rate; None where it has none."""
+    try:
+        return log if "r" in log.channels else complete_motion(log, MotionConfig())
+    except ResidnetError:
+        return None

@@ -1,0 +1,77 @@
+"""The same files give the same channel map through every door of residnet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import foreign_tables
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from foreign_tables import Style
+
+import residnet
+from residnet.core.log import Log
+from residnet.tasks.inspection import inspect_logs
+
+DEGREES = {"psi": "deg", "r": "deg/s", "delta": "deg", "n": "rpm"}
+GERMAN = {"psi": "°", "u": "kn", "v": "kn", "r": "°/min", "delta": "°", "n": "U/min"}
+STYLES = {
+    "English with units": Style(units=DEGREES, signs=("delta",)),
+    "no units": Style(told=False, units=DEGREES),
+    "German": Style("German", GERMAN, delimiter=";", decimal=",", dates="%d.%m.%Y %H:%M:%S,%f"),
+    "Unix milliseconds": Style(units=DEGREES),
+}
+
+
+@pytest.fixture(scope="module")
+def logs() -> list[Log]:
+    """Zigzags and a turn of a ship with rudder and propeller."""
+    trials: list[dict[str, Any]] = [
+        {"kind": "zigzag", "drive": 0.8, "steer": 0.5, "heading": "20 deg", "start": 3},
+        {"kind": "turning_circle", "drive": 0.9, "steer": 0.4, "start": 3},
+        {"kind": "zigzag", "drive": 0.6, "steer": -0.4, "heading": "10 deg", "start": 3},
+    ]
+    noise = {"u": 0.02, "v": 0.02, "r": 0.002}
+    flown = residnet.simulate(
+        "example_rudder_boat", trials, duration=90.0, step=0.1, noise=noise, seed=4
+    )
+    return list(flown.logs)
+
+
+@pytest.fixture(params=STYLES)
+def files(request: pytest.FixtureRequest, logs: list[Log], tmp_path: Path) -> list[Path]:
+    found = foreign_tables.write(logs, tmp_path / "logs", STYLES[request.param])
+    if request.param == "Unix milliseconds":
+        for file in found:
+            table = pd.read_csv(file)
+            table["time"] = 1_717_000_000_000 + np.rint(1e3 * table["time"]).astype(int)
+            table.to_csv(file, index=False)
+    return found
+
+
+def _told(work: Callable[..., object], files: Sequence[Path]) -> dict[str, Any]:
+    """The map that a function of Python reports to whoever listens."""
+    lines: list[str] = []
+    work(files, lambda told: lines.append(told.message))
+    text = "\n".join(line.removeprefix("  ") for line in lines if line.startswith("  "))
+    return dict(yaml.safe_load(text)["data"]["reader"])
+
+
+def test_one_map_from_every_door(files: list[Path], logs: list[Log]) -> None:
+    from_new = residnet.draft(files).config["data"]["reader"]
+    shown = inspect_logs(files, None).text.partition("paste into a config:\n")[2]
+    read = {
+        "inspect": yaml.safe_load(shown)["data"]["reader"],
+        "read_logs": _told(lambda f, hear: residnet.read_logs(f, progress=hear), files),
+        "fit": _told(lambda f, hear: residnet.prepare(f, ["delta", "n"], progress=hear), files),
+    }
+    for door, found in read.items():
+        assert found == from_new, door
+    for log, truth in zip(residnet.read_logs(files), logs, strict=True):
+        for name in ("x", "y", "u", "v", "r", "delta", "n"):
+            size = float(np.abs(truth[name]).max()) + 1e-3
+            np.testing.assert_allclose(log[name], truth[name], atol=1e-6 * size, err_msg=name)
