@@ -240,7 +240,7 @@ def judged(files: Sequence[Path], logs: Sequence[Log], layout: Layout) -> tuple[
     """What became of a layout, and what is to be said of it."""
     marks = Marks()
     try:
-        content = draft_tables(files, marks).content
+        content = draft_tables(files, marks)[0]
         reader = validate(content, ReaderConfig, "bench").build()
         faults = {
             fault

@@ -24,7 +24,7 @@ from residnet.data.readers import (
     TopicFolderConfig,
     UlogConfig,
 )
-from residnet.data.readers.composing.composed import RecordingConfig
+from residnet.data.readers.compose import RecordingConfig
 
 CASES: list[tuple[Callable[[Log, Path], Path], RecordingConfig]] = [
     (written_logs.mat5, MatConfig()),

@@ -67,8 +67,8 @@ def logs() -> list[Log]:
 @pytest.mark.parametrize("style", STYLES.values(), ids=STYLES.keys())
 def test_a_table_is_read_as_it_was(style: Style, logs: list[Log], tmp_path: Path) -> None:
     files, marks = foreign_tables.write(logs, tmp_path, style), Marks()
-    draft = draft_tables(files, marks)
-    reader = validate(draft.content, ReaderConfig, "here").build()
+    content, _ = draft_tables(files, marks)
+    reader = validate(content, ReaderConfig, "here").build()
     for file, truth in zip(files, logs, strict=True):
         read = reader.read(file)
         for name in set(CHANNELS) & set(truth.channels):
@@ -90,7 +90,7 @@ def test_a_heading_that_is_not_wrapped_may_be_large_in_radians(
     assert float(np.ptp(turning["psi"])) > 7.0
     columns = {"t": turning.t, **{name: turning[name] for name in ("x", "y", "psi", "u", "v", "r")}}
     pd.DataFrame(columns).to_csv(tmp_path / "turn.csv", index=False)
-    channels = draft_tables([tmp_path / "turn.csv"], Marks()).content["channels"]
+    channels = draft_tables([tmp_path / "turn.csv"], Marks())[0]["channels"]
     assert (channels["psi"]["unit"], channels["r"]["unit"]) == ("rad", "rad/s")
 
 
@@ -100,7 +100,7 @@ def test_letters_of_axes_are_told_by_their_units(logs: list[Log], tmp_path: Path
     columns = {"t [s]": log.t, "N [m]": log["x"], "E [m]": log["y"], "X [kN]": log["n"]}
     columns |= {"HDG [deg]": np.degrees(log["psi"]) % 360.0, "left rpm": 60.0 * log["n"]}
     pd.DataFrame(columns).to_csv(tmp_path / "turn.csv", index=False)
-    channels = draft_tables([tmp_path / "turn.csv"], Marks()).content["channels"]
+    channels = draft_tables([tmp_path / "turn.csv"], Marks())[0]["channels"]
     found = {name: entry["column"] for name, entry in channels.items()}
     assert found == {"x": "N [m]", "y": "E [m]", "psi": "HDG [deg]", "n_port": "left rpm"}
 
@@ -209,7 +209,7 @@ def test_axes_that_are_called_by_letters(logs: list[Log], tmp_path: Path) -> Non
             head = head.replace(old, letter)
         file.write_text(f"{head}\n{rest}")
     marks = Marks()
-    channels = draft_tables(files, marks).content["channels"]
+    channels = draft_tables(files, marks)[0]["channels"]
     # the mirror image fits as well, and is marked
     assert (channels["x"]["column"], "frame" in channels["psi"]) == ("x [m]", False)
     assert "data.reader.channels.x" in {".".join(key) for key, _ in marks.guesses}
@@ -225,7 +225,7 @@ def test_a_header_that_is_wrong_is_asked_about(logs: list[Log], tmp_path: Path) 
         asked.append(question)
         return question.default
 
-    content = draft_tables(files, Marks(answer)).content
+    content = draft_tables(files, Marks(answer))[0]
     assert content["channels"]["r"]["unit"] == "deg/min"
     assert [question.options for question in asked] == [("deg/min", "deg/s")]
     marks = Marks()

@@ -33,7 +33,7 @@ def _drafted(frame: pd.DataFrame, file: Path, **to_csv: Any) -> tuple[Log, Marks
     """Return the log that a table's draft reads, and what was marked."""
     frame.to_csv(file, index=False, **to_csv)
     marks = Marks()
-    content = draft_tables([file], marks).content
+    content = draft_tables([file], marks)[0]
     return validate(content, ReaderConfig, "test").build().read(file), marks
 
 
@@ -112,7 +112,7 @@ def test_a_workbook_that_begins_with_words(log: Log, tmp_path: Path) -> None:
             book, sheet_name="Info"
         )
         frame.to_excel(book, sheet_name="Daten", index=False)
-    content = draft_tables([file], Marks()).content
+    content = draft_tables([file], Marks())[0]
     assert content["sheet"] == "Daten"
     read = validate(content, ReaderConfig, "test").build().read(file)
     np.testing.assert_allclose(read["x"], log["x"], atol=1e-9)
@@ -224,7 +224,7 @@ def test_json_lines(log: Log, tmp_path: Path) -> None:
     whole = "\n".join(map(json.dumps, lines))
     file.write_text(whole + '\n\n{"stamp": 9')
     marks = Marks()
-    content = draft_tables([file], marks).content
+    content = draft_tables([file], marks)[0]
     read = validate(content, ReaderConfig, "test").build().read(file)
     assert content["kind"] == "json_lines"
     assert any(finding["code"] == "cut_line" for finding in read.meta["findings"])

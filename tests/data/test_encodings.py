@@ -15,7 +15,7 @@ from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import format_of, recording_for
 from residnet.data.readers.encoding import encoding_of
-from residnet.data.readers.recorders.topic_folder import load_folder
+from residnet.data.readers.formats.topic_folder import TopicFolderConfig
 
 T = np.arange(0.0, 30.0, 0.1)
 NORTH = 2.0 * T
@@ -30,7 +30,7 @@ JAPANESE = "\n".join(
 
 def read(path: Path, **settings: object) -> Log:
     """Return the log in a table by the map that residnet drafts."""
-    content = {**draft_tables([path], Marks()).content, **settings}
+    content = {**draft_tables([path], Marks())[0], **settings}
     return validate(content, ReaderConfig, "here").build().read(path)
 
 
@@ -103,7 +103,7 @@ def test_topics_in_utf_16(tmp_path: Path) -> None:
     for name in ("pose", "speed"):
         rows = "".join(f"{t:.1f},{2 * t:.2f}\n" for t in T)
         (tmp_path / f"{name}.csv").write_bytes(f"time,{name}_x\n{rows}".encode("utf-16"))
-    series = load_folder(tmp_path).series
+    series = TopicFolderConfig().load(tmp_path).series
     np.testing.assert_allclose(series["pose"].fields["pose_x"], NORTH, atol=1e-9)
 
 

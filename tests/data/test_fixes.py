@@ -18,8 +18,8 @@ from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.tables.angles import degrees_of
-from residnet.data.readers.tables.table import CsvConfig
+from residnet.data.readers.angles import degrees_of
+from residnet.data.readers.tables import CsvConfig
 from residnet.tasks.drafting.draft import drafted
 
 pytest.importorskip("pyproj")
@@ -178,5 +178,5 @@ def test_numbers_with_minutes_and_letters_beside_them(tmp_path: Path) -> None:
 
 def _read(file: Path) -> tuple[Log, Marks]:
     marks = Marks()
-    content = draft_tables([file], marks).content
+    content = draft_tables([file], marks)[0]
     return validate(content, ReaderConfig, "here").build().read(file), marks

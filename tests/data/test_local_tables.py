@@ -14,7 +14,7 @@ from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.units import known_unit, to_si
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.tables.dates import DateClock, date_order, looks_dated
+from residnet.data.readers.times import date_order, looks_dated, parse_texts
 
 
 @pytest.mark.parametrize(
@@ -75,22 +75,22 @@ def test_forms_of_dates(cells: list[str], order: str | None, seconds: float) -> 
     column = pd.Series(cells)
     assert looks_dated(column)
     assert date_order(column) == order
-    assert DateClock(None, None).seconds(column, None)[-1] == pytest.approx(seconds, abs=1e-9)
+    ns = parse_texts(column, dates=True).ns
+    assert ns[-1] - ns[0] == round(1e9 * seconds)
 
 
 def test_the_hour_that_comes_twice() -> None:
-    clock = DateClock("Europe/Berlin", None)
     local = ["27.10.2024 02:59:59", "27.10.2024 02:00:01", "27.10.2024 02:00:02"]
-    assert clock.seconds(pd.Series(local), None).tolist() == [0.0, 2.0, 3.0]
-    assert clock.epoch_ns == pd.Timestamp("2024-10-27 00:59:59").value
+    ns = parse_texts(pd.Series(local), zone="Europe/Berlin", dates=True).ns
+    assert (ns - pd.Timestamp("2024-10-27 00:59:59").value).tolist() == [0, 2 * 10**9, 3 * 10**9]
 
 
 def test_cells_that_are_no_dates() -> None:
     assert not looks_dated(pd.Series(["1.5", "2.5"]))
-    with pytest.raises(DataError, match="'soon' is no date"):
-        DateClock(None, None).seconds(pd.Series(["03.05.2024 10:00:00", "soon"]), None)
-    with pytest.raises(DataError, match=r"'31\.31\.2024 10:00' is no date with dmy"):
-        DateClock(None, None).seconds(pd.Series(["31.31.2024 10:00"]), None)
+    with pytest.raises(DataError, match="'soon' in row 2 is no date"):
+        parse_texts(pd.Series(["03.05.2024 10:00:00", "soon"]), dates=True)
+    with pytest.raises(DataError, match=r"'31\.31\.2024 10:00' in row 1 is no date with dmy"):
+        parse_texts(pd.Series(["31.31.2024 10:00"]), dates=True)
 
 
 def _read(path: Path, settings: dict[str, Any]) -> Log:

@@ -45,7 +45,7 @@ def text(columns: dict[str, Any], delimiter: str = ";", units: tuple[str, ...] =
 def drafted(path: Path) -> tuple[Log, dict[str, Any], Marks]:
     """What the drafted reader reads, its settings, and what is marked."""
     marks = Marks()
-    content = draft_tables([path], marks).content
+    content = draft_tables([path], marks)[0]
     return validate(content, ReaderConfig, "here").build().read(path), content, marks
 
 
@@ -235,7 +235,7 @@ def test_times_of_unix_keep_their_digits(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     lines = text({"No.": np.arange(T.size), **COLUMNS, "Zeit": np.floor(T)}, ";")
     path.write_text("\n".join(lines) + "\n")
-    content = draft_tables([path], Marks()).content
+    content = draft_tables([path], Marks())[0]
     assert content["time"]["column"] == "Zeit", "a counter is no time"
     with pytest.raises(DataError, match="time repeats"):
         validate(content, ReaderConfig, "here").build().read(path)

@@ -15,7 +15,7 @@ from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.progress import Progress, listen
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.composing.geodesy import tangent_plane
+from residnet.data.readers.frames import tangent_plane
 
 
 def folder(tmp_path: Path, **topics: dict[str, Any]) -> Path:
@@ -286,8 +286,7 @@ def test_chunks_of_a_topic_give_the_whole(tmp_path: Path, monkeypatch: pytest.Mo
         gyro={"time": printed(ns, "unpadded"), "data": cells, "header_frame_id": ["bow"] * 2000},
     )
     whole = read(place, channels={"r": field("gyro", "rad/s")})
-    monkeypatch.setattr("residnet.data.readers.recorders.topic_folder._CHUNK", 300)
-    monkeypatch.setattr("residnet.data.readers.recorders.topic_folder.LARGE", 0)
+    monkeypatch.setattr("residnet.data.readers.formats.topic_folder.LARGE", 0)
     pieces = read(place, channels={"r": field("gyro", "rad/s")})
     np.testing.assert_array_equal(pieces.t, whole.t)
     np.testing.assert_array_equal(pieces["r"], whole["r"])
@@ -340,7 +339,7 @@ def test_reading_a_large_recording_reports_its_progress(
     with listen(reports.append):
         read(place, channels=channels)
     assert not reports
-    monkeypatch.setattr("residnet.data.readers.files._LARGE", 1)
+    monkeypatch.setattr("residnet.data.readers.base._LARGE", 1)
     with listen(reports.append):
         read(place, channels=channels)
     assert {report.stage for report in reports} == {"reading run, per cent"}

@@ -15,8 +15,8 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import nearest
+from residnet.data.readers.base import files_of
 from residnet.data.readers.detect import format_of
-from residnet.data.readers.files import files_of
 
 _TABLES = (
     ".csv",

@@ -29,7 +29,7 @@ from residnet.data.drafting.reading import DraftedLogs, read_each
 from residnet.data.masks import Mask
 from residnet.data.parts import log_names
 from residnet.data.readers.base import LogReader
-from residnet.data.readers.composing.composed import RecordingConfig
+from residnet.data.readers.compose import RecordingConfig
 from residnet.data.sources import MeasuredLogs
 from residnet.tasks.drafting.yaml_text import commented
 from residnet.tasks.fit.task import FitConfig

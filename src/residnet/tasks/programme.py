@@ -13,7 +13,7 @@ from residnet.core.config import Config, ExistingPath, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.tables.canonical import CanonicalConfig
+from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import Craft, Flight, Sea, fly, log_names, source_of
 from residnet.data.simulated.sensors import SensorNoise

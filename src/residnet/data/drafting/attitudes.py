@@ -11,8 +11,8 @@ import numpy as np
 from residnet.data.drafting.channels import CHANNELS
 from residnet.data.drafting.physics import FRAMES, POSE_FRAMES, Frame, Raw
 from residnet.data.drafting.questions import Marks
-from residnet.data.readers.composing.orientation import unit_quaternion, yaw_of
-from residnet.data.readers.tables.channel_map import QUATERNION
+from residnet.data.readers.frames import unit_quaternion, yaw_of
+from residnet.data.readers.quantities import QUATERNION
 
 _COLUMN = re.compile(
     r"(?P<stem>(?:.*[\W_])?(?:q|quat|quaternions?|orient|orientation|att|attitude|rot|rotation))"

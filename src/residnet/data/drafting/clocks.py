@@ -12,7 +12,7 @@ from residnet.core.units import to_si
 from residnet.data.drafting.sheets import Sheet
 from residnet.data.drafting.units import written_unit
 from residnet.data.drafting.words import words_of
-from residnet.data.readers.tables.dates import DateClock, date_order, looks_dated
+from residnet.data.readers.times import date_order, looks_dated, parse_texts
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -95,8 +95,8 @@ def _dated(sheet: Sheet, dated: dict[str, pd.Series]) -> Clock:
         order = "dmy"
         guess = "day and month of the dates can be told apart nowhere in the first rows"
     settings |= {"order": order} if order in ("dmy", "mdy") else {}
-    clock = DateClock(None, None)
-    seconds = clock.seconds(dated[column], None if day is None else dated[day])
+    stamps = parse_texts(texts, dates=True)
+    seconds = stamps.since(int(stamps.ns[0])) if stamps.absolute else stamps.since(None)
     return Clock(settings, seconds, guess, (column,) if day is None else (column, day))
 
 

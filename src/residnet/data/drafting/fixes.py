@@ -9,7 +9,7 @@ import numpy as np
 
 from residnet.data.drafting.physics import Raw
 from residnet.data.drafting.questions import Marks
-from residnet.data.readers.composing.geodesy import tangent_plane
+from residnet.data.readers.frames import tangent_plane
 
 _FIXES = {"x": "latitude", "y": "longitude"}
 _WHERE = ("data", "reader", "channels")

@@ -24,7 +24,7 @@ from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.parts import log_names
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import kind_of
-from residnet.data.readers.tables.pieces import column_names
+from residnet.data.readers.tables import column_names
 
 INPUTS = ("signals", "inputs")
 """Key of a config's inputs."""

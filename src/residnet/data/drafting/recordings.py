@@ -20,10 +20,9 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sources import found_sources, step_of
 from residnet.data.drafting.units import thrown, unit_by_size
 from residnet.data.drafting.words import MOTION, input_channel, words_of
-from residnet.data.readers.composing.compose import Plan
-from residnet.data.readers.composing.quantities import FieldMap
 from residnet.data.readers.detect import AutoConfig, recording_for
 from residnet.data.readers.messages import standard_plan
+from residnet.data.readers.quantities import FieldMap, Plan
 from residnet.data.readers.recording import Recording
 
 _COHERENT = 0.7

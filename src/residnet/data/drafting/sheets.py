@@ -11,10 +11,9 @@ import numpy as np
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.units import known_unit
-from residnet.data.drafting.text_tables import text_table
 from residnet.data.readers.base import require_file
-from residnet.data.readers.tables.json_lines import json_table
-from residnet.data.readers.tables.pieces import excel_sheet, sheet_names
+from residnet.data.readers.tables import excel_sheet, json_rows, parquet_rows, sheet_names
+from residnet.data.readers.texts import first_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,13 +60,13 @@ def peek(path: Path, rows: int = _ROWS) -> Sheet:
 
     require_file(path)
     if path.suffix.lower() == ".parquet":
-        table, about = _parquet(path, rows), {"kind": "parquet"}
+        table, about = parquet_rows(path, rows), {"kind": "parquet"}
     elif path.suffix.lower() == ".xlsx":
         table, about = _excel(path, rows)
     elif path.suffix.lower() in (".jsonl", ".ndjson"):
-        table, about = json_table(path, rows), {"kind": "json_lines"}
+        table, about = json_rows(path, rows), {"kind": "json_lines"}
     else:
-        table, about = text_table(path, rows)
+        table, about = first_rows(path, rows)
     columns = _described(table)
     table.columns = pd.Index(list(columns))
     if table.empty:
@@ -121,15 +120,3 @@ def _excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
         if len(table.select_dtypes("number").columns) > 1:
             return table, {"kind": "excel", **({"sheet": name} if number else {})}
     return excel_sheet(path, None, rows), {"kind": "excel"}
-
-
-def _parquet(path: Path, rows: int) -> pd.DataFrame:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        table: pd.DataFrame = next(pq.ParquetFile(path).iter_batches(batch_size=rows)).to_pandas()
-        return table
-    except (pa.ArrowException, OSError, StopIteration) as error:
-        reason = str(error).splitlines()[0] if str(error) else "no rows"
-        raise DataError(f"{path}: not a readable Parquet table ({reason})") from error

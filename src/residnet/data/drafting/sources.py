@@ -12,8 +12,8 @@ from residnet.core.errors import ResidnetError
 from residnet.data.drafting.physics import FRAMES, Fit, Motion, Raw, along, follows, motion_of
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.words import state_channel, words_of
-from residnet.data.readers.composing.parts import heading_part, position_part
-from residnet.data.readers.composing.quantities import (
+from residnet.data.readers.compose import heading_part, position_part
+from residnet.data.readers.quantities import (
     Angle,
     Geodetic,
     HeadingConfig,

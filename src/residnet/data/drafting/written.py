@@ -15,7 +15,7 @@ from residnet.data.drafting.channels import CHANNELS
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sheets import Sheet
 from residnet.data.drafting.words import plain, state_channel, words_of
-from residnet.data.readers.tables.angles import Form, LetterO, degrees_of, side_signs
+from residnet.data.readers.angles import Form, LetterO, degrees_of, side_signs
 
 if TYPE_CHECKING:
     import pandas as pd

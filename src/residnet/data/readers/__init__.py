@@ -6,17 +6,16 @@ from typing import Annotated
 
 from residnet.core.registry import Kinds
 from residnet.data.readers.base import LogReader, ReaderKind
+from residnet.data.readers.canonical import CanonicalConfig, CanonicalReader
 from residnet.data.readers.detect import AutoConfig
-from residnet.data.readers.recorders.ardupilot import ArduPilotConfig
-from residnet.data.readers.recorders.hdf5 import Hdf5Config
-from residnet.data.readers.recorders.mat import MatConfig
-from residnet.data.readers.recorders.nmea import NmeaConfig
-from residnet.data.readers.recorders.rosbag import RosbagConfig
-from residnet.data.readers.recorders.topic_folder import TopicFolderConfig
-from residnet.data.readers.recorders.ulog import UlogConfig
-from residnet.data.readers.tables.canonical import CanonicalConfig, CanonicalReader
-from residnet.data.readers.tables.channel_map import ChannelMap
-from residnet.data.readers.tables.table import (
+from residnet.data.readers.formats.ardupilot import ArduPilotConfig
+from residnet.data.readers.formats.nmea import NmeaConfig
+from residnet.data.readers.formats.rosbag import RosbagConfig
+from residnet.data.readers.formats.topic_folder import TopicFolderConfig
+from residnet.data.readers.formats.trees import Hdf5Config, MatConfig
+from residnet.data.readers.formats.ulog import UlogConfig
+from residnet.data.readers.quantities import ChannelMap
+from residnet.data.readers.tables import (
     CsvConfig,
     ExcelConfig,
     JsonLinesConfig,

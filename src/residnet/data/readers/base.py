@@ -1,10 +1,11 @@
-"""The part that all readers of logs share: interface, identity of files, checks at the door."""
+"""What all readers of logs share: interface, identity of files, checks, progress."""
 
 from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,12 @@ from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import nearest
+from residnet.core.progress import report
+
+# recordings below this size are read before anybody waits, bytes
+_LARGE = 50_000_000
+LARGE = 300_000_000
+"""Bytes of a folder above which topics that nobody wants are not read."""
 
 
 class LogReader(ABC):
@@ -71,11 +78,9 @@ def provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[str, Any]:
 
     The SHA-256 is that of the file's bytes.
     """
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return {
         "source": str(path),
-        "sha256": digest,
+        "sha256": digest([path]),
         "rows_read": rows_read,
         "rows_dropped": rows_dropped,
     }
@@ -138,3 +143,54 @@ def require_values(path: Path, channel: str, column: str, values: np.ndarray) ->
             f"{path}: column '{column}' (channel {channel}) holds no number in any of {values.size}"
             " rows; take it out of the channel map"
         )
+
+
+def digest(files: Sequence[Path]) -> str:
+    """Return the SHA-256 of one file's bytes, or of the digests of several in order, as hex."""
+    if len(files) == 1:
+        return _file_digest(files[0])
+    return hashlib.sha256("".join(_file_digest(file) for file in files).encode()).hexdigest()
+
+
+def _file_digest(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return a file itself, or all files below a folder, in order."""
+    return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+
+
+def total_size(files: Iterable[Path]) -> int:
+    """Return the bytes of all files."""
+    return sum(file.stat().st_size for file in files)
+
+
+Advance = Callable[[float], None]
+"""Reports how far a reader is, in the unit of its total."""
+
+
+@contextmanager
+def progress(name: str, size: int, total: float) -> Iterator[Advance]:
+    """Report the reading of a large recording to whoever listens to progress.
+
+    Args:
+        name: of the file.
+        size: its bytes; nothing is reported of a small recording.
+        total: what the reader counts to.
+    """
+    if size < _LARGE:
+        yield lambda done: None
+        return
+    stage = f"reading {name}, per cent"
+    yield lambda done: report(stage, 100.0 * done / total, 100.0)
+    report(stage, 100.0, 100.0)
+
+
+def missing_package(extra: str, package: str, name: str) -> UsageError:
+    """Return the error for a format whose package is not installed."""
+    return UsageError(
+        f"{name} needs the package {package}, which is not installed; install it with: pip install"
+        f' "residnet[{extra}]"'
+    )

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.names import CHANNEL_UNITS
-from residnet.data.readers.composing.compose import Plan
-from residnet.data.readers.composing.quantities import (
+from residnet.data.readers.quantities import (
     Angle,
     CourseSpeed,
     Derived,
@@ -24,6 +23,7 @@ from residnet.data.readers.composing.quantities import (
     Geodetic,
     HeadingConfig,
     Local,
+    Plan,
     Quaternion,
 )
 from residnet.data.readers.recording import Recording, Series, key_of, remark

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 
@@ -169,3 +169,39 @@ def key_of(path: str) -> str:
     Exporters write `pose.position.x`, `pose/position/x` or `pose_position_x`.
     """
     return re.sub(r"[./\[\]_]+", "_", path).strip("_").removeprefix("field_")
+
+
+CLOCK_ONLY = "(clock)"
+"""Stands for a field where only the times of a topic are wanted."""
+
+
+@final
+class Wanted:
+    """Topics and fields that are to be read.
+
+    Args:
+        named: pairs of topic (None: the only one there is) and field; None wants everything. An
+            empty field wants all of its topic.
+    """
+
+    def __init__(self, named: Iterable[tuple[str | None, str]] | None = None) -> None:
+        self._named = None if named is None else tuple(named)
+
+    def __call__(self, topic: str) -> bool:
+        """Return whether anything of a topic is wanted."""
+        return self._named is None or any(self._same(name, topic) for name, _ in self._named)
+
+    def field(self, topic: str, path: str) -> bool:
+        """Return whether a field or a part of it is wanted (`orientation.w` of `orientation`)."""
+        key = key_of(path)
+        fields = [key_of(field) for name, field in self._named or () if self._same(name, topic)]
+        return self._named is None or any(
+            not field or key == field or key.startswith(field + "_") for field in fields
+        )
+
+    @staticmethod
+    def _same(name: str | None, topic: str) -> bool:
+        return name is None or same_topic(name, [topic]) is not None
+
+
+EVERYTHING = Wanted()

@@ -20,7 +20,7 @@ from residnet.data.drafting.reading import INPUTS, read_drafted
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.parts import logs_below
 from residnet.data.prepare import PrepareConfig, prepare
-from residnet.data.readers.tables.channel_map import QUATERNION
+from residnet.data.readers.quantities import QUATERNION
 from residnet.tasks.drafting import recipe
 from residnet.tasks.drafting.inputs import driving, lacks
 from residnet.tasks.drafting.yaml_text import commented

@@ -11,7 +11,7 @@ from residnet.core.names import ACCELERATION, STATE
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.reading import INPUTS
 from residnet.data.drafting.words import input_channel, state_channel, words_of
-from residnet.data.readers.tables.channel_map import QUATERNION
+from residnet.data.readers.quantities import QUATERNION
 from residnet.physics.environment.wind import WIND_INPUTS
 
 _PASSIVE = (

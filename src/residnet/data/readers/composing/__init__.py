@@ -1,1 +1,0 @@
-"""From the topics of a recording to one log on one clock."""

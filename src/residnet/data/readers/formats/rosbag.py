@@ -1,0 +1,214 @@
+"""ROS 1 bags, ROS 2 bags (SQLite, MCAP) and MCAP files, through rosbags; no ROS is needed."""
+
+from __future__ import annotations
+
+import dataclasses
+from array import array
+from collections.abc import Callable, Iterator
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
+
+import numpy as np
+
+from residnet.core.errors import DataError, UsageError
+from residnet.data.readers.base import (
+    files_of,
+    missing_package,
+    progress,
+    require_file,
+    total_size,
+)
+from residnet.data.readers.compose import RecordingConfig
+from residnet.data.readers.recording import EVERYTHING, Recording, Remark, Series, Wanted, remark
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
+
+# arrays of more elements are pictures, clouds and 6 x 6 covariances, no channels
+_ELEMENTS = 16
+_REPORT_EVERY = 5000
+
+
+@final
+class RosbagConfig(RecordingConfig):
+    """A ROS 1 bag, a ROS 2 bag (a folder with metadata.yaml), or an .mcap or .db3 file."""
+
+    kind: Literal["rosbag"] = "rosbag"
+    endings: ClassVar = (".mcap", ".db3", ".bag")
+    formats: ClassVar = {
+        "ROS 2 bag": lambda path, head: path.is_dir() and (path / "metadata.yaml").is_file(),
+        "ROS 1 bag": lambda path, head: head.startswith(b"#ROSBAG"),
+        "MCAP": lambda path, head: head.startswith(b"\x89MCAP0\r\n"),
+        "ROS 2 bag (SQLite)": lambda path, head: (
+            head.startswith(b"SQLite format 3\x00") and path.suffix == ".db3"
+        ),
+    }
+
+    def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
+        """Read the wanted topics of a bag, message by message.
+
+        Memory grows with the numbers kept, not with the file.
+
+        Raises:
+            UsageError: where the bag is missing or rosbags is not installed.
+            DataError: where it cannot be read.
+        """
+        try:
+            from rosbags.highlevel import AnyReader, AnyReaderError
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError as error:
+            raise missing_package("ros", "rosbags", "a ROS bag or MCAP file") from error
+        if not path.is_dir():
+            require_file(path)
+        elif not (path / "metadata.yaml").is_file():
+            raise UsageError(f"{path}: is a folder without metadata.yaml, a ROS 2 bag has one")
+        store = None if path.suffix == ".bag" else get_typestore(Stores.LATEST)
+        try:
+            with AnyReader([path], default_typestore=store) as reader:
+                return _read(path, reader, wanted)
+        except (DataError, UsageError):
+            raise
+        except AnyReaderError as error:
+            reason = " ".join(str(error).split())[:200]
+            raise DataError(f"{path}: not a readable bag ({reason})") from error
+        # a damaged bag fails in many ways inside rosbags and SQLite, no fault of residnet
+        except Exception as error:
+            raise DataError(
+                f"{path}: damaged or not a bag ({type(error).__name__}:"
+                f" {' '.join(str(error).split())[:200]})"
+            ) from error
+
+
+def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
+    chosen = [one for one in reader.connections if wanted(one.topic)]
+    topics = [one.topic for one in chosen]
+    not_wanted = tuple(sorted({one.topic for one in reader.connections} - set(topics)))
+    if not chosen:
+        raise UsageError(
+            f"{path}: none of its topics is wanted (it holds {', '.join(not_wanted) or 'none'})"
+        )
+    columns: dict[str, _Columns] = {}
+    failed: dict[str, str] = {}
+    files = tuple(files_of(path))
+    start, span = reader.start_time, max(1, reader.end_time - reader.start_time)
+    with progress(path.name, total_size(files), 1.0) as advance:
+        for count, (connection, arrival, raw) in enumerate(reader.messages(connections=chosen)):
+            if count % _REPORT_EVERY == 0:
+                advance((arrival - start) / span)
+            name, kind = connection.topic, connection.msgtype
+            if name in failed:
+                continue
+            if name not in columns:
+                columns[name] = _Columns(name, kind, wanted, shared=topics.count(name) > 1)
+            try:
+                columns[name].add(reader.deserialize(raw, kind), arrival, connection)
+            except Exception as error:
+                failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
+    remarks: list[Remark] = []
+    for name, why in failed.items():
+        rows = len(columns.pop(name).arrival)
+        text = f"topic {name}: message {rows + 1} cannot be read ({why}); the topic is left out"
+        remarks.append(remark("will mislead", "unreadable", text, rows=rows))
+    for name in sorted(set(topics) - set(columns) - set(failed)):
+        remarks.append(remark("note", "empty_topic", f"topic {name}: holds no messages"))
+    epoch = int(min((min(one.arrival) for one in columns.values()), default=0)) // 10**9 * 10**9
+    series = {name: one.series(epoch) for name, one in sorted(columns.items())}
+    return Recording(path, series, epoch, files, tuple(remarks), not_wanted)
+
+
+@final
+class _Columns:
+    """Messages of one topic as they come: times as whole ns, numbers row by row."""
+
+    def __init__(self, name: str, kind: str, wanted: Wanted, *, shared: bool) -> None:
+        self.name, self.kind, self._wanted, self._shared = name, kind, wanted, shared
+        self.arrival, self._stamp, self._sender = array("q"), array("q"), array("H")
+        self._senders: dict[str, int] = {}
+        self._rows = array("d")
+        self._leaves: _Leaves | None = None
+
+    def add(self, message: Any, arrival: int, connection: Connection) -> None:
+        """Append one message."""
+        if self._leaves is None:
+            self._leaves = _Leaves(message, lambda path: self._wanted.field(self.name, path))
+        self._rows.extend(self._leaves.numbers(message))
+        header = getattr(message, "header", None)
+        stamp = getattr(header, "stamp", None)
+        self._stamp.append(0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
+        sender = getattr(header, "frame_id", "")
+        if self._shared:
+            sender = getattr(connection.ext, "callerid", None) or f"connection {connection.id}"
+        self._sender.append(self._senders.setdefault(sender, len(self._senders)))
+        self.arrival.append(arrival)
+
+    def series(self, epoch: int) -> Series:
+        """Return the topic, times in s from the epoch (ns)."""
+        names = [] if self._leaves is None else self._leaves.names
+        rows = np.frombuffer(self._rows, dtype=np.float64).reshape(len(self.arrival), len(names))
+        stamps = np.frombuffer(self._stamp, dtype=np.int64)
+        sender = None
+        if len(self._senders) > 1 or next(iter(self._senders), ""):
+            callers = np.array(list(self._senders), dtype=object)
+            sender = callers[np.frombuffer(self._sender, dtype=np.uint16)]
+        remarks: tuple[Remark, ...] = ()
+        empty = int((stamps == 0).sum())
+        if 0 < empty < stamps.size:
+            text = (
+                f"topic {self.name}: {empty} of {stamps.size} header stamps are zero; arrival times"
+                " are used"
+            )
+            remarks = (remark("will mislead", "empty_stamps", text, rows=empty),)
+        stamp = None if empty else (stamps - epoch) * 1e-9
+        arrival = (np.frombuffer(self.arrival, dtype=np.int64) - epoch) * 1e-9
+        fields = {name: rows[:, i] for i, name in enumerate(names)}
+        return Series(self.name, self.kind, fields, stamp, arrival, sender, remarks)
+
+
+@final
+class _Leaves:
+    """The numbers in a message, by their paths; the first message of a topic decides."""
+
+    def __init__(self, message: Any, wanted: Callable[[str], bool]) -> None:
+        scalars: list[str] = []
+        arrays: list[tuple[str, int]] = []
+        for path, value in _walk(message, ""):
+            if isinstance(value, np.ndarray):
+                if value.dtype.kind in "biuf" and 0 < value.size <= _ELEMENTS:
+                    arrays.append((path, value.size))
+            elif isinstance(value, int | float | bool) and wanted(path):
+                scalars.append(path)
+        joints = list(message.name) if type(message).__name__.endswith("JointState") else []
+
+        def element(path: str, i: int) -> str:
+            named = path in ("position", "velocity", "effort") and i < len(joints)
+            return str(joints[i]) if named else str(i)
+
+        counted = [f"{path}.{element(path, i)}" for path, size in arrays for i in range(size)]
+        self.names = [*scalars, *counted]
+        self._scalars: Callable[[Any], Any] | None = attrgetter(*scalars) if scalars else None
+        self._single = len(scalars) == 1
+        self._arrays = [(attrgetter(path), size) for path, size in arrays]
+
+    def numbers(self, message: Any) -> list[float]:
+        """Return the numbers of a message, in the order of the paths."""
+        out: list[float] = []
+        if self._scalars is not None:
+            out = [self._scalars(message)] if self._single else list(self._scalars(message))
+        for getter, size in self._arrays:
+            values = getter(message).tolist()
+            out += values if len(values) == size else [*values, *[np.nan] * size][:size]
+        return out
+
+
+def _walk(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Return the paths and values of a message's leaves, the stamp aside."""
+    for entry in dataclasses.fields(message):
+        if entry.name == "__msgtype__" or (not prefix and entry.name == "header"):
+            continue
+        value = getattr(message, entry.name)
+        if dataclasses.is_dataclass(value):
+            yield from _walk(value, f"{prefix}{entry.name}.")
+        else:
+            yield prefix + entry.name, value

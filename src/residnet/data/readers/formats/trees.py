@@ -1,0 +1,368 @@
+"""MATLAB and HDF5 files: vectors in a tree of structs or groups; each with a time is a series."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, final
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from residnet.core.config import Config
+from residnet.core.errors import DataError, UsageError
+from residnet.core.names import to_si
+from residnet.data.readers.base import missing_package, require_file
+from residnet.data.readers.compose import RecordingConfig
+from residnet.data.readers.quantities import factor
+from residnet.data.readers.recording import EVERYTHING, Recording, Remark, Series, Wanted, remark
+from residnet.data.readers.times import Stamps, parse_numbers, parse_texts, whole_second
+
+if TYPE_CHECKING:
+    import h5py
+
+_TIMES = (
+    *("t", "time", "Time", "timestamp", "TIME", "T", "stamp", "time_s", "t_s", "utc", "datenum"),
+    *("Zeit", "zeit", "tiempo", "temps", "tijd", "tempo", "tid"),
+)
+# MATLAB's day 719529 is 1 January 1970
+_DATENUM_1970, _DAY = 719_529.0, 86_400.0
+_MOST_COLUMNS = 64
+_FEWEST = 20
+"""Fewest samples of a vector that is timed by another group's time."""
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_ALWAYS_HELD = 200_000_000
+_MOST_COMPRESSED = 1000
+"""Bytes of a dataset for each byte of its file at most; a constant channel has some 900."""
+
+
+class _Vector(Protocol):
+    """An array that may still lie in its file; `numpy.asarray` reads it."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    @property
+    def dtype(self) -> np.dtype: ...
+
+    @property
+    def size(self) -> int: ...
+
+
+class TreeTime(Config):
+    """Which vector of a group holds time.
+
+    Attributes:
+        column: its name; null looks for the usual ones (t, time, timestamp, ...).
+        unit: its unit, or `datenum` for MATLAB's days since year 0; null reads Unix time in s, ms,
+            us or ns by its size, and anything else as s.
+    """
+
+    column: str | None = Field(default=None, min_length=1)
+    unit: str | None = None
+
+    @field_validator("unit")
+    @classmethod
+    def _measures_time(cls, unit: str | None) -> str | None:
+        if unit is not None and unit != "datenum":
+            factor(unit, "s")
+        return unit
+
+    def parse(self, values: np.ndarray) -> Stamps:
+        """Return the times from one vector.
+
+        Raises:
+            DataError: where a cell is no time.
+        """
+        if values.dtype.kind not in "biuf":
+            return parse_texts(values)
+        if self.unit != "datenum":
+            return parse_numbers(values, None if self.unit is None else to_si(self.unit))
+        days = np.floor(values)
+        whole, rest = (days - _DATENUM_1970) * _DAY * 1e9, (values - days) * _DAY * 1e9
+        return Stamps(whole.astype(np.int64) + np.rint(rest).astype(np.int64), True)
+
+
+class _TreeConfig(RecordingConfig):
+    """What MATLAB and HDF5 files have in common.
+
+    Attributes:
+        time: which vector of a group (or struct, or column of a table) holds time.
+        table: the only group, struct or table that is read, where a file holds several experiments;
+            null reads all.
+    """
+
+    time: TreeTime = Field(default_factory=TreeTime)
+    table: str | None = Field(default=None, min_length=1)
+
+    def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
+        """Read the wanted groups of a file.
+
+        Raises:
+            UsageError: where the file is missing, has no time, or h5py is not installed.
+            DataError: where it cannot be read.
+        """
+        require_file(path)
+        wanted = wanted if self.table is None else Wanted([(self.table, "")])
+        if not is_hdf5(path) and isinstance(self, MatConfig):
+            return _tree_recording(path, _mat_leaves(path), self.time, wanted)
+        try:
+            import h5py
+        except ImportError as error:
+            what = "an HDF5 file" if isinstance(self, Hdf5Config) else "a MATLAB 7.3 file"
+            raise missing_package("hdf5", "h5py", what) from error
+        try:
+            with h5py.File(path, "r") as file:
+                return _tree_recording(path, _hdf5_leaves(path, file), self.time, wanted)
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise DataError(f"{path}: damaged or not an HDF5 file ({reason})") from error
+
+
+@final
+class MatConfig(_TreeConfig):
+    """A MATLAB file, v5 or v7.3: vectors, matrices, structs, Simulink's structures with time.
+
+    Matrices have one row per sample.
+    """
+
+    kind: Literal["mat"] = "mat"
+    endings: ClassVar = (".mat",)
+    formats: ClassVar = {
+        "MATLAB": lambda path, head: head.startswith(b"MATLAB 5.0") or path.suffix.lower() == ".mat"
+    }
+
+
+@final
+class Hdf5Config(_TreeConfig):
+    """HDF5 file: datasets in groups, or tables of named columns."""
+
+    kind: Literal["hdf5"] = "hdf5"
+    endings: ClassVar = (".h5", ".hdf5")
+    formats: ClassVar = {"HDF5": lambda path, head: is_hdf5(path)}
+
+
+def is_hdf5(path: Path) -> bool:
+    """Return whether a file starts as HDF5 does, at once or behind MATLAB's header of 512 bytes."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        head = stream.read(520)
+    return head.startswith(_HDF5) or head[512:520] == _HDF5
+
+
+def _mat_leaves(path: Path) -> dict[str, _Vector]:
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    # SciPy's parser fails in its own ways on damaged bytes
+    except Exception as error:
+        raise DataError(
+            f"{path}: damaged or not a MATLAB file ({type(error).__name__}:"
+            f" {' '.join(str(error).split())[:200]})"
+        ) from error
+    return dict(_below(content, ""))
+
+
+def _below(node: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the paths and arrays below a struct."""
+    if isinstance(node, dict):
+        for name, value in node.items():
+            if not name.startswith("__"):
+                yield from _below(value, f"{prefix}/{name}" if prefix else name)
+    elif (isinstance(node, np.ndarray) and node.dtype == object) or isinstance(node, list):
+        parts = list(node)
+        if parts and all(isinstance(part, str) for part in parts):
+            yield prefix, np.array(parts, dtype=object)
+            return
+        for i, part in enumerate(parts):
+            yield from _below(part, f"{prefix}/{i}")
+    elif isinstance(node, np.ndarray) and node.ndim:
+        yield prefix, node
+
+
+def _hdf5_leaves(path: Path, file: h5py.File) -> dict[str, _Vector]:
+    """Return the arrays of a file by path, not yet read; a table gives one for each column."""
+    import h5py
+
+    found: dict[str, h5py.Dataset] = {}
+
+    def visit(name: str, node: Any) -> None:
+        if isinstance(node, h5py.Dataset) and not name.startswith("#"):
+            found[name] = node
+
+    file.visititems(visit)
+    leaves: dict[str, _Vector] = {}
+    for dataset in found.values():
+        name, names = dataset.name.strip("/"), dataset.dtype.names
+        claimed, held = dataset.size * dataset.dtype.itemsize, path.stat().st_size
+        if claimed > max(_ALWAYS_HELD, _MOST_COMPRESSED * held):
+            # a size is only a number in the file
+            raise DataError(
+                f"{path}: {dataset.name} claims {claimed / 1e9:.3g} GB in a file of"
+                f" {held / 1e6:.3g} MB; the file is damaged, or was made and never filled"
+            )
+        if names and dataset.ndim == 1:
+            for column in names:
+                if not dataset.dtype[column].shape:
+                    leaves[f"{name}/{column}"] = _Column(dataset, column)
+            continue
+        text = dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
+        if not names and dataset.ndim and dataset.size and not text:
+            words = dataset.dtype.kind in "SO" and dataset.ndim == 1
+            leaves[name] = _plain(dataset[()]) if words else dataset
+    return leaves
+
+
+@final
+class _Column:
+    """One column of a table, read when it is used."""
+
+    def __init__(self, dataset: h5py.Dataset, name: str) -> None:
+        self._dataset, self._name = dataset, name
+        self.shape, self.size, self.dtype = dataset.shape, dataset.size, dataset.dtype[name]
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+        values = _plain(self._dataset.fields(self._name)[()])
+        return values if dtype is None else values.astype(dtype)
+
+
+def _plain(values: np.ndarray) -> np.ndarray:
+    """Return bytes as text, everything else as it is."""
+    if values.dtype.kind not in "SO" or values.ndim != 1:
+        return values
+    texts = (v.decode(errors="replace") if isinstance(v, bytes) else str(v) for v in values)
+    return np.array(list(texts), dtype=object)
+
+
+def _tree_recording(
+    path: Path, leaves: Mapping[str, _Vector], time: TreeTime, wanted: Wanted
+) -> Recording:
+    """Return the recording of vectors by their path (`trial/u`).
+
+    Each vector belongs to the nearest group above it whose time has its length, else to the only
+    time of the file that has it.
+
+    Args:
+        path: the file.
+        leaves: path -> array [T], [T, 1], [1, T] or [T, k] (whose columns become `name.0`,
+            `name.1`, ...).
+        time: how time is found.
+        wanted: whether a group is to be read.
+    """
+    clocks = _clocks(leaves, time)
+    if not clocks:
+        named = f"'{time.column}'" if time.column else "of time (t, time, timestamp, ...)"
+        near = ", ".join(list(leaves)[:12]) or "nothing"
+        raise UsageError(
+            f"{path}: no vector {named} in it; name it with time: {{column: ...}} (the file holds"
+            f" {near})"
+        )
+    fields: dict[str, dict[str, np.ndarray]] = {group: {} for group in clocks}
+    remarks: list[Remark] = []
+    left, adopted = [], []
+    for name, values in leaves.items():
+        group = _home(name, values, clocks)
+        if group is None:
+            left.append(f"{name} {list(values.shape)}")
+            continue
+        clock, t = clocks[group]
+        inside = _path_in(group, name)
+        if name != clock and wanted(group or "/") and wanted.field(group or "/", inside):
+            fields[group] |= _columns(inside, values, len(t))
+            if not name.startswith(f"{group}/" if group else ""):
+                adopted.append(f"{name} by {clock}")
+    for code, names, what in (
+        ("no_time", left, "belong to no time ({}); left out"),
+        (
+            "time_of_others",
+            adopted,
+            "without a time beside them are timed by the only one of their length ({})",
+        ),
+    ):
+        if names:
+            shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+            text = f"{len(names)} arrays {what.format(shown)}"
+            remarks.append(remark("note", code, text, arrays=len(names)))
+    parsed: dict[str, Stamps] = {}
+    for group, (name, values) in clocks.items():
+        if wanted(group or "/") and fields[group]:
+            try:
+                parsed[group] = time.parse(values)
+            except DataError as error:
+                raise DataError(f"{path}: {name}: {error}") from error
+    epoch = whole_second(list(parsed.values()))
+    series = {}
+    for group, stamps in parsed.items():
+        raw = clocks[group][1]
+        # seconds as they stand keep every bit
+        plain = not stamps.absolute and raw.dtype.kind == "f" and time.unit in (None, "s")
+        t = raw.astype(np.float64) if plain else stamps.since(epoch)
+        name = group or "/"
+        series[name] = Series(name, "", fields[group], t, remarks=stamps.remarks)
+    listed = tuple(group or "/" for group in clocks if group not in parsed)
+    if not series:
+        raise UsageError(f"{path}: none of its groups is wanted (it holds {', '.join(listed)})")
+    return Recording(path, series, epoch, (path,), tuple(remarks), listed)
+
+
+def _clocks(leaves: Mapping[str, _Vector], time: TreeTime) -> dict[str, tuple[str, np.ndarray]]:
+    """Return group -> path of its time and the time itself."""
+    out = {}
+    for rank in _TIMES if time.column is None else (time.column,):
+        for path, values in leaves.items():
+            group, _, last = path.rpartition("/")
+            if last == rank and values.size > 1 and values.size == max(values.shape):
+                out[group] = (path, np.asarray(values).reshape(-1))
+    return out
+
+
+def _home(path: str, values: _Vector, clocks: Mapping[str, tuple[str, np.ndarray]]) -> str | None:
+    """Return the nearest group above whose time has the length of `values`.
+
+    Where there is none, and all times of this length in the file are the same, the first of their
+    groups.
+    """
+    group = path
+    while group:
+        group = group.rpartition("/")[0]
+        if group in clocks and _time_axis(values, clocks[group][1].size) is not None:
+            return group
+    length = max(values.shape, default=0)
+    alike = [name for name, (_, t) in clocks.items() if length == t.size]
+    if length < _FEWEST or not alike or _time_axis(values, length) is None:
+        return None
+    same = all(np.array_equal(clocks[name][1], clocks[alike[0]][1]) for name in alike)
+    return alike[0] if same else None
+
+
+def _path_in(group: str, name: str) -> str:
+    """Return the path of a vector below what it has in common with the group of its time."""
+    shared, parts = 0, name.split("/")
+    for mine, other in zip(parts[:-1], group.split("/") if group else [], strict=False):
+        if mine != other:
+            break
+        shared += 1
+    return "/".join(parts[shared:])
+
+
+def _time_axis(values: _Vector, length: int) -> int | None:
+    """Return which axis of an array runs over time; None where none does."""
+    if values.dtype.kind not in "biuf":
+        return 0 if values.size == length else None
+    if len(values.shape) > 2 or values.size > _MOST_COLUMNS * length:
+        return None
+    return next((i for i, size in enumerate(values.shape) if size == length), None)
+
+
+def _columns(name: str, values: _Vector, length: int) -> dict[str, np.ndarray]:
+    """Return the fields of one array."""
+    if values.dtype.kind not in "biuf":
+        return {}
+    table = np.moveaxis(np.asarray(values), _time_axis(values, length) or 0, 0)
+    table = table.reshape(length, -1).astype(np.float64, copy=False)
+    name = name.replace("/", ".")
+    if table.shape[1] == 1:
+        return {name: table[:, 0]}
+    return {f"{name}.{i}": table[:, i] for i in range(table.shape[1])}

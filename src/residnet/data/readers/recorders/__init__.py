@@ -1,1 +1,0 @@
-"""Readers of recordings, one file per format."""

@@ -1,0 +1,612 @@
+"""Readers of tables (csv, Parquet, Excel, JSON lines), each column by its entry in a channel map.
+
+Everything foreign is converted here, once: units to SI, signs and frames to NED and body axes
+forward-starboard-down, psi unwrapped.
+"""
+
+from __future__ import annotations
+
+import codecs
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from residnet.core.config import Config
+from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.log import Log
+from residnet.core.names import nearest, shown
+from residnet.core.units import known_unit, to_si
+from residnet.data.plausible import beyond_belief, fills, largest
+from residnet.data.readers.angles import degrees_of, side_signs
+from residnet.data.readers.base import (
+    Advance,
+    LogReader,
+    missing_package,
+    progress,
+    provenance,
+    require_file,
+    require_increasing,
+    require_samples,
+    require_values,
+    unwrap,
+)
+from residnet.data.readers.encoding import as_utf8
+from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
+from residnet.data.readers.quantities import QUATERNION, ChannelMap, factor
+from residnet.data.readers.recording import Remark, remark
+from residnet.data.readers.texts import found_header, numbered, positions, read_csv
+from residnet.data.readers.times import Order, parse_texts, zone_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+DATE = "date"
+"""Stands for a unit where a column holds dates."""
+FIX = ("latitude", "longitude")
+_SEARCHED = 60
+"""Rows of a sheet among which names are looked for."""
+_LONGEST = 16
+"""Most entries of a list in JSON that become columns."""
+
+
+class TimeColumn(Config):
+    """The column that holds time, and its unit.
+
+    Attributes:
+        column: name of the column.
+        unit: unit of its numbers, for example `ms`; `date` for dates and times of day, as
+            `2024-05-03T12:00:00.5+02:00`, `03.05.2024 12:00:00,5` or `12:00:00.5`.
+        date: column with the dates, where `column` holds times of day; null for none.
+        zone: time zone of dates that name none, for example `Europe/Berlin`; null leaves them
+            without one.
+        order: of day, month and year in dates: `dmy`, `mdy` or `ymd`; null takes it from the cells.
+    """
+
+    column: str
+    unit: str = "s"
+    date: str | None = None
+    zone: str | None = None
+    order: Order | None = None
+
+    @field_validator("unit")
+    @classmethod
+    def _measures_time(cls, unit: str) -> str:
+        if unit == DATE:
+            return unit
+        factor(unit, "s")
+        return known_unit(unit, "s")
+
+    @field_validator("zone")
+    @classmethod
+    def _known_zone(cls, zone: str | None) -> str | None:
+        return zone if zone is None else zone_of(zone).key
+
+    @model_validator(mode="after")
+    def _dates(self) -> TimeColumn:
+        given = [name for name in ("date", "zone", "order") if getattr(self, name) is not None]
+        if given and self.unit != DATE:
+            raise ValueError(f"{given[0]} is for dates; set unit: {DATE}")
+        return self
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns that hold time."""
+        return (self.column,) if self.date is None else (self.column, self.date)
+
+
+class TableConfig(Config, ABC):
+    """The part that all tables have in common.
+
+    Attributes:
+        time: column of the time.
+        channels: canonical names (or names of your own) and the columns that they are taken from,
+            all of which must exist; `latitude` and `longitude` become x, y where these are not
+            there, and `qx`, `qy`, `qz`, `qw` become the heading psi where there is none.
+        manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder,
+            null says that it is not known.
+    """
+
+    time: TimeColumn
+    channels: dict[str, ChannelMap] = Field(min_length=1)
+    manoeuvre: str | None = None
+    row: ClassVar[str] = "row {0}"
+    """How a user calls a row of the table, by its number from 1, and from 2 behind a header."""
+
+    @field_validator("channels")
+    @classmethod
+    def _fits_names(cls, channels: dict[str, ChannelMap]) -> dict[str, ChannelMap]:
+        for name, entry in channels.items():
+            entry.require_fit(name)
+        parts = [name for name in QUATERNION if name in channels]
+        if parts and len(parts) < len(QUATERNION):
+            lost = ", ".join(name for name in QUATERNION if name not in channels)
+            raise ValueError(f"an attitude needs all of {', '.join(QUATERNION)}; add {lost}")
+        return channels
+
+    @abstractmethod
+    def load(self, path: Path, columns: Sequence[str], advance: Advance) -> pd.DataFrame:
+        """Return the columns side by side, in order; `advance` is told the share that is read.
+
+        Its `attrs` may hold `above`, lines above the values beside one header, and `cut`, whether
+        the file ends within a last row that is left out.
+
+        Raises:
+            UsageError: where a column is missing.
+            DataError: where the file cannot be read.
+        """
+
+    def build(self) -> TableReader:
+        """Build the reader of such tables."""
+        return TableReader(self)
+
+
+@final
+class CsvConfig(TableConfig):
+    """Text tables with a line of column names; lines above it, and units beneath it, are skipped.
+
+    The names' line is the first one that holds the time's and all channels' columns.
+
+    Attributes:
+        delimiter: between cells; a blank stands for any number of blanks and tabulators.
+        decimal: sign of the decimals, `.` or `,`.
+        encoding: of the text, for example `cp1252` for a file that an older Windows wrote; null
+            finds it by the bytes themselves, UTF-16 and Japanese (cp932) included.
+    """
+
+    kind: Literal["csv"] = "csv"
+    delimiter: str = Field(default=",", min_length=1, max_length=1)
+    decimal: Literal[".", ","] = "."
+    encoding: str | None = None
+    row: ClassVar[str] = "line {1}"
+
+    @field_validator("encoding")
+    @classmethod
+    def _known_encoding(cls, encoding: str | None) -> str | None:
+        if encoding is None:
+            return None
+        try:
+            return codecs.lookup(encoding).name
+        except LookupError as error:
+            raise ValueError(
+                f"no encoding is called '{encoding}'; usual are utf-8, utf-16, cp1252 and cp932"
+            ) from error
+
+    def load(self, path: Path, columns: Sequence[str], advance: Advance) -> pd.DataFrame:
+        """Return the columns of a text table."""
+        return read_csv(path, columns, self.delimiter, self.decimal, self.encoding, advance)
+
+
+@final
+class ExcelConfig(TableConfig):
+    """Sheets of Excel files (.xlsx); lines above the column names, and units beneath, are skipped.
+
+    Attributes:
+        sheet: name of the sheet; null takes the first.
+    """
+
+    kind: Literal["excel"] = "excel"
+    sheet: str | None = None
+    row: ClassVar[str] = "row {1}"
+
+    def load(self, path: Path, columns: Sequence[str], advance: Advance) -> pd.DataFrame:
+        """Return the columns of a sheet."""
+        table = excel_sheet(path, self.sheet)
+        wanted = table.iloc[:, positions(path, [str(name) for name in table.columns], columns)]
+        wanted.attrs["above"] = table.attrs["above"] - 1
+        return wanted
+
+
+@final
+class ParquetConfig(TableConfig):
+    """Parquet tables that residnet did not write."""
+
+    kind: Literal["parquet"] = "parquet"
+
+    def load(self, path: Path, columns: Sequence[str], advance: Advance) -> pd.DataFrame:
+        """Return the columns of a Parquet file."""
+        import pyarrow.parquet as pq
+
+        with _readable(path, "not a readable Parquet file"):
+            positions(path, pq.read_schema(path).names, columns)
+            with pq.ParquetFile(path, page_checksum_verification=True) as file:
+                table = file.read(columns=sorted(set(columns)))
+            return table.to_pandas(ignore_metadata=True)[list(columns)]
+
+
+@final
+class JsonLinesConfig(TableConfig):
+    """Files with a JSON object a line (.jsonl, .ndjson); a column is a key, `nav.lat` one within.
+
+    Entries of lists are counted from zero: `imu.q[0]`.
+    """
+
+    kind: Literal["json_lines"] = "json_lines"
+    row: ClassVar[str] = "object {0}"
+
+    def load(self, path: Path, columns: Sequence[str], advance: Advance) -> pd.DataFrame:
+        """Return the columns of JSON lines; an object without a key has an empty cell there."""
+        import pandas as pd
+
+        lines = _JsonLines(path)
+        rows = list(lines)
+        known = {key for row in rows for key in row}
+        for name in columns:
+            if name not in known and rows:
+                raise UsageError(f"{path}: no key '{name}'{nearest(name, list(known))}")
+        table = pd.DataFrame({i: [row.get(n) for row in rows] for i, n in enumerate(columns)})
+        table = table.infer_objects()
+        table.columns = pd.Index(list(columns))
+        table.attrs["cut"] = lines.cut
+        return table
+
+
+@final
+class TableReader(LogReader):
+    """Reads a table by its channel map."""
+
+    def __init__(self, config: TableConfig) -> None:
+        self._config = config
+
+    def read(self, path: Path) -> Log:
+        """Return the log in `path`.
+
+        See `LogReader.read`. Fill values far from all else (-999, 9.97e36) count as missing, and
+        are counted. Rows without a measurement at either end, and blank rows, are dropped and
+        counted; other rows keep NaN where a channel was not measured.
+
+        Raises:
+            UsageError: where the file or a column is missing.
+            DataError: where the file is empty, a cell is no finite number or none that a vessel can
+                have, a channel holds no number, or time is missing, repeats or runs backwards.
+        """
+        require_file(path)
+        config, maps = self._config, self._config.channels
+        columns = [*config.time.columns, *(entry.column for entry in maps.values())]
+        sides = [entry.hemisphere for entry in maps.values() if entry.hemisphere]
+        with progress(path.name, path.stat().st_size, 1.0) as advance:
+            table = config.load(path, [*columns, *sides], advance)
+        above = table.attrs.get("above", 0)
+        cells = {name: table.iloc[:, i] for i, name in enumerate([*columns, *sides])}
+        t, start, findings = self._times(path, cells, above)
+        raw = {name: self._values(path, name, cells, above) for name in maps}
+        measured = np.logical_or.reduce([np.isfinite(values) for values in raw.values()])
+        undated = np.flatnonzero(measured & ~np.isfinite(t))
+        if undated.size:
+            raise DataError(
+                f"{path}: {self._row(undated[0] + above)} has measurements but no time in column"
+                f" '{config.time.column}' ({undated.size} such rows); delete them or restore their"
+                " time"
+            )
+        for name, values in raw.items():
+            raw[name], said = self._plausible(path, name, values, above)
+            findings += said
+        ends = np.flatnonzero(measured)[[0, -1]] if measured.any() else np.array([0, -1])
+        kept = ends[0] + np.flatnonzero(np.isfinite(t[ends[0] : ends[1] + 1]))
+        require_samples(path, kept)
+        require_increasing(path, t[kept], lambda i: self._row(int(kept[i]) + above))
+        channels = {name: maps[name].convert(name, raw[name][kept]) for name in maps}
+        for name, values in channels.items():
+            require_values(path, name, maps[name].column, values)
+        units = {name: entry.si(name) for name, entry in maps.items()}
+        findings += _placed(path, channels, units)
+        _headed(path, channels, units, maps)
+        cut = bool(table.attrs.get("cut"))
+        if cut:
+            text = "the file ends within its last line, which is left out"
+            findings.append(remark("note", "cut_line", text))
+        rows = len(table) + cut
+        meta = provenance(path, rows, rows - kept.size)
+        meta |= {"findings": findings} if findings else {}
+        if start is not None:
+            first = start + int(np.rint(t[kept[0]] * 1e9))
+            meta |= {"epoch": first * 1e-9, "epoch_ns": first}
+        kind = config.manoeuvre
+        kind = path.resolve().parent.name if kind == "folder" else kind
+        return Log(path.stem, t[kept], channels, units, kind or "unknown", meta=meta)
+
+    def _row(self, i: int) -> str:
+        return self._config.row.format(i + 1, i + 2)
+
+    def _times(
+        self, path: Path, cells: Mapping[str, pd.Series], above: int
+    ) -> tuple[np.ndarray, int | None, list[Remark]]:
+        """Return the times [T] in s, from Unix time in ns where there are dates, and remarks."""
+        time = self._config.time
+        texts = cells[time.column]
+        if time.unit != DATE:
+            return self._numbers(path, texts, time.column, above) * to_si(time.unit), None, []
+        if time.date is not None:
+            days = cells[time.date].astype("string").str.strip()
+            texts = days + " " + texts.astype("string").str.strip()
+        try:
+            stamps = parse_texts(texts, zone=time.zone, order=time.order, dates=True)
+        except DataError as error:
+            raise DataError(f"{path}: column '{time.column}': {error}") from None
+        known = np.ones(len(texts), dtype=bool) if stamps.known is None else stamps.known
+        start = int(stamps.ns[known][0]) if known.any() else 0
+        t = np.where(known, (stamps.ns - start) * 1e-9, np.nan)
+        return t, start if stamps.absolute else None, list(stamps.remarks)
+
+    def _values(
+        self, path: Path, name: str, cells: Mapping[str, pd.Series], above: int
+    ) -> np.ndarray:
+        """Return one channel [T] as it stands in the table, NaN where empty."""
+        import pandas as pd
+
+        entry = self._config.channels[name]
+        column = entry.column
+        written = name in FIX and not pd.api.types.is_numeric_dtype(cells[column])
+        if not entry.is_angle and not written:
+            return self._numbers(path, cells[column], column, above)
+        if known_unit(entry.unit) != "deg":
+            raise DataError(f"{path}: column '{column}' is written in degrees; set unit: deg")
+        try:
+            angles = degrees_of(cells[column], name, entry.form, entry.letter_o)
+            if entry.hemisphere is not None:
+                column = entry.hemisphere
+                angles = angles * side_signs(cells[column], name, entry.letter_o)
+        except DataError as error:
+            raise DataError(f"{path}: column '{column}': {error}") from None
+        return angles
+
+    def _numbers(self, path: Path, column: pd.Series, name: str, above: int) -> np.ndarray:
+        """Return the cells of one column as float64 [T], NaN where empty."""
+        import pandas as pd
+
+        numeric = (
+            column
+            if pd.api.types.is_numeric_dtype(column)
+            else pd.to_numeric(column.astype("string"), errors="coerce")
+        )
+        values = numeric.to_numpy(dtype=np.float64, na_value=np.nan)
+        if np.isfinite(values).all():
+            return values
+        bad = np.flatnonzero((np.isnan(values) & column.notna().to_numpy()) | np.isinf(values))
+        if bad.size:
+            i = int(bad[0])
+            raise DataError(
+                f"{path}: {self._row(i + above)}, column '{name}': '{shown(column.iloc[i])}' is not"
+                f" a finite number ({bad.size} such cells in {len(column)} rows); leave cells"
+                " without a measurement empty, and check `delimiter` and `decimal`"
+            )
+        return values
+
+    def _plausible(
+        self, path: Path, name: str, values: np.ndarray, above: int
+    ) -> tuple[np.ndarray, list[Remark]]:
+        """Return a channel [T] without fill values; stop at one that no vessel can have."""
+        entry, findings = self._config.channels[name], []
+        filled = fills(values)
+        if filled.any():
+            count = int(filled.sum())
+            text = f"{count} cells of {name} hold a fill value and count as missing"
+            findings.append(remark("note", "fill_values", text, count=count))
+            values = np.where(filled, np.nan, values)
+        unit = entry.si(name)
+        bad = np.flatnonzero(beyond_belief(entry.in_si(name, values), unit))
+        if bad.size:
+            i = int(bad[0])
+            raise DataError(
+                f"{path}: {self._row(i + above)}, column '{entry.column}': {values[i]:g} makes"
+                f" {name} larger than {largest(unit):g} {unit}, which no vessel reaches"
+                f" ({bad.size} such cells); correct or empty them, or correct the unit"
+            )
+        return values, findings
+
+
+def _placed(path: Path, channels: dict[str, np.ndarray], units: dict[str, str]) -> list[Remark]:
+    """Put x, y in place of latitude and longitude, and tell from where; others are left alone."""
+    if not set(FIX) <= set(channels) or {"x", "y"} & set(channels):
+        return []
+    latitude, longitude = (channels.pop(name) for name in FIX)
+    unit, _ = (units.pop(name) for name in FIX)
+    north, east, origin, none = fixes_on_plane(latitude, longitude)
+    most = float(np.abs(latitude[np.isfinite(latitude)]).max(initial=0.0))
+    if unit != "rad" or most > np.pi / 2:
+        raise DataError(
+            f"{path}: latitude reaches {np.degrees(most):.4g} deg, which none does; give the unit"
+            " of its column (deg), and `form: ddmm` for degrees and minutes in one number"
+        )
+    if origin is None:
+        raise DataError(f"{path}: latitude and longitude hold no fix")
+    rest, rest_units = dict(channels), dict(units)
+    channels.clear()
+    units.clear()
+    channels |= {"x": north, "y": east} | rest
+    units |= {"x": "m", "y": "m"} | rest_units
+    where = [float(np.degrees(angle)) for angle in origin]
+    text = (
+        f"x, y are north and east of the first fix, latitude {where[0]:.6f} deg, longitude"
+        f" {where[1]:.6f} deg"
+    )
+    remarks = [remark("note", "origin", text, latitude=origin[0], longitude=origin[1])]
+    if none:
+        text = f"{none} fixes at latitude 0, longitude 0 are no fixes; left empty"
+        remarks.append(remark("note", "no_fix", text, count=float(none)))
+    return remarks
+
+
+def _headed(
+    path: Path,
+    channels: dict[str, np.ndarray],
+    units: dict[str, str],
+    maps: Mapping[str, ChannelMap],
+) -> None:
+    """Put psi in place of qx, qy, qz, qw where there is no heading.
+
+    Where qw has the frame `enu`, the heading counts anticlockwise from east.
+    """
+    if not set(QUATERNION) <= set(channels) or "psi" in channels:
+        return
+    yaw = yaw_of(*unit_quaternion(*(channels.pop(name) for name in QUATERNION)))
+    if not np.isfinite(yaw).any():
+        columns = ", ".join(maps[name].column for name in QUATERNION)
+        raise DataError(f"{path}: {columns} hold no attitude, all quaternions are empty")
+    channels["psi"] = unwrap(np.pi / 2.0 - yaw if maps["qw"].frame == "enu" else yaw)
+    for name in QUATERNION:
+        del units[name]
+    units["psi"] = "rad"
+
+
+@contextmanager
+def _readable(path: Path, what: str) -> Iterator[None]:
+    """Damaged files fail in every layer of a library: tell so in one line."""
+    try:
+        yield
+    except ResidnetError:
+        raise
+    except Exception as error:
+        reason = shown(" ".join(str(error).split()) or type(error).__name__, 200)
+        raise DataError(f"{path}: {what} ({reason})") from error
+
+
+def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.DataFrame:
+    """Return a sheet as its cells are, with the line above its values that holds names as names.
+
+    Its `attrs` hold `above`, the number of lines above the values, and `between`, the cells of the
+    lines between names and values.
+
+    Args:
+        path: the file.
+        sheet: its name; None takes the first.
+        rows: how many are read; None for all.
+
+    Raises:
+        UsageError: where there is no such sheet, or openpyxl is not installed.
+        DataError: where the file cannot be read.
+    """
+    import pandas as pd
+
+    names = sheet_names(path)
+    if sheet is not None and sheet not in names:
+        raise UsageError(f"{path}: no sheet '{sheet}'{nearest(sheet, names)}")
+    with _readable(path, "damaged or not an Excel file"):
+        cells = pd.read_excel(
+            path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl", header=None
+        )
+    first = [
+        ["" if pd.isna(cell) else str(cell).strip() for cell in row]
+        for row in cells.head(_SEARCHED).itertuples(index=False)
+    ]
+    at, values = found_header(first) or (0, 1)
+    # with the names among them, all columns were of objects
+    table = cells.iloc[values:].infer_objects()
+    table.columns = pd.Index(numbered(first[at] if first else []))
+    table = table.dropna(how="all")
+    table.attrs |= {"above": values, "between": first[at + 1 : values]}
+    return table
+
+
+def sheet_names(path: Path) -> list[str]:
+    """Return the names of the sheets of an Excel file, in order.
+
+    Raises:
+        UsageError: where openpyxl is not installed.
+        DataError: where the file cannot be read.
+    """
+    try:
+        import openpyxl
+    except ImportError as error:
+        raise missing_package("excel", "openpyxl", "an Excel sheet") from error
+    with _readable(path, "damaged or not an Excel file"):
+        return [str(name) for name in openpyxl.load_workbook(path, read_only=True).sheetnames]
+
+
+def parquet_rows(path: Path, rows: int) -> pd.DataFrame:
+    """Return the first rows of a Parquet file.
+
+    Raises:
+        DataError: where it cannot be read.
+    """
+    import pyarrow.parquet as pq
+
+    with _readable(path, "not a readable Parquet table"):
+        table: pd.DataFrame = next(pq.ParquetFile(path).iter_batches(batch_size=rows)).to_pandas()
+        return table
+
+
+def json_rows(path: Path, rows: int) -> pd.DataFrame:
+    """Return the first rows of a file of JSON lines, a column for each key.
+
+    Raises:
+        DataError: where it is empty, or a line is no JSON object.
+    """
+    import pandas as pd
+
+    found = list(islice(_JsonLines(path), rows))
+    if not found:
+        raise DataError(f"{path}: the file is empty; an object a line was expected")
+    return pd.DataFrame(found).infer_objects()
+
+
+def column_names(path: Path) -> tuple[str, ...]:
+    """Return what tells tables of the same columns: their names, or the first line of a text."""
+    if path.suffix.lower() == ".parquet":
+        import pyarrow.parquet as pq
+
+        with _readable(path, "not a readable Parquet file"):
+            return tuple(pq.read_schema(path).names)
+    if path.suffix.lower() in (".xlsx", ".jsonl", ".ndjson"):
+        return ()
+    with path.open("rb") as stream:
+        return (stream.readline(1 << 16).decode(errors="replace").strip(),)
+
+
+@final
+class _JsonLines:
+    """The objects of a file, flat: `nav.lat` for a key within, `imu.q[0]` for an entry of a list.
+
+    Raises:
+        DataError: where a line is no JSON object.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self.cut = path, False
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        number = 0
+        with as_utf8(self._path) as file, file.open("rb") as stream:
+            for line_number, line in enumerate(stream, start=1):
+                text = line.decode("utf-8-sig", errors="replace").strip()
+                try:
+                    if text:
+                        yield _flat(_object(text))
+                        number += 1
+                except (ValueError, RecursionError) as error:
+                    # a recorder that was switched off ends within a line
+                    self.cut = number > 0 and not line.endswith(b"\n")
+                    if self.cut:
+                        return
+                    raise DataError(
+                        f"{self._path}: line {line_number}, '{shown(text, 60)}', is no JSON object;"
+                        " give files with one object a line"
+                    ) from error
+
+
+def _object(text: str) -> dict[str, Any]:
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise ValueError("no object")
+    return value
+
+
+def _flat(value: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for key, entry in value.items():
+        name = f"{before}{key}"
+        if isinstance(entry, dict):
+            out |= _flat(entry, f"{name}.")
+        elif isinstance(entry, list):
+            # scans and pictures are no channels
+            entry = entry if len(entry) <= _LONGEST else []
+            out |= _flat({f"{name}[{i}]": part for i, part in enumerate(entry)})
+        else:
+            out[name] = entry
+    return out

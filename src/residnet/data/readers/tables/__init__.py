@@ -1,1 +1,0 @@
-"""Readers of tables: foreign ones through a channel map, and canonical logs."""

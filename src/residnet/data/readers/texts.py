@@ -1,0 +1,473 @@
+"""Text tables: where their names and values stand, whether every line is whole, their cells."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from residnet.core.errors import DataError, UsageError
+from residnet.core.names import nearest, shown
+from residnet.data.readers.base import Advance
+from residnet.data.readers.encoding import as_utf8
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+BLANKS = " "
+"""Stands for any number of blanks and tabulators between cells."""
+# lines among which names are looked for: of a described table, and of one that nobody described
+_SEARCHED, _GUESSED = 200, 60
+_BELOW = 3
+"""Most lines with units and the like between names and values."""
+_PIECE = 100_000
+_HEAD, _BLOCK = 1 << 16, 1 << 18
+_COMMENT = (b"#", b"%", b"//")
+_NUMBER = re.compile(
+    r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)", re.IGNORECASE
+)
+_TIME = re.compile(r"\d{1,4}\s*[-./:年時h]\s*\d")
+_FRACTION = r"\s*-?\d+{}\d+(?:[eE][-+]?\d+)?\s*"
+_BEYOND = "beyond the last column"
+
+
+class Header(NamedTuple):
+    """The names of a table's columns, and the number of lines above the first one with values."""
+
+    names: tuple[str, ...]
+    above: int
+
+
+def numbered(names: Sequence[str]) -> list[str]:
+    """Return names of which each stands once: copies are counted, nameless columns too."""
+    out: list[str] = []
+    for place, name in enumerate(names):
+        several = name and list(names).count(name) > 1
+        copy = f"{name}.{list(names[:place]).count(name)}"
+        unique = copy if several else name or f"Unnamed: {place}"
+        while unique in out:
+            unique += "_"
+        out.append(unique)
+    return out
+
+
+def positions(path: Path, header: Sequence[str], columns: Sequence[str]) -> list[int]:
+    """Return where the wanted columns stand in the header.
+
+    Raises:
+        UsageError: where one does not.
+        DataError: where one stands several times.
+    """
+    names = numbered(header)
+    for column in columns:
+        if column in names:
+            continue
+        count = list(header).count(column)
+        if count > 1:
+            raise DataError(
+                f"{path}: column '{column}' stands {count} times in the header; write"
+                f" '{column}.0' for the first, '{column}.1' for the second"
+            )
+        raise UsageError(f"{path}: no column '{column}'{nearest(column, names)}")
+    return [names.index(column) for column in columns]
+
+
+def read_csv(
+    path: Path,
+    columns: Sequence[str],
+    delimiter: str,
+    decimal: str,
+    encoding: str | None,
+    advance: Advance,
+) -> pd.DataFrame:
+    """Return the wanted columns of a text table, in order.
+
+    Its `attrs` hold `above`, the number of lines above the values less one, and `cut`, whether the
+    last line was left out because the file ends within it.
+
+    Args:
+        path: the file.
+        columns: names of the wanted columns.
+        delimiter: between cells.
+        decimal: sign of the decimals.
+        encoding: of the text; None finds it.
+        advance: is told the share that is read.
+
+    Raises:
+        UsageError: where a column is missing.
+        DataError: where the file is empty, not text of this encoding or not a regular table.
+    """
+    import pandas as pd
+
+    with as_utf8(path, encoding) as file:
+        try:
+            header = _header_with(path, delimiter, file, columns)
+            wide, size = len(header.names), max(1, file.stat().st_size)
+            try:
+                where = positions(path, header.names, columns)
+            except UsageError as error:
+                one = f" (only one column found; is the delimiter really '{delimiter}'?)"
+                raise UsageError(f"{error}{one if wide == 1 else ''}") from None
+            cut, comments = _check_lines(path, delimiter, header, file)
+            pieces = []
+            with file.open("rb") as stream:
+                form = _form(delimiter, decimal, (header.above, comments), range(wide))
+                for piece in pd.read_csv(stream, **form, chunksize=_PIECE):
+                    pieces.append(piece[sorted(set(where))])
+                    advance(min(1.0, stream.tell() / size))
+        except UnicodeDecodeError as error:
+            raise DataError(
+                f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8, or give its"
+                " `encoding`"
+            ) from error
+        except pd.errors.EmptyDataError:
+            pass
+        except pd.errors.ParserError as error:
+            reason = shown(" ".join(str(error).split()), 200)
+            raise DataError(
+                f"{path}: not a regular table, its header has {wide} columns ({reason}); check"
+                " `delimiter` and `decimal`"
+            ) from error
+    pieces = pieces or [pd.DataFrame({place: [] for place in where})]
+    table = pieces[0] if len(pieces) == 1 else pd.concat(pieces)
+    table = table[where].iloc[: -1 if cut else None]
+    table.attrs |= {"above": header.above - 1, "cut": cut}
+    return table
+
+
+def _form(
+    delimiter: str, decimal: str, skipped: tuple[int, Iterable[int]], names: Iterable[Any]
+) -> dict[str, Any]:
+    """Return how pandas reads the values of a table.
+
+    `skipped` are the number of lines above the values, and the numbers of lines of comments.
+    """
+    return {
+        # a byte order mark is no part of the first name
+        "encoding": "utf-8-sig",
+        "sep": r"\s+" if delimiter == BLANKS else delimiter,
+        "decimal": decimal,
+        "header": None,
+        "skiprows": [*range(skipped[0]), *skipped[1]],
+        "names": list(names),
+        "index_col": False,
+        "skip_blank_lines": False,
+        "skipinitialspace": True,
+        "low_memory": False,
+    }
+
+
+def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Return the first rows of a text table whose form nobody described, and its reader's settings.
+
+    The `attrs` of the rows hold `between`: the cells of the lines between names and values.
+
+    Raises:
+        DataError: where it is empty or no table.
+    """
+    import pandas as pd
+
+    with as_utf8(path) as file:
+        with file.open("rb") as stream:
+            head = stream.read(_HEAD)
+        lines = head.decode("utf-8-sig", errors="replace").splitlines()
+        lines = lines[:-1] if len(head) == _HEAD else lines
+        if not any(line.strip() for line in lines) or b"\x00" in head:
+            raise DataError(
+                f"{path}: the file is empty or no text; a table with a header line was expected"
+            )
+        delimiter, cells, (at, above) = _delimiter(path, lines)
+        comma, point = (
+            sum(bool(re.fullmatch(_FRACTION.format(sign), c)) for row in cells[1:50] for c in row)
+            for sign in (",", r"\.")
+        )
+        decimal = "," if delimiter != "," and comma > point else "."
+        names = numbered(cells[at])
+        comments = [
+            line + i
+            for line, block, _ in _blocks(file)
+            for i in _comments(block)
+            if line + i >= above
+        ]
+        form = _form(delimiter, decimal, (above, comments), [*names, _BEYOND])
+        try:
+            table = pd.read_csv(file, **form | {"skip_blank_lines": True}, nrows=rows)[names]
+        except (ValueError, csv.Error) as error:
+            reason = shown(" ".join(str(error).split()), 200)
+            raise DataError(f"{path}: not a regular table ({reason})") from error
+    table.attrs["between"] = cells[at + 1 : above]
+    about = {"kind": "csv"} | ({"delimiter": delimiter} if delimiter != "," else {})
+    return table, about | ({"decimal": ","} if decimal == "," else {})
+
+
+def _delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]], tuple[int, int]]:
+    """Return the delimiter whose cells are names over values in most lines, and where they stand.
+
+    Returns:
+        The delimiter, the cells of the first lines, and the places of the names and first values.
+
+    Raises:
+        DataError: where there is none.
+    """
+    found = []
+    for sign in (",", ";", "\t", "|", BLANKS):
+        if sign == BLANKS and found:
+            break
+        rows = [_cells(line, sign) for line in lines[:_GUESSED]]
+        place = found_header(rows)
+        if place is None:
+            continue
+        names = rows[place[0]]
+        wide, named = len(names), max((i for i, name in enumerate(names, 1) if name), default=0)
+        below = [row for row in rows[place[1] :] if any(row)]
+        alike = sum(
+            named <= len(row) <= wide or (len(row) == wide + 1 and not row[-1]) for row in below
+        )
+        if wide > 1 and 2 * alike > len(below):
+            found.append((alike, wide, (sign, rows, place)))
+    if not found:
+        raise DataError(
+            f"{path}: no line holds names of columns above its numbers; write one, with the sign"
+            f" between them that stands between numbers (its first line: '{shown(lines[0], 60)}')"
+        )
+    return max(found, key=lambda entry: entry[:2])[2]
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    """Return the cells of one line; a line that is no table's is one cell."""
+    if delimiter == BLANKS:
+        return line.split()
+    try:
+        row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+    except csv.Error:
+        return [line]
+    return [cell.strip() for cell in row]
+
+
+def _measures(cell: str) -> bool:
+    """Return whether a cell holds a number, a date or a time of day."""
+    return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell))
+
+
+def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str]) -> Header:
+    """Return the first line of a text table that holds all the names; else its first line.
+
+    Raises:
+        DataError: where the first line is blank or no line of cells.
+    """
+    wanted = set(columns)
+    rows: list[tuple[int, list[str]]] = []
+
+    def holding() -> list[int]:
+        return [i for i, (_, row) in enumerate(rows) if wanted <= {*row, *numbered(row)}][:1]
+
+    with file.open(newline="", encoding="utf-8-sig") as stream:
+        try:
+            if delimiter == BLANKS:
+                rows += enumerate((line.split() for line in islice(stream, _SEARCHED)), start=1)
+            else:
+                reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
+                for row in islice(reader, _SEARCHED):
+                    rows.append((reader.line_num, [cell.strip() for cell in row]))
+        except csv.Error as error:
+            if not holding():
+                raise DataError(
+                    f"{path}: line 1 is no header with column names ({error}); a quotation mark may"
+                    " be open, or lines are missing at the beginning"
+                ) from error
+    found = holding()
+    if not found and (not rows or not any(rows[0][1])):
+        raise DataError(
+            f"{path}: the file is empty or its first line is blank; a header line with column"
+            " names was expected"
+        )
+    at = found[0] if found else 0
+    names = rows[at][1]
+    called = numbered(names)
+    where = [called.index(column) for column in columns if column in called]
+    below = _without_values([cells for _, cells in rows[at + 1 :]], where) if found else 0
+    return Header(tuple(names), rows[at + below][0])
+
+
+def _without_values(rows: Sequence[Sequence[str]], where: Iterable[int]) -> int:
+    """Return how many of the first rows hold words, such as units, where values are wanted."""
+    where, count = list(where), 0
+    for row in rows[:_BELOW]:
+        cells = [row[i] for i in where if i < len(row)]
+        if not any(cells) or any(map(_measures, cells)):
+            break
+        count += 1
+    return count
+
+
+def found_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
+    """Return which of the first rows holds names, and which is the first with values.
+
+    None where no row above the values can be one of names.
+
+    Args:
+        rows: cells of the first rows, without the blanks around them.
+    """
+    filled = [sum(map(bool, row)) for row in rows]
+    valued = [sum(map(_measures, row)) for row in rows]
+    # what most rows look like is the table
+    later = sorted(filled[len(filled) // 2 :])
+    usual = later[len(later) // 2] if rows else 0
+    for at, row in enumerate(rows):
+        words = filled[at] - valued[at]
+        if filled[at] < max(2, 0.8 * usual) or words <= valued[at]:
+            continue
+        values = at + 1 + _without_values(rows[at + 1 :], range(len(row)))
+        # a title of several cells has names beneath it, a table has values
+        after = rows[values : values + 3]
+        if after and not any(sum(map(_measures, cells)) >= 0.3 * usual for cells in after):
+            continue
+        # groups above the names are passed over
+        while at + 1 < values and _repeats(rows[at]) and not _repeats(rows[at + 1]):
+            at += 1
+        return at, values
+    return None
+
+
+def _repeats(row: Sequence[str]) -> bool:
+    filled = [cell for cell in row if cell]
+    return len(set(filled)) < len(filled)
+
+
+def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tuple[bool, list[int]]:
+    """Look at every line of values: as many cells each as the header; blank lines do not count.
+
+    A parser fills short lines with nothing and reads on; cells that slipped by one column would be
+    numbers like any other. A delimiter more or less at the end of every line makes no cell.
+
+    Returns:
+        Whether the file ends within its last line, and the numbers of lines, from 0, that are
+        comments: they begin with `#`, `%` or `//`.
+
+    Raises:
+        DataError: where a line has more or fewer cells than the header, or a byte is zero.
+    """
+    wide, above = len(header.names), header.above
+    # names that are missing at the end are those of cells that are not there
+    named = max((i for i, name in enumerate(header.names, start=1) if name), default=wide)
+    cut, lines = _cut_short(file, delimiter, named), 0
+    comments: list[int] = []
+    for line, block, last in _blocks(file):
+        if b"\x00" in block:
+            at = line + block[: block.index(b"\x00")].count(b"\n") + 1
+            raise DataError(
+                f"{path}: line {at} holds a zero byte, which no text has; the file is damaged or"
+                " not UTF-8, write it again"
+            )
+        cells = _counted(block, delimiter)
+        odd = (cells != wide) & (cells != 0)
+        odd[: max(above - line, 0)] = False
+        said = [i for i in _comments(block) if line + i >= above]
+        comments += [line + i for i in said]
+        odd[[i for i in said if i < odd.size]] = False
+        if odd.any():
+            # rarely so: an empty cell more at the end of lines, or without names
+            rows = _lines(block)
+            sign = delimiter.encode()
+            ended = np.array([row.rstrip(b" ").endswith(sign) for row in rows])
+            odd &= ~((cells >= named) & (cells < wide))
+            odd &= ~((cells == wide + 1) & ended) if ended.size == cells.size else True
+        if last and cut:
+            odd[-1:] = False
+        if odd.any():
+            at = int(np.argmax(odd))
+            raise DataError(
+                f"{path}: line {line + at + 1} has {cells[at]} cells, the header {wide}"
+                f" ({int(odd.sum())} such lines nearby); check `delimiter` and `decimal`, or delete"
+                " the damaged lines"
+            )
+        lines = line + cells.size
+    return cut and lines - 1 not in comments[-1:], comments
+
+
+def _blocks(path: Path) -> Iterator[tuple[int, bytes, bool]]:
+    """Yield blocks of whole lines: the number of the first, its bytes, and whether it is the last.
+
+    Line ends are one byte each, and an open quote takes its line ends along.
+    """
+    with path.open("rb") as stream:
+        rest, line = b"", 0
+        while True:
+            block = stream.read(_BLOCK)
+            text, tail = rest + block, b""
+            if b"\r" in text:
+                # the other half of a line end may stand in the next block
+                if block and text.endswith(b"\r"):
+                    text, tail = text[:-1], b"\r"
+                text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+            if not block:
+                if text:
+                    yield line, text, True
+                return
+            end = text.rfind(b"\n") + 1 if text.count(b'"') % 2 == 0 else 0
+            if end:
+                yield line, text[:end], False
+                line += text.count(b"\n", 0, end)
+            rest = text[end:] + tail
+
+
+def _lines(block: bytes) -> list[bytes]:
+    lines = block.split(b"\n")
+    return lines if lines[-1] else lines[:-1]
+
+
+def _comments(block: bytes) -> list[int]:
+    """Return which lines of a block are comments."""
+    if not any(sign in block for sign in _COMMENT):
+        return []
+    return [i for i, line in enumerate(_lines(block)) if line.lstrip().startswith(_COMMENT)]
+
+
+def _counted(block: bytes, delimiter: str) -> np.ndarray:
+    """Return the number of cells of each line; 0 where it is blank."""
+    if delimiter == BLANKS:
+        return np.array([len(line.split()) for line in _lines(block)], dtype=np.int64)
+    if b'"' in block:
+        text = io.StringIO(block.decode("utf-8", errors="replace"), newline="")
+        reader = csv.reader(text, delimiter=delimiter, skipinitialspace=True)
+        try:
+            return np.array([len(row) if any(row) or len(row) > 1 else 0 for row in reader])
+        except csv.Error:
+            # a cell of more than 128 kB: an open quote has swallowed the lines after it
+            return np.ones(1, dtype=np.int64)
+    sign, lines = delimiter.encode(), _lines(block)
+    cells = np.array([line.count(sign) for line in lines], dtype=np.int64) + 1
+    for i in np.flatnonzero(cells == 1):
+        cells[i] = bool(lines[i].strip())
+    return cells
+
+
+def _cut_short(path: Path, delimiter: str, wide: int) -> bool:
+    """Return whether the file ends within its last line.
+
+    It has no end, and too few cells or a last cell shorter than any in that column shortly before.
+    """
+    with path.open("rb") as stream:
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(max(0, size - _HEAD))
+        tail = stream.read()
+    if not tail or tail.endswith((b"\n", b"\r")):
+        return False
+    lines = [line for line in tail.replace(b"\r", b"\n").split(b"\n") if line.strip()]
+    mark = None if delimiter == BLANKS else delimiter.encode()
+    last, before = lines[-1].split(mark), [line.split(mark) for line in lines[-51:-1]]
+    # the first of several lines may itself be cut, by the tail, or be the header
+    known = [
+        len(cells[-1].strip()) for cells in before[1:] if len(cells) == wide and cells[-1].strip()
+    ]
+    if size <= _HEAD and len(lines) < 2:
+        return False
+    return len(last) < wide or (
+        bool(known) and len(last) == wide and len(last[-1].strip()) < min(known)
+    )

@@ -1,0 +1,320 @@
+"""Times as people, programs and recorders write them: numbers, dates, times of day."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+
+from residnet.core.errors import DataError
+from residnet.core.names import shown
+from residnet.data.readers.recording import Remark, remark
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Order = Literal["dmy", "mdy", "ymd"]
+"""Order of day, month and year."""
+
+_NS = 10**9
+_DAY = 86_400 * _NS
+# Unix time in s, ms, us, ns between 1990 and 2090
+_EPOCH_FROM, _EPOCH_TO = 631_152_000, 3_786_912_000
+_SCALES = (1, 10**3, 10**6, 10**9)
+_MONTHS = {
+    word: number
+    for number, words in enumerate(
+        (
+            "jan ene gen",
+            "feb fév fev",
+            "mar mär mrz maa mrt",
+            "apr avr abr",
+            "may mai mei maj",
+            "jun jui",
+            "jul",
+            "aug aoû aou ago",
+            "sep set",
+            "oct okt out",
+            "nov",
+            "dec dez déc dic des",
+        ),
+        1,
+    )
+    for word in words.split()
+}
+_PARTS = (
+    r"(?:(?P<a>\d{1,4})\s*(?P<mark>[-./年])\s*(?P<b>\d{1,2}|[^\W\d_]{3,9}\.?)\s*[-./月]\s*"
+    r"(?P<c>\d{1,4})日?|(?P<packed>\d{8}))"
+)
+_DATE = r"(?P<date>\d{1,4}\s*[-./年]\s*(?:\d{1,2}|[^\W\d_]{3,9}\.?)\s*[-./月]\s*\d{1,4}日?|\d{8})"
+_CLOCK = (
+    r"(?P<hour>\d{1,2})\s*[:h時]\s*(?P<minute>\d{1,2})\s*"
+    r"(?:[:分']\s*(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d+))?秒?)?\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+)
+_FORM = (
+    rf"^\s*(?:{_DATE}(?:[T ,_;]+|$))?(?:{_CLOCK})?\s*(?P<zone>Z|UTC|GMT|[+-]\d{{2}}:?\d{{2}})?\s*$"
+)
+_NUMBER = r"^\s*(?P<whole>[-+]?\d+)(?:\.(?P<fraction>\d+))?\s*$"
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """The times of a column.
+
+    Attributes:
+        ns: [T] int64, whole ns; Unix time where `absolute`, and any number where a time is missing.
+        absolute: whether the source gave dates or Unix time.
+        known: [T] bool, where there is a time; None where there is one everywhere.
+        remarks: what was noticed.
+    """
+
+    ns: np.ndarray
+    absolute: bool
+    known: np.ndarray | None = None
+    remarks: tuple[Remark, ...] = ()
+
+    def since(self, start: int | None) -> np.ndarray:
+        """Return the times [T] in s from `start`, Unix time in ns, where they are absolute."""
+        seconds: np.ndarray = (self.ns - (start or 0 if self.absolute else 0)) * 1e-9
+        return seconds if self.known is None else np.where(self.known, seconds, np.nan)
+
+
+def whole_second(stamps: list[Stamps]) -> int | None:
+    """Return the whole second, in ns, at or before the first of absolute times; None for none."""
+    first = [int(one.ns.min()) for one in stamps if one.absolute and one.ns.size]
+    return min(first) // _NS * _NS if first else None
+
+
+def zone_of(name: str) -> ZoneInfo:
+    """Return a time zone by its name, for example `Europe/Berlin`.
+
+    Raises:
+        ValueError: where there is none of this name.
+    """
+    try:
+        return ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise ValueError(
+            f"no time zone is called '{name}'; names are such as 'Europe/Berlin' or 'UTC'"
+        ) from error
+
+
+def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
+    """Return the times from numbers [T], in units of `factor` seconds.
+
+    None reads Unix time in s, ms, us or ns by its size, and anything smaller as s.
+
+    Raises:
+        DataError: where a value is not finite.
+    """
+    if not np.isfinite(values).all():
+        raise DataError(f"{int((~np.isfinite(values)).sum())} rows have no time")
+    scale = _unix_scale(values) if factor is None else None
+    if scale is None:
+        return Stamps(np.rint(values * ((factor or 1.0) * _NS)).astype(np.int64), False)
+    whole = values if values.dtype.kind in "iu" else np.floor(values)
+    rest = np.rint((values - whole) * (_NS // scale)).astype(np.int64)
+    return Stamps(whole.astype(np.int64) * (_NS // scale) + rest, True)
+
+
+def _unix_scale(values: np.ndarray) -> int | None:
+    typical = abs(float(np.median(values))) if values.size else 0.0
+    return next((s for s in _SCALES if _EPOCH_FROM * s <= typical <= _EPOCH_TO * s), None)
+
+
+def looks_dated(texts: pd.Series) -> bool:
+    """Return whether the cells are dates or times of day."""
+    filled = texts.dropna().astype("string")
+    parts = filled.str.extract(_FORM)
+    return len(filled) > 0 and bool((parts["hour"].notna() | parts["date"].notna()).all())
+
+
+def date_order(texts: pd.Series) -> Order | None:
+    """Return the order of day, month and year in dates; None where it cannot be told."""
+    return _order_of(texts.dropna().astype("string").str.extract(_FORM))
+
+
+def _order_of(cells: pd.DataFrame) -> Order | None:
+    parts = cells["date"].drop_duplicates().str.extract(_PARTS)
+    first, second = parts["a"].dropna(), parts["b"].dropna()
+    if first.empty or (first.str.len() == 4).any():
+        return "ymd" if len(first) else None
+    if not second.str.isdigit().all() or (parts["mark"] == ".").any():
+        return "dmy"
+    if (first.astype(int) > 12).any():
+        return "dmy"
+    if (second.astype(int) > 12).any() or cells["half"].notna().any():
+        return "mdy"
+    return None
+
+
+def parse_texts(
+    texts: pd.Series | np.ndarray,
+    *,
+    zone: str | None = None,
+    order: Order | None = None,
+    dates: bool = False,
+) -> Stamps:
+    """Return the times of text [T]: dates and times of day in most forms, or numbers.
+
+    A fraction of a second printed as an integer without its leading zeros (`09.70533347` for
+    9.070533347 s) is recognised by the whole column. Times of day count on past midnight.
+
+    Args:
+        texts: in one style.
+        zone: time zone of dates that name none; None takes them as UTC.
+        order: of day, month and year; None takes it from the cells.
+        dates: none are numbers, and some cells may be empty.
+
+    Raises:
+        DataError: naming the first cell that is no time.
+    """
+    import pandas as pd
+
+    column = pd.Series(np.asarray(texts, dtype=object), dtype="string").str.strip()
+    known = (column.notna() & (column != "")).to_numpy(dtype=bool)
+    cells = column[known] if dates else column.fillna("")
+    if not len(cells):
+        return Stamps(np.zeros(len(column), dtype=np.int64), False, known)
+    if not dates:
+        return _dated(cells, zone, order) if ":" in cells.iloc[0] else _digits(cells)
+    stamps = _dated(cells, zone, order)
+    ns = np.full(len(column), stamps.ns[0])
+    ns[known] = stamps.ns
+    return Stamps(ns, stamps.absolute, known, stamps.remarks)
+
+
+def _require(cells: pd.Series, bad: np.ndarray, what: str) -> None:
+    if bad.any():
+        at = int(np.argmax(bad))
+        raise DataError(
+            f"'{shown(str(cells.iloc[at]))}' in row {int(cells.index[at]) + 1} is no {what}"
+            f" ({int(bad.sum())} such cells)"
+        )
+
+
+def _digits(cells: pd.Series) -> Stamps:
+    """Return the times of numbers as a clock printed them, to the last digit."""
+    import pandas as pd
+
+    parts = cells.str.extract(_NUMBER)
+    bad = parts["whole"].isna().to_numpy()
+    if bad.any():
+        # exponents: the digits are not the ones that a clock printed
+        numbers = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+        _require(cells, ~np.isfinite(numbers), "time")
+        return parse_numbers(numbers)
+    whole = parts["whole"].astype("int64").to_numpy()
+    fraction, remarks = _fractions(parts["fraction"], whole)
+    fraction = np.where(cells.str.startswith("-").to_numpy(dtype=bool), -fraction, fraction)
+    scale = _unix_scale(whole)
+    ns = whole * (_NS // (scale or 1)) + fraction // (scale or 1)
+    return Stamps(ns, scale is not None, None, remarks)
+
+
+def _dated(cells: pd.Series, zone: str | None, order: Order | None) -> Stamps:
+    parts = cells.str.extract(_FORM)
+    dated = bool(parts["date"].notna().all())
+    _require(cells, (parts["date" if dated else "hour"].isna()).to_numpy(), "date or time")
+    hour, minute, second = (
+        parts[name].fillna("0").astype("int64").to_numpy() for name in ("hour", "minute", "second")
+    )
+    half = parts["half"].str.lower().str.slice(0, 1).fillna("")
+    hour = np.where(half == "p", hour % 12 + 12, np.where(half == "a", hour % 12, hour))
+    whole = (hour * 60 + minute) * 60 + second
+    whole += (
+        _days(cells, parts["date"], order or _order_of(parts) or "dmy") * 86_400 if dated else 0
+    )
+    fraction, remarks = _fractions(parts["fraction"], whole)
+    ns = whole * _NS + fraction
+    if dated:
+        return Stamps(_in_utc(ns, parts["zone"], zone), True, None, remarks)
+    nights = np.cumsum(np.diff(ns, prepend=ns[0]) < -_DAY // 2)
+    if nights[-1]:
+        text = f"the times of day run past midnight {nights[-1]} times; the days are counted"
+        remarks = (*remarks, remark("note", "past_midnight", text, nights=int(nights[-1])))
+    return Stamps(ns + nights * _DAY, False, None, remarks)
+
+
+def _days(cells: pd.Series, dates: pd.Series, order: Order) -> np.ndarray:
+    """Return the days [T] since 1970; a day repeats over many rows, and is made a date once."""
+    import pandas as pd
+
+    days = dates.astype("category")
+    parts = pd.Series(days.cat.categories, dtype="string").str.extract(_PARTS)
+    packed = parts["packed"]
+    year, month, day = (
+        parts[name].where(packed.isna(), packed.str.slice(*span))
+        for name, span in zip(
+            {"ymd": "abc", "dmy": "cba", "mdy": "cab"}[order], ((0, 4), (4, 6), (6, 8)), strict=True
+        )
+    )
+    named = month.str.lower().str.slice(0, 3).map(_MONTHS).astype("Int64").astype("string")
+    month = month.where(month.str.isdigit(), named)
+    year = year.where(year.str.len() != 2, "20" + year)
+    text = year + "-" + month + "-" + day
+    moments = pd.to_datetime(text.astype("object"), format="%Y-%m-%d", errors="coerce")
+    row = days.cat.codes.to_numpy()
+    wrong = moments.isna().to_numpy()[row]
+    _require(cells, wrong, f"date with {order}; give the `order`" if wrong.any() else "")
+    out: np.ndarray = ((moments - pd.Timestamp(0)) // pd.Timedelta(days=1)).to_numpy("int64")[row]
+    return out
+
+
+def _in_utc(ns: np.ndarray, zones: pd.Series, zone: str | None) -> np.ndarray:
+    """Return Unix time [T] in ns from local time."""
+    import pandas as pd
+
+    written = zones.fillna("").astype("category")
+    if (written != "").any():
+        shift = np.array([_ahead(str(text)) for text in written.cat.categories])
+        moved: np.ndarray = ns - shift[written.cat.codes.to_numpy()] * _NS
+        return moved
+    if zone is None:
+        return ns
+    local = pd.DatetimeIndex(ns.astype("datetime64[ns]"))
+    # an hour comes twice in autumn: time rises, and does so without a leap where it can
+    first = local.tz_localize(zone, ambiguous=np.ones(ns.size, dtype=bool))
+    second = local.tz_localize(zone, ambiguous=np.zeros(ns.size, dtype=bool))
+    early, late = (index.as_unit("ns").asi8 for index in (first, second))
+    back = np.append(False, np.diff(early) < 0)
+    both = np.where(np.logical_or.accumulate(back), late, early)
+    rising = [reading for reading in (early, late, both) if (np.diff(reading) >= 0).all()]
+    out: np.ndarray = min(rising or [early], key=lambda reading: reading[-1] - reading[0])
+    return out
+
+
+def _ahead(zone: str) -> int:
+    """Return the seconds by which a written zone is ahead of UTC."""
+    if not zone or zone[0] not in "+-":
+        return 0
+    digits = zone[1:].replace(":", "")
+    return (1 if zone[0] == "+" else -1) * (3600 * int(digits[:2]) + 60 * int(digits[2:]))
+
+
+def _fractions(column: pd.Series, whole: np.ndarray) -> tuple[np.ndarray, tuple[Remark, ...]]:
+    """Return the fractions of the unit in ns [T] int64, mended where they lost leading zeros."""
+    digits = column.fillna("0").str.slice(0, 9)
+    length = digits.str.len().to_numpy(dtype=np.int64)
+    value = digits.astype("int64").to_numpy()
+    padded = value * 10 ** (9 - length)
+    longest = int(length.max(initial=0))
+    if longest not in (3, 6, 9) or (length == longest).all():
+        return padded, ()
+    unpadded = value * 10 ** (9 - longest)
+    back = [int((np.diff(whole * _NS + part) < 0).sum()) for part in (padded, unpadded)]
+    zeros = int((digits.str.startswith("0") & (length > 1)).sum())
+    # one fraction in ten starts with a zero where zeros are printed
+    if back[1] > back[0] or (back[1] == back[0] and (back[0] > 0 or zeros > 0 or whole.size < 100)):
+        return padded, ()
+    unit = {3: "ms", 6: "us", 9: "ns"}[longest]
+    changed = int((padded != unpadded).sum())
+    text = (
+        f"fractions of seconds are whole {unit} without their leading zeros: {changed} of"
+        f" {whole.size} times are repaired, taken as printed time runs backwards {back[0]} times"
+    )
+    figures = {"backwards_as_printed": back[0], "backwards_repaired": back[1]}
+    found = remark("note", "unpadded_fraction", text, repaired=changed, **figures)
+    return unpadded, (found,)
