@@ -408,7 +408,15 @@ def _command(command: list[str], said: Path) -> None:
         for output in (sys.stdout, sys.stderr):
             os.dup2(stream.fileno(), output.fileno())
         sys.argv = command
-        main()
+        code: object = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+        sys.stdout.flush()
+        sys.stderr.flush()
+    # the threads of the parent, which a fork of one cannot join, are not waited for
+    os._exit(code if isinstance(code, int) else 0)
 
 
 def carry_out_all(names: list[str], runs: Path, jobs: int) -> list[Result]:
