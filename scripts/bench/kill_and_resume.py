@@ -33,7 +33,7 @@ from typing import Any
 import yaml
 
 # imported before the forks, which then begin at once
-import residnet.report.figures.style
+import residnet.report.still
 import residnet.tasks.fit.running
 from residnet.__main__ import main as main_of_residnet
 
@@ -251,7 +251,7 @@ def _words(folder: Path, run: Path, *, report: bool) -> list[str]:
 
 def main() -> None:
     """Run the chains and print the tally."""
-    residnet.report.figures.style.DPI = 20  # most of the time would go into the pictures
+    residnet.report.still.DPI = 20  # most of the time would go into the pictures
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--chains", type=int, default=20)
     parser.add_argument("--most", type=int, default=4, help="interruptions of one chain at most")

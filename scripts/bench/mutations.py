@@ -40,7 +40,7 @@ from tiny_tasks import TINY_TASKS, boat, measured, resolved
 import residnet
 import residnet.api.models
 import residnet.api.tasks
-import residnet.report.figures.style
+import residnet.report.still
 import residnet.tasks.fit.external
 import residnet.tasks.fit.running
 import residnet.tasks.inspection
@@ -305,7 +305,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    residnet.report.figures.style.DPI = 20  # most of the time would go into the pictures
+    residnet.report.still.DPI = 20  # most of the time would go into the pictures
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     bad = 0
     with _place(given.out) as folder:

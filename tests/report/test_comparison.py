@@ -11,10 +11,14 @@ from PIL import Image
 
 from residnet.core.errors import DataError
 from residnet.judge.bootstrap import blocks, intervals
-from residnet.report.comparison import Variant, table, window_nrmse
-from residnet.report.figures.files import write_drawings
-from residnet.report.figures.study import differences
-from residnet.report.sections.study import variants_table
+from residnet.report.figure import write_figures
+from residnet.report.sections.study import (
+    Variant,
+    differences,
+    table,
+    variants_table,
+    window_nrmse,
+)
 
 KEYS = {"T30": tuple((f"log{i // 3}", i % 3) for i in range(18))}
 
@@ -77,8 +81,8 @@ def test_table_and_picture(tmp_path: Path) -> None:
     assert other.cells[3].mark == "best"
     assert other.cells[-1].text == "a=1"
     drawing = differences(rows, "recipe")
-    (figure,) = write_drawings(tmp_path, [drawing])
-    with Image.open(figure.path) as picture:
+    (figure,) = write_figures(tmp_path, [drawing])
+    with Image.open(figure.stills[0]) as picture:
         assert picture.width > 600
         assert picture.info["Title"] == figure.title
 

@@ -1,91 +1,264 @@
-"""Figures: pictures that can be opened and show something, of the right windows, from numbers that
-hold.
-"""
+"""Figures: one description, drawn still and in a browser, written and read back; those of a fit."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import browser, layout
 from made_run import DEG, LEVEL, made_run, metrics, residuals, write_json
 from PIL import Image
 
 from residnet.core.errors import UsageError
-from residnet.report.figures.errors import bar_group, growth, r_squared
-from residnet.report.figures.files import read_figures
-from residnet.report.figures.fit import write_figures
-from residnet.report.figures.style import styles
-from residnet.report.figures.terms import of_breeding
-from residnet.report.figures.tracks import representative, shown
+from residnet.report.blocks import Section
+from residnet.report.browser import draw
+from residnet.report.figure import (
+    BLUE,
+    MASKED,
+    MEASURED,
+    START,
+    Case,
+    Figure,
+    Look,
+    Panel,
+    Surface,
+    band,
+    bars,
+    family,
+    joined,
+    names_of,
+    parts,
+    read_figures,
+    steps,
+    thinned,
+    unpacked,
+    whiskers,
+    write_figures,
+)
+from residnet.report.fit import write_fit_figures, write_fit_page
+from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
+from residnet.report.sections import runs
+from residnet.report.sections.models import breeding
+from residnet.report.sections.sweep import parallel_coordinates
+from residnet.report.still import still
+
+T = np.linspace(0.0, 10.0, 900)
+needs_browser = pytest.mark.skipif(browser() is None, reason="no browser is installed")
+_MOST_BYTES = 4_000_000
+
+
+def every_kind() -> Figure:
+    """A figure of two cases with a map, lines with a gap, a band, a strip, points, bars, names."""
+    gap = np.where((T > 3) & (T < 4), np.nan, np.sin(T))
+    first = [
+        {"a": (20 * np.sin(T), 3 * T), "start": (np.zeros(1), np.zeros(1))},
+        {
+            "a": (T, np.sin(T)),
+            "measured": (T, gap),
+            "masked": (np.array([3.0]), np.array([4.0])),
+            "band": band(T, gap - 0.1, gap + 0.1),
+            "level": (np.zeros(2), np.array([-1.0, 1.0])),
+        },
+        {"b": (T, np.exp(-T)), "now": (np.array([5.0]), np.zeros(1))},
+        {"bars": bars([0, 1], [2.0, 3.0]), "spread": whiskers([0, 1], [1.0, 2.5], [2.5, 3.5])},
+    ]
+    return Figure(
+        "every_kind",
+        "Every kind",
+        "Look at it.",
+        {"measured": MEASURED, "masked": MASKED, **family(("a", "b"))}
+        | {
+            "band": Look("band of a", BLUE, kind="fill", alpha=0.2),
+            "level": Look("limits", kind="across", dash="dotted"),
+            "now": Look("now", kind="upright"),
+            "bars": Look("</script>", BLUE, kind="fill"),
+            "spread": Look("interval", shown=False),
+            "start": START,
+        },
+        [
+            Panel("north [m]", "east [m]", kind="map"),
+            Panel("heading\n[deg]", y_limits=(-2.0, 2.0)),
+            Panel("error", "time [s]", "first", y_log=True),
+            Panel("u", group="names", x_names=names_of(["u", "v"])),
+        ],
+        [
+            Case("one", first, "A note.", texts=[(1, 5.0, np.nan, "stage")]),
+            Case("two", [{}, {"b": (T[:90], np.full(90, 3.0))}, {}, {}], "Other.", still=False),
+        ],
+        "Run",
+    )
+
+
+def surfaces() -> Figure:
+    x, y = (one.ravel() for one in np.meshgrid([1.0, 2.0, 3.0, 4.0], [0.0, 1.0, 2.0]))
+    empty = {"section": (np.empty(0), np.empty(0))}
+    cases = []
+    for number, title in enumerate(("surge", "sway")):
+        heights = np.outer([1.0, 2.0, 5.0], [3.0, 7.0, 11.0, 13.0]).ravel() * 10.0**number
+        chosen = {"mark": (np.array([2.0 + number]), np.array([1.0]))}
+        curves = [{"surface": (x, y), **empty, **chosen}, empty, empty]
+        cases.append(Case(title, curves, heights=heights, chosen=(2.0 + number, 1.0)))
+    looks = {"surface": Look("", kind="cells"), "section": Look("section", "#D55E00")}
+    looks["mark"] = Look("chosen", "#D55E00", kind="points", marker="x")
+    panels = [
+        Panel("order", "functions", kind="surface"),
+        Panel("", "functions", group="x", y_log=True),
+        Panel("", "order", group="y", y_log=True),
+    ]
+    surface = Surface("share [%]", (1.0, 900.0), (1.0, 1.0), log=True)
+    return Figure("surface", "Surface", "Look.", looks, panels, cases, "Of", surface=surface)
+
+
+def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
+    given = every_kind()
+    (written,) = write_figures(tmp_path, [given])
+    (read,) = read_figures(tmp_path)
+    assert [path.name for path in read.stills] == ["01_every_kind.png"]
+    assert read.stills == written.stills
+    assert (read.looks, read.chooser) == (given.looks, "Run")
+    assert [panel.words for panel in read.panels] == [
+        "north [m]",
+        "heading [deg]",
+        "first: error",
+        "u",
+    ]
+    assert (read.panels[1].y_limits, read.panels[2].y_log) == ([-2.0, 2.0], True)
+    assert [case.note for case in read.cases] == ["A note.", "Other."]
+    x, y = read.cases[0].curves[1]["a"]
+    assert len(x) == 600, "no more samples than a screen shows"
+    np.testing.assert_allclose(y, np.sin(x), atol=1e-3)
+    assert (x[0], x[-1]) == pytest.approx((0.0, 10.0), abs=1e-3)
+    assert len(parts(*read.cases[0].curves[1]["measured"])) == 2, "a gap stays one"
+    with Image.open(read.stills[0]) as picture:
+        assert picture.info["Title"] == "Every kind"
+        assert picture.info["Description"] == "Look at it."
+    (tmp_path / "damaged.json").write_text('{"name": 1')
+    (tmp_path / "foreign.json").write_text("{}")
+    Image.new("RGB", (10, 10)).save(tmp_path / "mine.png")
+    assert len(read_figures(tmp_path)) == 1
+    write_figures(tmp_path, [])
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "damaged.json",
+        "foreign.json",
+        "mine.png",
+    }
+
+
+def test_still_pictures_show_what_is_switched_on() -> None:
+    canvas = still(every_kind())
+    track, heading, error, names = canvas.axes
+    assert track.get_aspect() in ("equal", 1.0)
+    assert heading.get_ylim() == (-2.0, 2.0)
+    assert error.get_yscale() == "log"
+    assert [text.get_text() for text in names.get_xticklabels()] == ["u", "v"]
+    (legend,) = canvas.legends
+    labels = {text.get_text() for text in legend.get_texts()}
+    assert labels >= {"a", "b", "measured", "masked", "band of a", "limits", "now", "start"}
+    assert "interval" not in labels
+    assert [text.get_text() for text in heading.texts] == ["stage"]
+    assert len(still(every_kind(), only=[1, 2]).axes) == 2
+
+
+def test_outlines_and_steps() -> None:
+    x, y = bars([0, 2], [1.0, 3.0], 0.5)
+    assert x[:4].tolist() == [-0.25, -0.25, 0.25, 0.25]
+    assert y[5:].tolist() == [0.0, 3.0, 3.0, 0.0]
+    assert np.isnan(x[4])
+    x, y = steps([0, 1, 2], [3.0, 1.0, 2.0])
+    assert (x.tolist(), y.tolist()) == ([0, 1, 1, 2, 2], [3, 3, 1, 1, 2])
+    rows = thinned(10_001, 500)
+    assert (rows[0], rows[-1], len(rows)) == (0, 10_000, 500)
+    assert joined([])[0].size == 0
+
+
+def test_cases_on_a_page_hold_their_curves_to_a_part_in_sixty_thousand() -> None:
+    figure = every_kind()
+    drawn = draw([figure])
+    assert drawn is not None
+    text = drawn.cases["figure-every-kind"]
+    assert "</script>" not in text
+    one, two = (case["panels"] for case in json.loads(text)["cases"])
+    curve = figure.cases[0].curves[1]["measured"][1]
+    np.testing.assert_allclose(unpacked(one[1], "measured")[: len(T)], curve, atol=2 / 60_000)
+    np.testing.assert_allclose(unpacked(one[1], "x of a")[: len(T)], T, atol=10 / 60_000)
+    assert np.isnan(unpacked(two[1], "a")).all(), "a case without a curve draws none"
+    assert draw([]) is None
+    many = [Figure(f"f{i}", "", "", figure.looks, figure.panels, figure.cases) for i in range(20)]
+    afforded = draw(many)
+    assert afforded is not None
+    assert len(afforded.parts) == 15, "60 panels of four a figure"
+
+
+@needs_browser
+def test_a_browser_draws_every_kind_and_cuts_a_surface(tmp_path: Path) -> None:
+    figures = write_figures(tmp_path / "figures", [surfaces(), every_kind()])
+    page = write_page(tmp_path, "Run", "", ["Done."], [Section("All", figures)])
+    found = layout(page, 390, tmp_path)
+    assert (found.overflow, found.broken) == (0, [])
+    assert found.panels == [True] * 7
+    assert found.used["cut"] == [["2", "1"], ["3", "1"]], "a slider chooses the next section"
+    assert found.used["section"] == pytest.approx([11.0, 22.0, 55.0], rel=1e-3)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = made_run(tmp_path_factory.mktemp("runs") / "made")
     residuals().to_parquet(folder / "residuals.parquet")
-    write_figures(RunFiles(folder))
+    write_fit_figures(RunFiles(folder))
     return folder
 
 
-def test_every_figure_is_a_light_picture_that_shows_something(run: Path) -> None:
+def test_every_figure_of_a_fit_is_a_light_picture_that_shows_something(run: Path) -> None:
     figures = read_figures(run / "figures")
-    names = [figure.path.stem[3:] for figure in figures]
-    assert names == [
-        "tracks",
-        "history_turning",
-        "history_zigzag",
-        "horizon_whole",
-        "horizon_T30",
-        "bars",
-        "residuals",
-        "learning",
-    ]
-    for figure in figures:
-        assert figure.path.stat().st_size < 200_000
-        with Image.open(figure.path) as picture:
-            picture.load()
+    names = ["free_runs", "horizon", "residuals", "bars", "learning"]
+    assert [figure.name for figure in figures] == names
+    for path in (path for figure in figures for path in figure.stills):
+        assert path.stat().st_size < 200_000
+        with Image.open(path) as picture:
             width, height = picture.size
             pixels = np.asarray(picture.convert("L"))
         assert width == 980
-        assert 250 < height < 1500
-        assert 0.005 < float((pixels < 200).mean()) < 0.6, figure.path.name
+        assert 250 < height < 1900
+        assert 0.005 < float((pixels < 200).mean()) < 0.6, path.name
         # nothing is cut off: the outermost pixels are white
-        edges = np.concatenate(
-            (pixels[:2].ravel(), pixels[-2:].ravel(), pixels[:, 0], pixels[:, -1])
-        )
-        assert edges.min() > 250, figure.path.name
-        assert figure.title
-        assert figure.caption.endswith(".")
+        edges = (pixels[:2].ravel(), pixels[-2:].ravel(), pixels[:, 0], pixels[:, -1])
+        assert np.concatenate(edges).min() > 250, path.name
 
 
-def test_figures_are_replaced_and_foreign_pictures_left_alone(run: Path) -> None:
-    stale, foreign = run / "figures" / "99_old.png", run / "figures" / "mine.png"
-    stale.write_bytes((run / "figures" / "01_tracks.png").read_bytes())
-    Image.new("RGB", (10, 10)).save(foreign)
-    before = (run / "figures" / "06_bars.png").read_bytes()
-    written = write_figures(RunFiles(run))
-    assert not stale.exists()
-    assert foreign.exists()
-    assert read_figures(run / "figures") == written
-    assert (run / "figures" / "06_bars.png").read_bytes() == before
-
-
-def test_the_representative_window_has_the_median_error(run: Path) -> None:
+def test_runs_to_choose_from_are_the_median_worst_and_best_of_each_kind(run: Path) -> None:
     files = RunFiles(run)
     windows = files.windows("test")
-    assert len(windows) == 8
-    chosen = representative(files, windows, "whole")
+    figure = runs.free_runs(files, windows)
+    assert figure is not None
+    titles = [case.title for case in figure.cases]
     # errors grow with the number of the log: of zigzags 01, 02, 03 the second is the median
-    assert [window.log for window in chosen] == ["turning_01", "zigzag_02"]
-    assert shown(files) == ["baseline", "truth", "plsr"]
+    assert "zigzag, whole: median error (zigzag_02)" in titles
+    assert [case.title.split(":")[0] for case in figure.pictured] == [
+        "zigzag, whole",
+        "turning, whole",
+    ]
+    looks = figure.looks
+    assert {name for name in ("measured", "plsr", "baseline", "truth") if looks[name].shown} == {
+        "measured",
+        "plsr",
+        "baseline",
+        "truth",
+    }
+    assert not looks["zero"].shown
+    assert (looks["plsr"].color, looks["baseline"].dash) == (BLUE, "dashed")
+    track, surge = figure.cases[titles.index("zigzag, whole: median error (zigzag_02)")].curves[:2]
+    assert np.isnan(track["measured"][0]).sum() == 10, "masked samples are a gap"
+    assert len(surge["masked"][0]) == 1
+    assert np.isfinite(surge["plsr"][1]).all()
 
 
 def test_masked_samples_do_not_count(run: Path) -> None:
     window = next(window for window in RunFiles(run).windows("test") if window.log == "zigzag_02")
     np.testing.assert_allclose(window.rmse("plsr"), LEVEL["plsr"], rtol=1e-12)
-    time, error = growth([window], "plsr")
+    time, error = runs.growth([window], "plsr")
     assert time[0] == pytest.approx(0.1)
     seen = np.isfinite(error[:, 0])
     # the second in which all samples are masked leaves no error of u, v and position, but one of r
@@ -95,20 +268,6 @@ def test_masked_samples_do_not_count(run: Path) -> None:
     assert error[-1, 3] == pytest.approx(np.hypot(*LEVEL["plsr"][:2]) * time[-1], rel=0.02)
 
 
-def test_roles_have_fixed_looks_and_no_two_models_share_one(run: Path) -> None:
-    look = styles(RunFiles(run))
-    assert look["plsr"]["color"] == "#0072B2"
-    assert look["baseline"]["linestyle"] == "--"
-    assert len({(style["color"], str(style["linestyle"])) for style in look.values()}) == len(look)
-
-
-def test_lines_keep_their_colours(run: Path) -> None:
-    with Image.open(run / "figures" / "03_history_zigzag.png") as picture:
-        pixels = np.asarray(picture.convert("RGB")).astype(int).reshape(-1, 3)
-    for color in ((0, 114, 178), (230, 159, 0), (0, 158, 115), (0, 0, 0)):
-        assert (np.abs(pixels - color).max(1) < 12).sum() > 200, color
-
-
 def test_many_heads_keep_distinct_looks(tmp_path: Path) -> None:
     content = metrics(("test",), ("plsr",))
     content["rows"] = [
@@ -116,14 +275,14 @@ def test_many_heads_keep_distinct_looks(tmp_path: Path) -> None:
     ]
     content["selected"] = None
     write_json(tmp_path / "metrics.json", content)
-    look = styles(RunFiles(tmp_path))
-    assert len({(style["color"], str(style["linestyle"])) for style in look.values()}) == 12
+    looks = runs.model_looks(RunFiles(tmp_path)).values()
+    assert len({(look.color, look.dash) for look in looks}) == 12
 
 
 def test_bars_follow_speed_and_steering_runs_where_there_are_such_groups(
     run: Path, tmp_path: Path
 ) -> None:
-    assert bar_group(RunFiles(run), "whole", "u") == "all"
+    assert runs.bar_group(RunFiles(run), "whole", "u") == "all"
     content = metrics(("test",))
     content["rows"] += [
         line | {"manoeuvre": name}
@@ -132,39 +291,18 @@ def test_bars_follow_speed_and_steering_runs_where_there_are_such_groups(
         for name in ("speed", "steering")
     ]
     write_json(tmp_path / "metrics.json", content)
-    assert [bar_group(RunFiles(tmp_path), "whole", channel) for channel in "uvr"] == [
-        "speed",
-        "steering",
-        "steering",
-    ]
+    groups = [runs.bar_group(RunFiles(tmp_path), "whole", channel) for channel in "uvr"]
+    assert groups == ["speed", "steering", "steering"]
 
 
-def test_r_squared() -> None:
-    target = np.array([1.0, 2.0, 4.0])
-    assert r_squared(target, target) == 1.0
-    assert r_squared(target, np.full(3, target.mean())) == pytest.approx(0.0)
-
-
-def test_a_folder_with_metrics_alone_gives_the_bars_alone(tmp_path: Path) -> None:
-    write_json(tmp_path / "metrics.json", metrics(("external",), ("baseline", "plsr")))
-    assert [figure.path.name for figure in write_figures(RunFiles(tmp_path))] == ["01_bars.png"]
-
-
-def test_a_folder_without_metrics_is_refused(tmp_path: Path) -> None:
+def test_metrics_alone_give_the_bars_alone_and_a_folder_without_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no metrics\.json"):
-        write_figures(RunFiles(tmp_path))
-
-
-def test_damaged_pictures_are_passed_over(tmp_path: Path) -> None:
-    """A report draws them again; nothing of them is needed."""
-    whole, folder = tmp_path / "whole.png", tmp_path / "figures"
-    Image.new("RGB", (40, 30)).save(whole)
-    folder.mkdir()
-    for cut in (0, 4, 20, 40, 60):
-        (folder / f"cut_{cut}.png").write_bytes(whole.read_bytes()[:cut])
-    (folder / "folder.png").mkdir()
-    (folder / "foreign.png").write_text("no picture")
-    assert read_figures(folder) == []
+        write_fit_figures(RunFiles(tmp_path))
+    write_json(tmp_path / "metrics.json", metrics(("external",), ("baseline", "plsr")))
+    (figure,) = write_fit_figures(RunFiles(tmp_path))
+    assert figure.stills[0].name == "01_bars.png"
+    outline = figure.cases[0].curves[0]["external"][0]
+    assert np.nanmax(outline) == pytest.approx(0.1)
 
 
 def test_a_bred_equation_shows_its_generations(tmp_path: Path) -> None:
@@ -173,9 +311,50 @@ def test_a_bred_equation_shows_its_generations(tmp_path: Path) -> None:
     history = [{"train": 1 / k, "validation": 1.2 / k, "terms": k} for k in range(1, 6)]
     row = {"history": history, "generation": 4}
     write_json(folder / "models" / model / "fit.json", {"equations": {"u_dot": row, "r_dot": row}})
-    (drawing,) = of_breeding(RunFiles(folder))
-    first, second = drawing.figure.axes
-    assert [axes.get_title(loc="left") for axes in (first, second)] == ["surge", "yaw"]
-    errors = np.asarray(first.lines[1].get_ydata(), dtype=float)
-    np.testing.assert_allclose(errors, [1.2 / k for k in range(1, 6)])
-    assert np.asarray(first.lines[2].get_xdata()).tolist() == [4]
+    (figure,) = breeding(RunFiles(folder))
+    assert [panel.title for panel in figure.panels] == ["surge", "yaw"]
+    curves = figure.cases[0].curves[0]
+    np.testing.assert_allclose(curves["validation"][1], [1.2 / k for k in range(1, 6)])
+    assert curves["kept"][0].tolist() == [4]
+
+
+def test_trials_of_a_sweep_over_their_keys() -> None:
+    trials = [
+        {"number": i, "value": 0.1 * i, "values": {"heads.size": i, "kind": "ab"[i % 2]}}
+        for i in range(20)
+    ]
+    content = {
+        "trials": [*trials, {"number": 20, "value": None, "values": {}}],
+        "keys": ["heads.size", "kind"],
+        "log": [],
+        "minimized": False,
+        "objective": "score [-]",
+    }
+    figure = parallel_coordinates(content)
+    assert figure.panels[0].x_names == {
+        "0": "heads.size\n0 to 19",
+        "1": 'kind\n"a" to "b"',
+        "2": "score\n0 to 1.9",
+    }
+    curves = figure.cases[0].curves[0]
+    assert [values.tolist() for values in curves["best"]] == [[0, 1, 2], [1.0, 1.0, 1.0]]
+    counts = {name: len(parts(*curve)) for name, curve in curves.items()}
+    assert counts["best tenth"] + counts["better half"] + counts["worse half"] == len(trials)
+
+
+@needs_browser
+def test_a_browser_draws_every_panel_of_a_fit_and_the_controls_work(run: Path) -> None:
+    page = write_fit_page(RunFiles(run))
+    assert page.stat().st_size < _MOST_BYTES
+    for width in (390, 820):
+        found = layout(page, width, run)
+        assert (found.overflow, found.broken) == (0, []), width
+        assert found.smallest >= 11
+        assert all(found.panels), "every panel is drawn"
+        assert found.used == {
+            "focused": True,
+            "zoomed": pytest.approx(0.5, abs=0.01),
+            "reset": pytest.approx(1.0, abs=0.01),
+            "hidden": True,
+            "chosen": True,
+        }

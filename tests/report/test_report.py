@@ -21,7 +21,7 @@ from residnet.dynamics.store import ModelSpec, save_model
 from residnet.report.fit import write_fit_page, write_fit_report
 from residnet.report.format import change, number
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.fit.coefficients import term_unit
+from residnet.report.sections.models import term_unit
 
 
 def shown(run: Path) -> str:

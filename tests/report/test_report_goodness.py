@@ -9,16 +9,16 @@ from made_run import DEG, made_run, write_json
 from made_series import autoregressive
 
 from residnet.judge.goodness import OneStep, content, table
-from residnet.report.blocks import Table, Text
+from residnet.report.blocks import Section, Table, Text
 from residnet.report.fit import write_fit_page
 from residnet.report.format import number
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.fit.goodness import axes
+from residnet.report.sections.models import goodness
 
 
 def test_section_shows_what_the_file_says(tmp_path: Path) -> None:
     run = made_run(tmp_path)
-    assert axes(RunFiles(run)) == []
+    assert goodness(RunFiles(run)) is None
     assert 'id="goodness-of-fit"' not in write_fit_page(RunFiles(run)).read_text()
     target = autoregressive(0.9, 3, 800, seed=0).T
     models = [
@@ -33,7 +33,9 @@ def test_section_shows_what_the_file_says(tmp_path: Path) -> None:
     ]
     rows = table(models, [target], 0.1)
     write_json(run / "goodness.json", content("made", {"train": rows, "test": rows}, 0.1))
-    parts = axes(RunFiles(run))
+    section = goodness(RunFiles(run))
+    assert section is not None
+    parts = [part for part in section.shown if isinstance(part, Section)]
     assert [part.title for part in parts] == [
         "surge u′ [m/s²], test data",
         "sway v′ [m/s²], test data",

@@ -24,7 +24,7 @@ from residnet.report.blocks import Section
 from residnet.report.fit import fit_sections
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections import actuators, autopilot, course, import_logs, simulate, study
+from residnet.report.sections import actuators, autopilot, course, import_logs, manoeuvres, study
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ TASKS = {
     "course": Reported(made_course, course.sections, course.draw),
     "fit": Reported(made_run, fit_sections),
     "import": Reported(made_import, import_logs.sections),
-    "simulate": Reported(made_simulate, simulate.sections),
+    "simulate": Reported(made_simulate, manoeuvres.sections),
     "study": Reported(made_study, study.sections, study.draw),
 }
 
@@ -139,7 +139,7 @@ def test_indices_stand_flight_by_flight_or_by_kind(tmp_path: Path) -> None:
         ["initial turning distance", "m", "8.000", "8.000", "0", "2.00", "2.00", ""],
     ]
     run = RunFiles(made_simulate(tmp_path / "many", logs=13))
-    text = plain(write_page(run.path, "many", "", [], simulate.sections(run)))
+    text = plain(write_page(run.path, "many", "", [], manoeuvres.sections(run)))
     (table,) = Page(text).tables
     assert table[0] == ["log", "first overshoot [deg]", "initial turning distance [m]"]
     assert len(table) == 1 + 2 * 13

@@ -15,7 +15,7 @@ from tiny import call
 
 from residnet.control.observed.config import PtosConfig
 from residnet.core.config import load_config
-from residnet.report.sections.conditions import cost_verdict
+from residnet.report.sections.autopilot import cost_verdict
 from residnet.tasks.autopilot.stored import stored_policy
 from residnet.tasks.autopilot.task import AutopilotConfig
 from residnet.tasks.autopilot.tuned import tuned_before

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from residnet.report.figures.free_runs import DrawnRun
+    from residnet.report.figure import Figure as Drawing
+
 
 _ORDER = ("u", "v", "r", "psi", "x", "y")
 
@@ -105,9 +106,10 @@ class FreeRuns:
         Raises:
             UsageError: where there is no such log, model, protocol or window.
         """
-        from residnet.report.figures.free_runs import draw_track
+        from residnet.report.still import still
 
-        return draw_track(self._drawn(log, models, protocol, window))
+        figure: Figure = still(self._drawn(log, models, protocol, window), only=[0])
+        return figure
 
     def plot_history(
         self,
@@ -128,14 +130,16 @@ class FreeRuns:
         Raises:
             UsageError: where there is no such log, model, protocol or window.
         """
-        from residnet.report.figures.free_runs import draw_history
+        from residnet.report.still import still
 
-        return draw_history(self._drawn(log, models, protocol, window))
+        figure: Figure = still(self._drawn(log, models, protocol, window), only=[1, 2, 3, 4])
+        return figure
 
     def _drawn(
         self, log: str | None, models: Sequence[str], protocol: str | None, window: int | None
-    ) -> DrawnRun:
-        from residnet.report.figures.free_runs import DrawnRun
+    ) -> Drawing:
+        from residnet.report.run_reader import StoredWindow
+        from residnet.report.sections.runs import window_figure
 
         usual = "manoeuvre" if "manoeuvre" in self.protocols else self.protocols[0]
         kind = _named(protocol or usual, self.protocols, "protocol")
@@ -156,16 +160,22 @@ class FreeRuns:
         rows = slice(drawn.start, drawn.stop)
         given = [models] if isinstance(models, str) else models
         shown = [_named(model, run.predictions, "model") for model in given]
-        return DrawnRun(
-            f"{name}, {kind}",
-            prepared.log.t[rows],
-            prepared.usable[rows],
-            prepared.y[rows],
-            {
-                model: run.predictions[model][of_log[place]].states
+        order = [STATE.index(channel) for channel in _ORDER]
+        stored = StoredWindow(
+            log=name,
+            manoeuvre=prepared.log.manoeuvre,
+            protocol=kind,
+            number=place,
+            t=prepared.log.t[rows],
+            usable=prepared.usable[rows],
+            measured=prepared.y[rows][:, order],
+            predicted={
+                model: run.predictions[model][of_log[place]].states[:, order]
                 for model in shown or [m for m in run.predictions if m != "zero"]
             },
+            diverged={},
         )
+        return window_figure(stored, f"{name}, {kind}")
 
 
 def _named(name: Any, known: Any, what: str) -> str:

@@ -10,13 +10,9 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeAlias
+from typing import Any, ClassVar, Literal, Protocol, TypeAlias
 
 from residnet.report.format import fixed
-
-if TYPE_CHECKING:
-    from residnet.report.interactive.explorer import Explorer
 
 Mark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 
@@ -93,24 +89,6 @@ class Code:
     kind: ClassVar[str] = "code"
     text: str
     wrap: bool = False
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A picture of the run folder with its title and caption.
-
-    Attributes:
-        path: of a PNG file.
-        title: a few words.
-        caption: whole sentences that say what to look for.
-        explorer: the interactive figure that shows the same; None where there is none.
-    """
-
-    kind: ClassVar[str] = "figure"
-    path: Path
-    title: str
-    caption: str
-    explorer: Explorer | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -332,6 +310,20 @@ def _at(row: Any, keys: str) -> Any:
     return row
 
 
+def nested(keys: Iterable[str], columns: Sequence[Column]) -> list[Column]:
+    """Return the columns of what stands below each of some keys of a row."""
+
+    def inside(key: str, column: Column) -> Column:
+        title, what, *rest = column
+
+        def of(row: Any) -> Any:
+            return what(row[key]) if callable(what) else _at(row[key], what)
+
+        return title, of, *rest
+
+    return [inside(key, column) for key in keys for column in columns]
+
+
 def bad_where(text: object, bad: object) -> Cell:
     """Return a cell that is set off where something is wrong."""
     return Cell(str(text), mark="bad" if bad else "")
@@ -357,15 +349,12 @@ class Section:
         title: a few words.
         blocks: what it shows, from top to bottom.
         folded: closed at first, for what most readers skip.
-        pictures: its figures show what interactive ones show too: hidden on a screen where those
-            are drawn, until a button is pressed; always printed.
     """
 
     kind: ClassVar[str] = "section"
     title: str
     blocks: Sequence[Block | None] = field(default_factory=tuple)
     folded: bool = False
-    pictures: bool = False
 
     @property
     def shown(self) -> list[Block]:

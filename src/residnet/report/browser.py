@@ -207,8 +207,8 @@ def _mark(figure: Figure, name: str, source: ColumnDataSource, on_cells: bool) -
     color, x = "#808080" if look.color == INK else look.color, f"x of {name}"
     # what is faint on paper stays to be seen on a screen
     alpha = max(look.alpha, 0.25)
-    fill = {"fill_color": color, "fill_alpha": alpha, "line_color": None}
-    line = {
+    fill: dict[str, Any] = {"fill_color": color, "fill_alpha": alpha, "line_color": None}
+    line: dict[str, Any] = {
         "line_color": color,
         "line_alpha": alpha,
         "line_dash": _DASHES.get(look.dash, look.dash),
@@ -250,7 +250,7 @@ def _columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarray]:
     """Return the columns of a panel's source; shorter curves are filled with gaps."""
     curves = case.curves[panel]
     longest = max((len(x) for x, _ in curves.values()), default=0)
-    columns = {}
+    columns: dict[str, np.ndarray] = {}
     for name in figure.names(panel):
         x, y = curves.get(name, (np.empty(0), np.empty(0)))
         columns |= {f"x of {name}": x, name: y}

@@ -17,6 +17,8 @@ from typing import Any, ClassVar, Literal, TypeAlias
 import numpy as np
 
 from residnet.core.files import whole
+from residnet.core.stretches import stretches
+from residnet.report.blocks import Section
 
 INK = "ink"
 """The colour of text: black on paper, light on a dark screen."""
@@ -210,6 +212,11 @@ class Figure:
         """Name of its parts on a page: letters, digits and `-`."""
         return "figure-" + re.sub(r"[^a-z0-9]+", "-", self.name.lower())
 
+    @property
+    def pictured(self) -> list[Case]:
+        """Cases in the order of the stills."""
+        return [case for case in self.cases if case.still]
+
     def names(self, panel: int) -> list[str]:
         """Return the names of what a panel shows in any case, in order."""
         present = {name for case in self.cases for name in case.curves[panel]}
@@ -339,6 +346,12 @@ def read_figures(folder: Path, names: str = ".*") -> list[Figure]:
     return [figure for figure in found if figure and re.fullmatch(names, figure.name)]
 
 
+def figures_section(folder: Path, names: str = ".*") -> list[Section]:
+    """Return a section with the figures of a folder, none where there are none."""
+    figures = read_figures(folder, names)
+    return [Section("Figures", figures)] if figures else []
+
+
 def _read(path: Path) -> Figure | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -373,8 +386,7 @@ def parts(x: Any, y: Any) -> list[Curve]:
     """Return a curve in the pieces that its gaps leave."""
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     good = np.isfinite(x) & np.isfinite(y)
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], good, [False]))))
-    return [(x[a:b], y[a:b]) for a, b in edges.reshape(-1, 2)]
+    return [(x[a:b], y[a:b]) for a, b in zip(*stretches(good), strict=True)]
 
 
 def joined(curves: Iterable[tuple[Any, Any]]) -> Curve:

@@ -1,53 +1,79 @@
-"""The report of a fit, and of its evaluation on other logs."""
+"""The report of a fit, and of its evaluation on other logs: its figures and its sections."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from residnet.judge.verdict.sanity_file import read_findings
 from residnet.report.blocks import Section
-from residnet.report.figures.files import figures_section
-from residnet.report.figures.fit import write_figures
-from residnet.report.interactive.free_runs import explorers
+from residnet.report.figure import Figure, figures_section, read_figures, write_figures
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.fit import (
-    bands,
-    booklet,
-    coefficients,
-    data,
-    doctor,
-    equations,
-    free_runs,
-    goodness,
-    limits,
-    models,
-    sanity,
-)
-from residnet.report.sections.fit.verdict import caution_section, verdict
-from residnet.report.sections.fit.verdict import figures_section as selected_section
+from residnet.report.sections import data, free_runs, manoeuvres, models, runs, verdict
 
 _DIVERGENCE = 3.0
 """Times the training envelope beyond which a run has diverged, where the config gives none."""
+_INTERACTIVE = "free_runs|horizon|residuals"
+"""Names of the figures that stand before the numbers."""
+
+
+def _sections(run: RunFiles) -> list[Callable[[RunFiles], Section | None]]:
+    """Return what gives each section of the page, in their order; None is left out.
+
+    A section is added here, and its figures below.
+    """
+    divergence = float(run.evaluation.get("divergence") or _DIVERGENCE)
+    findings = read_findings(run.path, divergence=divergence)
+    return [
+        partial(verdict.cautions, findings=findings),
+        verdict.figures_of_lead,
+        _looked_into,
+        free_runs.limits,
+        data.fitted_on_what,
+        data.doctor,
+        models.models,
+        manoeuvres.booklet,
+        free_runs.bands,
+        models.goodness,
+        free_runs.errors,
+        _other_figures,
+        partial(verdict.sanity, findings=findings),
+    ]
+
+
+def _figures(run: RunFiles) -> Iterator[Figure | None]:
+    windows = run.windows(run.focus)
+    yield runs.free_runs(run, windows)
+    yield runs.horizon(run, windows)
+    yield runs.residuals(run)
+    yield runs.error_bars(run)
+    yield runs.bands(run, windows)
+    yield from manoeuvres.booklet_figures(run)
+    yield from models.terms(run)
+    yield from models.breeding(run)
+    yield models.learning(run)
+
+
+def write_fit_figures(run: RunFiles) -> list[Figure]:
+    """Write the figures of a fit or an evaluation; what the folder has no data for is left out.
+
+    Raises:
+        UsageError: where the folder holds no metrics.json.
+    """
+    return write_figures(run.path / "figures", (one for one in _figures(run) if one is not None))
 
 
 def write_fit_report(path: Path) -> Path:
     """Write figures and `report.html` of a fit or an evaluation from its folder alone.
-
-    Parts that the folder holds nothing of are left out.
-
-    Args:
-        path: folder with metrics.json.
-
-    Returns:
-        Path of the page.
 
     Raises:
         UsageError: where the folder holds no metrics.json.
         DataError: where a file in it cannot be read.
     """
     run = RunFiles(path)
-    write_figures(run)
+    write_fit_figures(run)
     return write_fit_page(run)
 
 
@@ -59,7 +85,7 @@ def write_fit_page(run: RunFiles) -> Path:
         DataError: where a file in it cannot be read.
     """
     title = str(run.metrics.get("run") or run.path.name)
-    return write_page(run.path, title, run.description, verdict(run), fit_sections(run))
+    return write_page(run.path, title, run.description, verdict.verdict(run), fit_sections(run))
 
 
 def fit_sections(run: RunFiles) -> list[Section]:
@@ -69,34 +95,14 @@ def fit_sections(run: RunFiles) -> list[Section]:
         UsageError: where the folder holds no metrics.json.
         DataError: where a file in it cannot be read.
     """
-    divergence = float(run.evaluation.get("divergence") or _DIVERGENCE)
-    findings = read_findings(run.path, divergence=divergence)
-    found = [
-        caution_section(run, findings),
-        selected_section(run),
-        _interactive(run),
-        limits.section(run),
-        data.section(run),
-        doctor.section(run),
-        _models(run),
-        booklet.section(run),
-        bands.section(run),
-        goodness.section(run),
-        free_runs.section(run),
-        figures_section(run.path / "figures", "tracks|history_.*|horizon_.*|residuals.*"),
-        sanity.section(run, findings),
-    ]
+    found = [section(run) for section in _sections(run)]
     return [section for section in found if section is not None]
 
 
-def _interactive(run: RunFiles) -> Section | None:
-    """Return the section of interactive figures, None where there are no free runs."""
-    found = explorers(run)
+def _looked_into(run: RunFiles) -> Section | None:
+    found = read_figures(run.path / "figures", _INTERACTIVE)
     return Section("Runs to look into", found) if found else None
 
 
-def _models(run: RunFiles) -> Section | None:
-    """Return the section on what was identified and learned."""
-    parts = [coefficients.section(run), models.section(run), *equations.sections(run)]
-    there = [part for part in parts if part is not None]
-    return Section("Models", there) if there else None
+def _other_figures(run: RunFiles) -> Section | None:
+    return next(iter(figures_section(run.path / "figures", f"(?!({_INTERACTIVE})$).*")), None)

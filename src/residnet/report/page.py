@@ -1,31 +1,31 @@
-"""The one page builder: every task's `report.html` is written here."""
+"""The one page builder: every task's `report.html` is written here, the field's words linked."""
 
 from __future__ import annotations
 
 import base64
 import re
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from markupsafe import Markup, escape
 
 from residnet.core.config import load_mapping
+from residnet.core.errors import UsageError
 from residnet.core.files import read_json, whole
-from residnet.report.blocks import Block, Code, Facts, Figure, Section
-from residnet.report.figures.files import picture_alone
-from residnet.report.glossary import Glossary
-from residnet.report.interactive.drawing import Drawn, draw
-from residnet.report.interactive.explorer import Explorer
+from residnet.report.blocks import Block, Bullets, Cell, Code, Facts, Section, bad_where, table_of
+from residnet.report.browser import Drawn, draw
+from residnet.report.figure import Figure
 
 _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
+EXPORTS = "exports.json"
+"""File of a run folder that says what came of each export."""
 _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
 
 
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """The space between a number and its unit."""
-_MOST_PANELS = 60
-"""Most panels of interactive figures of one page, which a browser has to draw."""
 _LONG = 20
 """Least number of characters of a name that may break in the middle."""
 
@@ -35,7 +35,7 @@ def draw_sections(sections: Sequence[Section]) -> Drawn | None:
 
     Drawing them takes most of the time of a page: one that is written twice needs them once.
     """
-    return draw(_afforded(_explorers(sections)))
+    return draw(_figures(sections))
 
 
 def write_page(
@@ -82,7 +82,7 @@ def write_page(
     glossary = Glossary()
     environment.filters |= {
         "breakable": _breakable,
-        "embedded": _embedded,
+        "embedded": lambda path: base64.b64encode(path.read_bytes()).decode("ascii"),
         "pixels": _pixels,
         "anchor": _anchor,
         "linked": lambda text: glossary.linked(_breakable(str(text))),
@@ -111,28 +111,43 @@ def title_and_description(run: Path) -> tuple[str, str]:
     return str(resolved.get("name") or run.name), str(resolved.get("description") or "")
 
 
-def _explorers(blocks: Sequence[Block]) -> list[Explorer]:
-    """Return the interactive figures among blocks and the sections that they hold."""
-    found: list[Explorer] = []
+def _figures(blocks: Sequence[Block]) -> list[Figure]:
+    """Return the figures among blocks and the sections that they hold."""
+    found: list[Figure] = []
     for block in blocks:
-        if isinstance(block, Explorer):
+        if isinstance(block, Figure):
             found.append(block)
-        elif isinstance(block, Figure) and block.explorer is not None:
-            found.append(block.explorer)
         elif isinstance(block, Section):
-            found += _explorers(block.shown)
+            found += _figures(block.shown)
     return found
 
 
-def _afforded(explorers: Sequence[Explorer]) -> list[Explorer]:
-    """Return the interactive figures that a page has room for; others stay pictures."""
-    out: list[Explorer] = []
-    panels = 0
-    for explorer in explorers:
-        panels += len(explorer.panels)
-        if panels <= _MOST_PANELS or not out:
-            out.append(explorer)
-    return out
+def exports_section(run: Path) -> Section | None:
+    """Return what a run exported for controllers, and what it could not; None where nothing.
+
+    Raises:
+        UsageError: where exports.json is not readable.
+    """
+    file = run / EXPORTS
+    if not file.is_file():
+        return None
+    try:
+        rows = [
+            (str(row["model"]), str(row["file"] or ""), str(row["fault"] or ""))
+            for row in read_json(file)["exports"]
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{file}: not readable as a list of exports ({error})") from None
+    faults = [f"Not exported: {fault}." for _, _, fault in rows if fault]
+
+    def result(row: Sequence[str]) -> Cell:
+        if row[2]:
+            return bad_where("not exported", True)
+        return Cell("the file gives the model's own answers", mark="text")
+
+    columns = [("model", lambda row: row[0]), ("file", lambda row: row[1]), ("result", result)]
+    blocks: list[Block] = [Bullets(faults, warning=True)] if faults else []
+    return Section("Exports for controllers", [*blocks, table_of(rows, columns)])
 
 
 def _record(run: Path) -> Mapping[str, Any]:
@@ -203,5 +218,58 @@ def _pixels(path: Path) -> Markup:
     return Markup(f' width="{width}" height="{height}"')
 
 
-def _embedded(path: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(picture_alone(path)).decode("ascii")
+_ENTRY = re.compile(r"^(?P<terms>\S.*)\n:\s+(?P<text>.*)$", re.MULTILINE)
+_CODE = re.compile(r"`([^`]*)`|\*([^*]*)\*")
+
+
+def entries() -> Mapping[str, str]:
+    """Return terms, several of one meaning with commas between, and what they mean."""
+    file = resources.files("residnet.report") / "templates" / "glossary.md"
+    found = _ENTRY.finditer(file.read_text(encoding="utf-8"))
+    return {_plain(entry["terms"]): _plain(entry["text"]) for entry in found}
+
+
+def _plain(text: str) -> str:
+    return _CODE.sub(lambda found: found[1] or found[2], text)
+
+
+@final
+class Glossary:
+    """The words of one page: links to them, and what they mean for its end."""
+
+    def __init__(self) -> None:
+        self._meant = entries()
+        self._of = {word.lower(): key for key in self._meant for word in key.split(", ")}
+        words = sorted(self._of, key=len, reverse=True)
+        several = "|".join(re.escape(word).replace(r"\ ", r"[ \u00a0]") for word in words)
+        self._words = re.compile(rf"(?<![\w/.-])(?:{several})(?=s?(?![\w/-]|\.\w))", re.IGNORECASE)
+        self._here: set[str] = set()
+        self._used: set[str] = set()
+
+    def fresh(self) -> str:
+        """Begin a section, whose words are linked anew; returns nothing to print."""
+        self._here.clear()
+        return ""
+
+    def linked(self, text: Markup) -> Markup:
+        """Return escaped text with links at the first use of each word in the section."""
+
+        def link(found: re.Match[str]) -> str:
+            key = self._of[found[0].lower().replace("\u00a0", " ")]
+            if key in self._here:
+                return found[0]
+            self._here.add(key)
+            self._used.add(key)
+            meant = escape(self._meant[key])
+            return f'<a class="term" href="#{name_of(key)}" title="{meant}">{found[0]}</a>'
+
+        return Markup(self._words.sub(link, str(text)))
+
+    def used(self) -> list[tuple[str, str, str]]:
+        """Return name, terms and meaning of each word that was linked, in alphabetical order."""
+        return [(name_of(key), key, self._meant[key]) for key in self._meant if key in self._used]
+
+
+def name_of(key: str) -> str:
+    """Return the name by which a word is linked."""
+    return "word-" + re.sub(r"[^a-z0-9]+", "-", key.lower()).strip("-")

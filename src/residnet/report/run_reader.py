@@ -201,6 +201,12 @@ class RunFiles:
         return sorted(heads, key=lambda model: model != self.selected)
 
     @cached_property
+    def lead(self) -> str:
+        """The model that a report is on: the selected one, else the first head or the baseline."""
+        names = [self.selected, *self.heads, self.baseline, *self.kinds]
+        return next(name for name in names if name is not None and name in self.kinds)
+
+    @cached_property
     def splits(self) -> list[str]:
         """The splits of the rows, in their order."""
         return list(dict.fromkeys(row["split"] for row in self.rows))

@@ -177,6 +177,8 @@ def _mark(axes: Any, look: Look, x: np.ndarray, y: np.ndarray) -> Any:
         for piece in parts(x, y):
             drawn = axes.fill(*piece, **line, linewidth=0)[0]
         return drawn
+    low: float
+    high: float
     for low, high in zip(x, y, strict=True):
         if look.kind == "strip" and np.isfinite(low):
             drawn = axes.axvspan(low, high, **line, linewidth=0)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from residnet.core.errors import ResidnetError
-from residnet.report.sections.exports import EXPORTS
+from residnet.report.page import EXPORTS
 from residnet.runs.folder import RunFolder
 
 Exports = Mapping[str, Callable[[], Path]]

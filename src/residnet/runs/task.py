@@ -17,9 +17,14 @@ from residnet.core.arrays.heap import keep_freed_memory
 from residnet.core.config import Config, dump_config, load_mapping
 from residnet.core.errors import DataError, ExportError, UsageError
 from residnet.report.blocks import Section
-from residnet.report.interactive.drawing import Drawn
-from residnet.report.page import draw_sections, title_and_description, write_page
-from residnet.report.sections.exports import EXPORTS, exports_section
+from residnet.report.browser import Drawn
+from residnet.report.page import (
+    EXPORTS,
+    draw_sections,
+    exports_section,
+    title_and_description,
+    write_page,
+)
 from residnet.runs.checksums import seal
 from residnet.runs.exports import Exported, Exports, write_exports
 from residnet.runs.folder import RunFolder

@@ -19,7 +19,7 @@ from residnet.physics.actuators.identify import (
     fit_thrust,
 )
 from residnet.report.blocks import Section
-from residnet.report.figures.files import write_drawings
+from residnet.report.figure import write_figures
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.actuators import sections
 from residnet.runs.folder import RunFolder
@@ -174,7 +174,7 @@ class ActuatorsTaskConfig(Task):
         Raises:
             ResidnetError: where the logs cannot be used or do not determine the actuators.
         """
-        from residnet.report.figures.actuators import actuator_tests
+        from residnet.report.sections.actuators import actuator_tests
 
         logs = _Logs(self)
         throttle = fit_throttle(logs.throttle[0], logs.throttle[1]) if logs.throttle else None
@@ -193,7 +193,7 @@ class ActuatorsTaskConfig(Task):
             (logs.steps, step) if step else None,
             pull_of_one,
         )
-        write_drawings(folder.figures, [drawing])
+        write_figures(folder.figures, [drawing])
         figures = {}
         if throttle is not None:
             figures["n_max"] = MainFigure(throttle.n_max.value, "1/s")

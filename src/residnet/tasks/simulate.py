@@ -14,9 +14,9 @@ from residnet.data.simulated.trials import SimulatedTrials, fly_trials, stand_in
 from residnet.manoeuvres import Replay
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Section
-from residnet.report.figures.files import write_drawings
+from residnet.report.figure import write_figures
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.simulate import indices_text, sections
+from residnet.report.sections.manoeuvres import indices_text, sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome
 from residnet.tasks.programme import Programme
@@ -87,7 +87,7 @@ class SimulateConfig(ComputingTask):
             UsageError: where something cannot fly the manoeuvres.
         """
         from residnet.judge.index_table import contents, index_rows
-        from residnet.report.figures.flights import flight_drawings
+        from residnet.report.sections.manoeuvres import flight_figures
 
         flown, places, length = (
             self._drawn() if self.programme is None else self._listed(self.programme)
@@ -100,8 +100,8 @@ class SimulateConfig(ComputingTask):
         rows = [row for craft, flights in flown for row in index_rows(craft, flights, length)]
         content = contents(self.name, length, rows)
         folder.write_json(folder.path / "indices.json", content)
-        drawings = flight_drawings({craft.name: flights for craft, flights in flown})
-        write_drawings(folder.figures, drawings)
+        figures = flight_figures({craft.name: flights for craft, flights in flown})
+        write_figures(folder.figures, figures)
         faults = [row for row in rows if row["fault"]]
         ended = (
             f"{len(faults)} of {count} manoeuvres did NOT end as they should"

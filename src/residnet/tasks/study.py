@@ -18,9 +18,15 @@ from residnet.core.names import nearest
 from residnet.core.processes import processes
 from residnet.core.progress import report
 from residnet.report.blocks import Section
-from residnet.report.comparison import Variant, table, window_nrmse
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.study import draw, sections, variants_table
+from residnet.report.sections.study import (
+    Variant,
+    draw,
+    sections,
+    table,
+    variants_table,
+    window_nrmse,
+)
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 from residnet.tasks.fit import FitConfig

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from residnet.report.blocks import Block, Code, Section, Table, Text
-from residnet.report.figures.files import figures_section
+import numpy as np
+
+from residnet.physics.actuators.identify import StepAnswer, ThrottleMap, ThrustFit, follow_command
+from residnet.report.blocks import Block, Code, Section, Table, Text, table_of
+from residnet.report.figure import (
+    GREEN,
+    SOLID,
+    Case,
+    Curve,
+    Figure,
+    Look,
+    Panel,
+    figures_section,
+    joined,
+)
 from residnet.report.format import DASH, interval, number
-from residnet.report.run_reader import RunFiles
+from residnet.report.run_reader import Content, RunFiles
 
 _TITLES = {
     ("throttle", "slope"): "revolutions at full throttle, slope",
@@ -21,21 +35,19 @@ _PER_MINUTE = {"1/s": ("rpm", 60.0), "1/s^2": ("rpm/s", 60.0)}
 """Units of revolutions as test engineers read them, with the factor from SI."""
 
 
+Step = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Time in s, command and measured revolutions in 1/s of one step response, each [N]."""
+
+
 def sections(run: RunFiles) -> list[Section]:
     """Return the identified parameters, the figure, and the lines for a vessel file."""
     found = run.json("actuators.json")
     blocks: list[Block] = [parameter_table(found)]
     throttle = found.get("throttle")
     if throttle and not throttle["saturated"]:
-        blocks.append(
-            Text(
-                "Nothing saturated in the throttle test. The largest revolutions are measured ones."
-            )
-        )
-    out = [Section("Identified parameters", blocks)]
-    figures = figures_section(run.path / "figures")
-    if figures:
-        out.append(figures)
+        text = "Nothing saturated in the throttle test. The largest revolutions are measured ones."
+        blocks.append(Text(text))
+    out = [Section("Identified parameters", blocks), *figures_section(run.path / "figures")]
     lines = run.path / "actuators.yaml"
     if lines.is_file():
         about = "These lines belong to the section actuators of a vessel file."
@@ -44,29 +56,97 @@ def sections(run: RunFiles) -> list[Section]:
 
 
 def parameter_table(found: Mapping[str, Any]) -> Table:
-    """Return a row for each parameter with its 95 % interval.
+    """Return a row for each parameter of actuators.json with its 95 % interval."""
+    rows: list[Content] = []
+    for test, parts in found.items():
+        estimates = parts.items() if isinstance(parts, Mapping) else ()
+        for name, estimate in estimates:
+            if isinstance(estimate, Mapping):
+                unit, factor = _PER_MINUTE.get(estimate["unit"], (estimate["unit"], 1.0))
+                rows.append(
+                    {
+                        "test": test,
+                        "title": _TITLES.get((test, name), f"{test} thrust, {name}"),
+                        "value": number(factor * estimate["value"], 4),
+                        "interval": interval([estimate["low"], estimate["high"]], factor, 4),
+                        "unit": unit,
+                    }
+                )
+    rows += [
+        {
+            "test": "residual",
+            "title": f"{test} thrust, rms residual",
+            "value": number(found[test]["rms"]),
+            "interval": DASH,
+            "unit": "N",
+        }
+        for test in ("forward", "reverse")
+        if test in found
+    ]
+    return table_of(
+        rows,
+        [
+            ("parameter", "title"),
+            ("value", "value", str),
+            ("95 % interval", "interval", str),
+            ("unit", "unit", str),
+        ],
+        rule=lambda row: row["test"],
+    )
+
+
+def actuator_tests(
+    name: str,
+    throttle: tuple[np.ndarray, np.ndarray, ThrottleMap] | None = None,
+    steps: tuple[Sequence[Step], StepAnswer] | None = None,
+    bollard: tuple[np.ndarray, np.ndarray, tuple[ThrustFit, ThrustFit]] | None = None,
+) -> Figure:
+    """Draw measurements as dots and the fits over them, a panel for each test (Figs. 4, 6, 7).
 
     Args:
-        found: the contents of actuators.json.
+        name: of the run.
+        throttle: throttle [N], revolutions [N] in 1/s, and the fitted map.
+        steps: measured step responses, and the fitted one.
+        bollard: revolutions [N] in 1/s, thrust [N] of one thruster in N, and the fitted curves.
     """
-    table = Table(["parameter", "value", "95 % interval", "unit"])
-    last = ""
-    for test, name, estimate in _estimates(found):
-        unit, factor = _PER_MINUTE.get(estimate["unit"], (estimate["unit"], 1.0))
-        bounds = [estimate["low"], estimate["high"]]
-        title = _TITLES.get((test, name), f"{test} thrust, {name}")
-        cells = [number(factor * estimate["value"], 4), interval(bounds, factor, 4), unit]
-        table.add(title, cells, rule=test != last)
-        last = test
-    for test in ("forward", "reverse"):
-        if test in found:
-            table.add(f"{test} thrust, rms residual", [number(found[test]["rms"]), DASH, "N"])
-    return table
-
-
-def _estimates(found: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    for test, parts in found.items():
-        if isinstance(parts, Mapping):
-            for name, estimate in parts.items():
-                if isinstance(estimate, Mapping):
-                    yield test, name, estimate
+    drawn: list[tuple[Panel, dict[str, Curve]]] = []
+    if throttle is not None:
+        share, n, fitted = throttle
+        grid = np.linspace(share.min(), share.max(), 300)
+        panel = Panel("revolutions [rpm]", "throttle [%]", "throttle map", height=250, group="map")
+        curves = {"measured": (100 * share, 60 * n), "fit": (100 * grid, 60 * fitted(grid))}
+        drawn.append((panel, curves))
+    if steps is not None:
+        runs, answer = steps
+        rate, dead = answer.rate.value, answer.dead_time.value
+        panel = Panel("revolutions [rpm]", "time [s]", "step response", height=250, group="step")
+        of_runs = {
+            "command": joined((t - t[0], 60 * command) for t, command, _ in runs),
+            "measured": joined((t - t[0], 60 * n) for t, _, n in runs),
+            "fit": joined(
+                (t - t[0], 60 * follow_command(t, command, rate, dead, float(n[:3].mean())))
+                for t, command, n in runs
+            ),
+        }
+        drawn.append((panel, of_runs))
+    if bollard is not None:
+        n, thrust, fits = bollard
+        grids = [np.linspace(fit.low, fit.high, 200) for fit in fits]
+        panel = Panel(
+            "thrust of one [N]", "revolutions [rpm]", "bollard pull", height=250, group="n"
+        )
+        lines = joined((60 * grid, fit(grid)) for grid, fit in zip(grids, fits, strict=True))
+        drawn.append((panel, {"measured": (60 * n, thrust), "fit": lines}))
+    return Figure(
+        "actuators",
+        f"Actuators of {name}",
+        f"Actuator tests of {name}: the measurements, and the fits over them.",
+        {
+            "command": Look("command", GREEN, "dashed"),
+            "measured": Look("measured", "#666666", kind="points", size=2.5),
+            "fit": replace(SOLID, label="fit"),
+        },
+        [panel for panel, _ in drawn],
+        [Case("", [curves for _, curves in drawn])],
+        columns=len(drawn),
+    )

@@ -1,70 +1,262 @@
-"""The report of an autopilot run: step responses, settling and effort of every controller."""
+"""The report of an autopilot run: settling, effort and cost of every controller."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from residnet.report.blocks import Block, Cell, Code, Figure, Section, Table, Text
-from residnet.report.figures.autopilot import distributions, responses
-from residnet.report.figures.conditions import costs, learning
-from residnet.report.figures.files import figures_section, write_drawings
-from residnet.report.format import DEG, fixed
+import numpy as np
+import pandas as pd
+
+from residnet.control.conditions.quiet import quiet_after
+from residnet.report.blocks import Block, Code, Column, Section, Table, Text, bad_where, table_of
+from residnet.report.figure import (
+    ZERO,
+    Case,
+    Curve,
+    Figure,
+    Look,
+    Panel,
+    band,
+    family,
+    figures_section,
+    steps,
+    write_figures,
+)
+from residnet.report.format import DEG, signed
 from residnet.report.run_reader import Content, RunFiles
-from residnet.report.sections.conditions import CONDITIONS, conditions_section
 
 FLIGHTS = "flights.parquet"
 """Responses at the corners of the spread."""
 PLANTS = "plants.parquet"
 """What each random vessel gave."""
+CONDITIONS = "conditions.parquet"
+"""What each flight under the stated conditions cost, by controller."""
+_KINDS = {
+    "policy": "learned",
+    "network": "learned, no law inside",
+    "constants": "law, constants trained",
+    "untrained": "policy before training",
+    "network_off": "policy, network set to zero",
+    "classical": "classical, tuned",
+    "predictive": "document's autopilot",
+    "floor": "knows the nominal vessel",
+}
 
 
 def draw(run: RunFiles) -> list[Figure]:
     """Write the figures of an autopilot run from its folder alone; returns them."""
+    return write_figures(run.path / "figures", _figures(run))
+
+
+def _figures(run: RunFiles) -> Iterator[Figure]:
     kinds = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "conditions"}
-    test = run.resolved["test"]
-    flights, plants = run.frame(FLIGHTS), run.frame(PLANTS)
     flown = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "nominal"}
-    drawings = [
-        responses(flights, flown, test["heading"], test["band"], run.title),
-        distributions(plants, flown, run.title),
-    ]
+    yield _responses(run.frame(FLIGHTS), flown, run.resolved["test"], run.title)
+    yield _distributions(run.frame(PLANTS), flown, run.title)
     conditioned = run.frame(CONDITIONS)
     if conditioned is not None:
-        drawings.append(costs(conditioned, kinds, run.title))
-    fits = {
-        name: run.json(f"models/{name}/fit.json") for name in run.resolved.get("recurrent") or {}
-    }
+        yield _costs(conditioned, kinds, run.title)
+    fits = {name: run.fit(name) for name in run.resolved.get("recurrent") or {}}
     if fits:
-        drawings.append(learning(fits, run.title))
-    return write_drawings(run.path / "figures", drawings)
+        yield _learning(fits, run.title)
+
+
+def _looks(kinds: Mapping[str, str]) -> dict[str, Look]:
+    """Return how each controller looks; policies have the widest lines and lie on top."""
+    return {
+        name: replace(look, width=1.8, order=4) if kinds[name] == "policy" else look
+        for name, look in family(kinds, width=1.2).items()
+    }
+
+
+def _responses(series: pd.DataFrame, kinds: Mapping[str, str], test: Content, name: str) -> Figure:
+    """Draw a step of the nominal vessel; of policies, the corners of the spread as shades."""
+    heading, settled = test["heading"], test["band"]
+    series = series.assign(error=heading - series["psi"])
+    looks = _looks(kinds)
+    curves: dict[str, dict[str, Curve]] = {key: {} for key in ("psi", "error", "r", "rudder")}
+    for controller, kind in kinds.items():
+        flights = series[series["controller"] == controller]
+        for quantity, panel in curves.items():
+            wide: Any = DEG * flights.pivot_table(
+                index="t", columns=["effect", "time"], values=quantity
+            )
+            panel[controller] = (wide.index.to_numpy(), wide[(1.0, 1.0)].to_numpy())
+            if kind == "policy" and quantity in ("psi", "error"):
+                shade, color = f"{controller}, corners", looks[controller].color
+                looks[shade] = Look(shade, color, kind="fill", alpha=0.25, order=1)
+                values = wide.to_numpy()
+                panel[shade] = band(wide.index, values.min(axis=1), values.max(axis=1))
+    for key, middle in (("psi", heading), ("error", 0.0)):
+        curves[key]["settled"] = (np.zeros(2), DEG * (middle + settled * np.array([-1.0, 1.0])))
+    looks["settled"] = replace(ZERO, label="band of settling", dash="dotted")
+    return Figure(
+        "responses",
+        f"Step responses of {name}",
+        f"Step of {DEG * heading:.0f} deg. Lines show the nominal vessel, shades the corners of the"
+        f" spread under the learned policies. The dotted band of {DEG * settled:.1f} deg, enlarged"
+        " in the second panel, is the one in which a change has settled.",
+        looks,
+        [
+            Panel("heading\n[deg]", height=195),
+            Panel(
+                "heading error\n[deg]",
+                height=150,
+                y_limits=(-2.5 * DEG * settled, 2.5 * DEG * settled),
+            ),
+            Panel("yaw rate\n[deg/s]", height=150),
+            Panel("rudder\n[deg]", "time [s]", height=150),
+        ],
+        [Case("", list(curves.values()))],
+    )
+
+
+def _shares(
+    frame: pd.DataFrame, looks: Mapping[str, Look], quantities: Sequence[tuple[str, float, str]]
+) -> list[dict[str, Curve]]:
+    """Return the shares of rows that stay below a value, a panel for each quantity."""
+    out = []
+    for quantity, scale, _ in quantities:
+        panel = {}
+        for controller in looks:
+            values = frame.loc[frame["controller"] == controller, quantity].dropna()
+            found = scale * np.sort(values.to_numpy(float))
+            share = np.arange(len(found) + 1) / max(len(found), 1)
+            panel[controller] = steps(np.concatenate((found[:1], found)), share[: len(found) + 1])
+        out.append(panel)
+    return out
+
+
+def _share_panels(
+    quantities: Sequence[tuple[str, float, str]], limits: Sequence[Sequence[float]], what: str
+) -> list[Panel]:
+    return [
+        Panel(
+            f"share of {what}" if place % 2 == 0 else "",
+            text,
+            height=200,
+            group=quantity,
+            x_limits=reach,
+            y_limits=(0.0, 1.02),
+        )
+        for place, ((quantity, _, text), reach) in enumerate(zip(quantities, limits, strict=True))
+    ]
+
+
+def _distributions(plants: pd.DataFrame, kinds: Mapping[str, str], name: str) -> Figure:
+    """Draw settling time, overshoot, error, rudder travel and energy over random vessels."""
+    quantities = (
+        ("settling", 1.0, "settling time [s]"),
+        ("overshoot", DEG, "overshoot [deg]"),
+        ("iae", DEG, "integral of the absolute error [deg s]"),
+        ("travel", DEG, "rudder travel [deg]"),
+        ("energy", DEG**2, "control energy [deg² s]"),
+    )
+    # axes hold those controllers that settle more often than not
+    middle = plants.groupby("controller")["settling"].median()
+    settling = plants[plants["controller"].isin(middle.index[middle < plants["settling"].max()])]
+    limits: list[Sequence[float]] = []
+    for quantity, scale, _ in quantities:
+        shown = scale * settling[quantity].to_numpy(float)
+        room = 0.05 * float(np.ptp(shown) or abs(shown[0]) or 1.0) if len(shown) else 0.0
+        limits.append((shown.min() - room, shown.max() + room) if len(shown) else ())
+    looks = _looks(kinds)
+    return Figure(
+        "distributions",
+        f"Random vessels of {name}",
+        f"Share of {len(plants) // len(kinds)} random vessels of the spread that stay below a"
+        " value. A change that had not settled at the end of its flight counts with the flight's"
+        " length. Controllers that seldom settle may lie beyond the axes.",
+        looks,
+        _share_panels(quantities, limits, "vessels"),
+        [Case("", _shares(plants, looks, quantities))],
+        columns=2,
+    )
+
+
+def _costs(flights: pd.DataFrame, kinds: Mapping[str, str], name: str) -> Figure:
+    """Draw the shares of flights under the stated conditions that stay below a value."""
+    stated = flights[flights["protocol"] == "conditions"]
+    quantities = (
+        ("cost", 1.0, "cost [s]"),
+        ("time_outside", 1.0, "time outside the band [s]"),
+        ("overshoot", DEG, "overshoot [deg]"),
+        ("travel", DEG, "rudder travel [deg]"),
+    )
+    known = stated[stated["controller"].isin(kinds)]
+    limits: list[Sequence[float]] = []
+    for quantity, scale, _ in quantities:
+        shown = scale * known[quantity].dropna().to_numpy(float)
+        limits.append((0.0, float(np.quantile(shown, 0.98)) * 1.05 or 1.0) if len(shown) else ())
+    looks = _looks(kinds)
+    return Figure(
+        "conditions",
+        f"Flights of {name} under the stated conditions",
+        f"Share of {stated['flight'].nunique()} flights under the stated conditions that stay below"
+        " a value. The two per cent of all flights with the largest values may lie beyond an axis.",
+        looks,
+        _share_panels(quantities, limits, "flights"),
+        [Case("", _shares(stated, looks, quantities))],
+        columns=2,
+    )
+
+
+def _learning(fits: Mapping[str, Content], name: str) -> Figure:
+    """Draw the cost over the flights that epochs are chosen on, from the start of training on."""
+    panel: dict[str, Curve] = {}
+    for policy, fit in fits.items():
+        curve = [point for point in fit["curve"] if "validation" in point]
+        epochs = np.array([0.0, *(point["epoch"] + 1.0 for point in curve)])
+        first = fit["start_validation"]
+        panel[policy] = (epochs, np.array([first, *(point["validation"] for point in curve)]))
+        panel[f"{policy}, start"] = (epochs[:1], np.array([first]))
+    looks = _looks(dict.fromkeys(fits, "policy"))
+    starts = {f"{policy}, start": replace(ZERO, label="start", dash="dotted") for policy in fits}
+    return Figure(
+        "learning",
+        f"Training of {name}",
+        "Mean cost over the flights that epochs are chosen on; epoch 0 is the start, the law as"
+        " tuned, and the dotted line goes on from it. The epoch of least cost is kept.",
+        looks | starts,
+        [Panel("mean cost [s]", "epoch", height=290)],
+        [Case("", [panel])],
+    )
 
 
 def sections(run: RunFiles) -> list[Section]:
-    """Return comparison, effort, figures and controllers of an autopilot run.
+    """Return costs, comparison, effort, figures and controllers of an autopilot run.
 
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
-    controllers = run.json("controllers.json")
-    found: list[Section | None] = [
-        conditions_section(run),
-        Section(
-            "Controllers compared",
-            [
-                settling_table(run.rows, run.metrics.get("floor")),
-                Text(_definition(run.resolved), quiet=True),
-            ],
-        ),
-        Section("Effort", _effort(run)),
-        figures_section(run.path / "figures"),
-        Section("Controllers", [Code(json.dumps(controllers, indent=1))], folded=True)
-        if controllers
-        else None,
+    test = run.resolved["test"]
+    compared = settling_table(run.rows, run.metrics.get("floor"))
+    out = [
+        Section("Controllers compared", [compared, Text(_definition(run.resolved), quiet=True)]),
+        Section("Effort", [effort_table(run.rows), Text(_effort(test), quiet=True)]),
+        *figures_section(run.path / "figures"),
     ]
-    return [section for section in found if section is not None]
+    if stated := run.resolved.get("conditions"):
+        blocks: list[Block] = [cost_table(run.rows), Text(_conditions(stated), quiet=True)]
+        beyond = beyond_table(run.rows)
+        if beyond is not None:
+            blocks += [Text(["Outside the conditions of tuning and training:"]), beyond]
+        out.insert(0, Section("Under the stated conditions", blocks))
+    if controllers := run.json("controllers.json"):
+        out.append(Section("Controllers", [Code(json.dumps(controllers, indent=1))], folded=True))
+    return out
+
+
+def _by_model(rows: Sequence[Content], protocol: str) -> dict[str, dict[str, Content]]:
+    """Return the rows of the controllers that have one of that protocol, by model and protocol."""
+    out: dict[str, dict[str, Content]] = {}
+    for row in rows:
+        out.setdefault(row["model"], {})[row["protocol"]] = row
+    return {model: found for model, found in out.items() if protocol in found}
 
 
 def settling_table(rows: Sequence[Content], floor: str | None) -> Table:
@@ -74,69 +266,57 @@ def settling_table(rows: Sequence[Content], floor: str | None) -> Table:
         rows: of metrics.json.
         floor: the controller whose nominal settling time the others are divided by.
     """
-    find = {(row["model"], row["protocol"]): row for row in rows}
-    windy = any(row["protocol"] == "wind" for row in rows)
-    base = find[(floor, "nominal")]["settling"]["max"] if floor else None
-    table = Table(
-        [
-            "controller",
-            "nominal [s]",
-            *([f"over {floor} [-]"] if floor else []),
-            "worst [s]",
-            "random, mean [s]",
-            "random, 95 % [s]",
-            "overshoot [deg]",
-            "bias [deg]",
-            *(["wind [deg]"] if windy else []),
-            "not settled",
-        ]
+    found = _by_model(rows, "nominal")
+
+    def unsettled(row: Content) -> Any:
+        lost = sum(row[protocol]["unsettled"] for protocol in ("corners", "random", "nominal"))
+        return bad_where(lost, lost)
+
+    def overshoot(row: Content) -> float:
+        return max(float(row[protocol]["overshoot"]["max"]) for protocol in ("corners", "random"))
+
+    columns: list[Column] = [
+        ("controller", "nominal.model"),
+        ("nominal [s]", "nominal.settling.max", 2),
+    ]
+    if floor:
+        base = found[floor]["nominal"]["settling"]["max"]
+        columns.append((f"over {floor} [-]", "nominal.settling.max", 3, 1.0 / base))
+    columns += [
+        ("worst [s]", "corners.settling.max", 2),
+        ("random, mean [s]", "random.settling.mean", 2),
+        ("random, 95 % [s]", "random.settling.p95", 2),
+        ("overshoot [deg]", overshoot, 3, DEG),
+        ("bias [deg]", "bias.error_end", 4, DEG),
+    ]
+    if any(row["protocol"] == "wind" for row in rows):
+        columns.append(("wind [deg]", "wind.error_end", 4, DEG))
+    return table_of(
+        found.values(),
+        [*columns, ("not settled", unsettled)],
+        selected=lambda row: row["nominal"]["kind"] == "policy",
     )
-    for name in dict.fromkeys(row["model"] for row in rows if row["protocol"] == "nominal"):
-        nominal, corners, random, bias = (
-            find[(name, protocol)] for protocol in ("nominal", "corners", "random", "bias")
-        )
-        overshoot = max(corners["overshoot"]["max"], random["overshoot"]["max"])
-        unsettled = corners["unsettled"] + random["unsettled"] + nominal["unsettled"]
-        settling = nominal["settling"]["max"]
-        table.add(
-            name,
-            [
-                fixed(settling, 2),
-                *([fixed(settling / base, 3)] if base else []),
-                fixed(corners["settling"]["max"], 2),
-                fixed(random["settling"]["mean"], 2),
-                fixed(random["settling"]["p95"], 2),
-                fixed(DEG * overshoot, 3),
-                fixed(DEG * bias["error_end"], 4),
-                *([fixed(DEG * find[(name, "wind")]["error_end"], 4)] if windy else []),
-                Cell(str(unsettled), mark="bad" if unsettled else ""),
-            ],
-            selected=nominal["kind"] == "policy",
-        )
-    return table
 
 
 def effort_table(rows: Sequence[Content]) -> Table:
     """Return what a change of heading costs over random vessels, and what a course costs at sea."""
-    find = {(row["model"], row["protocol"]): row for row in rows}
-    names = list(dict.fromkeys(row["model"] for row in rows if row["protocol"] == "random"))
-    sea = [row for row in rows if row["protocol"] == "sea"]
-    rolls = any("heel_rms" in row for row in sea)
     groups = [("absolute error [deg s]", 2), ("rudder travel [deg]", 2), ("energy [deg² s]", 2)]
-    if sea:
-        groups.append(("sea, root mean square [deg]", 3 if rolls else 2))
-    at_sea = ["heading", "rudder", *(["heel"] if rolls else [])] if sea else []
-    table = Table(["controller", *["mean", "95 %"] * 3, *at_sea], groups=groups)
-    for name in names:
-        random = find[(name, "random")]
-        cells: list[str] = []
-        for quantity, scale in (("iae", DEG), ("travel", DEG), ("energy", DEG**2)):
-            cells += [fixed(scale * random[quantity][key], 2) for key in ("mean", "p95")]
-        for quantity in at_sea:
-            found = find.get((name, "sea"), {}).get(f"{quantity}_rms")
-            cells.append(fixed(DEG * found["mean"] if found else None, 3))
-        table.add(name, cells, selected=random["kind"] == "policy")
-    return table
+    columns: list[Column] = [("controller", "random.model")]
+    for quantity, scale in (("iae", DEG), ("travel", DEG), ("energy", DEG**2)):
+        columns += [
+            ("mean", f"random.{quantity}.mean", 2, scale),
+            ("95 %", f"random.{quantity}.p95", 2, scale),
+        ]
+    if sea := [row for row in rows if row["protocol"] == "sea"]:
+        at_sea = ["heading", "rudder", *(["heel"] if any("heel_rms" in row for row in sea) else [])]
+        columns += [(name, f"sea.{name}_rms.mean", 3, DEG) for name in at_sea]
+        groups.append(("sea, root mean square [deg]", len(at_sea)))
+    return table_of(
+        _by_model(rows, "random").values(),
+        columns,
+        groups=groups,
+        selected=lambda row: row["random"]["kind"] == "policy",
+    )
 
 
 def _definition(config: Mapping[str, Any]) -> list[str]:
@@ -157,8 +337,7 @@ def _definition(config: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _effort(run: RunFiles) -> list[Block]:
-    test = run.resolved["test"]
+def _effort(test: Content) -> list[str]:
     texts = [
         f"Mean and 95th percentile over the {test['plants']} random vessels: integral of the"
         " absolute heading error, travel of the rudder command, and its energy (the integral of"
@@ -177,4 +356,129 @@ def _effort(run: RunFiles) -> list[Block]:
             f" {sea['peak_period']:g} s peak period ({sea['spectrum']['kind']}) and travel towards"
             f" {math.degrees(sea['direction']):.3g} deg."
         )
-    return [effort_table(run.rows), Text(texts, quiet=True)]
+    return texts
+
+
+def best_classical(rows: Sequence[Content]) -> Content:
+    """Return the row of the classical controller with the least mean cost."""
+    of_conditions = [row for row in rows if row["protocol"] == "conditions"]
+    classical = [row for row in of_conditions if row["kind"] == "classical"]
+    return min(classical or of_conditions, key=_mean_cost)
+
+
+def _mean_cost(row: Content) -> float:
+    return float(row["cost"]["mean"])
+
+
+def cost_verdict(rows: Sequence[Content]) -> list[str]:
+    """Return a sentence for each learned policy, the cheapest first: its cost and the best law's.
+
+    Without stated conditions there is none.
+    """
+    found = {row["model"]: row for row in rows if row["protocol"] == "conditions"}
+    if not found:
+        return []
+    best = best_classical(rows)
+    sentences = []
+    for row in sorted(found.values(), key=_mean_cost):
+        if row["kind"] not in ("policy", "network"):
+            continue
+        name, off = row["model"], found.get(f"{row['model']} network off")
+        cost, other = row["cost"]["mean"], best["cost"]["mean"]
+        without = (
+            "; it has no law inside"
+            if off is None
+            else f"; with its network set to zero it costs {off['cost']['mean']:.3f} s"
+        )
+        sentences.append(
+            f"Under the stated conditions '{name}' costs {cost:.3f} s a change,"
+            f" {100 * abs(cost / other - 1):.1f} % {'below' if cost < other else 'above'}"
+            f" '{best['model']}', the best classical law, with {other:.3f} s{without}."
+        )
+    return sentences
+
+
+def cost_table(rows: Sequence[Content]) -> Table:
+    """Return cost, overshoot and rudder travel under the stated conditions by controller."""
+    best = best_classical(rows)
+    found = _by_model(rows, "conditions")
+    return table_of(
+        sorted(found.values(), key=lambda row: _mean_cost(row["conditions"])),
+        [
+            ("controller", "conditions.model"),
+            ("what it is", lambda row: _KINDS[row["conditions"]["kind"]]),
+            ("mean [s]", "conditions.cost.mean", 3),
+            (
+                f"over {best['model']} [%]",
+                lambda row: 100 * (_mean_cost(row["conditions"]) / _mean_cost(best) - 1),
+                lambda value: signed(value, 1),
+            ),
+            ("95 % [s]", "conditions.cost.p95", 2),
+            ("outside, mean [s]", "conditions.time_outside.mean", 2),
+            ("mean [deg]", "conditions.overshoot.mean", 2, DEG),
+            ("95 % [deg]", "conditions.overshoot.p95", 2, DEG),
+            ("travel, mean [deg]", "conditions.travel.mean", 1, DEG),
+            ("heading [deg]", "quiet.heading_swing.max", 2, DEG),
+            ("rudder [deg]", "quiet.rudder_swing.max", 2, DEG),
+            ("diverged", "conditions.diverged", lambda lost: bad_where(lost, lost)),
+        ],
+        groups=[("", 1), ("cost", 3), ("", 1), ("overshoot", 2), ("", 1), ("swing, most", 2)],
+        selected=lambda row: row["conditions"]["kind"] in ("policy", "network"),
+    )
+
+
+def beyond_table(rows: Sequence[Content]) -> Table | None:
+    """Return mean and worst costs outside the conditions of training; None without such flights."""
+    tests = list(
+        dict.fromkeys(row["protocol"] for row in rows if row["protocol"].startswith("beyond_"))
+    )
+    if not tests:
+        return None
+    columns: list[Column] = [("controller", f"{tests[0]}.model")]
+    for test in tests:
+        columns += [
+            ("mean [s]", f"{test}.cost.mean", 3),
+            ("most [s]", f"{test}.cost.max", 1),
+            ("diverged", f"{test}.diverged", lambda lost: bad_where(lost, lost)),
+        ]
+    return table_of(
+        _by_model(rows, tests[0]).values(),
+        columns,
+        groups=[(test.removeprefix("beyond_"), 3) for test in tests],
+        selected=lambda row: row[tests[0]]["kind"] == "policy",
+    )
+
+
+def _conditions(judged: Mapping[str, Any]) -> list[str]:
+    given = judged["stated"]
+    low, high = (math.degrees(value) for value in given["heading"])
+    texts = [
+        f"{judged['flights']} changes of heading of {low:.3g} to {high:.3g} deg, which no tuning or"
+        f" training has seen, the same for all controllers. The vessel's K lies within"
+        f" {given['effect'][0]:g} to {given['effect'][1]:g} and its T within {given['time'][0]:g}"
+        f" to {given['time'][1]:g} of the nominal one; commands arrive {given['delay'][0]:g} to"
+        f" {given['delay'][1]:g} s late; the rudder has a bias of up to"
+        f" {math.degrees(given['bias']):.3g} deg and a slow push of"
+        f" {math.degrees(given['push']):.3g} deg; the noise is"
+        f" {math.degrees(given['noise_psi']):.3g} deg on the heading and"
+        f" {math.degrees(given['noise_r']):.3g} deg/s on the yaw rate.",
+        "Cost: the integral of |e| / (|e| +"
+        f" {math.degrees(given['band']):.3g} deg) over {given['duration']:g} s from the change on,"
+        f" plus {given['overshoot_weight']:g} s per deg of overshoot and"
+        f" {given['travel_weight']:g} s per deg of rudder travel. Swing: largest movement, peak to"
+        f" peak, from {quiet_after(given['duration']):.3g} s after a change on in flights without"
+        " noise and slow push. Classical controllers are tuned by the same cost, by differential"
+        " evolution.",
+    ]
+    if given["wind"] or given["current"]:
+        wind = f"wind of {given['wind'][0]:g} to {given['wind'][1]:g} m/s" if given["wind"] else ""
+        current = f"current of up to {given['current']:g} m/s" if given["current"] else ""
+        found = " and ".join(part for part in (wind, current) if part)
+        texts.append(f"There is {found}, from all directions.")
+    if given.get("waves"):
+        texts.append(
+            "Heading and yaw rate are measured with the motion in waves, of up to"
+            f" {math.degrees(given['waves']):.3g} deg (standard deviation) and peak periods of"
+            f" {given['wave_period'][0]:g} to {given['wave_period'][1]:g} s."
+        )
+    return texts

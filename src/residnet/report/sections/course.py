@@ -4,12 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
 
-from residnet.report.blocks import Block, Cell, Figure, Section, Table, Text
-from residnet.report.figures.courses import histories, spread, tracks
-from residnet.report.figures.files import Drawing, figures_section, write_drawings
-from residnet.report.format import DEG, fixed, number
-from residnet.report.interactive.courses import course_explorer
+import numpy as np
+
+from residnet.report.blocks import Block, Cell, Column, Section, Table, Text, bad_where, table_of
+from residnet.report.figure import (
+    COLORS,
+    ZERO,
+    Case,
+    Curve,
+    Figure,
+    Look,
+    Panel,
+    figures_section,
+    joined,
+    names_of,
+    read_figures,
+    write_figures,
+)
+from residnet.report.format import DEG, number
 from residnet.report.run_reader import Content, RunFiles
 
 TRACKS = "tracks.parquet"
@@ -23,25 +38,75 @@ RULES = {
     "sides": "Every buoy is to be passed on its side, outside its circle.",
 }
 """What each protocol demands."""
+_DASHES = {"course": "solid", "lookahead": "long", "enclosure": "short", "integral": "dense"}
+_WORDS = {
+    "course": "",
+    "lookahead": ", look-ahead",
+    "enclosure": ", enclosure",
+    "integral": ", integral",
+}
+_PANELS = (
+    ("psi", "heading\n[deg]", DEG),
+    ("rudder", "rudder\n[deg]", DEG),
+    ("cross_track", "cross-track\nerror [m]", 1.0),
+    ("speed", "speed\n[m/s]", 1.0),
+)
 
 
 def draw(run: RunFiles) -> list[Figure]:
     """Write the figures of a course run from its folder alone; returns them."""
-    return write_drawings(run.path / "figures", _drawings(run))
+    return write_figures(run.path / "figures", _figures(run))
 
 
-def _drawings(run: RunFiles) -> Iterator[Drawing]:
-    course = run.resolved["course"]
+def _figures(run: RunFiles) -> Iterator[Figure]:
     flown, plans, every = run.frame(TRACKS), run.frame(COURSES), run.frame(SPREAD)
-    for protocol, radii in _radii(run).items():
-        rule = RULES[protocol]
-        flights = flown[flown["protocol"] == protocol]
-        plan = plans[plans["protocol"] == protocol]
-        name = f"{protocol}_tracks"
-        yield tracks(name, flights, plan, course["buoys"], radii, course["start"], rule)
-        yield histories(f"{protocol}_time", flights, run.metrics["rudder"], rule)
-        if every is not None:
-            yield spread(f"{protocol}_spread", every[every["protocol"] == protocol], rule)
+    looks = _looks(flown, "controller")
+    yield Figure(
+        "courses",
+        "Flights past the buoys",
+        f"{' '.join(RULES[name] for name in run.resolved['protocols'])} North is up, and scales of"
+        " the track are equal. S and P name the side on which a buoy is left, dotted circles are"
+        " those of the buoys, and the triangle is the start; dotted lines are the limits of the"
+        " rudder. A track that leaves the picture has lost the course. A controller that leaves the"
+        " plan early has to steer more later; look for rudder angles at the limit and for errors"
+        " that grow from buoy to buoy.",
+        {
+            **looks,
+            "plan": Look("plan", "#BFBFBF", width=5.0, order=1),
+            "limits": replace(ZERO, label="limits of the rudder", dash="dotted"),
+            "circles": Look("circles of the buoys", "#737373", "dotted", 0.9, order=1),
+            "buoys": Look("buoys", kind="points", size=3.5, order=4),
+            "start": Look("start", kind="points", marker="^", size=6, order=4),
+        },
+        [
+            Panel("north [m]", "east [m]", kind="map", height=420),
+            *(Panel(title, height=145) for _, title, _ in _PANELS[:-1]),
+            Panel(_PANELS[-1][1], "time [s]", height=145),
+        ],
+        [
+            _case(run, protocol, radii, *(t[t["protocol"] == protocol] for t in (flown, plans)))
+            for protocol, radii in _radii(run).items()
+        ],
+        "Protocol",
+    )
+    if every is not None:
+        yield _spread(every)
+
+
+def _looks(flights: Any, column: str) -> dict[str, Look]:
+    """Return how the flights of each controller and guidance look."""
+    controllers = flights[column].drop_duplicates().tolist()
+    pairs = flights[[column, "guidance"]].drop_duplicates()
+    return {
+        f"{name}{_WORDS[guidance]}": Look(
+            f"{name}{_WORDS[guidance]}",
+            COLORS[controllers.index(name) % len(COLORS)],
+            _DASHES[guidance],
+            # flights that coincide show beside each other
+            max(2.6 - 0.7 * controllers.index(name), 1.0),
+        )
+        for name, guidance in pairs.itertuples(index=False, name=None)
+    }
 
 
 def _radii(run: RunFiles) -> dict[str, list[float]]:
@@ -56,124 +121,179 @@ def _radii(run: RunFiles) -> dict[str, list[float]]:
     }
 
 
+def _case(run: RunFiles, protocol: str, radii: Sequence[float], flown: Any, plan: Any) -> Case:
+    course = run.resolved["course"]
+    east, north = (np.array([buoy[name] for buoy in course["buoys"]]) for name in ("east", "north"))
+    angle = np.linspace(0.0, 2.0 * np.pi, 37)
+    circles = [
+        (x + r * np.sin(angle), y + r * np.cos(angle))
+        for x, y, r in zip(east, north, radii, strict=True)
+    ]
+    limit = DEG * np.array([-1.0, 1.0]) * run.metrics["rudder"]
+    track: dict[str, Curve] = {
+        "plan": (plan["east"].to_numpy(float), plan["north"].to_numpy(float)),
+        "circles": joined(circles),
+        "buoys": (east, north),
+        "start": (np.array([course["start"][1]]), np.array([course["start"][0]])),
+    }
+    panels: list[dict[str, Curve]] = [track, *({} for _ in _PANELS)]
+    panels[2]["limits"] = (np.zeros(2), limit)
+    # what leaves the picture has lost the course
+    seen = [np.concatenate((plan[name], at)) for name, at in (("east", east), ("north", north))]
+    edge = 0.3 * max(map(np.ptp, seen)) + max(radii)
+    for (controller, guidance), flight in flown.groupby(["controller", "guidance"], sort=False):
+        name = f"{controller}{_WORDS[guidance]}"
+        values = {key: flight[key].to_numpy(float) for key in ("east", "north", "t")}
+        lost = np.zeros(len(flight), dtype=bool)
+        for key, known in zip(("east", "north"), seen, strict=True):
+            lost |= (values[key] < known.min() - edge) | (values[key] > known.max() + edge)
+        track[name] = tuple(np.where(lost, np.nan, values[key]) for key in ("east", "north"))  # type: ignore[assignment]
+        for panel, (quantity, _, factor) in zip(panels[1:], _PANELS, strict=True):
+            panel[name] = (values["t"], factor * flight[quantity].to_numpy(float))
+    sides = [
+        (0, float(x), float(y), f"{number}{buoy['leave_to'][0].upper()}")
+        for number, (x, y, buoy) in enumerate(zip(east, north, course["buoys"], strict=True), 1)
+    ]
+    return Case(protocol, panels, RULES[protocol], texts=sides)
+
+
+def _spread(every: Any) -> Figure:
+    """Draw the course time of every flight of the spread over that of the reference."""
+    looks = _looks(every, "model")
+    cases = []
+    for protocol, flights in every.groupby("protocol", sort=False):
+        panel: dict[str, Curve] = {}
+        medians = []
+        kinds = {f"{m}{_WORDS[g]}": rows for (m, g), rows in flights.groupby(["model", "guidance"])}
+        for line, name in enumerate(looks):
+            done = kinds[name][kinds[name]["finished"]] if name in kinds else flights[:0]
+            beside = line + 0.5 * (np.arange(len(done)) / max(len(done) - 1, 1) - 0.5)
+            for passed, ending in ((True, ""), (False, ", missed")):
+                rows = (done["passed"] == passed).to_numpy(bool)
+                panel[name + ending] = (done["ratio"].to_numpy(float)[rows], beside[rows])
+            if len(done):
+                medians.append(([done["ratio"].median()] * 2, [line - 0.38, line + 0.38]))
+        panel["median"] = joined(medians)
+        lost = len(flights) - int(flights["finished"].sum())
+        note = f"{lost} of {len(flights)} flights did not finish and are left out." if lost else ""
+        cases.append(Case(str(protocol), [panel], f"{RULES[str(protocol)]} {note}".strip()))
+    marks = {}
+    for name, look in looks.items():
+        marks[name] = replace(look, kind="points", size=4)
+        marks[f"{name}, missed"] = replace(marks[name], hollow=True, label="")
+    return Figure(
+        "spread",
+        "Spread of vessels and currents",
+        "Each point is one vessel in one current. It is filled where all buoys were passed as"
+        " demanded, and a ring elsewhere; the bar is the median. Flights that did not finish are"
+        " left out.",
+        marks | {"median": Look("median", width=1.2, order=4)},
+        [
+            Panel(
+                "",
+                "course time over that of the reference, in water at rest",
+                height=75 + 36 * len(looks),
+                y_names=names_of(looks),
+                y_limits=(len(looks) - 0.5, -0.5),
+            )
+        ],
+        cases,
+        "Protocol",
+    )
+
+
 def sections(run: RunFiles) -> list[Section]:
     """Return times and margins by protocol, what the numbers mean, and the figures.
 
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
-    out = [_protocol(run, protocol) for protocol in run.resolved["protocols"]]
-    flown, plans = run.frame(TRACKS), run.frame(COURSES)
-    if flown is not None and plans is not None:
-        buoys = run.resolved["course"]["buoys"]
-        explorer = course_explorer(flown, plans, _radii(run), buoys, RULES)
-        out.append(Section("Flights to look into", [explorer]))
+    out = []
+    for protocol, (nominal, drawn) in _by_protocol(run.rows).items():
+        blocks: list[Block] = [Text(_rule(nominal)), nominal_table(nominal)]
+        if drawn:
+            blocks.append(Section("Spread of vessels and currents", [spread_table(drawn)]))
+        out.append(Section(f"Protocol {protocol}", blocks))
+    if flown := read_figures(run.path / "figures", "courses"):
+        out.append(Section("Flights to look into", flown))
     out.append(Section("What the numbers mean", [Text(_definition(run))]))
-    figures = figures_section(run.path / "figures", ".*_(tracks|time)")
-    return [*out, figures] if figures else out
+    return [*out, *figures_section(run.path / "figures", "spread")]
 
 
-def _protocol(run: RunFiles, protocol: str) -> Section:
-    rows = [row for row in run.rows if row["protocol"] == protocol]
-    nominal = [row for row in rows if row["split"] == "simulated"]
+def _by_protocol(rows: Sequence[Content]) -> dict[str, tuple[list[Content], list[Content]]]:
+    """Return the rows of the nominal flights and of the spread by protocol."""
+    out: dict[str, tuple[list[Content], list[Content]]] = {}
+    for row in rows:
+        nominal, spread = out.setdefault(row["protocol"], ([], []))
+        (spread if row["split"] == "spread" else nominal).append(row)
+    return out
+
+
+def _rule(nominal: Sequence[Content]) -> str:
     shortest = f"The reference takes {nominal[0]['reference_time']:.2f} s."
-    blocks: list[Block] = [Text(f"{RULES[protocol]} {shortest}"), nominal_table(nominal)]
-    drawn = [row for row in rows if row["split"] == "spread"]
-    if drawn:
-        blocks.append(Section("Spread of vessels and currents", [spread_table(drawn)]))
-    return Section(f"Protocol {protocol}", blocks)
+    return f"{RULES[nominal[0]['protocol']]} {shortest}"
 
 
 def text_of(rows: Sequence[Content]) -> str:
-    """Return the tables of a course run for the terminal.
-
-    Args:
-        rows: of metrics.json.
-    """
+    """Return the tables of a course run, of the rows of metrics.json, for the terminal."""
     parts = []
-    for protocol in dict.fromkeys(row["protocol"] for row in rows):
-        found = [row for row in rows if row["protocol"] == protocol]
-        nominal = [row for row in found if row["split"] == "simulated"]
-        drawn = [row for row in found if row["split"] == "spread"]
-        shortest = f"Reference: {nominal[0]['reference_time']:.2f} s."
-        parts += [f"{RULES[protocol]} {shortest}", nominal_table(nominal).text()]
+    for nominal, drawn in _by_protocol(rows).values():
+        parts += [_rule(nominal), nominal_table(nominal).text()]
         parts += [spread_table(drawn).text()] if drawn else []
     return "\n".join(parts)
 
 
 def nominal_table(rows: Sequence[Content]) -> Table:
     """Return time, margin and cross-track error of the nominal flights of one protocol."""
-    enters = rows[0]["protocol"] == "enter"
-    table = Table(
+
+    def of_all(key: str) -> Any:
+        return lambda row: bad_where(f"{row[key]} of {row['n']}", row[key] != row["n"])
+
+    passed: list[Column] = [("on its side", of_all("right_side")), ("clear", of_all("clear"))]
+    if rows[0]["protocol"] == "enter":
+        passed = [("entered", of_all("entered"))]
+    return table_of(
+        rows,
         [
-            "controller",
-            "guidance",
-            "time [s]",
-            "ratio",
-            "ratio, turning",
-            *(["entered"] if enters else ["on its side", "clear"]),
-            "margin [m]",
-            "tightest turn [m]",
-            "cross-track, rms [m]",
-            "cross-track, largest [m]",
-            "rudder travel [deg]",
-            "finished",
-        ]
+            ("controller", "model"),
+            ("guidance", "guidance"),
+            ("time [s]", "course_time", 2),
+            ("ratio", "ratio", 4),
+            ("ratio, turning", "ratio_turning", 4),
+            *passed,
+            ("margin [m]", "margin", 3),
+            ("tightest turn [m]", "tightest_turn", 2),
+            ("cross-track, rms [m]", "cross_track_rms", 3),
+            ("cross-track, largest [m]", "cross_track_max", 3),
+            ("rudder travel [deg]", "travel", 1, DEG),
+            ("finished", lambda row: Cell("yes") if row["finished"] else bad_where("no", True)),
+        ],
+        selected=_chosen,
     )
-    for row in rows:
-        passed = [row["entered"]] if enters else [row["right_side"], row["clear"]]
-        table.add(
-            row["model"],
-            [
-                Cell(row["guidance"], mark="text"),
-                fixed(row["course_time"], 2),
-                fixed(row["ratio"], 4),
-                fixed(row["ratio_turning"], 4),
-                *(Cell(f"{n} of {row['n']}", mark="" if n == row["n"] else "bad") for n in passed),
-                fixed(row["margin"], 3),
-                fixed(row["tightest_turn"], 2),
-                fixed(row["cross_track_rms"], 3),
-                fixed(row["cross_track_max"], 3),
-                fixed(DEG * row["travel"], 1),
-                Cell("yes") if row["finished"] else Cell("no", mark="bad"),
-            ],
-            selected=row["kind"] == "policy" and row["guidance"] == "course",
-        )
-    return table
 
 
 def spread_table(rows: Sequence[Content]) -> Table:
     """Return shares and medians over the flights of the spread of one protocol."""
-    table = Table(
+    return table_of(
+        rows,
         [
-            "controller",
-            "guidance",
-            "passed [%]",
-            "finished [%]",
-            "ratio, median",
-            "ratio, worst",
-            "margin, median [m]",
-            "margin, worst [m]",
-            "cross-track, rms [m]",
+            ("controller", "model"),
+            ("guidance", "guidance"),
+            ("passed [%]", "passed", 1, 100),
+            ("finished [%]", "finished", 1, 100),
+            ("ratio, median", "ratio", 4),
+            ("ratio, worst", "ratio_worst", 4),
+            ("margin, median [m]", "margin", 3),
+            ("margin, worst [m]", "margin_worst", 3),
+            ("cross-track, rms [m]", "cross_track_rms", 3),
         ],
+        selected=_chosen,
         caption=f"{rows[0]['n']} vessels and currents for each controller and guidance.",
     )
-    for row in rows:
-        table.add(
-            row["model"],
-            [
-                Cell(row["guidance"], mark="text"),
-                fixed(100 * row["passed"], 1),
-                fixed(100 * row["finished"], 1),
-                fixed(row["ratio"], 4),
-                fixed(row["ratio_worst"], 4),
-                fixed(row["margin"], 3),
-                fixed(row["margin_worst"], 3),
-                fixed(row["cross_track_rms"], 3),
-            ],
-            selected=row["kind"] == "policy" and row["guidance"] == "course",
-        )
-    return table
+
+
+def _chosen(row: Content) -> bool:
+    return bool(row["kind"] == "policy" and row["guidance"] == "course")
 
 
 def _definition(run: RunFiles) -> list[str]:

@@ -8,8 +8,17 @@ from typing import Any
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text
-from residnet.report.format import DASH, minus, number, shown_unit, whole
+from residnet.report.blocks import (
+    Block,
+    Bullets,
+    Cell,
+    Section,
+    Table,
+    Text,
+    bad_where,
+    table_of,
+)
+from residnet.report.format import minus, number, shown_unit, whole
 from residnet.report.run_reader import RunFiles
 
 _NOTE = "note"
@@ -28,52 +37,61 @@ def sections(run: RunFiles) -> list[Section]:
 
 def log_table(logs: Sequence[Log], findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
     """Return a row for each log: samples, step, duration, gaps and number of findings."""
-    table = Table(
+
+    def notes(log: Log) -> int:
+        return sum(finding["level"] == _NOTE for finding in findings.get(log.name, []))
+
+    def severe(log: Log) -> Cell:
+        count = len(findings.get(log.name, [])) - notes(log)
+        return bad_where(count, count)
+
+    def lost(log: Log) -> int:
+        return sum(int(mask.sum()) for kind, mask in log.masks.items() if kind.startswith("hard:"))
+
+    def duration(log: Log) -> float:
+        return float(log.t[-1] - log.t[0])
+
+    return table_of(
+        logs,
         [
-            "log",
-            "samples",
-            "step [s]",
-            "duration [s]",
-            "channels",
-            "samples in gaps",
-            "to look at",
-            "notes",
-        ]
+            ("log", lambda log: log.name),
+            ("samples", len, whole),
+            ("step [s]", lambda log: number(duration(log) / max(len(log) - 1, 1), 4), str),
+            ("duration [s]", lambda log: number(duration(log), 4), str),
+            ("channels", lambda log: len(log.channels), str),
+            ("samples in gaps", lost, whole),
+            ("to look at", severe),
+            ("notes", notes, str),
+        ],
     )
-    for log in logs:
-        found = findings.get(log.name, [])
-        notes = sum(finding["level"] == _NOTE for finding in found)
-        duration = float(log.t[-1] - log.t[0])
-        lost = sum(int(mask.sum()) for kind, mask in log.masks.items() if kind.startswith("hard:"))
-        table.add(
-            log.name,
-            [
-                whole(len(log)),
-                number(duration / max(len(log) - 1, 1), 4),
-                number(duration, 4),
-                str(len(log.channels)),
-                whole(lost),
-                Cell(str(len(found) - notes), mark="bad" if len(found) > notes else ""),
-                str(notes),
-            ],
-        )
-    return table
 
 
 def channel_table(log: Log) -> Table:
     """Return a row for each channel: unit, range, and how many samples are missing."""
-    table = Table(["channel", "unit", "least", "mean", "largest", "missing [%]"])
+    rows = []
     for name, values in log.channels.items():
         unit, factor = shown_unit(log.units.get(name, "-"))
-        finite = values[np.isfinite(values)]
-        shown = (
-            [number(factor * float(value)) for value in (finite.min(), finite.mean(), finite.max())]
-            if finite.size
-            else [DASH] * 3
+        finite = factor * np.asarray(values, dtype=float)[np.isfinite(values)]
+        known = finite if finite.size else np.array([np.nan])
+        rows.append(
+            {
+                "channel": name,
+                "unit": unit,
+                "least": float(known.min()),
+                "mean": float(known.mean()),
+                "largest": float(known.max()),
+                "missing": number(100.0 * (1.0 - finite.size / max(values.size, 1)), 2),
+            }
         )
-        missing = 100.0 * (1.0 - finite.size / max(values.size, 1))
-        table.add(name, [unit, *shown, number(missing, 2)])
-    return table
+    return table_of(
+        rows,
+        [
+            ("channel", "channel"),
+            ("unit", "unit", str),
+            *((name, name, number) for name in ("least", "mean", "largest")),
+            ("missing [%]", "missing", str),
+        ],
+    )
 
 
 def _noticed(findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Block]:

@@ -193,8 +193,8 @@
       });
       plot.renderers.forEach(function (curve) {
         if (looks[curve.name].color !== "ink" || curve.glyph.type === "Rect") { return; }
-        var part = curve.glyph.type === "Line" ? "line_color" : "fill_color";
-        curve.glyph[part] = { value: ink };
+        var glyph = curve.glyph, filled = glyph.fill_color && glyph.fill_color.value !== null && /^(Scatter|Patch|VStrip)$/.test(glyph.type);
+        glyph[filled ? "fill_color" : "line_color"] = { value: ink };
       });
     });
   };

@@ -26,12 +26,14 @@ from residnet.judge.autopilots import QUANTITIES
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
 from residnet.report.sections.autopilot import (
+    CONDITIONS,
     FLIGHTS,
     PLANTS,
+    cost_table,
+    cost_verdict,
     effort_table,
     settling_table,
 )
-from residnet.report.sections.conditions import CONDITIONS, cost_table, cost_verdict
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome

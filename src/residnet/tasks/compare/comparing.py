@@ -11,7 +11,7 @@ import numpy as np
 from residnet.core.config import load_mapping
 from residnet.core.errors import UsageError
 from residnet.report.blocks import Block, Cell, Section, Table
-from residnet.report.figures.files import read_figures
+from residnet.report.figure import Case, Figure, Panel, family, write_figure
 from residnet.report.page import write_page
 from residnet.tasks.compare.errors import JudgedRun, common_windows, judged_runs, paired
 
@@ -178,24 +178,21 @@ def _sentence(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]])
 
 def _curves(runs: Sequence[JudgedRun], out: Path) -> Block:
     """Draw how the errors of the selected models grow over the common windows."""
-    from residnet.report.figures.style import new_figure, save
-
     windows = common_windows(runs)
     protocol = windows[0][1]
     chosen = [window for window in windows if window[1] == protocol]
     shortest = min(len(runs[0].series[window][0]) for window in chosen)
-    figure = new_figure(3.2)
-    axes = figure.subplots()
+    curves = {}
     for run in runs:
         size = np.stack([(run.series[window][1][:shortest] ** 2) for window in chosen])
         growth = np.sqrt(np.nanmean(size, axis=0)) / runs[0].scales
-        axes.plot(run.series[chosen[0]][0][:shortest], growth.mean(axis=1), label=run.name)
-    axes.set_xlabel("time from the start of a free run [s]")
-    axes.set_ylabel("error [-]")
-    axes.legend()
-    title = "Error against horizon"
-    caption = f"Selected models over {len(chosen)} common windows of {protocol}, mean over u, v, r."
-    (out / "figures").mkdir(exist_ok=True)
-    path = out / "figures" / "horizon.png"
-    save(figure, path, title, caption)
-    return read_figures(path.parent)[0]
+        curves[run.name] = (run.series[chosen[0]][0][:shortest], growth.mean(axis=1))
+    figure = Figure(
+        "horizon",
+        "Error against horizon",
+        f"Selected models over {len(chosen)} common windows of {protocol}, mean over u, v, r.",
+        family(curves),
+        [Panel("error [-]", "time from the start of a free run [s]", height=300)],
+        [Case("", [curves])],
+    )
+    return write_figure(out / "figures", figure)

@@ -13,8 +13,8 @@ from residnet.judge.limits import SCHEMA as LIMITS
 from residnet.judge.repeats import repeatability
 from residnet.judge.tables import metrics_content
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.fit.free_runs import errors_table
-from residnet.report.sections.fit.verdict import verdict
+from residnet.report.sections.free_runs import errors_table
+from residnet.report.sections.verdict import verdict
 from residnet.runs.exports import Exports
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome

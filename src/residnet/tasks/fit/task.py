@@ -46,12 +46,11 @@ class FitConfig(FitTaskSettings):
         """Draw the figures, those of a published study too, and return the sections."""
         from residnet.core.config import load_mapping
         from residnet.documents import study_sections
-        from residnet.report.figures.fit import write_figures
-        from residnet.report.fit import fit_sections
+        from residnet.report.fit import fit_sections, write_fit_figures
         from residnet.report.run_reader import RunFiles
 
         files = RunFiles(run.path)
-        write_figures(files)
+        write_fit_figures(files)
         sections = fit_sections(files)
         study = load_mapping(run.resolved).get("study")
         if study is not None and "test" in files.splits:

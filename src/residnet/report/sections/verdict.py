@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from residnet.data.doctor import summary
-from residnet.judge.verdict.sanity import Finding
+from residnet.judge.verdict.sanity import CHECKS, Finding
 from residnet.judge.verdict.sentences import UNSEEN, Evidence
 from residnet.judge.verdict.sentences import verdict as judged
-from residnet.report.blocks import Bullets, Section
+from residnet.report.blocks import Bullets, Cell, Facts, Section, table_of
 from residnet.report.format import DEG, minus, number, percent, title_of
 from residnet.report.run_reader import Content, RunFiles
-from residnet.report.sections.fit.manoeuvres import distinct
+from residnet.report.sections.free_runs import distinct
 
 
 def verdict(run: RunFiles) -> list[str]:
@@ -20,27 +20,22 @@ def verdict(run: RunFiles) -> list[str]:
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
-    lead = leading(run)
-    if lead is None or run.row(lead, run.focus, run.protocols[0]) is None:
+    lead = run.lead
+    if run.row(lead, run.focus, run.protocols[0]) is None:
         return [
             f"The run holds no free runs of its selected model on {run.focus} data; see the tables."
         ]
     return judged(evidence(run, lead))
 
 
-def leading(run: RunFiles) -> str | None:
-    """Return the model that a verdict is on: the selected one, else the first head."""
-    return run.selected or (run.heads[0] if run.heads else run.baseline)
-
-
-def figures_section(run: RunFiles) -> Section | None:
+def figures_of_lead(run: RunFiles) -> Section | None:
     """Return the figures behind the verdict in words, None where the model has no free runs.
 
     The model is compared with the baseline and, where the logs are simulated, with the plant.
     """
-    protocol, split, lead = run.protocols[0], run.focus, leading(run)
+    protocol, split, lead = run.protocols[0], run.focus, run.lead
     row = run.row(lead, split, protocol)
-    if lead is None or row is None:
+    if row is None:
         return None
     base = run.row(run.baseline, split, protocol)
     out = [_seen(run, lead, row), _level(run, lead, row, base)]
@@ -160,21 +155,8 @@ def _divergence(run: RunFiles, split: str) -> str:
     )
 
 
-def caution_section(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
+def cautions(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
     """Return what speaks against using the selected model, None where nothing does."""
-    found = cautions(run, findings)
-    if not found:
-        return None
-    return Section("Before you use it", [Bullets([minus(text) for text in found], warning=True)])
-
-
-def cautions(run: RunFiles, findings: Sequence[Finding]) -> list[str]:
-    """Return sentences on what speaks against using the selected model.
-
-    Args:
-        run: folder of a fit, or of its evaluation.
-        findings: of the checks for physical sanity.
-    """
     out = []
     lead = run.selected
     for protocol in run.protocols:
@@ -221,7 +203,8 @@ def cautions(run: RunFiles, findings: Sequence[Finding]) -> list[str]:
         f"{finding.model}, {finding.check}: {finding.text.partition('. ')[0].rstrip('.')}."
         for finding in failed
     ]
-    return out
+    told = [Bullets([minus(text) for text in out], warning=True)]
+    return Section("Before you use it", told) if out else None
 
 
 def worse_than_reference(run: RunFiles, protocol: str) -> str:
@@ -233,7 +216,7 @@ def worse_than_reference(run: RunFiles, protocol: str) -> str:
     for model in run.heads:
         rows = [
             row
-            for kind in distinct(run, run.manoeuvres(run.focus, protocol), run.focus, protocol)
+            for kind in distinct(run, run.focus, protocol)
             if (row := run.row(model, run.focus, protocol, kind))
         ]
         bad = [
@@ -255,3 +238,39 @@ def worse_than_reference(run: RunFiles, protocol: str) -> str:
         if lost
         else ""
     )
+
+
+def sanity(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
+    """Return a table of all checks and what each found, None where no model was checked."""
+    if not findings:
+        return None
+    of: dict[str, dict[str, Finding]] = {}
+    for finding in findings:
+        of.setdefault(finding.model, {})[finding.check] = finding
+    looks = {
+        None: Cell("n/a", mark="weak"),
+        True: Cell("✓ ok"),
+        False: Cell("✗ look", mark="bad"),
+    }
+    table = table_of(
+        of,
+        [
+            ("model", str),
+            *((check, lambda model, check=check: looks[of[model][check].ok]) for check in CHECKS),
+        ],
+        selected=lambda model: model == run.selected,
+    )
+    details = [
+        Section(
+            run.label(model),
+            [
+                Facts(
+                    [(check, minus(finding.text)) for check, finding in found.items()],
+                    failed=[check for check, finding in found.items() if finding.ok is False],
+                )
+            ],
+            folded=model != run.selected,
+        )
+        for model, found in of.items()
+    ]
+    return Section("Physical sanity", [table, *details])

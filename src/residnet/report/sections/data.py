@@ -1,0 +1,239 @@
+"""The data: what was fitted on what, what each log holds, and what would mislead a fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from residnet.report.blocks import (
+    Block,
+    Bullets,
+    Cell,
+    Column,
+    Facts,
+    Section,
+    Table,
+    Text,
+    bad_where,
+    table_of,
+)
+from residnet.report.format import DASH, DEG, minus, number
+from residnet.report.run_reader import Content, RunFiles
+
+_LEVELS = ("fatal", "will mislead")
+"""Levels above a note, the worst first."""
+
+
+def fitted_on_what(run: RunFiles) -> Section | None:
+    """Return the section on the data, None where the folder says nothing about them."""
+    facts = fitted_on(run)
+    blocks: list[Block] = [Facts(facts)] if facts else []
+    if run.quality:
+        short, full = quality_tables(run)
+        short.caption = (
+            "Scored: share of the samples on which u and v are compared. Learned from: share on"
+            " which smoothed states and accelerations are defined."
+        )
+        blocks += [
+            Section("Data quality", [short, Section("Log by log", [full], folded=True)]),
+        ]
+    return Section("What was fitted on what", blocks) if blocks else None
+
+
+def fitted_on(run: RunFiles) -> list[tuple[str, str]]:
+    """Return what was fitted on what, as pairs of a name and a text."""
+    baseline = run.resolved.get("baseline") or {}
+    samples = run.fit(run.baseline or "baseline").get("samples")
+    fit = f", fitted on {samples} samples" if samples else ""
+    logs: dict[str, list[Content]] = {}
+    for entry in run.quality:
+        logs.setdefault(entry["split"], []).append(entry)
+    splits = [
+        f"{split} {len(members)} logs, {sum(log['seconds'] for log in members) / 60:.1f} min"
+        for split, members in logs.items()
+    ]
+    protocols = run.evaluation.get("protocols") or {}
+    scales = [
+        f"{name} {number(run.unit(name)[1] * value)} {run.unit(name)[0]}"
+        for name, value in (run.metrics.get("scales") or {}).items()
+    ]
+    facts = [
+        ("data", _data(run)),
+        ("splits", "; ".join(splits)),
+        ("inputs", _inputs(run)),
+        *_model(run),
+    ]
+    facts.append(("baseline", str(baseline.get("kind", "")) + fit if baseline else ""))
+    for name, protocol in protocols.items():
+        facts.append(
+            (
+                f"protocol {name}",
+                _protocol(protocol)
+                + ("; selects the model" if name == run.evaluation.get("selection") else ""),
+            )
+        )
+    facts.append(("NRMSE divides by", ", ".join(scales)))
+    return [(name, text) for name, text in facts if text]
+
+
+def _data(run: RunFiles) -> str:
+    data = run.resolved.get("data") or {}
+    if not data:
+        return ""
+    if data.get("kind") != "simulated":
+        return (
+            f"measured logs ({(data.get('reader') or {}).get('kind', 'files')}),"
+            f" {len(run.provenance.get('inputs') or {})} files"
+        )
+    text = f"simulated sea trials of vessel {data.get('vessel')}"
+    noise = data.get("noise") or {}
+    if noise:
+        text += (
+            f", noise u {number(noise.get('u'), 2)} m/s, v {number(noise.get('v'), 2)} m/s, r"
+            f" {number(DEG * noise.get('r', 0), 2)} deg/s"
+        )
+    return text + f"; data seed {data.get('seed')}"
+
+
+def _inputs(run: RunFiles) -> str:
+    signals = run.resolved.get("signals") or {}
+    text = ", ".join(signals.get("inputs") or [])
+    if signals.get("exogenous"):
+        text += "; exogenous: " + ", ".join(signals["exogenous"])
+    if signals.get("forces"):
+        text += (
+            f"; forces from the thrusters of {signals['forces']}"
+            if isinstance(signals["forces"], str)
+            else "; forces from given thrusters"
+        )
+    return text
+
+
+def _model(run: RunFiles) -> list[tuple[str, str]]:
+    card = run.card(run.baseline or "baseline")
+    if not card:
+        return []
+    signals = card.get("signals") or {}
+    names = ["u", "v", "r", *(signals.get("inputs") or []), *(signals.get("exogenous") or [])]
+    ranges = []
+    for name, low, high in zip(names, card["low"], card["high"], strict=False):
+        unit, factor = run.unit(name)
+        ranges.append(
+            f"{name} {number(factor * low)} to {number(factor * high)} {unit}".removesuffix(" -")
+        )
+    return [
+        ("model step", f"{card['dt']:g} s, {card['integrator']}; inputs held over a step"),
+        ("training range", "; ".join(ranges)),
+    ]
+
+
+def _protocol(protocol: Content) -> str:
+    if protocol.get("kind") == "windows":
+        return (
+            f"back-to-back windows of {protocol['length']:g} s, the first from"
+            f" {protocol.get('first', 0):g} s on, each from the measured state"
+        )
+    if protocol.get("kind") == "manoeuvre":
+        return (
+            "whole manoeuvres; they start from the mean velocities of the first"
+            f" {protocol['initial']:g} s and are scored after them"
+        )
+    return str(protocol.get("kind", "not described"))
+
+
+def quality_tables(run: RunFiles) -> tuple[Table, Table]:
+    """Return what the logs hold: by split and kind of manoeuvre, and log by log."""
+    groups: dict[tuple[str, str], list[Content]] = {}
+    for entry in run.quality:
+        groups.setdefault((entry["split"], entry.get("manoeuvre") or DASH), []).append(entry)
+
+    def label(members: Sequence[Content]) -> str:
+        return f"{members[0]['split']}: {(members[0].get('manoeuvre') or DASH).replace('_', ' ')}"
+
+    columns: list[Column] = [
+        ("seconds", lambda logs: f"{sum(log['seconds'] for log in logs):.0f}", str),
+        ("samples", lambda logs: sum(log["samples"] for log in logs), str),
+        ("scored [%]", lambda logs: _mean(logs, "usable"), number),
+        ("learned from [%]", lambda logs: _mean(logs, "learned_from"), number),
+        ("masked", _masked),
+        *(
+            (
+                f"largest |{name}| [{unit}]",
+                lambda logs, name=name: _largest(logs, name),
+                number,
+                factor,
+            )
+            for name, unit, factor in (("u", "m/s", 1.0), ("v", "m/s", 1.0), ("r", "deg/s", DEG))
+        ),
+    ]
+    short: list[Column] = [("split, manoeuvre", label), ("logs", len, str), *columns]
+    return (
+        table_of(groups.values(), short, rule=lambda logs: logs[0]["split"]),
+        table_of([[log] for log in run.quality], [("log", lambda logs: logs[0]["log"]), *columns]),
+    )
+
+
+def _mean(logs: Sequence[Content], key: str) -> float:
+    samples = sum(log["samples"] for log in logs)
+    return float(100 * sum(log[key] * log["samples"] for log in logs) / samples)
+
+
+def _largest(logs: Sequence[Content], channel: str) -> float:
+    return float(max((log.get("largest") or {}).get(channel, math.nan) for log in logs))
+
+
+def _masked(logs: Sequence[Content]) -> str:
+    samples = sum(log["samples"] for log in logs)
+    masked: dict[str, float] = {}
+    for log in logs:
+        for reason, share in (log.get("masked") or {}).items():
+            masked[reason] = masked.get(reason, 0.0) + share * log["samples"] / samples
+    shown = ", ".join(f"{reason} {100 * share:.2g} %" for reason, share in masked.items())
+    return shown or "nothing"
+
+
+def doctor(run: RunFiles) -> Section | None:
+    """Return the findings by kind and the notes by log, None where the run has no doctor.json."""
+    inspection = run.json("doctor.json")
+    logs = inspection.get("logs") or []
+    if not logs:
+        return None
+    findings = [(str(log["name"]), finding) for log in logs for finding in log["findings"]]
+    findings += [("together", finding) for finding in inspection.get("together") or []]
+    severe = [(name, finding) for name, finding in findings if finding["level"] != "note"]
+    beyond = "What the masks of this run leave out does not count."
+    if severe:
+        misled = len({name for name, _ in severe} - {"together"})
+        held = "log holds" if len(logs) == 1 else "logs hold"
+        about = f"{misled} of {len(logs)} {held} something that would mislead a fit. {beyond}"
+    else:
+        count = "the log" if len(logs) == 1 else f"the {len(logs)} logs"
+        about = f"Nothing in {count} would mislead a fit. {beyond}"
+    blocks: list[Block] = [Text(about)]
+    if severe:
+        # one row for each kind of finding, the worst first
+        kinds: dict[tuple[int, str], list[tuple[str, Content]]] = {}
+        for name, finding in severe:
+            key = (_LEVELS.index(finding["level"]), str(finding["code"]))
+            kinds.setdefault(key, []).append((name, finding))
+        columns: list[Column] = [
+            ("finding", lambda row: row[0][1].replace("_", " ")),
+            ("level", lambda row: bad_where(_LEVELS[row[0][0]], row[0][0] == 0)),
+            ("logs", lambda row: len({name for name, _ in row[1]}), str),
+            ("for example", lambda row: _example(*row[1][0])),
+            ("what to do", lambda row: row[1][0][1]["action"]),
+        ]
+        blocks.append(table_of(sorted(kinds.items(), key=lambda row: row[0]), columns))
+    notes: dict[str, list[str]] = {}
+    for name, finding in findings:
+        if finding["level"] == "note":
+            action = f"; {finding['action']}" if finding["action"] else ""
+            notes.setdefault(name, []).append(minus(f"{finding['text']}{action}"))
+    if notes:
+        by_log = [Section(name, [Bullets(texts)]) for name, texts in notes.items()]
+        blocks.append(Section("Notes, log by log", by_log, folded=True))
+    return Section("Data doctor", blocks)
+
+
+def _example(name: str, finding: Content) -> Cell:
+    return Cell(minus(str(finding["text"])), note=name, mark="text")

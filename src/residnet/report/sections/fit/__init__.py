@@ -1,1 +1,0 @@
-"""The parts of the report of a fit, one file each."""

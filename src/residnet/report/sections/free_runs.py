@@ -1,0 +1,506 @@
+"""Errors of free runs by model, split and kind of manoeuvre; what limits them; their bands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from residnet.judge.verdict.sentences import diverged_note
+from residnet.report.blocks import (
+    Block,
+    Bullets,
+    Cell,
+    Column,
+    Section,
+    Table,
+    Text,
+    bad_where,
+    table_of,
+)
+from residnet.report.format import (
+    DASH,
+    DEG,
+    change,
+    fixed,
+    number,
+    percent,
+    plural,
+    signed,
+    title_of,
+)
+from residnet.report.run_reader import Content, RunFiles
+
+_DRAWN = {
+    "logs": "whole logs",
+    "windows": "runs of consecutive windows, since there are too few logs to draw whole ones",
+}
+"""What the blocks of the bootstrap are."""
+_BANDS = ("u", "v", "r", "heading", "position")
+
+
+def distinct(run: RunFiles, split: str, protocol: str) -> list[str]:
+    """Return kinds and groups of manoeuvres without those that hold the same runs as one before.
+
+    A group of a single kind holds the same runs as that kind.
+    """
+    seen: list[Any] = []
+    out: list[str] = []
+    for kind in run.manoeuvres(split, protocol):
+        rows = [run.row(model, split, protocol, kind) for model in run.kinds]
+        errors = [(row["windows"], row["rmse"]) for row in rows if row is not None]
+        if errors not in seen:
+            seen.append(errors)
+            out.append(kind)
+    return out
+
+
+def errors(run: RunFiles) -> Section:
+    """Return the section on free runs: for each protocol all models, then kind by kind."""
+    where = (
+        f"The splits {' and '.join(run.sides)} stand side by side."
+        if len(run.sides) > 1
+        else f"The data are those of the split {run.focus}."
+    )
+    small = "the 95 % interval of NRMSE"
+    if run.baseline is not None:
+        small = f"the change against the baseline on the same data, and {small}"
+    about = (
+        "The tables give the root mean square error of each free run, averaged over the runs."
+        f" {where} Small print gives {small}. A run that diverged counts with the error of held"
+        " velocities, and its number stands beside the score."
+    )
+    blocks: list[Block] = [Text(about)]
+    for protocol in run.protocols:
+        sides = [
+            side for side in run.sides if any(run.row(one, side, protocol) for one in run.kinds)
+        ]
+        if not sides:
+            continue
+        parts: list[Block] = [_side_by_side(run, protocol, sides)]
+        kinds = by_manoeuvre(run, protocol, run.focus)
+        if kinds is not None:
+            title = f"By kind of manoeuvre, {run.focus} data"
+            parts.append(Section(title, [kinds], folded=protocol != run.protocols[0]))
+        blocks.append(Section(f"Protocol {protocol}", parts))
+    return Section("Free runs", blocks)
+
+
+def _quantities(run: RunFiles, nrmse: str = "NRMSE [-]") -> dict[str, str]:
+    """Return the titles of what tables of errors show."""
+    return {
+        **{channel: f"{title_of(channel)} [{run.unit(channel)[0]}]" for channel in run.channels},
+        "nrmse": nrmse,
+        "position": "position, end [m]",
+        "heading": "heading, end [deg]",
+        "diverged": "diverged",
+    }
+
+
+def _side_by_side(run: RunFiles, protocol: str, sides: Sequence[str]) -> Table:
+    """Return the errors of all models, the splits side by side for each quantity."""
+
+    def cell(model: str, key: str, split: str) -> Cell:
+        own = run.kinds[model] in ("zero", "baseline")
+        base = None if own else run.row(run.baseline, split, protocol)
+        return _quantity(run, key, run.row(model, split, protocol), base)
+
+    quantities = _quantities(run, "NRMSE, mean [-]")
+    return table_of(
+        run.kinds,
+        [
+            ("model", run.label),
+            *(
+                (split, lambda model, key=key, split=split: cell(model, key, split))
+                for key in quantities
+                for split in sides
+            ),
+        ],
+        groups=[(title, len(sides)) for title in quantities.values()],
+        selected=lambda model: model == run.selected,
+    )
+
+
+def errors_table(run: RunFiles, split: str) -> Table:
+    """Return the errors of all models on one split under all protocols, for the terminal."""
+    rows = [
+        row
+        for protocol in run.protocols
+        for model in run.kinds
+        if (row := run.row(model, split, protocol))
+    ]
+
+    def cell(row: Content, key: str) -> Cell:
+        found = _quantity(run, key, row, None)
+        if key in run.channels:
+            return Cell(found.text)
+        return Cell(found.text, diverged_note(row), found.mark) if key == "nrmse" else found
+
+    return table_of(
+        rows,
+        [
+            ("model", lambda row: run.label(row["model"])),
+            ("protocol", "protocol"),
+            *(
+                (title, lambda row, key=key: cell(row, key))
+                for key, title in _quantities(run).items()
+            ),
+        ],
+        caption=f"Free-run errors on {split} data, mean over windows.",
+    )
+
+
+def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
+    """Return the errors of one split by kind of manoeuvre, None where there is a single kind."""
+    kinds = distinct(run, split, protocol)
+    if len(kinds) < 2:
+        return None
+    models = [model for model, role in run.kinds.items() if role != "zero"]
+    rows = [row for kind in kinds for one in models if (row := run.row(one, split, protocol, kind))]
+
+    def label(row: Content) -> str:
+        # the kind stands once, before its first model
+        first = f"{row['manoeuvre'].replace('_', ' ')}: " if row["model"] == models[0] else ""
+        return first + run.label(row["model"])
+
+    def cell(row: Content, key: str) -> Cell:
+        own = run.kinds[row["model"]] == "baseline"
+        base = None if own else run.row(run.baseline, split, protocol, row["manoeuvre"])
+        return _quantity(run, key, row, base)
+
+    return table_of(
+        rows,
+        [
+            ("manoeuvre, model", label),
+            ("runs", "windows", str),
+            *(
+                (title, lambda row, key=key: cell(row, key))
+                for key, title in _quantities(run).items()
+            ),
+        ],
+        selected=lambda row: row["model"] == run.selected,
+        rule=lambda row: row["manoeuvre"],
+    )
+
+
+def _quantity(run: RunFiles, key: str, row: Content | None, base: Content | None) -> Cell:
+    if row is None:
+        return Cell(DASH)
+    if key == "diverged":
+        return Cell(f"{row['diverged']}/{row['windows']}", mark="bad" if row["diverged"] else "")
+    if key == "position":
+        return Cell(number(row.get("position_error_end"), 2))
+    if key == "heading":
+        return Cell(number(DEG * row.get("heading_error_end", math.nan), 2))
+    lost = diverged_note(row)
+    if key == "nrmse":
+        interval = row.get("nrmse_mean_ci95")
+        small = f"{number(interval[0])}–{number(interval[1])}" if interval else ""
+        value, worse, factor = row["nrmse"]["mean"], False, 1.0
+    else:
+        value, factor = row["rmse"].get(key), run.unit(key)[1]
+        if value is None:
+            return Cell(DASH)
+        worse = base is not None and value > 1.005 * base["rmse"][key]
+        small = change(value, base["rmse"][key]) if base is not None else ""
+    note = "; ".join(text for text in (small, lost) if text)
+    return Cell(number(factor * value), note, "bad" if worse or row["diverged"] else "")
+
+
+def limits(run: RunFiles) -> Section | None:
+    """Return for each protocol errors by manoeuvre and band, worst windows and what limits them.
+
+    None where the selected model has no row.
+    """
+    lead = run.lead
+    parts: list[Block] = []
+    for protocol in run.protocols:
+        row = run.row(lead, run.focus, protocol)
+        if row is not None:
+            known = (run.limits.get("splits") or {}).get(run.focus, {}).get(protocol, {})
+            blocks = [
+                Text(_how_good(lead, row)),
+                _where(run, lead, protocol, known),
+                _worst(run, lead, known),
+                Text(_what_limits(run, lead, row, protocol, known)),
+            ]
+            title = f"Protocol {protocol}" + ("" if parts else f", {run.focus} data")
+            parts.append(Section(title, blocks, folded=bool(parts)))
+    if not parts:
+        return None
+    notes = (
+        "Intervals are percentiles of a block bootstrap. For few blocks they are widened as"
+        " Student's t is. Change and difference are those of the mean NRMSE; negative is better. A"
+        " bold interval excludes zero. Bands are thirds of the windows; bands of fewer than three"
+        " windows are left out."
+    )
+    title = "How good, where it fails, what limits it"
+    return Section(title, [*parts, Text(notes, quiet=True)])
+
+
+def _how_good(lead: str, row: Content) -> str:
+    drawn, interval = row.get("ci95_blocks"), row.get("nrmse_mean_ci95")
+    text = f"{lead}: NRMSE {number(row['nrmse']['mean'])}"
+    if row["diverged"]:
+        text += f" ({diverged_note(row)})"
+    if interval:
+        text += f", 95 % interval {number(interval[0])} to {number(interval[1])}"
+    if drawn:
+        text += f" (bootstrap of {drawn['count']} blocks: {_DRAWN[drawn['of']]})"
+    elif "ci95_blocks" in row:
+        text += "; too few logs for an interval"
+    return f"{text}. {against(lead, row.get('difference'))}".strip()
+
+
+def against(lead: str, difference: Content | None) -> str:
+    """Return a paired difference as a sentence, empty where there is none."""
+    if not difference:
+        return ""
+    value, interval = difference["nrmse_mean"], difference["ci95"]
+    text = f"Against {difference['to']} over the same windows: {signed(value)}"
+    if difference["ratio"] is not None:
+        text += f" ({percent(100 * (difference['ratio'] - 1))})"
+    if interval is None:
+        return text + "; too few logs for an interval of the difference."
+    text += f", paired 95 % interval {signed(interval[0])} to {signed(interval[1])}"
+    if not difference["excludes_zero"]:
+        return text + ". The interval holds zero: these data cannot tell the two apart."
+    return text + f". The interval excludes zero: {lead} is {'better' if value < 0 else 'WORSE'}."
+
+
+def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table | None:
+    """Return the errors by kind of manoeuvre, speed and wind, None where there is a single row."""
+    lines: list[Content] = []
+    for kind in ["all", *distinct(run, run.focus, protocol)]:
+        row = run.row(lead, run.focus, protocol, kind)
+        if row is not None:
+            shown = {"by": "kind", "label": kind.replace("_", " "), "value": row["nrmse"]["mean"]}
+            lines.append(
+                {**shown, "windows": row["windows"], "difference": row.get("difference") or {}}
+            )
+    for band in known.get("bands") or []:
+        found = band["models"].get(lead)
+        if found is not None:
+            label = f"{band['by']} {number(band['low'], 2)} to {number(band['high'], 2)} m/s"
+            shown = {"by": band["by"], "label": label, "value": found["nrmse_mean"]}
+            lines.append(
+                {**shown, "windows": band["windows"], "difference": found["difference"] or {}}
+            )
+    if len(lines) < 2:
+        return None
+    reference = next((line["difference"]["to"] for line in lines if line["difference"]), None)
+
+    def ratio(line: Content) -> Cell:
+        value = line["difference"].get("ratio")
+        text = DASH if value is None else percent(100 * (value - 1))
+        return bad_where(text, line["difference"].get("worse"))
+
+    def span(line: Content) -> Cell:
+        bounds = line["difference"].get("ci95")
+        text = " to ".join(map(signed, bounds)) if bounds else DASH
+        return Cell(text, mark="best" if line["difference"].get("excludes_zero") else "")
+
+    def less(line: Content) -> str:
+        apart = line["difference"].get("nrmse_mean")
+        return number(None if apart is None else line["value"] - apart)
+
+    columns: list[Column] = [
+        ("windows of", "label"),
+        ("windows", "windows", str),
+        (f"NRMSE of {lead}", "value", number),
+    ]
+    if reference:
+        columns += [
+            (f"NRMSE of {reference}", less, str),
+            ("change", ratio),
+            ("difference", "difference.nrmse_mean", _signed),
+            ("paired 95 % interval", span),
+        ]
+    return table_of(lines, columns, rule=lambda line: line["by"])
+
+
+def _signed(value: float | None) -> str:
+    return DASH if value is None else signed(value)
+
+
+def _worst(run: RunFiles, lead: str, known: Content) -> Table | None:
+    """Return the windows with the largest errors of a model, None where none are recorded."""
+    entries = (known.get("worst") or {}).get(lead) or []
+    if not entries:
+        return None
+    channels = [name for name in run.channels if name in entries[0]["rmse"]]
+    return table_of(
+        entries,
+        [
+            (
+                "worst windows",
+                lambda entry: f"{entry['log']} ({entry['manoeuvre'].replace('_', ' ')})",
+            ),
+            ("log time at start [s]", "t", 1),
+            ("NRMSE", "nrmse", number),
+            *((_quantities(run)[c], f"rmse.{c}", number, run.unit(c)[1]) for c in channels),
+            ("position, end [m]", lambda entry: number(entry["position_error_end"], 2), str),
+        ],
+    )
+
+
+def _what_limits(
+    run: RunFiles, lead: str, row: Content, protocol: str, known: Content
+) -> list[str]:
+    out = []
+    if found := known.get("kinematics"):
+        out.append(
+            "Consistency of the measured channels: the measured velocities, integrated over each"
+            f" window from its measured pose, end {number(found['position_mean'], 2)} m and"
+            f" {number(DEG * found['heading_mean'], 2)} deg from the measured pose on average (root"
+            f" mean square {number(found['position_rms'], 2)} m,"
+            f" {number(DEG * found['heading_rms'], 2)} deg). A model that predicted the measured"
+            f" velocities exactly would be off by as much; {lead} is off by"
+            f" {number(row['position_error_end'], 2)} m and"
+            f" {number(DEG * row['heading_error_end'], 2)} deg."
+        )
+    if repeats := (run.limits.get("repeatability") or {}).get(protocol):
+        out.append(_repeatability(run, repeats))
+    return out
+
+
+def _repeatability(run: RunFiles, found: Content) -> str:
+    tolerance = found["tolerance"]
+
+    def listed(values: Mapping[str, float], *digits: int) -> str:
+        return ", ".join(
+            f"{name} {number(run.unit(name)[1] * values[name], *digits)} {run.unit(name)[0]}"
+            for name in tolerance["start"]
+        )
+
+    rule = (
+        f"commands within {100 * tolerance['command_share_of_range']:.0f} % of their range (root"
+        " mean square over the window) and initial velocities within"
+        f" {listed(tolerance['start'], 2)}"
+    )
+    where = "the logs evaluated here" if run.focus == "external" else "the logs of all splits"
+    if not found["pairs"]:
+        return (
+            f"Repeatability: {where} hold no two stretches as long as a window with {rule}. How"
+            " well the vessel repeats itself is not known."
+        )
+    share = 1 / math.sqrt(2)
+    kinds = ", ".join(
+        f"{name.replace('_', ' ')} {part['pairs']}" for name, part in found["manoeuvres"].items()
+    )
+    exogenous = (run.resolved.get("signals") or {}).get("exogenous")
+    wind = " A model that knows the wind, as these do, can do better." if exogenous else ""
+    return (
+        f"Repeatability: {plural(found['pairs'], 'pair')} of stretches ({kinds}) in"
+        f" {found['logs']} of {where} have {rule}. Their measured motions differ by"
+        f" {listed(found)} (root"
+        f" mean square), and by {number(found['position'], 2)} m and"
+        f" {number(DEG * found['heading'], 2)} deg at the end. Each motion is off their mean by"
+        f" 1/√2 of that: an NRMSE of {number(share * found['nrmse'])} and"
+        f" {number(share * found['position'], 2)} m. The remaining differences of commands and"
+        " starts are part of it. A model that knows only commands and initial velocities is left"
+        f" with an error of this order in such runs, whatever its form.{wind}"
+    )
+
+
+def bands(run: RunFiles) -> Section | None:
+    """Return how wide bands are, what they held and what they do not promise; None without any."""
+    models: Content = run.json("bands.json").get("models") or {}
+    if not models:
+        return None
+    band = next(iter(next(iter(models.values())).values()))
+    level = f"{100 * band['level']:.0f} %"
+    about = [
+        f"A band is to hold {level} of the errors of a free run on logs that nobody has seen. It"
+        " grows with the horizon, and is wider where the predicted run is livelier. It was"
+        " calibrated over logs that its model was not fitted on: training logs, predicted by"
+        " models that leave them out, and the validation logs.",
+        f"The tables say what the bands held of the {run.focus} data. Whole: share of the runs that"
+        f" a band holds from beginning to end, each channel for itself, where it is widened to hold"
+        f" {level} of them. Score: mean width, and {2 / (1 - band['level']):.0f} times what lies"
+        " outside, in units of the error of zero; less is better. Beside it stand a band of one"
+        " width at all horizons and the spread of the run's models, taken for normal.",
+    ]
+    blocks: list[Block] = [Text(about)]
+    if told := cautions(run, run.lead):
+        blocks.append(Bullets(told, warning=True))
+    for protocol in run.protocols:
+        models_rows = [run.row(model, run.focus, protocol) for model in run.kinds]
+        known = [row for row in models_rows if row and "band_coverage" in row]
+        if not known:
+            continue
+        parts = [_coverage(known, "model", lambda row: run.label(row["model"]), run.selected)]
+        of_kinds = [
+            run.row(run.lead, run.focus, protocol, kind)
+            for kind in distinct(run, run.focus, protocol)
+        ]
+        kinds = [row for row in of_kinds if row and "band_coverage" in row]
+        if len(kinds) > 1:
+            title = f"manoeuvre, {run.lead}"
+            parts.append(_coverage(kinds, title, lambda row: row["manoeuvre"].replace("_", " ")))
+        if found := models.get(run.lead, {}).get(protocol):
+            parts.append(_widths(found))
+        blocks.append(Section(f"Protocol {protocol}", parts, folded=protocol != run.protocols[0]))
+    return Section("Bands", blocks)
+
+
+def cautions(run: RunFiles, model: str) -> list[str]:
+    """Return whole sentences about what the bands of a model do not promise."""
+    known: Content = (run.json("bands.json").get("models") or {}).get(model) or {}
+    windows = run.windows(run.focus) if known else []
+    out: list[str] = []
+    for protocol, band in known.items():
+        out += [text for text in band["cautions"] if text not in out]
+        lengths = [float(w.t[-1] - w.t[0]) for w in windows if w.protocol == protocol]
+        longest = max(lengths, default=0.0)
+        if longest > band["horizon"] + 1e-6:
+            out.append(
+                f"Runs of protocol {protocol} last up to {fixed(longest, 0)} s, and the band is"
+                f" calibrated up to {fixed(band['horizon'], 0)} s only; beyond, it grows in"
+                " proportion to time, without any promise."
+            )
+    return out
+
+
+def _coverage(
+    rows: Sequence[Content], title: str, label: Any, selected: str | None = None
+) -> Table:
+    def beside(row: Content, name: str) -> Cell:
+        value, own = row.get(name), row["band_score"]
+        note = percent(100 * (value / own - 1)) if value is not None and own > 0 else ""
+        return Cell(number(value), note)
+
+    return table_of(
+        rows,
+        [
+            (title, label),
+            *((name, f"band_coverage.{name}", 2) for name in (*_BANDS, "mean", "whole")),
+            ("bands", "band_score", number),
+            ("one width", lambda row: beside(row, "band_score_constant")),
+            ("spread", lambda row: beside(row, "band_score_spread")),
+        ],
+        groups=[("coverage", 7), ("score", 3)],
+        selected=lambda row: row["model"] == selected,
+    )
+
+
+def _widths(band: Content) -> Table:
+    """Return the half widths of the leading model at a few horizons."""
+    steps, widths = band["steps"], band["half_width_of_any_run"]
+    places = [
+        min(range(len(steps)), key=lambda i: abs(steps[i] - share * steps[-1]))
+        for share in (0.1, 0.25, 0.5, 1.0)
+    ]
+    units = {"r": ("deg/s", DEG), "heading": ("deg", DEG), "position": ("m", 1.0)}
+
+    def column(name: str) -> Column:
+        unit, factor = units.get(name, ("m/s", 1.0))
+        return f"{name} [{unit}]", lambda i: number(factor * widths[name][i]), str
+
+    return table_of(
+        places,
+        [
+            ("half width after", lambda i: f"{number(steps[i] * band['step'])} s"),
+            *map(column, _BANDS),
+        ],
+    )

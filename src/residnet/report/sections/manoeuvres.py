@@ -1,0 +1,530 @@
+"""Manoeuvres of a vessel or a model: flights, their indices, and the manoeuvring booklet."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from residnet.core.log import Log
+from residnet.data.simulated.flying import Flight
+from residnet.manoeuvres import Replay, Spiral, Waypoints, Zigzag
+from residnet.report.blocks import Block, Bullets, Cell, Column, Section, Table, Text, table_of
+from residnet.report.figure import (
+    DASHED,
+    GREY,
+    MEASURED,
+    SOLID,
+    START,
+    ZERO,
+    Case,
+    Curve,
+    Figure,
+    Look,
+    Panel,
+    band,
+    figures_section,
+    joined,
+    read_figures,
+    steps,
+)
+from residnet.report.format import DASH, DEG, fixed, interval, number, plural, shown_unit
+from residnet.report.run_reader import Content, RunFiles
+
+_EACH = 12
+"""Most flights that have a table and a picture each; of more, the first of each kind has."""
+_MOST_CASES = 30
+_MOST_PANELS = 12
+_MOST_ZIGZAGS = 6
+_TITLES = {
+    "time_90": "time to 90 deg",
+    "time_180": "time to 180 deg",
+    "steady_speed_ratio": "steady speed over approach speed",
+    "pull_out_yaw_rate": "yaw rate after pull-out",
+}
+"""Names of indices that are not their key with spaces."""
+_COMPARED = (
+    "first_overshoot",
+    "second_overshoot",
+    "initial_turning_time",
+    "reach",
+    "period",
+    "largest_yaw_rate",
+)
+_CHANNELS = {
+    "u": "surge velocity\nu", "v": "sway velocity\nv", "r": "yaw rate\nr", "p": "roll rate\np",
+    "psi": "heading\n", "phi": "roll angle\n",
+    "cmd_delta": "rudder\ncommand", "cmd_n": "revolutions\ncommand", "cmd_port": "port command\n",
+    "cmd_stbd": "starboard\ncommand",
+}  # fmt: skip
+
+
+def index_title(name: str) -> str:
+    """Return a manoeuvring index in words."""
+    return _TITLES.get(name, name.replace("_", " "))
+
+
+def sections(run: RunFiles) -> list[Section]:
+    """Return the manoeuvring indices and the figures that stand in the folder."""
+    content = run.json("indices.json")
+    out = []
+    if content.get("rows"):
+        blocks: list[Block] = []
+        if faulty := [row for row in content["rows"] if row["fault"]]:
+            faults = [f"{row['craft']}, {row['log']}: {row['fault']}" for row in faulty]
+            blocks.append(Bullets(faults, warning=True))
+        blocks.append(Text(_about(content), quiet=True))
+        blocks += [Section(title, [table]) for title, table in index_tables(content)]
+        out.append(Section("Manoeuvring indices", blocks))
+    if flown := read_figures(run.path / "figures", "manoeuvres"):
+        out.append(Section("Runs to look into", flown))
+    return [*out, *figures_section(run.path / "figures", "(?!manoeuvres).*")]
+
+
+def _about(content: Content) -> str:
+    length = content.get("length")
+    if length is None:
+        text = "The length of the hull is not known, so there are no values in hull lengths."
+    else:
+        text = (
+            f"L: hull lengths of {number(length)} m. The limits are those of IMO resolution"
+            " MSC.137(76), where they apply to a manoeuvre."
+        )
+    without = dict.fromkeys(
+        str(row["manoeuvre"]).replace("_", " ") for row in content["rows"] if not row["indices"]
+    )
+    return text + (f" Flights without indices: {', '.join(without)}." if without else "")
+
+
+def indices_text(content: Content) -> str:
+    """Return the contents of indices.json for the terminal."""
+    return "\n\n".join(f"{title}\n{table.text()}" for title, table in index_tables(content))
+
+
+def index_tables(content: Content) -> list[tuple[str, Table]]:
+    """Return titles and tables of the manoeuvring indices of indices.json.
+
+    Few flights have a table each, with a row for each index; more stand in one table for each kind
+    of manoeuvre, with a row for each flight.
+    """
+    groups: dict[str, list[Content]] = {}
+    few = len({row["log"] for row in content["rows"]}) <= _EACH
+    for row in content["rows"]:
+        groups.setdefault(str(row["log" if few else "manoeuvre"]), []).append(row)
+    make = _of_log if few else _of_kind
+    tables = [(name.replace("_", " "), make(content, rows)) for name, rows in groups.items()]
+    return [(title, table) for title, table in tables if table.rows and len(table.columns) > 1]
+
+
+def _of_log(content: Content, rows: Sequence[Content]) -> Table:
+    """Return a row for each index of one log; of two crafts the second is compared to the first."""
+    crafts = [str(row["craft"]) for row in rows]
+    units = {name: shown_unit(str(content["units"].get(name, "-"))) for name in _single(rows)}
+
+    def value(place: int, name: str) -> str:
+        return number(_times(units[name][1], rows[place]["indices"].get(name)), 4)
+
+    def apart(name: str) -> str:
+        first, second = (row["indices"].get(name) for row in rows)
+        return number(None if None in (first, second) else units[name][1] * (second - first))
+
+    def lengths(place: int, name: str) -> str:
+        found = rows[place]["indices"].get(f"{name}_lengths")
+        return "" if found is None else fixed(found, 2)
+
+    def limit(name: str) -> Cell:
+        limits = [row["limits"][name] for row in rows if name in row["limits"]]
+        if not limits:
+            return Cell("")
+        kept = all(one["kept"] for one in limits)
+        text = number(units[name][1] * limits[0]["limit"], 4)
+        return Cell(text, "kept" if kept else "exceeded", "" if kept else "bad")
+
+    columns: list[Column] = [("index", index_title), ("unit", lambda name: units[name][0], str)]
+    columns += [
+        (craft, lambda name, place=place: value(place, name), str)
+        for place, craft in enumerate(crafts)
+    ]
+    if len(rows) == 2:
+        columns.append(("difference", apart, str))
+    if any(f"{name}_lengths" in row["indices"] for row in rows for name in units):
+        columns += [
+            (f"{craft} [L]", lambda name, place=place: lengths(place, name), str)
+            for place, craft in enumerate(crafts)
+        ]
+    if any(row["limits"] for row in rows):
+        columns.append(("IMO limit", limit))
+    return table_of(units, columns)
+
+
+def _of_kind(content: Content, rows: Sequence[Content]) -> Table:
+    """Return a row for each flight of one kind of manoeuvre."""
+    several = len({row["craft"] for row in rows}) > 1
+
+    def cell(row: Content, name: str, factor: float) -> Cell:
+        text = number(_times(factor, row["indices"].get(name)), 4)
+        beyond = name in row["limits"] and not row["limits"][name]["kept"]
+        return Cell(text, "beyond the IMO limit", "bad") if beyond else Cell(text)
+
+    columns: list[Column] = [
+        ("log", lambda row: f"{row['log']} ({row['craft']})" if several else row["log"])
+    ]
+    for name in _single(rows):
+        unit, factor = shown_unit(str(content["units"].get(name, "-")))
+        title = f"{index_title(name)} [{unit}]"
+        columns.append((title, lambda row, name=name, factor=factor: cell(row, name, factor)))
+    return table_of(rows, columns)
+
+
+def _single(rows: Sequence[Content]) -> list[str]:
+    """Return the names of indices that are one number each; lengths are shown beside them."""
+    names = dict.fromkeys(name for row in rows for name in row["indices"])
+    return [
+        name
+        for name in names
+        if not name.endswith("_lengths")
+        and not any(isinstance(row["indices"].get(name), list) for row in rows)
+    ]
+
+
+def _times(factor: float, value: float | None) -> float | None:
+    return None if value is None else factor * value
+
+
+def flight_figures(flown: Mapping[str, Sequence[Flight]]) -> Iterator[Figure]:
+    """Draw track, motion and commands of flights and, of spirals, yaw rate over helm.
+
+    Of many flights, only the first of each kind of manoeuvre has a still picture.
+
+    Args:
+        flown: flights of the same manoeuvres by what flew them; of two, the first is the solid line
+            and the second the dashed one.
+    """
+    groups: list[Sequence[Flight]] = list(zip(*flown.values(), strict=True))
+    kinds: dict[str, Sequence[Flight]] = {}
+    for group in groups:
+        kinds.setdefault(group[0].manoeuvre.kind, group)
+    stills = groups if len(groups) <= _EACH else list(kinds.values())
+    looks = {"recorded": Look("recorded", GREY, width=2.2, order=2)}
+    looks |= {
+        craft: replace(DASHED if place else SOLID, label=craft) for place, craft in enumerate(flown)
+    }
+    looks["way-point"] = Look("way-point", "#666666", kind="points", marker="s", size=5, order=5)
+    looks["reversals"] = replace(ZERO, label="heading of reversals", dash="dotted")
+    looks["start"] = START
+    shown = [*stills, *(one for one in groups if one not in stills)][:_MOST_CASES]
+    logs = [flight.motion for group in shown for flight in group]
+    present = dict.fromkeys(name for log in logs for name in log.channels)
+    channels: list[str] = [name for name in ("u", "v", "r", "p", "psi", "phi") if name in present]
+    channels += [name for name in present if name.startswith("cmd_")]
+    channels = channels[:_MOST_PANELS]
+    units = {name: shown_unit(log.units[name]) for log in logs for name in log.channels}
+    units |= {name: ("rpm", 60.0) for log in logs for name in log.units if log.units[name] == "1/s"}
+    panels = [Panel("north [m]", "east [m]", kind="map")]
+    panels += [
+        Panel(f"{_CHANNELS.get(name, name)} [{units[name][0]}]".replace("\n ", "\n"), height=145)
+        for name in channels
+    ]
+    panels[-1] = replace(panels[-1], x_label="time [s]")
+    cases = []
+    for group in [one for one in groups if one in shown]:
+        motion = group[0].motion
+        length = max(float(flight.motion.t[-1]) for flight in group)
+        cases.append(
+            Case(
+                motion.name.replace("_", " "),
+                _flight_curves(list(flown), group, {name: units[name][1] for name in channels}),
+                f"{group[0].manoeuvre.kind.replace('_', ' ')}, {length:.0f} s",
+                group in stills,
+            )
+        )
+    yield Figure(
+        "manoeuvres",
+        "Manoeuvres",
+        "North is up, scales of the track are equal, and each track begins at its start. Below,"
+        " the motion itself, without the noise of sensors, and the commands over time.",
+        looks,
+        panels,
+        cases,
+        "Manoeuvre",
+    )
+    for group in stills:
+        if isinstance(group[0].manoeuvre, Spiral):
+            yield _spiral(list(flown), group, looks)
+
+
+def _flight_curves(
+    crafts: Sequence[str], group: Sequence[Flight], factors: Mapping[str, float]
+) -> list[dict[str, Curve]]:
+    manoeuvre, first = group[0].manoeuvre, group[0].motion
+    x0, y0 = (float(first[name][0]) for name in ("x", "y"))
+    drawn: dict[str, Log] = {}
+    if isinstance(manoeuvre, Replay):
+        drawn["recorded"] = manoeuvre.recorded
+    drawn |= {craft: flight.motion for craft, flight in zip(crafts, group, strict=True)}
+    track: dict[str, Curve] = {}
+    out: list[dict[str, Curve]] = [track, *({} for _ in factors)]
+    for name, log in drawn.items():
+        # a recording, as far as it was flown
+        known = log.t - log.t[0] <= first.t[-1] if name == "recorded" else slice(None)
+        time = (log.t - log.t[0])[known] if name == "recorded" else log.t
+        if "x" in log.channels and "y" in log.channels:
+            track[name] = (log["y"][known] - y0, log["x"][known] - x0)
+        for panel, (channel, factor) in zip(out[1:], factors.items(), strict=True):
+            if channel in log.channels:
+                curve = (time, factor * np.asarray(log[channel][known], dtype=float))
+                panel[name] = steps(*curve) if channel.startswith("cmd_") else curve
+    track["start"] = (np.zeros(1), np.zeros(1))
+    if isinstance(manoeuvre, Waypoints):
+        north, east = np.array(manoeuvre.points).T
+        track["way-point"] = (east - y0, north - x0)
+    if isinstance(manoeuvre, Zigzag) and "psi" in factors:
+        turn = np.array([-1.0, 1.0]) * manoeuvre.heading
+        heading = factors["psi"] * (first["psi"][0] + turn)
+        out[1 + list(factors).index("psi")]["reversals"] = (np.zeros(2), heading)
+    return out
+
+
+def _spiral(crafts: Sequence[str], group: Sequence[Flight], looks: Mapping[str, Look]) -> Figure:
+    name, manoeuvre = group[0].motion.name, group[0].manoeuvre
+    by_angle = isinstance(manoeuvre, Spiral) and len(manoeuvre.rudders) > 0
+    panel: dict[str, Curve] = {}
+    for craft, flight in zip(crafts, group, strict=True):
+        found = flight.manoeuvre.indices(flight.motion)
+        helm = (DEG if by_angle else 1.0) * np.asarray(found["steers"])
+        panel[craft] = panel[f"{craft} steady"] = (helm, np.degrees(found["yaw_rates"]))
+    label = "rudder [deg]" if by_angle else "helm [share of full steer]"
+    return Figure(
+        f"spiral_{name}",
+        f"Spiral: {name}",
+        "Steady yaw rate over helm; a loop about zero shows an unstable vessel.",
+        {craft: looks[craft] for craft in crafts}
+        | {f"{craft} steady": replace(looks[craft], kind="points") for craft in crafts},
+        [Panel("steady yaw rate [deg/s]", label, name, height=360)],
+        [Case("", [panel])],
+    )
+
+
+def booklet(run: RunFiles) -> Section | None:
+    """Return a table for each standard manoeuvre and one that compares measured zigzags.
+
+    None where the run has no booklet.json.
+    """
+    content = run.json("booklet.json")
+    if not content:
+        return None
+    scale = float(content["scale"])
+    hull = f"a hull of {number(float(content['length']))} m"
+    hull += f", a model at 1:{number(scale)}" if scale != 1 else ""
+    ship = " The column ship scales the values by Froude's law." if scale != 1 else ""
+    about = (
+        f"Model {content['model']} ran these manoeuvres for {hull}.{ship} The intervals"
+        f" ({100 * content['level']:.0f} %) come from {content['draws']} draws of the parameters"
+        " from their uncertainty after the trials. They assume that the model's form is right."
+    )
+    blocks: list[Block] = [Text(about)]
+    for page in content["pages"]:
+        if not page["split"]:
+            parts: list[Block] = [_standard(content, page)]
+            if page["faults"]:
+                draws = plural(page["faults"], "draw")
+                text = f"The intervals leave out {draws} that did not end the manoeuvre."
+                parts.append(Bullets([text], warning=True))
+            blocks.append(Section(page_title(page), parts))
+    repeated = [page for page in content["pages"] if page["split"]]
+    if repeated:
+        firsts = [page["indices"].get("first_overshoot", {}) for page in repeated]
+        apart = [abs(found["difference"]) for found in firsts if "difference" in found]
+        about = (
+            "The model steers the rudder angle of each trial and reverses it at the trial's"
+            " headings, from the state that the trial began with."
+        )
+        if apart:
+            worst = number(math.degrees(max(apart)), 2)
+            about += f" First overshoots differ by at most {worst} deg."
+        title = "Measured zigzags, repeated in closed loop"
+        blocks.append(Section(title, [Text(about), _repeated(content, repeated)]))
+    return Section("Manoeuvring booklet", blocks)
+
+
+def page_title(page: Content) -> str:
+    """Return the name of a page, with the split of a measured log."""
+    name = str(page["name"])
+    return f"{name} ({page['split']})" if page["split"] else name.replace("_", " ")
+
+
+def _standard(content: Content, page: Content) -> Table:
+    """Return the indices of a standard manoeuvre with intervals and limits, a row for each."""
+    found = {
+        name: {"name": name, "factor": shown_unit(content["units"][name])[1], **entry}
+        for name, entry in page["indices"].items()
+    }
+
+    def value(key: str, absent: str = "") -> Any:
+        def text(row: Content) -> str:
+            return number(row["factor"] * row[key]) if key in row else absent
+
+        return text
+
+    def kept(row: Content) -> Cell:
+        share = row.get("kept_share")
+        text = "" if share is None else f"{100 * share:.0f} % of draws"
+        return Cell(text, mark="" if row.get("kept", True) else "bad")
+
+    columns: list[Column] = [
+        ("index", lambda row: index_title(row["name"])),
+        ("value", value("value"), str),
+        (
+            f"{100 * content['level']:.0f} % interval",
+            lambda row: interval(row.get("interval"), row["factor"]),
+            str,
+        ),
+        ("unit", lambda row: shown_unit(content["units"][row["name"]])[0], str),
+        ("lengths", lambda row: number(row["lengths"]) if "lengths" in row else "", str),
+    ]
+    columns += [("ship", value("ship"), str)] if float(content["scale"]) != 1 else []
+    columns += [("IMO limit", value("limit"), str), ("kept by", kept)]
+    return table_of(found.values(), columns)
+
+
+def _repeated(content: Content, pages: Sequence[Content]) -> Table:
+    """Return measured and predicted indices of the repeated zigzags, a row for each."""
+    used = {
+        name: shown_unit(content["units"][name])
+        for name in _COMPARED
+        if any("measured" in page["indices"].get(name, {}) for page in pages)
+    }
+
+    def cell(page: Content, name: str, key: str) -> Cell:
+        found, factor = page["indices"].get(name, {}), used[name][1]
+        if "measured" not in found:
+            return Cell(DASH)
+        if key == "difference":
+            return Cell(number(factor * found[key], 2))
+        note = interval(found.get("interval"), factor) if key == "value" else ""
+        return Cell(number(factor * found[key]), note)
+
+    return table_of(
+        pages,
+        [
+            ("log", page_title),
+            *(
+                (title, lambda page, name=name, key=key: cell(page, name, key))
+                for name in used
+                for title, key in (
+                    ("measured", "measured"),
+                    ("model", "value"),
+                    ("difference",) * 2,
+                )
+            ),
+        ],
+        groups=[(f"{index_title(name)} [{unit}]", 3) for name, (unit, _) in used.items()],
+    )
+
+
+def booklet_figures(run: RunFiles) -> Iterator[Figure]:
+    """Draw the turning circles with all draws and the repeated zigzags of a booklet."""
+    content, frame = run.json("booklet.json"), run.frame("booklet.parquet")
+    if not content or frame is None:
+        return
+    by_page = {str(name): rows for name, rows in frame.groupby("page", sort=False)}
+    pages: list[Mapping[str, Any]] = content["pages"]
+    circles = [page for page in pages if page["manoeuvre"] == "turning_circle"]
+    if circles:
+        yield _circles(by_page, circles, content)
+    zigzags = [page for page in pages if page["manoeuvre"] == "zigzag"]
+    for place in range(0, len(zigzags), _MOST_ZIGZAGS):
+        chosen = zigzags[place : place + _MOST_ZIGZAGS]
+        panels = [
+            Panel("heading, rudder [deg]", "time [s]", page_title(page), height=200, group=str(i))
+            for i, page in enumerate(chosen)
+        ]
+        yield Figure(
+            f"booklet_zigzags_{place // _MOST_ZIGZAGS + 1}",
+            "Zigzags in closed loop",
+            "The model steers by its own heading with the rudder angle and the reversals of"
+            " each trial; the rudder is dotted. Look for the height of the peaks (overshoot)"
+            f" and for periods that run apart. The band holds {100 * content['level']:.0f} % of the"
+            " draws at each instant.",
+            {
+                "band": Look("band of the draws", SOLID.color, kind="fill", alpha=0.22, order=1),
+                "model": replace(SOLID, label="model"),
+                "rudder": Look("rudder", "#737373", "dotted", 1.0, order=1),
+                "measured": replace(MEASURED, width=1.1, order=5),
+            },
+            panels,
+            [Case("", [_zigzag(by_page[page["name"]], content["level"]) for page in chosen])],
+            columns=min(2, len(chosen)),
+        )
+
+
+def _circles(
+    by_page: Mapping[str, Any], pages: Sequence[Mapping[str, Any]], content: Content
+) -> Figure:
+    length = float(content["length"])
+    panel: dict[str, Curve] = {}
+    looks = {
+        "draws": Look("draws", SOLID.color, width=0.7, alpha=0.12, order=1),
+        "model": replace(SOLID, label="model"),
+    }
+    of_draws: dict[bool, list[Curve]] = {True: [], False: []}
+    for page in pages:
+        rows, found = by_page[page["name"]], page["indices"]
+        for draw, part in rows[rows["draw"] >= 0].groupby("draw"):
+            of_draws[draw == 0].append((part["y"] / length, part["x"] / length))
+        if "tactical_diameter" in found:
+            side = 1.0 if rows[rows["draw"] == 0]["psi"].iloc[-1] > 0 else -1.0
+            advance, transfer, diameter = (
+                found[name]["lengths"] for name in ("advance", "transfer", "tactical_diameter")
+            )
+            name = page_title(page)
+            panel[name] = joined(
+                [
+                    ([0.0, side * transfer], [advance, advance]),
+                    ([side * diameter] * 2, [0.0, advance]),
+                ]
+            )
+            looks[name] = Look(
+                f"{name}: advance {advance:.2f}, tactical diameter {diameter:.2f}",
+                width=0.8,
+                dash="solid" if side > 0 else "dashed",
+                order=4,
+            )
+    panel |= {"draws": joined(of_draws[False]), "model": joined(of_draws[True])}
+    panel["start"] = (np.zeros(1), np.zeros(1))
+    return Figure(
+        "booklet_circles",
+        "Turning circles",
+        "North is up; distances are in hull lengths from the place of the order. Thin"
+        f" lines are {content['draws']} draws of the model's parameters. Black lines mark"
+        " advance (to 90 deg) and tactical diameter (to 180 deg) of the fitted model.",
+        looks | {"start": START},
+        [Panel("north [hull lengths]", "east [hull lengths]", kind="map")],
+        [Case("", [panel])],
+    )
+
+
+def _zigzag(rows: Any, level: float) -> dict[str, Curve]:
+    def heading(part: Any) -> np.ndarray:
+        turned: np.ndarray = DEG * (part["psi"] - part["psi"].iloc[0]).to_numpy()
+        return turned
+
+    fitted, measured = rows[rows["draw"] == 0], rows[rows["draw"] == -1]
+    t = fitted["t"].to_numpy()
+    out = {"model": (t, heading(fitted)), "rudder": (t, DEG * fitted["rudder"].to_numpy())}
+    drawn = [heading(part) for _, part in rows[rows["draw"] > 0].groupby("draw")]
+    first = rows[rows["draw"] == 1]["t"].to_numpy()
+    if drawn and first.size:
+        # flights that end at their stop condition are of different length: the band ends with the
+        # shortest
+        size = min(map(len, drawn))
+        ends = np.quantile(
+            [line[:size] for line in drawn], (0.5 - level / 2, 0.5 + level / 2), axis=0
+        )
+        out["band"] = band(first[:size], *ends)
+    if len(measured):
+        out["measured"] = (measured["t"].to_numpy(), heading(measured))
+    return out
