@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
 
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import to_si
-from residnet.data.drafting.fixes import as_fixes
 from residnet.data.drafting.physics import (
     FRAMES,
     POSE_FRAMES,
@@ -26,12 +26,171 @@ from residnet.data.drafting.physics import (
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.units import thrown, unit_by_size, written_unit
 from residnet.data.drafting.words import axis_velocity, words_of
+from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
+from residnet.data.readers.quantities import QUATERNION
 
 READER = ("data", "reader")
 CHANNELS = (*READER, "channels")
 _SURE = 0.9
 """Correlation from which a measured factor overrules a header."""
 STATE_NAMES = ("x", "y", "psi", "u", "v", "r", "phi", "p", "wind_speed", "wind_dir")
+_FIXES = {"x": "latitude", "y": "longitude"}
+_QUATERNION = re.compile(
+    r"(?P<stem>(?:.*[\W_])?(?:q|quat|quaternions?|orient|orientation|att|attitude|rot|rotation))"
+    r"[\W_]*(?P<part>[xyzwijk0-3])\W*",
+    re.IGNORECASE,
+)
+_PARTS = {**dict(zip("xyzw", QUATERNION, strict=True)), "i": "qx", "j": "qy", "k": "qz"}
+_COUNTED = (("qw", "qx", "qy", "qz"), QUATERNION)
+"""What counted parts may be: most write the scalar part first, some last."""
+_POSE = {"x": r"position\W*x", "y": r"position\W*y", "qw": r"orientation\W*w"}
+"""How the columns of a message geometry_msgs/Pose end."""
+_NED = re.compile(r"(?:^|[\W_])(?:ned|frd)(?:$|[\W_])", re.IGNORECASE)
+
+
+def quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
+    """Return for each quaternion channel -> column, by what the columns are called.
+
+    Parts that are counted 0 to 3 stand twice, with the scalar part first and last.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for column in columns:
+        # units in brackets do not belong to the name
+        match = _QUATERNION.fullmatch(re.sub(r"\s*\[\D*\]$|\s*\(\D*\)$", "", column.strip()))
+        if match is not None:
+            part = match["part"].lower()
+            channels = [_PARTS[part]] if part in _PARTS else [row[int(part)] for row in _COUNTED]
+            for number, channel in enumerate(channels):
+                kind = f"{match['stem']} {number if part.isdigit() else 'named'}"
+                found.setdefault(kind, {}).setdefault(channel, column)
+    return [parts for parts in found.values() if set(parts) == set(QUATERNION)]
+
+
+def levelled(
+    attitudes: Sequence[dict[str, str]], tables: Sequence[Mapping[str, np.ndarray]]
+) -> dict[str, str]:
+    """Return the first of quaternions, in the order of its parts that leaves a vessel level.
+
+    Empty where its squares do not add up to one.
+
+    Args:
+        attitudes: channel -> column of each, as `quaternions` gave them.
+        tables: column -> values of each table.
+    """
+    if not attitudes:
+        return {}
+    columns = set(attitudes[0].values())
+    whole = [table for table in tables if columns <= set(table)]
+    alike = [parts for parts in attitudes if set(parts.values()) == columns]
+
+    def joined(names: Iterable[str]) -> np.ndarray:
+        return np.array([np.concatenate([table[name] for table in whole]) for name in names])
+
+    if not whole:
+        return {}
+    norm = np.sqrt((joined(columns) ** 2).sum(axis=0))
+    norm = norm[np.isfinite(norm) & (norm > 0)]
+    if not norm.size or abs(float(np.median(norm)) - 1.0) >= 0.02:
+        return {}
+    return min(alike, key=lambda parts: np.nanmean(joined((parts["qx"], parts["qy"])) ** 2))
+
+
+def _frames(names: Mapping[str, str], texts: Iterable[str]) -> tuple[Frame, ...]:
+    """Return the frames that a position and a heading may have, by what they are called.
+
+    A pose of ROS counts from east, as REP 103 asks, unless something is called NED.
+    """
+    posed = all(
+        re.search(rf"(?:^|[\W_]){ending}$", names[name].strip(), re.IGNORECASE)
+        for name, ending in _POSE.items()
+        if name in names
+    )
+    return FRAMES if "qw" not in names or not posed or any(map(_NED.search, texts)) else POSE_FRAMES
+
+
+def drafted_channels(
+    names: Mapping[str, str], logs: Sequence[Raw], marks: Marks, texts: Iterable[str] = ()
+) -> dict[str, dict[str, Any]]:
+    """Return channel -> entry of a channel map.
+
+    Args:
+        names: channel -> column.
+        logs: their columns by channel.
+        marks: is told what is not sure.
+        texts: names of columns and cells that may tell a frame.
+    """
+    attitude = {name: column for name, column in names.items() if name in QUATERNION}
+    frames = _frames(names, texts)
+    rest = {name: column for name, column in names.items() if name not in QUATERNION}
+    if attitude:
+        rest["psi"] = "heading of the quaternion [rad]"
+        logs = [_headed(raw) for raw in logs]
+    rest, logs, fixes = _from_fixes(rest, logs, marks)
+    entries = Channels(rest, logs, marks, fixes, frames).drafted()
+    if fixes:
+        entries = {_FIXES.get(name, name): entry for name, entry in entries.items()}
+    if not attitude:
+        return entries
+    psi = entries.pop("psi")
+    entries |= {name: {"column": attitude[name], "unit": "-"} for name in QUATERNION}
+    entries["qw"] |= {"frame": psi["frame"]} if "frame" in psi else {}
+    marks.move((*CHANNELS, "psi"), (*CHANNELS, "qw"))
+    turned = "anticlockwise from east" if "frame" in psi else "clockwise from north"
+    text = f"no position tells the frame; the heading is taken to count {turned}"
+    if {"x", "y"} <= set(rest):
+        text = f"position and heading fit together best where the heading counts {turned}"
+    marks.guess((*CHANNELS, "qw"), text)
+    if re.search(r"\d\W*$", attitude["qw"]):
+        text = f"'{attitude['qw']}' is taken as the scalar part, which leaves the vessel level"
+        marks.guess((*CHANNELS, "qw"), text)
+    return entries
+
+
+def _headed(raw: Raw) -> Raw:
+    """Return a log with a heading in rad from its quaternion."""
+    if not set(QUATERNION) <= set(raw.columns):
+        return raw
+    yaw = yaw_of(*unit_quaternion(*(raw.columns[name] for name in QUATERNION)))
+    rest = {name: raw.columns[name] for name in raw.columns if name not in QUATERNION}
+    return Raw(raw.t, {**rest, "psi": yaw})
+
+
+def _from_fixes(
+    names: Mapping[str, str], logs: Sequence[Raw], marks: Marks
+) -> tuple[dict[str, str], list[Raw], float]:
+    """Return channel -> column, the logs, and how many degrees one count of x and y is, or 0.
+
+    Where they are latitude and longitude, x, y of the logs are metres north and east of the first
+    fix of each.
+    """
+    fixes = set(_FIXES.values())
+    if not fixes <= set(names) or set(_FIXES) & set(names):
+        return dict(names), list(logs), 0.0
+    rest = {name: column for name, column in names.items() if name not in fixes}
+    whole = [raw for raw in logs if fixes <= set(raw.columns)]
+    cells = {f: np.concatenate([raw.columns[f] for raw in whole] or [np.zeros(0)]) for f in fixes}
+    known = {name: values[np.isfinite(values)] for name, values in cells.items()}
+    largest = float(np.abs(known["latitude"]).max(initial=0.0))
+    # autopilots count ten millionths of a degree in whole numbers
+    counts = all(bool((values == np.round(values)).all()) for values in known.values())
+    count = 1e-7 if 1e6 < largest <= 90e7 and counts else 1.0
+    if not whole or largest * count > 90.0:
+        columns = ", ".join(names[name] for name in _FIXES.values())
+        marks.note(CHANNELS, f"{columns} are no degrees with decimals; left out")
+        return rest, list(logs), 0.0
+    if count < 1.0:
+        for name in _FIXES.values():
+            text = "whole numbers of this size are ten millionths of a degree"
+            marks.guess((*CHANNELS, name), text)
+    placed = []
+    for raw in logs:
+        if fixes <= set(raw.columns):
+            degrees = (count * raw.columns[name] for name in _FIXES.values())
+            north, east, origin, _ = fixes_on_plane(*map(np.radians, degrees))
+            if origin is not None:
+                raw = Raw(raw.t, {**raw.columns, "x": north, "y": east})
+        placed.append(raw)
+    return {**{name: names[fix] for name, fix in _FIXES.items()}, **rest}, placed, count
 
 
 @final
@@ -62,8 +221,7 @@ class Channels:
             self._settle_axes()
             self._settle_frame()
         self._settle_wind()
-        entries = {name: self._entry(name) for name in self._names}
-        return as_fixes(entries) if self._fixes else entries
+        return {name: self._entry(name) for name in self._names}
 
     @property
     def _posed(self) -> bool:

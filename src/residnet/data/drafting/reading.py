@@ -24,6 +24,7 @@ from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.parts import log_names
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import kind_of
+from residnet.data.readers.recording import Recording
 from residnet.data.readers.tables import column_names
 
 INPUTS = ("signals", "inputs")
@@ -69,17 +70,21 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
             f"the logs are of several formats, and a fit reads one ({named}); give those of one"
         )
     kind, read = kinds[paths[0]], DraftedLogs({"kind": "canonical"}, marks)
+    loaded: dict[Path, Recording] = {}
     if kind == "table":
         read.reader, read.left_out = draft_tables(paths, marks)
     elif kind != "canonical":
-        read.reader = draft_recordings(paths, marks)
+        read.reader, loaded = draft_recordings(paths, marks)
     settings = {key: value for key, value in read.reader.items() if gridded or key != "clock"}
     reader, names = validate(settings, ReaderConfig, "draft").build(), log_names(paths)
     for number, path in enumerate(paths):
         report("reading logs", number, len(paths))
         try:
             if path not in read.left_out:
-                read.logs[path] = reader.read(path).replace(name=names[path])
+                # a recording that was drafted from is not loaded again
+                there = loaded.pop(path, None)
+                log = reader.read(path) if there is None else reader.log_of(there)
+                read.logs[path] = log.replace(name=names[path])
         except ResidnetError as error:
             read.left_out[path] = error
     report("reading logs", len(paths), len(paths))

@@ -9,17 +9,15 @@ from typing import Any
 
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.names import CHANNEL_UNITS
-from residnet.data.drafting.attitudes import (
-    as_quaternion,
-    frames_of,
-    from_quaternion,
-    is_unit,
+from residnet.data.drafting.channels import (
+    CHANNELS,
+    READER,
+    STATE_NAMES,
+    drafted_channels,
     levelled,
     quaternions,
 )
-from residnet.data.drafting.channels import CHANNELS, READER, STATE_NAMES, Channels
 from residnet.data.drafting.clocks import Clock, clock_of
-from residnet.data.drafting.fixes import from_fixes
 from residnet.data.drafting.physics import Raw
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sheets import Sheet, peek
@@ -63,28 +61,27 @@ def draft_tables(
     parts = {column for attitude in attitudes for column in attitude.values()}
     names = named([name for name in numeric if name not in parts], marks)
     refuse_written_positions(first, names)
-    attitude = levelled(attitudes, [one.numbers for one in sheets]) if "psi" not in names else {}
-    logs = _raw(sheets, {**names, **attitude}, left_out)
-    attitude = attitude if is_unit(logs) else {}
-    names, logs, fixes = from_fixes(names, logs, marks)
-    if attitude:
-        names, logs = from_quaternion(names, attitude, logs)
-    frames = frames_of(names, attitude, _words(first))
-    channels = Channels(names, logs, marks, fixes, frames).drafted()
-    if attitude:
-        channels = as_quaternion(channels, attitude, marks, {"x", "y"} <= set(names))
-        names = {**{name: names[name] for name in names if name != "psi"}, **attitude}
+    if "psi" not in names:
+        names |= levelled(attitudes, [one.numbers for one in sheets])
+    logs = _raw(sheets, names, left_out)
+    channels = drafted_channels(names, logs, marks, _words(first))
     for entry in channels.values():
         settings = written.get(entry["column"], {})
         entry |= {"column": first.column(entry["column"]), **settings}
     about = {key: value for key, value in first.about.items() if key != "kind"}
     time = {**clock.settings, "column": first.column(clock.settings["column"])}
     content = {"kind": first.about["kind"], **about, "time": time}
-    if len({path.resolve().parent for path in files}) > 1:
-        content["manoeuvre"] = "folder"
-        marks.guess((*READER, "manoeuvre"), "the kind of manoeuvre is taken from the folder's name")
+    content |= mark_folders(files, marks)
     _unused(first, names, clock, marks)
     return {**content, "channels": channels}, left_out
+
+
+def mark_folders(files: Sequence[Path], marks: Marks) -> dict[str, str]:
+    """Return the setting of files in several folders, whose names tell the manoeuvres."""
+    if len({path.resolve().parent for path in files}) < 2:
+        return {}
+    marks.guess((*READER, "manoeuvre"), "the kind of manoeuvre is taken from the folder's name")
+    return {"manoeuvre": "folder"}
 
 
 def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, ResidnetError]]:

@@ -242,8 +242,9 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
     values, units = _values(parts, plan, times, step)
     t = times
     if recording.epoch is not None:
-        uniform = isinstance(clock, Uniform)
-        t = clock.step * np.arange(times.size) if uniform else times - times[:1]
+        t = times - times[:1]
+        if isinstance(clock, Uniform):
+            t = clock.step * np.arange(times.size)
     if len(t) < 2:
         raise DataError(
             f"{recording.path}: {len(t)} samples on the log's clock, at least 2 are needed"
@@ -610,7 +611,9 @@ def _meta(
         remarks += series.remarks
         # senders that each have a channel are told apart already
         remarks += [r for r in found if not (named > 1 and r["code"] == "several_publishers")]
-        rate = next((r["figures"] for r in found if r["code"] == "topic_rate"), {})
+        rate: dict[str, float] = next(
+            (r["figures"] for r in found if r["code"] == "topic_rate"), {}
+        )
         topics[series.name] = {"kind": series.kind, "rows": len(series), **rate}
     present = _present(recording, plan.channels)
     absent = [name for name in plan.channels if name not in present]

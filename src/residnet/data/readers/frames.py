@@ -64,8 +64,8 @@ def fixes_on_plane(
         return latitude, longitude, None, int(none.sum())
     first = int(np.argmax(known))
     at = origin or (float(latitude[first]), float(longitude[first]))
-    fixes = (np.where(known, angle, np.nan) for angle in (latitude, longitude))
-    north, east = tangent_plane(*fixes, *at)
+    phi, lam = (np.where(known, angle, np.nan) for angle in (latitude, longitude))
+    north, east = tangent_plane(phi, lam, *at)
     return north, east, at, int(none.sum())
 
 

@@ -217,7 +217,8 @@ class ParquetConfig(TableConfig):
             positions(path, pq.read_schema(path).names, columns)
             with pq.ParquetFile(path, page_checksum_verification=True) as file:
                 table = file.read(columns=sorted(set(columns)))
-            return table.to_pandas(ignore_metadata=True)[list(columns)]
+            wanted: pd.DataFrame = table.to_pandas(ignore_metadata=True)[list(columns)]
+            return wanted
 
 
 @final

@@ -215,7 +215,7 @@ def _delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]], tupl
     Raises:
         DataError: where there is none.
     """
-    found = []
+    found: list[tuple[int, int, tuple[str, list[list[str]], tuple[int, int]]]] = []
     for sign in (",", ";", "\t", "|", BLANKS):
         if sign == BLANKS and found:
             break

@@ -111,7 +111,7 @@ def agreement(idle: Sequence[Series], log: Log, start: float) -> list[Remark]:
 
     `start` is the log's first sample on the recording's clock, s.
     """
-    rates = {name: log[name] for name in ("u", "v", "r") if name in log.channels}
+    rates: dict[str, np.ndarray] = {n: log[n] for n in ("u", "v", "r") if n in log.channels}
     if {"u", "v", "psi"} <= set(log.channels):
         c, s = np.cos(log["psi"]), np.sin(log["psi"])
         rates["north velocity"] = c * log["u"] - s * log["v"]
@@ -130,7 +130,8 @@ def agreement(idle: Sequence[Series], log: Log, start: float) -> list[Remark]:
 
 def _at(t: np.ndarray, clock: np.ndarray, values: np.ndarray) -> np.ndarray:
     known = np.isfinite(values)
-    return np.interp(t, clock[known], values[known], left=np.nan, right=np.nan)
+    out: np.ndarray = np.interp(t, clock[known], values[known], left=np.nan, right=np.nan)
+    return out
 
 
 def _lag(

@@ -182,7 +182,8 @@ class _Lines:
         epoch = whole_second([ticks, *arrivals.values()])
         series = {}
         for name, one in sorted(self.series.items()):
-            times, said = np.frombuffer(one.own, dtype=np.int64), ()
+            times = np.frombuffer(one.own, dtype=np.int64)
+            said: tuple[Remark, ...] = ()
             timed = bool((times >= 0).all())
             if not timed and not stamped:
                 times = _between(np.frombuffer(one.after, dtype=np.int64), ticks.ns)
