@@ -17,13 +17,18 @@ from residnet.data.drafting.channels import (
     levelled,
     quaternions,
 )
-from residnet.data.drafting.clocks import Clock, clock_of
 from residnet.data.drafting.physics import Raw
 from residnet.data.drafting.questions import Marks
-from residnet.data.drafting.sheets import Sheet, peek
+from residnet.data.drafting.sheets import (
+    Clock,
+    Sheet,
+    clock_of,
+    peek,
+    refuse_written_positions,
+    with_degrees,
+)
 from residnet.data.drafting.units import other_dimension
 from residnet.data.drafting.words import input_channel, state_channel, words_of
-from residnet.data.drafting.written import refuse_written_positions, with_degrees
 
 _LOOKED_AT = 24
 """Tables whose values are looked at; of the others only the header is."""
