@@ -46,7 +46,7 @@ CALLS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "nothing": (lambda m: residnet.read_logs(wrong(None)), "expected a path, given None"),
     "no such file": (lambda m: residnet.read_logs("nowhere.csv"), "no such file"),
     "no match": (lambda m: residnet.read_logs("no*where.csv"), "matches no file"),
-    "an empty folder": (lambda m: residnet.read_logs(m["folder"] / "empty"), "holds no csv"),
+    "an empty folder": (lambda m: residnet.read_logs(m["folder"] / "empty"), "holds no log"),
     "no unit": (
         lambda m: residnet.read_logs(m["folder"] / "trials", channels={"u": "surge"}),
         r"channels: u: give the column and its unit, for example \('surge', 'm/s'\)",

@@ -166,7 +166,7 @@ def new(
     Channels, units, frames, inputs, splits, protocols and models are proposed. What the logs do
     not tell is asked on a terminal; elsewhere the default is taken and marked as a guess.
     """
-    from residnet.tasks.drafting.verb import new_config
+    from residnet.tasks.drafting.draft import new_config
     from residnet.terminal import asked
 
     limit_threads()

@@ -9,7 +9,7 @@ import pytest
 import written_logs
 
 from residnet.core.errors import UsageError
-from residnet.tasks.log_files import log_files
+from residnet.data.drafting.reading import log_files
 
 
 def test_folders_hold_tables_recordings_or_other_logs(tmp_path: Path) -> None:

@@ -12,11 +12,10 @@ from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.progress import ProgressCallback, report, say
-from residnet.data.drafting.reading import read_each
+from residnet.data.drafting.reading import log_files, read_each
 from residnet.data.parts import log_names
 from residnet.data.readers import LogReader, ReaderConfig
 from residnet.tasks.drafting.yaml_text import commented
-from residnet.tasks.log_files import log_files
 
 if TYPE_CHECKING:
     import pandas as pd

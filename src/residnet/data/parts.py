@@ -16,24 +16,7 @@ from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.data.readers.base import files_of
-from residnet.data.readers.detect import format_of
-
-_TABLES = (
-    ".csv",
-    ".tsv",
-    ".txt",
-    ".dat",
-    ".xlsx",
-    ".parquet",
-    ".mat",
-    ".h5",
-    ".hdf5",
-    ".jsonl",
-    ".ndjson",
-)
-_RECORDERS = (".mcap", ".db3", ".bag", ".ulg", ".bin", ".nmea", ".log")
-LOG_ENDINGS = (*_TABLES, *_RECORDERS)
-"""Endings of files that may be logs."""
+from residnet.data.readers.detect import LOG_ENDINGS, format_of
 
 
 class LogPart(Config):

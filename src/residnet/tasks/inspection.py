@@ -25,7 +25,7 @@ from residnet.data.doctor import (
 )
 from residnet.data.doctor.dates import date_findings
 from residnet.data.doctor.excitation import conditioning
-from residnet.data.drafting.reading import DraftedLogs, read_each
+from residnet.data.drafting.reading import DraftedLogs, log_files, read_each
 from residnet.data.masks import Mask
 from residnet.data.parts import log_names
 from residnet.data.readers.base import LogReader
@@ -35,7 +35,6 @@ from residnet.tasks.drafting.yaml_text import commented
 from residnet.tasks.fit.task import FitConfig
 from residnet.tasks.import_logs import ImportConfig
 from residnet.tasks.loading import load_task
-from residnet.tasks.log_files import log_files
 
 _ILL_CONDITIONED = 1e6
 """Condition number from which regressors leave their coefficients to the noise."""

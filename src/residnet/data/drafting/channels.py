@@ -185,8 +185,8 @@ def _from_fixes(
     placed = []
     for raw in logs:
         if fixes <= set(raw.columns):
-            degrees = (count * raw.columns[name] for name in _FIXES.values())
-            north, east, origin, _ = fixes_on_plane(*map(np.radians, degrees))
+            phi, lam = (np.radians(count * raw.columns[name]) for name in _FIXES.values())
+            north, east, origin, _ = fixes_on_plane(phi, lam)
             if origin is not None:
                 raw = Raw(raw.t, {**raw.columns, "x": north, "y": east})
         placed.append(raw)

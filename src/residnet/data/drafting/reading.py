@@ -21,7 +21,7 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.recordings import draft_recordings
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.parts import log_names
+from residnet.data.parts import log_names, logs_below
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import kind_of
 from residnet.data.readers.recording import Recording
@@ -29,6 +29,40 @@ from residnet.data.readers.tables import column_names
 
 INPUTS = ("signals", "inputs")
 """Key of a config's inputs."""
+_TABLES = (".csv", ".parquet")
+
+
+def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
+    """Return the files, and the logs below folders, in order; each once.
+
+    Args:
+        paths: files and folders.
+        folders: a folder may itself be a log, as a ROS 2 bag is, and where a folder holds neither
+            such nor tables, logs of any other format are taken.
+
+    Raises:
+        UsageError: where a path does not exist or a folder holds no log.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            below = logs_below(path) if folders else sorted(path.rglob("*"))
+            # notes and settings often lie beside tables
+            found = [p for p in below if (folders and p.is_dir()) or p.suffix in _TABLES]
+            if not found and folders:
+                found = below
+            if not found:
+                what = "log of a format that is known" if folders else "csv or Parquet file"
+                raise UsageError(f"{path}: holds no {what}")
+            files += found
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise UsageError(f"{path}: no such file or folder")
+    once: dict[Path, Path] = {}
+    for file in files:
+        once.setdefault(file.resolve(), file)
+    return list(once.values())
 
 
 @dataclass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +17,8 @@ from residnet.data.division import divided, without_copies
 from residnet.data.doctor import inspect
 from residnet.data.drafting.channels import CHANNELS
 from residnet.data.drafting.questions import Answer, Marks
-from residnet.data.drafting.reading import INPUTS, read_drafted
+from residnet.data.drafting.reading import INPUTS, log_files, read_drafted
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.parts import logs_below
 from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers.quantities import QUATERNION
 from residnet.tasks.drafting import recipe
@@ -29,6 +29,8 @@ from residnet.tasks.fit.task import FitConfig
 _UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
 _INSPECTED = 12
 """Logs that the data doctor looks at."""
+_SHOWN = 12
+"""Guesses that the terminal shows."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def drafted(
         DataError: where no log can be used.
     """
     marks = Marks(answer)
-    read = _completed(_found(paths), marks)
+    read = _completed(log_files(paths, folders=True), marks)
     inputs = driving(list(read.whole.values()), marks)
     if not inputs:
         held = ", ".join(next(iter(read.whole.values())).channels)
@@ -134,18 +136,6 @@ def _completed(paths: Sequence[Path], marks: Marks) -> _Logs:
         reason = next(iter(left_out.values()))
         raise DataError(f"{reason} ({untold})" if untold else reason)
     return _Logs(read.reader, {path: read.logs[path] for path in whole}, whole, left_out)
-
-
-def _found(paths: Sequence[Path]) -> list[Path]:
-    """Return the recordings and files of logs that paths name."""
-    out: dict[Path, None] = {}
-    for path in paths:
-        if not path.exists():
-            raise UsageError(f"{path}: no such file or folder")
-        out |= dict.fromkeys(logs_below(path) if path.is_dir() else [path])
-    if not out:
-        raise UsageError(f"{', '.join(map(str, paths))}: holds no log of a format that is known")
-    return list(out)
 
 
 def _plain_names(read: _Logs, inputs: Sequence[str], marks: Marks) -> tuple[_Logs, tuple[str, ...]]:
@@ -361,3 +351,40 @@ def _head(read: _Logs, marks: Marks) -> list[str]:
         )
     say(f"{len(read.logs)} logs were read, {len(read.left_out)} left out")
     return lines
+
+
+def new_config(
+    logs: Sequence[Path],
+    out: Path,
+    answer: Answer | None,
+    *,
+    overwrite: bool,
+    standard: bool = False,
+) -> list[str]:
+    """Write a config for logs; returns what the terminal shows.
+
+    Args:
+        logs: files, folders and bags.
+        out: file to write.
+        answer: asks the user; None takes every default.
+        overwrite: replace the file.
+        standard: propose the standard recipe.
+
+    Raises:
+        UsageError: where the file exists already, or a path does not.
+        DataError: where no log can be used.
+    """
+    if out.suffix not in (".yaml", ".yml"):
+        raise UsageError(f"--out {out}: a config is a YAML file; name it {out}.yaml")
+    if out.exists() and not overwrite:
+        raise UsageError(f"--out {out}: exists; give --overwrite, or another name")
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", out.stem).strip("_.-") or "my_boat"
+    draft = drafted(logs, out.parent, name, answer, standard=standard)
+    file = draft.save(out)
+    lines = [f"{key}: {why}" for key, why in draft.guesses[:_SHOWN]]
+    if len(draft.guesses) > _SHOWN:
+        lines.append(f"and {len(draft.guesses) - _SHOWN} more, marked in the file")
+    count = len(draft.guesses)
+    head = f"{count} values are guesses, each marked in the file:" if lines else ""
+    head = "one value is a guess, marked in the file:" if count == 1 else head
+    return [*([head] if head else []), *lines, f"config: {file}", f"next: residnet run {file}"]

@@ -11,6 +11,7 @@ import numpy as np
 from residnet.core.config import dump_config
 from residnet.core.log import Log
 from residnet.core.progress import say
+from residnet.data.drafting.reading import log_files
 from residnet.data.parts import data_files, log_names
 from residnet.data.prepare import prepare
 from residnet.data.readers import CanonicalConfig
@@ -31,7 +32,6 @@ from residnet.tasks.fit.files import (
     write_limits,
     write_metrics,
 )
-from residnet.tasks.log_files import log_files
 
 SPLIT = "external"
 """Name of the split of these logs."""

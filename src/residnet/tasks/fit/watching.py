@@ -12,6 +12,7 @@ import numpy as np
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest
+from residnet.data.drafting.reading import log_files
 from residnet.data.parts import data_files
 from residnet.data.prepare import Prepared, prepare
 from residnet.identification.models import FittedModel
@@ -30,7 +31,6 @@ from residnet.runs.model_store import FolderStore
 from residnet.tasks.fit.config import FitTaskSettings
 from residnet.tasks.fit.external import SPLIT, read_external, takes_folders
 from residnet.tasks.fit.inputs import take_logs
-from residnet.tasks.log_files import log_files
 
 _NAMED = 3
 """Causes that are named."""
