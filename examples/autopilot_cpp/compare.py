@@ -81,7 +81,7 @@ def eager(folder: Path, card: dict[str, Any]) -> Any:
         ObservedPolicySpec,
         load_recurrent,
     )
-    from residnet.export.autopilot import for_export
+    from residnet.export.policy import for_export
 
     recurrent = {"observed": ObservedPolicySpec, "network": NetworkPolicySpec}
     if card["kind"] in recurrent:

@@ -64,7 +64,7 @@ def eager(run: Path, card: dict[str, Any]) -> Any:
     called one by one from Python.
     """
     from residnet.core.config import load_config
-    from residnet.export.course import ExportedCourse
+    from residnet.export.policy import ExportedCourse
     from residnet.runs.folder import RunFolder
     from residnet.tasks.course.autopilot_run import load_policy, ready
     from residnet.tasks.course.running import plan_for

@@ -34,9 +34,8 @@ from residnet.core.registry import kinds
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, model_names
-from residnet.export.autopilot import for_export
-from residnet.export.course import MEASURED, ExportedCourse
-from residnet.export.torchscript import export_torchscript
+from residnet.export import ExportedVessel, exporter
+from residnet.export.policy import COURSE, ExportedCourse, for_export
 from residnet.heads import HeadConfig, SymbolicConfig
 from residnet.heads.delay_line import DelayConfig
 from residnet.heads.symbolic import SymbolicHead
@@ -165,7 +164,7 @@ def vessel(made: Model, cases: int, seed: int) -> None:
     spec, model = made
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "model.pt"
-        export_torchscript(spec, model, file, [])
+        exporter("torchscript").export(ExportedVessel(spec, model), file)
         check_bad_inputs(torch.jit.load(str(file)), spec, model, cases=cases, seed=seed)
 
 
@@ -231,7 +230,7 @@ def ensemble() -> Model:
 def policy(turning: Turning, limit: float, rate: float) -> HeadingPolicy:
     """Return a policy with random weights."""
     torch.manual_seed(0)
-    made = HeadingPolicy(MEASURED, turning=turning, limit=limit, dt=0.1, rate=rate)
+    made = HeadingPolicy(tuple(COURSE), turning=turning, limit=limit, dt=0.1, rate=rate)
     for weights in made.network.parameters():
         torch.nn.init.normal_(weights, std=0.3)
     return made.eval().requires_grad_(False)
@@ -264,7 +263,7 @@ def course(own: HeadingPolicy, safe: Any, cases: int, seed: int) -> None:
     rudder = np.full(len(angle), own.limit / 3.0)
     planned = Course(0.002 * radius, track, angle, angle, rudder, 5.0 * radius)
     sight = 3.0 * own.speed * own.dt + 0.3 * radius
-    guidance = CourseGuidance(planned, sight, MEASURED, DriftEstimate(10.0, 0.8, 0.02))
+    guidance = CourseGuidance(planned, sight, tuple(COURSE), DriftEstimate(10.0, 0.8, 0.02))
     module = ExportedCourse(own, guidance, safe).eval()
     both = torch.jit.script(module)
     check_bad_measurements(

@@ -28,9 +28,9 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "support"))
 import exported_models  # noqa: E402
 
-from residnet.export import contract, exporter  # noqa: E402
+from residnet.export import ExportedVessel, exporter, vessel  # noqa: E402
 from residnet.export.aoti import AotiModel  # noqa: E402
-from residnet.export.c.compiled import compiler  # noqa: E402
+from residnet.export.c_code import compiler  # noqa: E402
 from residnet.export.casadi_function import CasadiModel  # noqa: E402
 from residnet.export.guard import GuardedDynamics  # noqa: E402
 from residnet.export.onnx_file import OnnxModel  # noqa: E402
@@ -101,13 +101,14 @@ def ways(variant: str, folder: Path, cpp: Path | None, aoti: bool) -> dict[str, 
     """Return what times each format, eager first."""
     exported_models.VARIANTS[variant] |= SIZES.get(variant, {})
     spec, model = exported_models.built(variant)
+    exported = ExportedVessel(spec, model)
     formats = ["torchscript", "c", "onnx", "casadi", *(["aoti"] if aoti else [])]
     files = {}
     for name in formats:
         kind = exporter(name)
         files[name] = folder / f"boat{kind.suffix}"
         print(f"  {variant}: {name}", file=sys.stderr, flush=True)
-        kind.export(spec, model, files[name], [])
+        kind.export(exported, files[name])
     model = model.float()
     x, w = torch.tensor([[0.0, 0, 0, 1, 0, 0]]), torch.tensor([[9.0, 9, 3, 1]])
     s = model.initial_state(1)
@@ -116,10 +117,10 @@ def ways(variant: str, folder: Path, cpp: Path | None, aoti: bool) -> dict[str, 
     scripted = torch.jit.load(str(files["torchscript"]))
     torch._C._jit_set_profiling_executor(False)
     torch._C._set_graph_executor_optimize(False)
-    session = OnnxModel(files["onnx"], spec, model).session
+    session = OnnxModel(files["onnx"], exported).session
     feed = {name: part.numpy() for name, part in (("x", x), ("w", w), ("s", s))}
     feed = {i.name: feed[i.name] for i in session.get_inputs()}
-    function = CasadiModel(files["casadi"], spec, model).function
+    function = CasadiModel(files["casadi"]).function
     doubles = [np.asarray(part, dtype=float) for part in given]
     loop = c_loop(folder)
     out: dict[str, Way] = {
@@ -134,7 +135,7 @@ def ways(variant: str, folder: Path, cpp: Path | None, aoti: bool) -> dict[str, 
         program = [str(cpp), str(files["torchscript"]), "4", "400"]
         out["torchscript, C++"] = lambda: printed(program)
     if aoti:
-        package = AotiModel(files["aoti"], spec, model).package
+        package = AotiModel(files["aoti"]).package
         out["aoti"] = lambda: timed(lambda: package(x, w, s))
     return out
 
@@ -159,7 +160,7 @@ def main() -> None:
     parser.add_argument("--no-cpp", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    contract.PARITY_STEPS = 50
+    vessel.PARITY_STEPS = 50
     with tempfile.TemporaryDirectory() as name:
         cpp = None if given.no_cpp else cpp_program(Path(name))
         head = f"{'model':8}{'format':24}{'step us':>10}{'of eager':>10}{'first call':>14}"

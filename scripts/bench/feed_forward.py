@@ -28,7 +28,8 @@ from residnet.documents.jervan2020.ferry import (
     record_of,
     study,
 )
-from residnet.export.feed_forward import RequiredForce, export_feed_forward
+from residnet.export.feed_forward import ExportedForce, RequiredForce
+from residnet.export.torchscript import TorchScriptExporter
 from residnet.physics.force_model import ForceModel
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.vessel import load_vessel
@@ -85,7 +86,8 @@ def judge(found: Study, interval: float, random: torch.Generator) -> list[str]:
             file = Path(folder) / "feed_forward.pt"
             ranges = list(zip(low.tolist(), high.tolist(), strict=True))
             force = RequiredForce(*model.model.parts(), mirrored=True)
-            export_feed_forward(force, model.notes.get("lag"), ranges, file)
+            exported = ExportedForce(name, force, ranges, model.notes.get("lag"))
+            TorchScriptExporter().export(exported, file)
             exported = torch.jit.load(str(file))
         far = torch.tensor(REACHES, dtype=torch.float64).repeat_interleave(5000).unsqueeze(-1)
         away = far * (2 * torch.rand(len(far), 6, generator=random, dtype=torch.float64) - 1)

@@ -35,14 +35,15 @@ from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.store import ModelSpec, load_model
-from residnet.export import contract, exporter
+from residnet.export import ExportedVessel, exporter, vessel
 from residnet.export.aoti import AotiModel
-from residnet.export.c.compiled import CompiledModel, compile_shared
-from residnet.export.c.source import identifier
+from residnet.export.base import DOUBLE, SINGLE, Loaded
+from residnet.export.c import CompiledModel
+from residnet.export.c_code import compile_shared, identifier
 from residnet.export.casadi_function import CasadiModel
-from residnet.export.contract import DOUBLE, SINGLE, Stepped
 from residnet.export.guard import GuardedDynamics
 from residnet.export.onnx_file import OnnxModel
+from residnet.export.torchscript import ScriptedModel
 
 ZIGZAG = ("zigzag", "zz", "_z_")
 """Parts of the names of logs that are zigzags."""
@@ -123,36 +124,15 @@ def eager(
     return np.asarray(torch.cat(path).numpy())
 
 
-def played(stepped: Stepped, given: Recording, kind: Any) -> np.ndarray:
+def played(loaded: Loaded, exported: ExportedVessel, given: Recording, kind: Any) -> np.ndarray:
     """Return the states [T + 1, 6] of a file that has steps."""
-    x, s = given.x0.astype(kind), stepped.warmup(given.past.astype(kind), given.past_w.astype(kind))
+    past = given.past.astype(kind), given.past_w.astype(kind)
+    x, s = given.x0.astype(kind), exported.memory(loaded, *past, "the file")
     path = [x]
     for w in given.w.astype(kind):
-        x, s, _ = stepped.step(x, w, s)
+        x, s, _ = loaded.step(x, w, s)
         path.append(x)
     return np.stack(path)
-
-
-class Scripted:
-    """A TorchScript file with the steps of other formats."""
-
-    def __init__(self, file: Path) -> None:
-        self.module: Any = torch.jit.load(str(file))
-
-    def step(self, x: Any, w: Any, s: Any) -> tuple[Any, Any, bool]:
-        """Return state, memory and flag one step later."""
-        with torch.no_grad():
-            after, memory, outside = self.module.step(*(_row(part) for part in (x, w, s)))
-        return after[0].numpy(), memory[0].numpy(), bool(outside[0])
-
-    def warmup(self, y: Any, w: Any) -> Any:
-        """Return the memory that a measured past leaves."""
-        with torch.no_grad():
-            return self.module.warmup(_row(y), _row(w))[0].numpy()
-
-
-def _row(part: Any) -> torch.Tensor:
-    return torch.from_numpy(np.asarray(part, np.float32))[None]
 
 
 def unit_played(file: Path, spec: ModelSpec, given: Recording) -> np.ndarray:
@@ -173,11 +153,14 @@ def unit_played(file: Path, spec: ModelSpec, given: Recording) -> np.ndarray:
     return np.stack([table[name] for name in STATE], axis=1)
 
 
-def compiled(file: Path, folder: Path, spec: ModelSpec, memory: int, double: bool) -> CompiledModel:
-    prefix = identifier(spec.name)
-    flags = [f"-D{prefix.upper()}_DOUBLE"] if double else []
+def scripted(file: Path) -> ScriptedModel:
+    return ScriptedModel(torch.jit.load(str(file)), torch.float32)
+
+
+def compiled(file: Path, folder: Path, exported: ExportedVessel, double: bool) -> CompiledModel:
+    flags = [f"-D{identifier(exported.name).upper()}_DOUBLE"] if double else []
     library = compile_shared([file], folder / f"{double}.so", flags)
-    return CompiledModel(library, prefix, memory, "double" if double else "single")
+    return CompiledModel(library, exported, torch.float64 if double else torch.float32)
 
 
 @dataclass(frozen=True)
@@ -210,13 +193,14 @@ def shares(
     """Yield how each format does; `folder` is left with the files of formats that do not refuse."""
     wanted: dict[tuple[str, bool], np.ndarray] = {}
     cards: dict[str, Any] = {}
+    exported = ExportedVessel(spec, model)
 
     def written(kind: str) -> Path:
         found = exporter(kind)
         file = folder / kind / f"boat{found.suffix}"
         if kind not in cards:
             file.parent.mkdir(exist_ok=True)
-            cards[kind] = found.export(spec, copy.deepcopy(model), file, [])
+            cards[kind] = found.export(exported, file)
         return file
 
     def precision(kind: str) -> Any:
@@ -226,24 +210,29 @@ def shares(
         file = written("c")
         if not double and precision("c") is np.float64:
             raise ExportError(DOUBLE_ALONE)
-        stepped = compiled(file, folder, spec, model.n_state, double)
-        return played(stepped, given, np.float64 if double else np.float32)
+        stepped = compiled(file, folder, exported, double)
+        return played(stepped, exported, given, np.float64 if double else np.float32)
 
     def in_aoti() -> np.ndarray:
         file, kind = written("aoti"), precision("aoti")
         dtype = torch.float64 if kind is np.float64 else torch.float32
-        return played(AotiModel(file, spec, model, dtype), given, kind)
+        return played(AotiModel(file, dtype), exported, given, kind)
 
     # a unit begins without a past
     ways: dict[str, tuple[bool, Callable[[], np.ndarray]]] = {
-        "torchscript": (True, lambda: played(Scripted(written("torchscript")), given, np.float32)),
+        "torchscript": (
+            True, lambda: played(scripted(written("torchscript")), exported, given, np.float32),
+        ),
         "onnx": (
-            True, lambda: played(OnnxModel(written("onnx"), spec, model), given, precision("onnx")),
+            True,
+            lambda: played(
+                OnnxModel(written("onnx"), exported), exported, given, precision("onnx")
+            ),
         ),
         "c, single": (True, lambda: in_c(False)),
         "c, double": (True, lambda: in_c(True)),
         "casadi": (
-            True, lambda: played(CasadiModel(written("casadi"), spec, model), given, np.float64),
+            True, lambda: played(CasadiModel(written("casadi")), exported, given, np.float64),
         ),
         "fmu": (False, lambda: unit_played(written("fmu"), spec, given)),
         "fmu2": (False, lambda: unit_played(written("fmu2"), spec, given)),
@@ -308,7 +297,7 @@ def main(arguments: Sequence[str]) -> int:
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)
     # the playback is the longer check
-    contract.PARITY_STEPS = 50
+    vessel.PARITY_STEPS = 50
     wrong = 0
     with tempfile.TemporaryDirectory() as name:
         runs = [*given.runs, *(fits(Path(name)) if given.fits else [])]

@@ -14,7 +14,7 @@ from residnet.baselines import BelievedConfig
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.export.torchscript import export_torchscript
+from residnet.export import ExportedVessel, exporter
 from residnet.physics.plant import HullPlant
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel, vessel_files
@@ -89,7 +89,7 @@ def test_a_stored_model_needs_no_vessel_file(
 def test_export(tmp_path: Path) -> None:
     spec = believed()
     file = tmp_path / "m.pt"
-    export_torchscript(spec, spec.build().eval(), file, [])
+    exporter("torchscript").export(ExportedVessel(spec, spec.build()), file)
     extra = {"card.json": ""}
     module = torch.jit.load(str(file), _extra_files=extra)
     assert json.loads(extra["card.json"])["baseline"]["kind"] == "believed"

@@ -17,7 +17,7 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.registry import kinds
 from residnet.data.readers import ReaderConfig
-from residnet.export import contract, exporter, exporters
+from residnet.export import exporter, exporters, vessel
 from residnet.heads import HeadConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.signals import SignalsConfig
@@ -152,14 +152,14 @@ def test_reader(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["torchscript", "feed_forward", "parameters"])
 def test_export_format(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(contract, "PARITY_STEPS", 60)
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
     check_exporter(exporter(name))
 
 
 @pytest.mark.exporters
 @pytest.mark.parametrize("name", exporters())
 def test_export_format_that_needs_compilers(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(contract, "PARITY_STEPS", 60)
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
     check_exporter(exporter(name))
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steering import SteeredPlant, fly
-from residnet.export.autopilot import ExportedPolicy, export_autopilot, for_export
+from residnet.export import exporter
+from residnet.export.policy import ExportedHeading, ExportedPolicy, for_export
 from residnet.physics.vessel import load_vessel
 
 LIMIT = math.radians(5)
@@ -69,7 +70,8 @@ def test_a_constant_push_leaves_no_error_whatever_the_weights(bias: float) -> No
 
 def exported(tmp_path: Path, policy: HeadingPolicy) -> tuple[ExportedPolicy, object]:
     file = tmp_path / "policy.pt"
-    card = export_autopilot("policy", policy, file, safe="amidships", about={}, metrics=[])
+    made = ExportedHeading("policy", policy, safe="amidships", about={}, metrics=[])
+    card = exporter("torchscript").export(made, file)
     assert card["dt"] == 0.05
     return for_export(policy, "amidships"), torch.jit.load(str(file))
 

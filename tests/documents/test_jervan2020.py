@@ -31,7 +31,8 @@ from residnet.documents.jervan2020.residual import (
     forward_equations,
     missing_coefficients,
 )
-from residnet.export.feed_forward import RequiredForce, export_feed_forward
+from residnet.export import exporter
+from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.physics.force_model import FERRY_TERMS, Correction, ForceModel
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.vessel import load_vessel
@@ -201,7 +202,8 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
 def test_exported_feed_forward_is_the_model(short: Study, tmp_path: Path) -> None:
     model = short.models["lag_ridge"].model
     force = RequiredForce(*model.parts(), mirrored=False)
-    export_feed_forward(force, None, [(-5.0, 5.0)] * 3 + [(-9.0, 9.0)] * 3, tmp_path / "f.pt")
+    exported = ExportedForce("ferry", force, [(-5.0, 5.0)] * 3 + [(-9.0, 9.0)] * 3)
+    exporter("torchscript").export(exported, tmp_path / "f.pt")
     loaded = torch.jit.load(str(tmp_path / "f.pt"))
     with torch.no_grad():
         tau, outside = loaded(short.first.nu_dot, short.first.nu)
@@ -222,12 +224,12 @@ def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
     )
     motion = torch.cat((record.nu_dot, record.nu), dim=-1)[record.train]
     low, high = motion.amin(0), motion.amax(0)
-    export_feed_forward(
+    exported = ExportedForce(
+        "ferry",
         RequiredForce(*hull_force.extended(wild).parts(), mirrored=True),
-        None,
         list(zip(low.tolist(), high.tolist(), strict=True)),
-        tmp_path / "f.pt",
     )
+    exporter("torchscript").export(exported, tmp_path / "f.pt")
     loaded = torch.jit.load(str(tmp_path / "f.pt"))
     random = torch.Generator().manual_seed(3)
     seen = low + (2.0 * torch.rand(2000, 6, generator=random, dtype=torch.float64) - 0.5) * (

@@ -17,7 +17,8 @@ from residnet.control.heading.steering import SteeredPlant
 from residnet.control.observed.config import PtosConfig
 from residnet.control.observed.stored import ObservedPolicySpec
 from residnet.dynamics.store import save_model
-from residnet.export.autopilot import export_autopilot
+from residnet.export import exporter
+from residnet.export.policy import ExportedHeading
 from residnet.physics.vessel import load_vessel
 
 SOURCE = Path(__file__).parents[2] / "examples" / "autopilot_cpp"
@@ -62,9 +63,9 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with torch.no_grad():
         own.network[-1].weight.copy_(0.05 * torch.randn_like(own.network[-1].weight))  # type: ignore[union-attr, arg-type, operator]
     file = tmp_path_factory.mktemp("policy") / "policy.pt"
-    export_autopilot(
-        "policy", own.requires_grad_(False), file, safe="amidships", about={}, metrics=[]
-    )
+    own.requires_grad_(False)
+    exported = ExportedHeading("policy", own, safe="amidships", about={}, metrics=[])
+    exporter("torchscript").export(exported, file)
     return file
 
 
@@ -119,7 +120,8 @@ def test_an_observed_policy_steers_alike_with_delay_and_noise(
     save_model(tmp_path / "models" / "p", spec, own)
     file = tmp_path / "exports" / "p.pt"
     file.parent.mkdir()
-    export_autopilot("p", own, file, safe="amidships", about={}, metrics=[])
+    exported = ExportedHeading("p", own, safe="amidships", about={}, metrics=[])
+    exporter("torchscript").export(exported, file)
     words = [sys.executable, str(SOURCE / "compare.py"), str(file), str(program), "--seconds", "8"]
     said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     differences = [float(line.split()[-1]) for line in said.splitlines() if "difference" in line]

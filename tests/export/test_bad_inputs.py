@@ -12,7 +12,7 @@ import torch
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export.torchscript import ExportedModel
+from residnet.export.vessel import ExportedModel
 from residnet.heads import SymbolicConfig
 from residnet.heads.delay_line import DelayConfig
 from residnet.heads.symbolic import SymbolicHead

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from residnet.dynamics.band import BandTable
-from residnet.export import contract, exporter
-from residnet.export.c.compiled import compile_shared
-from residnet.export.torchscript import ExportedModel, export_torchscript
+from residnet.export import ExportedVessel, exporter, vessel
+from residnet.export.c_code import compile_shared
+from residnet.export.vessel import ExportedModel
 from residnet.testing.examples import example_model, example_spec
 
 TABLE = BandTable(
@@ -32,9 +32,10 @@ TABLE = BandTable(
 def test_half_widths_are_those_of_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: BandTable | None
 ) -> None:
-    monkeypatch.setattr(contract, "PARITY_STEPS", 5)
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 5)
     spec = example_spec(None).model_copy(update={"band": table})
-    card = export_torchscript(spec, example_model(spec), tmp_path / "model.pt", [])
+    exported = ExportedVessel(spec, example_model(spec))
+    card = exporter("torchscript").export(exported, tmp_path / "model.pt")
     loaded = torch.jit.load(str(tmp_path / "model.pt"))
     assert loaded.band(0).tolist() == [0.0] * 5
     if table is None:
@@ -55,10 +56,10 @@ def test_half_widths_are_those_of_the_table(
 def test_c_has_the_same_half_widths(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: BandTable | None
 ) -> None:
-    monkeypatch.setattr(contract, "PARITY_STEPS", 5)
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 5)
     spec = example_spec(None).model_copy(update={"band": table})
     model = example_model(spec)
-    exporter("c").export(spec, model, tmp_path / "boat.c", [])
+    exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
     library = ctypes.CDLL(
         str(compile_shared([tmp_path / "boat.c"], tmp_path / "boat.so", ["-DEXAMPLE_DOUBLE"]))
     )

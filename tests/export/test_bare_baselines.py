@@ -11,7 +11,7 @@ from residnet.baselines import BaselineConfig
 from residnet.core.config import validate
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export import contract, exporter
+from residnet.export import ExportedVessel, exporter, vessel
 from residnet.physics.signals import SignalsConfig
 from residnet.testing import example_samples
 
@@ -45,8 +45,9 @@ def ship() -> tuple[ModelSpec, HybridDynamics]:
 def test_a_model_without_buffers_is_exported(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contract, "PARITY_STEPS", 60)
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
     spec, model = ship()
     assert not list(model.buffers())
-    card = exporter(name).export(spec, model, tmp_path / f"ship{exporter(name).suffix}", [])
+    file = tmp_path / f"ship{exporter(name).suffix}"
+    card = exporter(name).export(ExportedVessel(spec, model), file)
     assert card["format"] == name

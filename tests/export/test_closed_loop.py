@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,8 +13,8 @@ from torch import Tensor, nn
 from residnet.core.errors import ExportError
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.export.c import loop_source
-from residnet.export.c.closed_loop import CompiledLoop
+from residnet.export import c_code, closed_loop
+from residnet.export.closed_loop import CompiledLoop, _held
 
 DT = 0.1
 
@@ -84,9 +86,9 @@ def test_the_number_of_threads_changes_nothing() -> None:
 
 def test_a_loop_that_is_off_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     rollout, given = loop()
-    wrong = loop_source.BACK.replace("AT(gx, N_X, k)[i * width + l] +=", "(void)")
-    assert wrong != loop_source.BACK
-    monkeypatch.setattr(loop_source, "BACK", wrong)
+    wrong = closed_loop.BACK.replace("AT(gx, N_X, k)[i * width + l] +=", "(void)")
+    assert wrong != closed_loop.BACK
+    monkeypatch.setattr(closed_loop, "BACK", wrong)
     with pytest.raises(ExportError, match="is off by"):
         CompiledLoop(rollout, *given)
 
@@ -97,3 +99,54 @@ def test_a_missing_compiler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     rollout, given = loop()
     with pytest.raises(ExportError, match="no C compiler"):
         CompiledLoop(rollout, *given)
+
+
+SOURCE = "double twice(double x) { return 2.0 * x; }\n"
+
+
+def called(library: ctypes.CDLL) -> float:
+    library.twice.restype = ctypes.c_double
+    found: float = library.twice(ctypes.c_double(1.5))
+    return found
+
+
+def test_the_same_source_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RESIDNET_CACHE", str(tmp_path / "kept"))
+    calls: list[Path] = []
+    compile_one = c_code._compile
+
+    def counted(tool: str, source: str, out: Path) -> None:
+        calls.append(out)
+        compile_one(tool, source, out)
+
+    monkeypatch.setattr(c_code, "_compile", counted)
+    assert [called(c_code.compiled_library(SOURCE)) for _ in range(2)] == [3.0, 3.0]
+    assert len(calls) == 1
+    c_code.compiled_library(SOURCE.replace("2.0", "4.0"))
+    assert len(calls) == 2
+    assert len(list((tmp_path / "kept").iterdir())) == 2
+    # where nothing can be written, it is compiled each time
+    monkeypatch.setenv("RESIDNET_CACHE", str(next((tmp_path / "kept").iterdir()) / "below"))
+    assert called(c_code.compiled_library(SOURCE)) == 3.0
+    assert len(calls) == 3
+
+
+def test_source_that_does_not_compile_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RESIDNET_CACHE", str(tmp_path))
+    with pytest.raises(ExportError, match="does not compile"):
+        c_code.compiled_library("int f(")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_flight_whose_gradient_explodes_does_not_drown_the_others() -> None:
+    gradients = torch.tensor([[1.0, 0.0], [0.0, 2.0], [3e9, 4e9], [torch.inf, 0.0], [6.0, 8.0]])
+    asked = torch.tensor([1.0, 1.0, 1.0, 1.0, 4.0])
+    held = _held(gradients, asked, 2.0)
+    # the median row has 2.5 times what was asked of it
+    assert torch.allclose(held[2], torch.tensor([3.0, 4.0]))
+    assert torch.equal(held[3], torch.zeros(2))
+    for row in (0, 1, 4):
+        assert torch.equal(held[row], gradients[row])
+    assert _held(gradients, asked, float("inf")) is gradients

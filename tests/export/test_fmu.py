@@ -15,7 +15,7 @@ from exported_models import built
 from fmpy.validation import validate_fmu
 
 from residnet.dynamics.rollout import Rollout
-from residnet.export import contract, exporter
+from residnet.export import ExportedVessel, exporter, vessel
 
 pytestmark = pytest.mark.exporters
 INPUTS = {"n_port": 20.0, "n_stbd": 25.0, "wind_speed": 3.0, "wind_dir": 1.0}
@@ -24,7 +24,7 @@ INPUTS = {"n_port": 20.0, "n_stbd": 25.0, "wind_speed": 3.0, "wind_dir": 1.0}
 @pytest.fixture(autouse=True)
 def short_parity() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contract, "PARITY_STEPS", 60)
+        patch.setattr(vessel, "PARITY_STEPS", 60)
         yield
 
 
@@ -32,7 +32,7 @@ def short_parity() -> Iterator[None]:
 def test_a_unit_is_imported_and_stepped(name: str, tmp_path: Path) -> None:
     spec, model = built("lstm_mirror")
     file = str(tmp_path / "boat.fmu")
-    exporter(name).export(spec, model, Path(file), [])
+    exporter(name).export(ExportedVessel(spec, model), Path(file))
     assert validate_fmu(file) == []
     model = model.double()
     x0 = torch.tensor([[0.0, 0, 0, 1, 0, 0]], dtype=torch.float64)

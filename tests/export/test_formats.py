@@ -7,9 +7,10 @@ loaded back as a user would.
 from __future__ import annotations
 
 import copy
+import ctypes
 import json
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,103 +19,197 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from exported_models import VARIANTS, AsTensors, built
+from exported_models import HIGH, LOW, VARIANTS, AsTensors, built, spec_of
 
-from residnet.control.heading.policy import HeadingPolicy
-from residnet.control.heading.turning import Turning
 from residnet.core.errors import ExportError
-from residnet.export import contract, exporter
+from residnet.dynamics.ensemble import mean_of
+from residnet.export import ExportedVessel, base, exporter, torchscript, vessel
 from residnet.export.aoti import AotiModel
-from residnet.export.autopilot import MEASURED
-from residnet.export.c.compiled import STRICT, CompiledModel, compile_shared, compiler
-from residnet.export.c.policy import export_autopilot_as_c
+from residnet.export.base import Loaded, RoundingError
+from residnet.export.c import CompiledModel
+from residnet.export.c_code import STRICT, CFunction, c_files, compile_shared, compiler
 from residnet.export.casadi_function import CasadiModel
-from residnet.export.contract import Stepped
-from residnet.export.guard import GuardedDynamics
-from residnet.export.lowering.build import lowered
+from residnet.export.lowering import lowered
 from residnet.export.onnx_file import OnnxModel
+from residnet.export.torchscript import ScriptedModel
 from residnet.testing import check_bad_inputs
 
 STEPS = 60
+ROW = {"model": "mine", "split": "test", "protocol": "T30", "nrmse": {"mean": 0.1}}
 
 
 @pytest.fixture(scope="module", autouse=True)
 def short_parity() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contract, "PARITY_STEPS", STEPS)
+        patch.setattr(vessel, "PARITY_STEPS", STEPS)
         yield
 
 
-@pytest.mark.exporters
+def exported(variant: str) -> ExportedVessel:
+    return ExportedVessel(*built(variant), [ROW])
+
+
+def compiled(file: Path, made: ExportedVessel) -> Loaded:
+    library = compile_shared([file], file.with_suffix(".so"))
+    return CompiledModel(library, made, torch.float32)
+
+
+LOADED: dict[str, Callable[[Path, ExportedVessel], Loaded]] = {
+    "c": compiled,
+    "onnx": lambda file, made: OnnxModel(file, made),
+    "casadi": lambda file, made: CasadiModel(file),
+    "aoti": lambda file, made: AotiModel(file),
+}
+SOME = ("plsr", "kernel", "mlp_mirror", "lstm")
+CASES = [
+    *(("c", variant) for variant in VARIANTS),
+    *(("casadi", variant) for variant in VARIANTS),
+    *(("onnx", variant) for variant in SOME),
+    ("aoti", "plsr"),
+]
+QUICK = {("c", "plsr"), ("casadi", "plsr")}
+
+
+@pytest.mark.parametrize(
+    ("name", "variant"),
+    [pytest.param(*case, marks=() if case in QUICK else pytest.mark.exporters) for case in CASES],
+)
+def test_a_file_keeps_the_contract(name: str, variant: str, tmp_path: Path) -> None:
+    made = exported(variant)
+    file = tmp_path / "deep" / f"boat{exporter(name).suffix}"
+    card = exporter(name).export(made, file)
+    parities = card["parity"].values() if name == "c" else [card["parity"]]
+    for parity in parities:
+        assert parity["steps"] == STEPS
+        assert max(parity["share_of_range"].values()) <= 1e-5
+    assert card["format"] == name
+    check_bad_inputs(
+        AsTensors(LOADED[name](file, made), made), made.spec, copy.deepcopy(made.model), cases=60
+    )
+    stored = file.with_suffix(".card.json")
+    if name == "onnx":
+        held = onnxruntime.InferenceSession(str(file)).get_modelmeta().custom_metadata_map["card"]
+    else:
+        held = stored.read_text()
+    assert json.loads(held) == json.loads(json.dumps(card))
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_c_holds_every_head(variant: str, tmp_path: Path) -> None:
-    spec, model = built(variant)
-    file = tmp_path / "deep" / "boat.c"
-    card = exporter("c").export(spec, model, file, [])
-    stored = json.loads((tmp_path / "deep" / "boat.card.json").read_text())
-    assert stored == json.loads(json.dumps(card))
-    for precision, allowed in (("single", 1e-5), ("double", 1e-12)):
-        assert max(card["parity"][precision]["share_of_range"].values()) <= allowed
-        assert card["parity"][precision]["steps"] == STEPS
-    source = compile_shared([file], tmp_path / "boat.so")
-    stepped = CompiledModel(source, "mine", model.n_state, "single")
-    check_bad_inputs(AsTensors(stepped, spec, model), spec, model, cases=60)
-    assert sorted(path.name for path in file.parent.iterdir()) == [
-        "boat.c",
-        "boat.card.json",
-        "boat.h",
+def test_torchscript_is_the_model(variant: str, tmp_path: Path) -> None:
+    """With all its methods, in single precision; the model itself is left alone."""
+    made = exported(variant)
+    before = copy.deepcopy(made.model.state_dict())
+    card = exporter("torchscript").export(made, tmp_path / "boat.pt")
+    extra = {"card.json": ""}
+    module: Any = torch.jit.load(str(tmp_path / "boat.pt"), _extra_files=extra)
+    assert json.loads(extra["card.json"]) == json.loads(json.dumps(card))
+    for name, value in made.model.state_dict().items():
+        torch.testing.assert_close(value, before[name], rtol=0, atol=0, equal_nan=True)
+    check_bad_inputs(module, made.spec, made.at(torch.float32), cases=100)
+    random, model = np.random.default_rng(1), made.at(torch.float32)
+    x = random.normal(size=(3, 6)) * [50, 50, 3, 0.5, 0.1, 0.1] + [0, 0, 0, 1, 0, 0]
+    x0, w = (
+        torch.from_numpy(x).float(),
+        torch.from_numpy(random.uniform(LOW[3:], HIGH[3:], size=(3, 30, 4))).float(),
+    )
+    past = torch.cat((x0[:, None, :3].expand(-1, 8, -1), torch.full((3, 8, 3), 0.2)), dim=-1)
+    with torch.no_grad():
+        s = model.warmup(past, w[:, :8])
+        together, last, outside = module.rollout(x0, w, module.warmup(past, w[:, :8]))
+        at = x0
+        for k in range(30):
+            at, s = model.step(at, w[:, k], s)
+    torch.testing.assert_close(together[:, -1], at, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(last, s, rtol=1e-4, atol=1e-5)
+    assert (together.dtype, outside.dtype, outside.shape) == (torch.float32, torch.bool, (3, 30))
+
+
+def test_the_card_says_what_a_controller_needs() -> None:
+    made = exported("lstm")
+    card = made.card()
+    units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
+    assert card["schema"] == "residnet.card/1"
+    assert card["states"] == [{"name": name, "unit": unit} for name, unit in units.items()]
+    assert [(e["name"], e["unit"], e["role"]) for e in card["inputs"]] == [
+        ("n_port", "1/s", "command"),
+        ("n_stbd", "1/s", "command"),
+        ("wind_speed", "m/s", "exogenous"),
+        ("wind_dir", "rad", "exogenous"),
     ]
+    assert (card["dt"], card["integrator"], card["model"]) == (0.1, "rk4", "mine")
+    names = ("u", "v", "r", "n_port", "n_stbd", "wind_speed", "wind_dir")
+    ranges = zip(names, zip(LOW, HIGH, strict=True), strict=True)
+    assert card["training_range"] == {name: list(limits) for name, limits in ranges}
+    assert card["metrics"] == [ROW]
+    assert (card["memory"], card["members"], card["band"]) == (made.model.n_state, [], None)
+    assert (card["head"]["kind"], card["baseline"]["kind"]) == ("lstm", "regressors")
 
 
-@pytest.mark.exporters
-@pytest.mark.parametrize("variant", ["plsr", "kernel", "mlp_mirror", "lstm"])
-def test_onnx_needs_no_torch(variant: str, tmp_path: Path) -> None:
-    spec, model = built(variant)
-    card = exporter("onnx").export(spec, model, tmp_path / "boat.onnx", [])
-    assert max(card["parity"]["share_of_range"].values()) <= 1e-5
-    session = onnxruntime.InferenceSession(str(tmp_path / "boat.onnx"))
-    stored = json.loads(session.get_modelmeta().custom_metadata_map["card"])
-    assert stored == json.loads(json.dumps(card))
-    stepped = OnnxModel(tmp_path / "boat.onnx", spec, model)
-    check_bad_inputs(AsTensors(stepped, spec, model), spec, model, cases=60)
+def test_outside_flags_each_channel_beyond_its_range() -> None:
+    made = exported("lstm")
+    module: Any = made.module(torch.float32)
+    low, high = torch.tensor(LOW), torch.tensor(HIGH)
+    middle = 0.5 * (low + high)
+    # rows: the middle, both corners, then each channel just below and just above its range
+    seen = [middle, low, high]
+    for i in range(len(LOW)):
+        for edge, step in ((low, -1e-3), (high, 1e-3)):
+            row = middle.clone()
+            row[i] = edge[i] + step
+            seen.append(row)
+    rows = torch.stack(seen)
+    # position and heading have no training range
+    x = torch.cat((torch.full((len(rows), 3), 6e3), rows[:, :3]), dim=1)
+    _, _, outside = module.step(x, rows[:, 3:], module.initial_state(len(rows)))
+    assert outside.tolist() == [False] * 3 + [True] * (2 * len(LOW))
+
+
+def test_an_ensemble_exports_and_names_its_members(tmp_path: Path) -> None:
+    parts = [built("mlp"), built("lstm")]
+    members = tuple(
+        spec.model_copy(update={"name": name})
+        for (spec, _), name in zip(parts, ("one", "two"), strict=True)
+    )
+    spec = spec_of(None, role="ensemble", baseline={"kind": "still"})
+    spec = spec.model_copy(update={"members": members})
+    made = ExportedVessel(spec, mean_of([model for _, model in parts]))
+    card = exporter("torchscript").export(made, tmp_path / "mean.pt")
+    told = [(member["name"], member["head"]["kind"]) for member in card["members"]]
+    assert told == [("one", "mlp"), ("two", "lstm")]
 
 
 @pytest.mark.exporters
 def test_a_compiled_package_takes_rows_of_a_transposed_array(tmp_path: Path) -> None:
     """The package reads memory without strides, so that a view of a row must be copied first."""
-    spec, model = built("plsr")
-    card = exporter("aoti").export(spec, model, tmp_path / "boat.pt2", [])
-    assert max(card["parity"]["share_of_range"].values()) <= 1e-5
-    stepped = AotiModel(tmp_path / "boat.pt2", spec, model)
+    made = exported("plsr")
+    exporter("aoti").export(made, tmp_path / "boat.pt2")
+    loaded = AotiModel(tmp_path / "boat.pt2")
     rows = np.asfortranarray([[9.0, 12, 3, 1], [4.0, 2, 1, 0.5]], dtype=np.float32)
     x, s = np.array([0, 0, 0, 1.0, 0, 0], np.float32), np.zeros(0, np.float32)
     for row in rows:
-        np.testing.assert_array_equal(stepped.step(x, row, s)[0], stepped.step(x, row.copy(), s)[0])
+        np.testing.assert_array_equal(loaded.step(x, row, s)[0], loaded.step(x, row.copy(), s)[0])
 
 
-@pytest.mark.exporters
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", ["plsr", "lstm"])
 def test_casadi_has_exact_derivatives(variant: str, tmp_path: Path) -> None:
-    spec, model = built(variant)
-    card = exporter("casadi").export(spec, model, tmp_path / "boat.casadi", [])
+    made = exported(variant)
+    card = exporter("casadi").export(made, tmp_path / "boat.casadi")
     assert max(card["parity"]["share_of_range"].values()) <= 1e-12
-    stepped = CasadiModel(tmp_path / "boat.casadi", spec, model)
-    model = model.double()
+    model = made.at(torch.float64)
     x = torch.tensor([[1.0, 2, 0.3, 1.1, 0.05, 0.02]], dtype=torch.float64)
     w = torch.tensor([[9.0, 12, 3, 1]], dtype=torch.float64)
     s = model.initial_state(1).double()
     exact = torch.autograd.functional.jacobian(lambda at: model.step(at, w, s)[0][0], x)[:, 0]
-    function = stepped.function
-    symbols = [casadi.MX.sym(name, size) for name, size in (("x", 6), ("w", 4), ("s", s.shape[1]))]
-    slope = casadi.Function("slope", symbols, [casadi.jacobian(function(*symbols)[0], symbols[0])])(
-        *(part[0].numpy() for part in (x, w, s))
-    )
-    torch.testing.assert_close(torch.from_numpy(np.asarray(slope)), exact, rtol=1e-9, atol=1e-12)
+    function = CasadiModel(tmp_path / "boat.casadi").function
+    symbols = [casadi.MX.sym(name, size) for name, size in made.arguments]
+    slope = casadi.Function("slope", symbols, [casadi.jacobian(function(*symbols)[0], symbols[0])])
+    found = slope(*(part[0].numpy() for part in (x, w, s)))
+    torch.testing.assert_close(torch.from_numpy(found.full()), exact, rtol=1e-9, atol=1e-12)
 
 
 def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
-    spec, model = built("lstm")
-    exporter("c").export(spec, model, tmp_path / "boat.c", [])
+    made = exported("lstm")
+    exporter("c").export(made, tmp_path / "boat.c")
     text = (tmp_path / "boat.c").read_text()
     assert "malloc" not in text
     kept = [line for line in text.splitlines() if line.startswith("static") and "(" not in line]
@@ -126,25 +221,16 @@ def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
         "mine_initial_state(s); outside = mine_step(x, w, s, x, s);"
         ' printf("%d %.9g", outside, x[3]); return 0; }\n'
     )
-    (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
-    narrow = ("-m32", "-msse2", "-mfpmath=sse")
-    tried = [compiler(), *narrow, "empty.c", "-o", "empty", "-lm"]
-    # where the compiler has the libraries of a 32-bit target
-    found = subprocess.run(tried, cwd=tmp_path, capture_output=True).returncode == 0
-    more = [narrow] if found else []
-    for flags in [(), ("-O3", "-Wconversion"), *more]:
-        subprocess.run(
-            [compiler(), *STRICT, *flags, "boat.c", "main.c", "-o", "main", "-lm"],
-            cwd=tmp_path,
-            check=True,
-        )
-        printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True).stdout
-        model = model.float()
-        x, w = torch.tensor([[0.0, 0, 0, 1, 0, 0]]), torch.tensor([[9.0, 9, 3, 1]])
-        with torch.no_grad():
-            after, _ = model.step(x, w, model.initial_state(1))
-        assert printed.split()[0] == "0"
-        assert float(printed.split()[1]) == pytest.approx(float(after[0, 3]), rel=1e-6)
+    model = made.at(torch.float32)
+    x, w = torch.tensor([[0.0, 0, 0, 1, 0, 0]]), torch.tensor([[9.0, 9, 3, 1]])
+    with torch.no_grad():
+        after, _ = model.step(x, w, model.initial_state(1))
+    for flags in [(), ("-O3", "-Wconversion")]:
+        call = [compiler(), *STRICT, *flags, "boat.c", "main.c", "-o", "main", "-lm"]
+        subprocess.run(call, cwd=tmp_path, check=True)
+        printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True).stdout.split()
+        assert printed[0] == "0"
+        assert float(printed[1]) == pytest.approx(float(after[0, 3]), rel=1e-6)
 
 
 @pytest.mark.parametrize("left", [0, 5])
@@ -153,28 +239,28 @@ def test_coefficients_of_zero_are_left_out(left: int, tmp_path: Path) -> None:
     spec, model = built("plsr")
     with torch.no_grad():
         model.head.coefficients[left:] = 0.0  # type: ignore[index, operator]
-    card = exporter("c").export(spec, model, tmp_path / "boat.c", [])
+    card = exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
     assert max(card["parity"]["double"]["share_of_range"].values()) <= 1e-12
 
 
-@pytest.mark.parametrize("name", ["c", "onnx"])
+@pytest.mark.parametrize("name", ["c", pytest.param("onnx", marks=pytest.mark.exporters)])
 def test_what_single_precision_does_not_determine_is_written_in_double(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Large coefficients that cancel make a model round; here no difference at all is let pass."""
-    monkeypatch.setattr(contract, "SINGLE", -1.0)
-    spec, model = built("plsr")
-    file = tmp_path / f"boat.{name}"
-    card = exporter(name).export(spec, model, file, [])
-    assert card["dtype"] == "float64"
-    given = copy.deepcopy(model).double()
-    stepped: Stepped = (
-        OnnxModel(file, spec, model)
-        if name == "onnx"
-        else CompiledModel(compile_shared([file], tmp_path / "boat.so"), "mine", 0, "double")
+    monkeypatch.setattr(base, "SINGLE", -1.0)
+    made, file = exported("plsr"), tmp_path / f"boat.{name}"
+    monkeypatch.setattr(
+        "residnet.export.onnx_file._TOLERANCE", {torch.float32: -1.0, torch.float64: 1e-7}
     )
-    shares = contract.require_parity(spec, given, stepped, "the file", torch.float64, 1e-7)
-    assert max(shares.values()) < 1e-7
+    card = exporter(name).export(made, file)
+    assert card["dtype"] == "float64"
+    loaded = (
+        OnnxModel(file, made)
+        if name == "onnx"
+        else CompiledModel(compile_shared([file], tmp_path / "boat.so"), made, torch.float64)
+    )
+    assert max(made.require_parity(loaded, "the file", torch.float64, 1e-7).values()) < 1e-7
 
 
 def test_an_operation_that_is_not_known_is_refused_by_name() -> None:
@@ -184,43 +270,95 @@ def test_an_operation_that_is_not_known_is_refused_by_name() -> None:
         lowered(lambda x: x if bool(x.sum() > 1) else -x, [("x", 2)], ["y"], "model mine")
 
 
-def test_a_weight_that_is_not_finite_is_refused(tmp_path: Path) -> None:
-    spec, model = built("mlp")
+OPERATIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "table": lambda x: torch.arange(90.0, dtype=x.dtype).reshape(30, 3)[(5 * x[:, 0].abs()).long()],
+    "short table": lambda x: torch.eye(3, dtype=x.dtype).index_select(0, x[0, :1].abs().long()),
+    "gather": lambda x: x.gather(1, x[:, :1].abs().long() % 4),
+    "largest": lambda x: torch.cat((x.max(1)[0], x.argmin(1).to(x.dtype), x.amax(1)))[None],
+    "products": lambda x: torch.bmm(x.reshape(1, 2, 2), x.reshape(1, 2, 2)).reshape(1, 4) @ x.T,
+    "moves": lambda x: torch.stack((x.flip(1), x.roll(1, 1)), 2).permute(0, 2, 1).reshape(1, -1),
+    "rounding": lambda x: torch.cat((x.trunc(), x.floor(), x % 0.7, x.sign(), x.clamp(-1, 1)), 1),
+    "powers": lambda x: x.abs() ** 1.5 + x**3 + x**2 / x.abs().sqrt() + torch.pow(2.0, x),
+    "choice": lambda x: torch.where((x > 0) & ~(x > 1), x.exp(), x.square()).mean(1, True),
+    "wide": lambda x: torch.tanh(x @ torch.linspace(-1, 1, 240, dtype=x.dtype).reshape(4, 60)),
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_operations_are_those_of_torch_in_casadi_and_in_c(name: str, tmp_path: Path) -> None:
+    given = torch.tensor([[0.3, -1.7, 2.6, 1.2]], dtype=torch.float64)
+    wanted = OPERATIONS[name](given).reshape(-1).numpy()
+    function = lowered(OPERATIONS[name], [("x", 4)], ["y"], "a step")
+    np.testing.assert_allclose(function(given[0].numpy()).full().ravel(), wanted, rtol=1e-12)
+    source, header = c_files("f", [CFunction("step", "", function)], [], {}, "", "f.h")
+    (tmp_path / "f.c").write_text(source)
+    (tmp_path / "f.h").write_text(header)
+    library = ctypes.CDLL(
+        str(compile_shared([tmp_path / "f.c"], tmp_path / "f.so", ["-DF_DOUBLE"]))
+    )
+    out, x = np.zeros(len(wanted)), given[0].numpy()
+    library.f_step(ctypes.c_void_p(x.ctypes.data), ctypes.c_void_p(out.ctypes.data))
+    np.testing.assert_allclose(out, wanted, rtol=1e-12)
+
+
+def test_a_changed_weight_and_a_wrong_rollout_are_found() -> None:
+    made = exported("lstm")
+    module = made.module(torch.float32)
+    made.check(ScriptedModel(module, torch.float32), "the module", torch.float32)
+    other = exported("lstm")
     with torch.no_grad():
-        next(model.head.parameters())[0, 0] = torch.nan
-    with pytest.raises(ExportError, match=r"model mine: head.net.0.weight holds nan"):
-        exporter("c").export(spec, model, tmp_path / "boat.c", [])
-    assert not list(tmp_path.iterdir())
+        other.model.head.networks[0].readout[0].bias[2] += 1e-3  # type: ignore[union-attr, index]
+    with pytest.raises(
+        ExportError, match=r"model mine: the module differs .* allowed 1e-05"
+    ) as said:
+        other.check(ScriptedModel(module, torch.float32), "the module", torch.float32)
+    assert "\n" not in str(said.value)
+
+    class NotFinite(ScriptedModel):
+        def rollout(self, *given: Any) -> Any:
+            out = super().rollout(*given)
+            out[-1, 5] = np.nan
+            return out
+
+    with pytest.raises(ExportError, match="differs from the model"):
+        made.check(NotFinite(module, torch.float32), "the module", torch.float32)
 
 
-def test_a_policy_is_written_as_c(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    turning = Turning(0.2, 3.9, 3.2)
-    policy = HeadingPolicy(MEASURED, turning=turning, limit=0.35, dt=0.02, rate=0.2, hidden=(8,))
-    card = {"dt": 0.02, "parity": {"steps": 1000}}
-    export_autopilot_as_c("pilot", policy, tmp_path / "pilot.c", safe="hold", card=card)
-    stored = json.loads((tmp_path / "pilot.card.json").read_text())
-    assert stored["parity"]["share_of_limit"] <= 1e-4
-    assert "int pilot_step(const pilot_real *y" in (tmp_path / "pilot.h").read_text()
-
-
-def test_tracks_whose_inputs_jump_find_rounding_that_grows(
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_file_that_differs_from_its_model_does_not_stand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """What is written is read back and compared before it takes its place."""
+    wrong = torch.jit.script(exported("mlp_mirror").module(torch.float32))
+    save = torch.jit.save
+    monkeypatch.setattr(
+        torchscript.torch.jit,
+        "save",
+        lambda module, path, _extra_files: save(wrong, path, _extra_files=_extra_files),
+    )
+    with pytest.raises(ExportError, match="model mine"):
+        exporter("torchscript").export(exported("mlp"), tmp_path / "mine.pt")
+    assert not (tmp_path / "mine.pt").exists()
+
+
+def test_tracks_whose_inputs_jump_find_rounding_that_grows() -> None:
     """What rounds states to four decimals is refused; the model itself is not."""
-    monkeypatch.setattr(contract, "PARITY_STEPS", 200)
-    spec, model = built("plsr")
-    guard = GuardedDynamics(model.float(), spec).eval()
+    made = exported("plsr")
 
-    def exact(x: Any, w: Any, s: Any) -> Any:
-        with torch.no_grad():
-            found = guard.flagged_step(*map(torch.from_numpy, (x, w, s)))
-        return tuple(part.numpy() for part in found)
+    class Exact(Loaded):
+        step_of = made.graph(torch.float32)
 
-    def rounding(x: Any, w: Any, s: Any) -> Any:
-        after, memory, outside = exact(x, w, s)
-        return after.round(4), memory, outside
+        def step(self, *given: Any) -> tuple[Any, ...]:
+            raise NotImplementedError
 
-    contract.require_tracks(spec, model, exact, "the file", torch.float32, 1e-5)
-    with pytest.raises(contract.Apart, match="the file differs from the model"):
-        contract.require_tracks(spec, model, rounding, "the file", torch.float32, 1e-5)
+        def rows(self, *given: Any) -> tuple[Any, ...]:
+            with torch.no_grad():
+                return tuple(part.numpy() for part in self.step_of(*map(torch.from_numpy, given)))
+
+    class Rounding(Exact):
+        def rows(self, *given: Any) -> tuple[Any, ...]:
+            after, *rest = super().rows(*given)
+            return (after.round(4), *rest)
+
+    made.require_tracks(Exact(), "the file", torch.float32, 1e-5)
+    with pytest.raises(RoundingError, match="the file differs from the model"):
+        made.require_tracks(Rounding(), "the file", torch.float32, 1e-5)

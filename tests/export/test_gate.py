@@ -12,7 +12,7 @@ from residnet.core.samples import Samples
 from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.export import contract, exporter
+from residnet.export import ExportedVessel, exporter, vessel
 
 
 def gated() -> tuple[ModelSpec, HybridDynamics]:
@@ -42,11 +42,11 @@ def gated() -> tuple[ModelSpec, HybridDynamics]:
 def test_every_format_holds_a_gate(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contract, "PARITY_STEPS", 60)
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
     spec, model = gated()
     kind = exporter(name)
     file = tmp_path / f"gate{kind.suffix}"
-    card = kind.export(spec, model, file, [])
+    card = kind.export(ExportedVessel(spec, model), file)
     assert file.is_file()
     assert card["gated"] is True
 

@@ -16,9 +16,14 @@ from exported_models import built
 from residnet.core.errors import UsageError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export import exporter
+from residnet.export import ExportedVessel, exporter
 
 FORCES = ("tau_x", "tau_y", "tau_n")
+
+
+def put(folder: Path, spec: ModelSpec, model: HybridDynamics) -> Any:
+    file = folder / "hull.parameters.json"
+    return exporter("parameters").export(ExportedVessel(spec, model), file)
 
 
 def believed() -> tuple[ModelSpec, HybridDynamics]:
@@ -43,7 +48,7 @@ def believed() -> tuple[ModelSpec, HybridDynamics]:
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("parameters")
     (folder / "hull.masses.yaml").write_text("mass: 180\ninertia: 446\n")
-    exporter("parameters").export(*believed(), folder / "hull.parameters.json", [])
+    exporter("parameters").export(ExportedVessel(*believed()), folder / "hull.parameters.json")
     return folder
 
 
@@ -147,7 +152,7 @@ def drawn(seed: int, lift: float) -> tuple[ModelSpec, HybridDynamics]:
 def test_hulls_drawn_at_random_keep_their_overshoots(seed: int, tmp_path: Path) -> None:
     spec, model = drawn(seed, 0.0)
     (tmp_path / "hull.masses.yaml").write_text("mass: 20\ninertia: 10\n")
-    card = exporter("parameters").export(spec, model, tmp_path / "hull.parameters.json", [])
+    card = put(tmp_path, spec, model)
     assert max(card["share_left_out"].values()) < 1e-9
     drive, push = 0.4 * card["M"][0][0], 0.1 * card["M"][2][2]
     wanted, first, second = overshoots(tmp_path, model, drive, push)
@@ -159,7 +164,7 @@ def test_hulls_drawn_at_random_keep_their_overshoots(seed: int, tmp_path: Path) 
 def test_what_a_drawn_hull_has_besides_is_listed_with_its_share(tmp_path: Path) -> None:
     spec, model = drawn(3, 0.3)
     (tmp_path / "hull.masses.yaml").write_text("mass: 20\ninertia: 10\n")
-    card = exporter("parameters").export(spec, model, tmp_path / "hull.parameters.json", [])
+    card = put(tmp_path, spec, model)
     assert card["terms_left_out"]["v_dot"] == ["|u|v"]
     assert card["share_left_out"]["v"] > 0.01
     assert card["share_left_out"]["u"] < 1e-9
@@ -179,7 +184,7 @@ def test_gazebo_gets_added_masses_and_resistances(written: Path) -> None:
 def test_what_cannot_be_told_is_asked_for(tmp_path: Path) -> None:
     spec, model = believed()
     with pytest.raises(UsageError, match=r"hull.masses.yaml: write there mass \(kg\), inertia"):
-        exporter("parameters").export(spec, model, tmp_path / "hull.parameters.json", [])
+        put(tmp_path, spec, model)
     with pytest.raises(UsageError, match="accelerations do not tell all masses"):
-        exporter("parameters").export(*built("mlp"), tmp_path / "mlp.parameters.json", [])
+        put(tmp_path, *built("mlp"))
     assert not list(tmp_path.iterdir())

@@ -13,7 +13,7 @@ from tiny import TINY, call
 from residnet.core.errors import ResidnetError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, save_model
-from residnet.export import contract, exporter, exporters
+from residnet.export import ExportedVessel, exporter, exporters, vessel
 
 FORMATS = list(exporters())
 
@@ -42,7 +42,7 @@ def test_a_number_that_is_not_finite_is_refused(name: str, value: float, tmp_pat
         model.baseline.theta[0, 1] = value  # type: ignore[index, operator]
     file = tmp_path / f"boat{exporter(name).suffix}"
     with pytest.raises(ResidnetError) as caught:
-        exporter(name).export(spec, model, file, [])
+        exporter(name).export(ExportedVessel(spec, model), file)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
@@ -90,7 +90,7 @@ def test_an_edited_model_is_refused(
 def test_a_format_writes_a_model_or_says_why_not(
     name: str, variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contract, "PARITY_STEPS", 40)
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 40)
     if variant == "none":
         spec = spec_of(None)
         model = spec.build()
@@ -105,7 +105,7 @@ def test_a_format_writes_a_model_or_says_why_not(
 def refusal(name: str, spec: ModelSpec, model: HybridDynamics, file: Path) -> str | None:
     """Return why a format does not write a model, in its one line; None where it does."""
     try:
-        exporter(name).export(spec, model, file, [])
+        exporter(name).export(ExportedVessel(spec, model), file)
     except ResidnetError as error:
         return str(error).splitlines()[-1]
     return None

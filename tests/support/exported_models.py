@@ -13,8 +13,8 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export.contract import Stepped
-from residnet.export.guard import GuardedDynamics
+from residnet.export.base import Loaded
+from residnet.export.vessel import ExportedVessel
 from residnet.heads import ClosedFormHead, HeadConfig
 from residnet.physics.signals import SignalsConfig
 
@@ -94,26 +94,29 @@ def built(variant: str) -> tuple[ModelSpec, HybridDynamics]:
 
 
 class AsTensors:
-    """A loaded file of any format as a module of batches, row by row."""
+    """A loaded file of a vessel in any format as a module of batches, row by row."""
 
-    def __init__(self, stepped: Stepped, spec: ModelSpec, model: HybridDynamics) -> None:
-        self.stepped, self.memory = stepped, model.n_state
-        self.guard = GuardedDynamics(model, spec)
+    def __init__(self, loaded: Loaded, exported: ExportedVessel) -> None:
+        self.loaded, self.exported = loaded, exported
+        self.size = exported.model.n_state
+        self.guard = exported.guarded(torch.float32)
 
     def initial_state(self, batch: int) -> Tensor:
-        return torch.zeros(batch, self.memory)
+        return torch.zeros(batch, self.size)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rows = [
-            self.stepped.step(*(part.numpy() for part in row)) for row in zip(x, w, s, strict=True)
+            self.loaded.step(*(part.numpy() for part in row)) for row in zip(x, w, s, strict=True)
         ]
-        after, memory, outside = zip(*rows, strict=True)
-        states, memories = (torch.from_numpy(np.stack(part)) for part in (after, memory))
-        return states, memories, torch.tensor(outside)
+        found = (torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
+        after, memory, outside = found
+        return after, memory, outside.bool().reshape(-1)
 
     def warmup(self, y: Tensor, w: Tensor) -> Tensor:
         rows = zip(y.numpy(), w.numpy(), strict=True)
-        return torch.from_numpy(np.stack([self.stepped.warmup(*row) for row in rows]))
+        return torch.from_numpy(
+            np.stack([self.exported.memory(self.loaded, *row, "the file") for row in rows])
+        )
 
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         states, flags, x = [self.guard.accept_state(x0)], [], x0

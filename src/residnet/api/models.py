@@ -20,7 +20,7 @@ from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.scripted import scripted
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.export import exporter
+from residnet.export import ExportedVessel, exporter
 from residnet.identification.models import FittedModel
 from residnet.judge.bands.band import Band
 from residnet.judge.bands.file import read_bands
@@ -306,9 +306,8 @@ def export_model(
         card = residnet.export_model(models["lstm"], "lstm.pt")
     """
     require_model(model, "export_model")
-    return exporter(format).export(
-        model.spec, copy.deepcopy(model.module), path(file, "export_model"), list(metrics)
-    )
+    exported = ExportedVessel(model.spec, model.module, list(metrics))
+    return exporter(format).export(exported, path(file, "export_model"))
 
 
 def require_model(model: Any, who: str) -> None:

@@ -1,19 +1,20 @@
-"""Export of models for controllers: one file per format, found by name in `exporters`."""
+"""Export for controllers: one file per format, found by name in `exporters`."""
 
 from __future__ import annotations
 
 from residnet.core.registry import ThirdParty, objects, usable
 from residnet.export.aoti import AotiExporter
-from residnet.export.base import Exporter
-from residnet.export.c.exporter import CExporter
+from residnet.export.base import Exported, Exporter
+from residnet.export.c import CExporter
 from residnet.export.casadi_function import CasadiExporter
 from residnet.export.feed_forward import FeedForwardExporter
-from residnet.export.fmu.exporter import Fmu2Exporter, Fmu3Exporter
+from residnet.export.fmu import Fmu2Exporter, Fmu3Exporter
 from residnet.export.onnx_file import OnnxExporter
-from residnet.export.parameters.exporter import ParametersExporter
+from residnet.export.parameters import ParametersExporter
 from residnet.export.torchscript import TorchScriptExporter
+from residnet.export.vessel import ExportedVessel
 
-__all__ = ["Exporter", "exporter", "exporters"]
+__all__ = ["Exported", "ExportedVessel", "Exporter", "exporter", "exporters"]
 
 _BUILTIN: tuple[Exporter, ...] = (
     TorchScriptExporter(),

@@ -1,12 +1,10 @@
-"""The format `aoti`: the model's step compiled ahead of time by torch, for this machine."""
+"""The format `aoti`: a step compiled ahead of time by torch, for this machine."""
 
 from __future__ import annotations
 
-import copy
-import json
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, final
 
@@ -14,38 +12,29 @@ import numpy as np
 import torch
 
 from residnet.core.errors import ExportError
-from residnet.core.names import STATE
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec
-from residnet.export.base import Exporter
-from residnet.export.card import make_card
-from residnet.export.contract import Apart, Numbers, accepted, checked, require_numbers, warmed
-from residnet.export.stepping import Step
+from residnet.export.base import (
+    Exported,
+    Exporter,
+    Loaded,
+    Numbers,
+    in_precision,
+    name_of,
+    write_card,
+)
 
 
-class AotiModel:
-    """A compiled package, loaded back, for one vessel."""
+class AotiModel(Loaded):
+    """A compiled package, loaded back."""
 
-    def __init__(
-        self, file: Path, spec: ModelSpec, model: HybridDynamics, dtype: torch.dtype = torch.float32
-    ) -> None:
+    def __init__(self, file: Path, dtype: torch.dtype = torch.float32) -> None:
         self.package: Any = torch._inductor.aoti_load_package(str(file))
-        self.memory, self.dtype = model.n_state, dtype
-        self.measured = accepted(spec, model)
+        self.dtype = dtype
 
-    def step(self, x: Numbers, w: Numbers, s: Numbers) -> tuple[Numbers, Numbers, bool]:
-        """Return state, memory and flag one step later."""
+    def step(self, *given: Numbers) -> tuple[Any, ...]:
+        """Return the results of one step."""
         # the package takes numbers as they lie in memory, whatever a tensor's strides say
-        given = [
-            torch.from_numpy(np.ascontiguousarray(part)).to(self.dtype)[None] for part in (x, w, s)
-        ]
-        after, memory, outside = self.package(*given)
-        return after[0].numpy(), memory[0].numpy(), bool(outside[0])
-
-    def warmup(self, y: Numbers, w: Numbers) -> Numbers:
-        """Return the memory that a measured past leaves."""
-        empty = torch.zeros(self.memory, dtype=self.dtype).numpy()
-        return warmed(self.measured, self.step, y, w, empty)
+        rows = [torch.from_numpy(np.ascontiguousarray(part)).to(self.dtype)[None] for part in given]
+        return tuple(part[0].numpy() for part in self.package(*rows))
 
 
 @final
@@ -56,70 +45,50 @@ class AotiExporter(Exporter):
     suffix: ClassVar[str] = ".pt2"
     about: ClassVar[str] = "The model's step compiled for this machine (AOTInductor), one row."
 
-    def export(
-        self,
-        spec: ModelSpec,
-        model: HybridDynamics,
-        file: Path,
-        rows: Sequence[Mapping[str, Any]],
-    ) -> Mapping[str, Any]:
-        """Compile the model; the card stands beside the package.
+    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+        """Compile the step; the card stands beside the package.
 
         It works in float64 where float32 does not determine the track.
         """
-        require_numbers(spec, model)
-        model = copy.deepcopy(model).eval().requires_grad_(False)
-        card = make_card(spec, model, rows, {}) | {
-            "format": "aoti",
-            "layout": "Give contiguous tensors: the package does not look at strides.",
-            "safety": "The package holds machine code that runs when loaded: load only what"
-            " you trust. It is for the kind of machine that it was made on.",
-        }
-        with tempfile.TemporaryDirectory() as name:
-            partial = Path(name) / "model.pt2"
-            try:
-                parity = _checked(spec, copy.deepcopy(model).float(), partial, torch.float32)
-            except Apart:
-                parity = _checked(spec, model.double(), partial, torch.float64)
-                card |= {"dtype": "float64"}
-            card |= {"parity": parity}
+        exported.require_numbers()
+        with tempfile.TemporaryDirectory() as folder:
+            partial = Path(folder) / "model.pt2"
+
+            def attempt(dtype: torch.dtype) -> dict[str, Any]:
+                _compile(exported, partial, dtype)
+                return exported.check(AotiModel(partial, dtype), "the compiled package", dtype)
+
+            dtype, parity = in_precision(exported, attempt)
+            card = exported.card() | {
+                "format": "aoti",
+                "dtype": name_of(dtype),
+                "layout": "Give contiguous tensors: the package does not look at strides.",
+                "safety": "The package holds machine code that runs when loaded: load only what"
+                " you trust. It is for the kind of machine that it was made on.",
+                "parity": parity,
+            }
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.with_suffix(".card.json").write_text(json.dumps(card, indent=1) + "\n")
+            write_card(file, card)
             file.write_bytes(partial.read_bytes())
         return card
 
 
-def _checked(
-    spec: ModelSpec, model: HybridDynamics, file: Path, dtype: torch.dtype
-) -> dict[str, Any]:
-    """Write the package in a precision and return what a card says of its parity.
-
-    Raises:
-        Apart: where the precision does not determine the track.
-        ExportError: where the package is wrong otherwise, or cannot be compiled.
-    """
-    _compile(spec, model, file, dtype)
-    stepped = AotiModel(file, spec, model, dtype)
-    return checked(spec, model, stepped, "the compiled package", dtype)
-
-
-def _compile(spec: ModelSpec, model: HybridDynamics, file: Path, dtype: torch.dtype) -> None:
+def _compile(exported: Exported, file: Path, dtype: torch.dtype) -> None:
     """Write the package.
 
     Raises:
         ExportError: where torch cannot compile the step, or there is no C++ compiler.
     """
-    sizes = (len(STATE), len(spec.signals.columns), model.n_state)
-    examples = tuple(torch.zeros(1, size, dtype=dtype) for size in sizes)
+    examples = tuple(torch.zeros(1, count, dtype=dtype) for _, count in exported.arguments)
     try:
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")
-            program = torch.export.export(Step(model, spec).to(dtype).eval(), examples)
+            program = torch.export.export(exported.graph(dtype), examples)
             torch._inductor.aoti_compile_and_package(program, package_path=str(file))
     except (RuntimeError, OSError) as error:
         # what torch raises here has no class of its own
         first = str(error).strip().splitlines() or [type(error).__name__]
         raise ExportError(
-            f"model {spec.name}: cannot be compiled ahead of time ({first[0]}); export it as c or"
+            f"{exported.what}: cannot be compiled ahead of time ({first[0]}); export it as c or"
             " torchscript"
         ) from None

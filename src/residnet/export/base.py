@@ -1,6 +1,10 @@
-"""What every export format shares: its name, the ending of its files, how a model is written.
+"""What every export format shares: what is exported, how it is written, how it is checked.
 
-Whatever the format, a stepped model keeps this contract, with batches of rows B in all tensors:
+A vessel, a heading policy, a policy along a course and a feed-forward are one kind of thing here:
+a step of fixed arguments, called once per `dt`, with the memory passed in and out. Whatever the
+format, a bad input gives a flag and a finite output, and the next good sample recovers.
+
+A stepped vessel keeps this contract, with batches of rows B in all tensors:
 
 - `initial_state(batch) -> s`: the memory [B, n_state] without a past, zeros.
 - `warmup(y_history, w_history) -> s`: the memory that a measured past leaves, states [B, T, 6] and
@@ -11,26 +15,134 @@ Whatever the format, a stepped model keeps this contract, with batches of rows B
 - `band(k) -> half widths [5]` of u, v, r, heading and position k steps after a measured state,
   where a format has methods; the table that it reads stands in every card as `band`.
 
-`outside` is true where a velocity or an input lies beyond the training range, and where anything
-was no number or beyond what is accepted; states and memories that come out are finite always. What
-is accepted, and what stands in the place of the rest, is defined once, in `residnet.export.guard`;
-its `GuardedDynamics` is the module that formats translate. A tensor of a wrong shape is refused
-where the format can refuse, and never broadcast.
+A controller has `initial_state(y) -> s` at the first measurement y, and `step`, which gives the
+command, the memory and the flag `fault`. A format without methods starts it with a memory that is
+no number: its first answer is the safe command, with the flag.
 """
 
 from __future__ import annotations
 
+import importlib.util
+import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from residnet.core.errors import ExportError, UsageError
+
+Numbers = npt.NDArray[Any]
+SINGLE, DOUBLE = 1e-5, 1e-12
+"""Largest difference in each precision, as a share of a channel's range."""
+Attempt = TypeVar("Attempt")
+
+
+class RoundingError(ExportError):
+    """A file that rounds otherwise than what it was made of, and ends elsewhere for that alone."""
+
+
+class Loaded(ABC):
+    """A file that was written, loaded back; arrays of one row.
+
+    Attributes:
+        reorders: whether it adds up in another order than torch, so that rounding may grow.
+    """
+
+    reorders: bool = True
+
+    @abstractmethod
+    def step(self, *given: Numbers) -> tuple[Any, ...]:
+        """Return the results of one step."""
+
+    def rows(self, *given: Numbers) -> tuple[Any, ...]:
+        """Return the results of one step of many rows."""
+        found = zip(*(self.step(*row) for row in zip(*given, strict=True)), strict=True)
+        return tuple(map(np.stack, found))
+
+    def memory(self, *past: Numbers) -> Numbers | None:
+        """Return the memory that a past leaves; None where the format has only steps.
+
+        It is measured states [T, 6] and inputs [T, m] of a vessel, and the first measurement of a
+        controller.
+        """
+        return None
+
+
+    def rollout(self, *given: Numbers) -> Numbers | None:
+        """Return the states of a free run of one row; None where the format has only steps."""
+        return None
+
+
+class Exported(ABC):
+    """What is exported: a step, what its card says, and how a file of it is checked.
+
+    Attributes:
+        name: of the model or policy.
+        what: it is, with its name, for messages.
+        dt: step in s; None where there is none.
+        arguments: names and sizes of what a step takes; the memory stands last where there is any.
+        results: names of what a step gives.
+        flags: those of them that are truth values; they stand last.
+        precisions: that are tried, one after the other.
+        methods: of `module`, beside `forward`.
+    """
+
+    name: str
+    what: str
+    dt: float | None
+    arguments: Sequence[tuple[str, int]]
+    results: Sequence[str]
+    flags: Sequence[str]
+    precisions: Sequence[torch.dtype] = (torch.float32, torch.float64)
+    methods: Sequence[str] = ()
+
+    def require_numbers(self) -> None:  # noqa: B027 (policies are built from finite numbers)
+        """Refuse what holds numbers that are not finite.
+
+        Raises:
+            ExportError: that names the first such number.
+        """
+
+    @abstractmethod
+    def module(self, dtype: torch.dtype) -> nn.Module:
+        """Return the module of the TorchScript file, in evaluation mode.
+
+        Its `forward` is the step, of batches.
+        """
+
+    @abstractmethod
+    def graph(self, dtype: torch.dtype) -> nn.Module:
+        """Return a module whose `forward` is the step, without checks of shapes."""
+
+    @abstractmethod
+    def card(self) -> dict[str, Any]:
+        """Return the card, without format, precision and parity."""
+
+    @abstractmethod
+    def check(
+        self, loaded: Loaded, what: str, dtype: torch.dtype, tolerance: float | None = None
+    ) -> dict[str, Any]:
+        """Return what the card says of the parity, once a file answers as it must.
+
+        Args:
+            loaded: the file.
+            what: it is, for messages.
+            dtype: its precision.
+            tolerance: largest difference; None for what the precision allows.
+
+        Raises:
+            RoundingError: where the precision does not determine the answers.
+            ExportError: where the file is wrong otherwise, or what was exported is.
+        """
 
 
 class Exporter(ABC):
-    """A format that a model is written in for controllers, found by its name.
+    """A format, found by its name.
 
     Another package adds one with an entry point in the group `residnet.exporters` that leads to a
     subclass without arguments.
@@ -46,22 +158,50 @@ class Exporter(ABC):
     about: ClassVar[str]
 
     @abstractmethod
-    def export(
-        self,
-        spec: ModelSpec,
-        model: HybridDynamics,
-        file: Path,
-        rows: Sequence[Mapping[str, Any]],
-    ) -> Mapping[str, Any]:
-        """Write one model, after a parity check, and return what its card says.
+    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+        """Write a model or a policy, after a parity check, and return what its card says.
 
         Args:
-            spec: the model's description.
-            model: the model; its precision may be changed.
+            exported: for example `residnet.export.vessel.ExportedVessel`, with the attributes
+                `spec`, `model` and `metrics`.
             file: where to write; its folder may not exist yet.
-            rows: of metrics.json of this model, for the card; empty where there are none.
 
         Raises:
-            UsageError: where the format cannot hold such a model.
-            ExportError: where what was written does not reproduce the model.
+            UsageError: where the format cannot hold such a thing.
+            ExportError: where what was written does not reproduce it.
         """
+
+
+def in_precision(
+    exported: Exported, attempt: Callable[[torch.dtype], Attempt]
+) -> tuple[torch.dtype, Attempt]:
+    """Return the first precision that determines the answers, and what an attempt gave in it."""
+    for dtype in exported.precisions[:-1]:
+        try:
+            return dtype, attempt(dtype)
+        except RoundingError:
+            continue
+    return exported.precisions[-1], attempt(exported.precisions[-1])
+
+
+def name_of(dtype: torch.dtype) -> str:
+    """Return a precision as cards name it."""
+    return "float64" if dtype == torch.float64 else "float32"
+
+
+def write_card(file: Path, card: Mapping[str, Any]) -> None:
+    """Write a card beside its file."""
+    file.with_suffix(".card.json").write_text(json.dumps(card, indent=1) + "\n")
+
+
+def require_package(name: str, what: str) -> None:
+    """Refuse to go on without a package of the extra `export`.
+
+    Raises:
+        UsageError: that says how to install it.
+    """
+    if importlib.util.find_spec(name) is None:
+        raise UsageError(
+            f"{what} needs the package {name}, which is not installed: pip install"
+            " 'residnet[export]'"
+        )

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, final
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -16,9 +17,10 @@ from residnet.core.errors import ExportError, UsageError
 from residnet.core.layout import PLANAR, RANGE_VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export.base import Exporter
+from residnet.export.base import Exported, Exporter, Loaded
 from residnet.export.guard import replaced, widening
-from residnet.export.scripting import require_shape, size, within, write_scripted
+from residnet.export.torchscript import TorchScriptExporter, require_shape, size
+from residnet.export.vessel import ExportedVessel
 from residnet.heads import ForceHead
 from residnet.physics.force_model import MOTION
 from residnet.physics.signals import FORCE_CHANNELS
@@ -27,6 +29,8 @@ FADE = 0.25
 """Share of the width of a training range, beyond its edge, over which a correction fades out."""
 EFFORT = 1.2
 """Most force outside the training range, in forces of the believed model, axis by axis."""
+_SAME = 1e-9
+"""Largest difference of a file, as a share of each force's range."""
 _EDGE = 0.05
 """Share of the width of a training range, within its edge, over which that limit sets in."""
 
@@ -155,7 +159,7 @@ class GuardedForce(nn.Module):
         most = self.effort * torch.minimum(believed.abs(), least)
         most = most + free * (believed.abs() + more.abs())
         force = torch.minimum(torch.maximum(force, -most), most)
-        return force, ~within(seen, self.low, self.high).squeeze(-1)
+        return force, ~((seen >= self.low) & (seen <= self.high)).all(dim=-1)
 
 
 def required_force(
@@ -190,50 +194,74 @@ def required_force(
     return force.eval().requires_grad_(False), ranges
 
 
-def export_feed_forward(
-    model: RequiredForce,
-    lag: dict[str, float] | None,
-    ranges: Sequence[tuple[float, float]],
-    file: Path,
-) -> dict[str, Any]:
-    """Write (tau, outside) = F(nu_dot, nu) as TorchScript with its card.
+@final
+class ExportedForce(Exported):
+    """A feed-forward (tau, outside) = F(nu_dot, nu), in double precision.
 
     Args:
+        name: of the model that it comes from.
         model: the believed force and its correction.
-        lag: of the thrusters, for the card; None where it was not fitted.
         ranges: of nu_dot and nu in the data that identified the correction, six.
-        file: where to write.
-
-    Returns:
-        The card.
-
-    Raises:
-        ExportError: where the exported module differs from the model.
+        lag: of the thrusters, for the card; None where it was not fitted.
     """
-    model = model.eval()
-    guarded = GuardedForce(model, ranges).eval()
 
-    def check(exported: Any) -> float:
-        """Return the largest difference at random motions within the training ranges.
+    dt = None
+    arguments = (("nu_dot", PLANAR.dof), ("nu", PLANAR.dof))
+    results = ("tau", "outside")
+    flags = ("outside",)
+    precisions = (torch.float64,)
 
-        It is a share of each force's range.
+    def __init__(
+        self,
+        name: str,
+        model: RequiredForce,
+        ranges: Sequence[tuple[float, float]],
+        lag: dict[str, float] | None = None,
+    ) -> None:
+        self.name, self.what = name, f"feed-forward of {name}"
+        self.inner, self.ranges, self.lag = model.eval(), ranges, lag
+
+    def module(self, dtype: torch.dtype) -> nn.Module:
+        """Return the force with its guard."""
+        return GuardedForce(self.inner, self.ranges).eval()
+
+    def graph(self, dtype: torch.dtype) -> nn.Module:
+        """Return the force with its guard."""
+        return self.module(dtype)
+
+    def check(
+        self, loaded: Loaded, what: str, dtype: torch.dtype, tolerance: float | None = None
+    ) -> dict[str, Any]:
+        """Compare the force at random motions, in and far beyond the training ranges.
+
+        Raises:
+            ExportError: where it differs, or a flag does.
         """
-        low, high = torch.tensor(ranges, dtype=torch.float64).T
-        motion = low + torch.rand(
-            200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-        ) * (high - low)
+        low, high = torch.tensor(self.ranges, dtype=torch.float64).T
+        random = torch.Generator().manual_seed(0)
+        share = torch.rand(200, 2 * PLANAR.dof, generator=random, dtype=torch.float64)
+        # a tenth is replaced by what no vessel does
+        share[180:] = 1e6 * (share[180:] - 0.5)
+        motion = low + share * (high - low)
+        motion[190:195, 0] = torch.nan
+        parts = motion.split(PLANAR.dof, dim=1)
         with torch.no_grad():
-            eager, _ = guarded(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :])
-            scripted, _ = exported(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :])
-        share = float(((eager - scripted).abs().amax(0) / (eager.amax(0) - eager.amin(0))).max())
-        if not share < 1e-9:
+            tau, outside = self.module(dtype)(*parts)
+        found = [loaded.step(*(part[k].numpy() for part in parts)) for k in range(len(motion))]
+        off = (torch.from_numpy(np.stack([force for force, _ in found])) - tau).abs()
+        worst = float((off[:180].amax(0) / (tau[:180].amax(0) - tau[:180].amin(0))).max())
+        flags = [bool(flag) for _, flag in found] == outside.tolist()
+        if not (worst < _SAME and bool((off <= _SAME * (1.0 + tau.abs())).all()) and flags):
             raise ExportError(
-                f"{file.name}: the exported feed-forward differs from the model by {share:.1e} of"
-                " its range; allowed 1e-9"
+                f"{self.what}: {what} differs from the model by {worst:.1e} of its range; allowed"
+                f" {_SAME:g}"
             )
-        return share
+        return {"steps": len(motion), "share_of_range": worst}
 
-    def card(share: float) -> dict[str, Any]:
+    def card(self) -> dict[str, Any]:
+        """Return what a controller needs to know."""
+        guarded = GuardedForce(self.inner, self.ranges)
+        accepted = torch.stack((guarded.least, guarded.most), dim=1).tolist()
         return {
             "schema": "residnet.feed_forward/1",
             "arguments": {
@@ -246,14 +274,7 @@ def export_feed_forward(
                 " `accepted` the nearest value of the training range; `outside` is then true, as"
                 " for every motion beyond the training range"
             ),
-            "accepted": {
-                name: list(limits)
-                for name, limits in zip(
-                    MOTION,
-                    zip(guarded.least.tolist(), guarded.most.tolist(), strict=True),
-                    strict=True,
-                )
-            },
+            "accepted": dict(zip(MOTION, accepted, strict=True)),
             "outside_the_training_range": (
                 f"the correction of the believed model fades out over {FADE:g} of the range's"
                 f" width; no axis commands more than {EFFORT:g} times the believed model's force,"
@@ -262,18 +283,14 @@ def export_feed_forward(
             "mirror": (
                 "the correction is the mean of itself and its mirror image: a straight course needs"
                 " no sway force and no yaw moment beyond the believed model's"
-                if model.mirrored
+                if self.inner.mirrored
                 else "the correction is as it was fitted, not the same to port and starboard"
             ),
             "training_range": {
-                name: list(limits) for name, limits in zip(MOTION, ranges, strict=True)
+                name: list(limits) for name, limits in zip(MOTION, self.ranges, strict=True)
             },
-            "thruster_lag": lag,
-            "parity_share_of_range": share,
-            "safety": "TorchScript is code that runs when loaded: load only files that you trust.",
+            "thruster_lag": self.lag,
         }
-
-    return write_scripted(file, guarded, (), check, card)
 
 
 @final
@@ -286,13 +303,9 @@ class FeedForwardExporter(Exporter):
         "The force tau = F(nu_dot, nu) that a motion needs, from a model in force space."
     )
 
-    def export(
-        self,
-        spec: ModelSpec,
-        model: HybridDynamics,
-        file: Path,
-        rows: Sequence[Mapping[str, Any]],
-    ) -> Mapping[str, Any]:
-        """Write the feed-forward of a model and return its card; `rows` are not part of it."""
-        force, ranges = required_force(spec, model)
-        return export_feed_forward(force, None, ranges, file)
+    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+        """Write the feed-forward of a model and return its card."""
+        if not isinstance(exported, ExportedVessel):
+            raise UsageError(f"{exported.what}: a feed-forward is made of a vessel model alone")
+        force, ranges = required_force(exported.spec, exported.at(torch.float64))
+        return TorchScriptExporter().export(ExportedForce(exported.name, force, ranges), file)

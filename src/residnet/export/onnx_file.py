@@ -1,48 +1,64 @@
-"""The format `onnx`: the model's step as an ONNX graph, memory in and out, any number of rows."""
+"""The format `onnx`: a step as an ONNX graph, memory in and out, any number of rows."""
 
 from __future__ import annotations
 
-import copy
 import importlib
 import json
 import logging
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, final
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
-from residnet.core.names import STATE
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec
-from residnet.export import contract
-from residnet.export.base import Exporter
-from residnet.export.card import make_card
-from residnet.export.contract import (
-    Apart,
+from residnet.core.files import whole
+from residnet.export.base import (
+    SINGLE,
+    Exported,
+    Exporter,
+    Loaded,
     Numbers,
-    accepted,
-    checked,
-    require_numbers,
-    require_tracks,
-    warmed,
+    RoundingError,
+    in_precision,
+    name_of,
+    require_package,
 )
-from residnet.export.packages import require_package
-from residnet.export.stepping import Step, StepWithoutMemory
 
-_INPUTS, _OUTPUTS = ("x", "w", "s"), ("x_after", "s_after", "outside")
-# onnxruntime computes sines of doubles to thirteen digits
-_DOUBLE = 1e-7
+_TOLERANCE = {torch.float32: SINGLE, torch.float64: 1e-7}
+"""Largest share of a range; onnxruntime computes sines of doubles to thirteen digits."""
 
 
-class OnnxModel:
-    """An ONNX file in onnxruntime, for one vessel."""
+class _Sized(nn.Module):
+    """A step without the arguments and results in which there is nothing, which ONNX refuses."""
 
-    def __init__(self, file: Path, spec: ModelSpec, model: HybridDynamics) -> None:
+    def __init__(self, exported: Exported, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.inner = exported.graph(dtype)
+        self.sizes = [count for _, count in exported.arguments]
+        self.kept = [exported.results.index(name) for name in _results(exported)]
+
+    def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
+        rest = iter(given)
+        empty = given[0][:, :0]
+        found = self.inner(*(next(rest) if count else empty for count in self.sizes))
+        return tuple(found[i] for i in self.kept)
+
+
+def _results(exported: Exported) -> list[str]:
+    """Return the names of the results in which there is something."""
+    empty = any(count == 0 for _, count in exported.arguments)
+    return [name for name in exported.results if not (empty and name == "s_after")]
+
+
+class OnnxModel(Loaded):
+    """An ONNX file in onnxruntime."""
+
+    def __init__(self, file: Path, exported: Exported) -> None:
         runtime = importlib.import_module("onnxruntime")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -51,28 +67,20 @@ class OnnxModel:
         )
         double = self.session.get_inputs()[0].type == "tensor(double)"
         self.dtype: Any = np.float64 if double else np.float32
-        self.memory = model.n_state
-        self.measured = accepted(spec, model)
+        self.exported = exported
 
-    def step(self, x: Numbers, w: Numbers, s: Numbers) -> tuple[Numbers, Numbers, bool]:
-        """Return state, memory and flag one step later."""
-        after, memory, outside = self.rows(x[None], w[None], s[None])
-        return after[0], memory[0], bool(outside[0])
+    def step(self, *given: Numbers) -> tuple[Any, ...]:
+        """Return the results of one step."""
+        return tuple(part[0] for part in self.rows(*(part[None] for part in given)))
 
-    def rows(self, x: Numbers, w: Numbers, s: Numbers) -> tuple[Numbers, Numbers, Numbers]:
-        """Return states [B, 6], memories [B, n_state] and flags [B] one step later."""
-        given = {"x": np.asarray(x, self.dtype), "w": np.asarray(w, self.dtype)}
-        if self.memory == 0:
-            after, outside = self.session.run(["x_after", "outside"], given)
-            return after, np.asarray(s, self.dtype), outside
-        after, memory, outside = self.session.run(
-            list(_OUTPUTS), given | {"s": np.asarray(s, self.dtype)}
-        )
-        return after, memory, outside
-
-    def warmup(self, y: Numbers, w: Numbers) -> Numbers:
-        """Return the memory that a measured past leaves."""
-        return warmed(self.measured, self.step, y, w, np.zeros(self.memory, self.dtype))
+    def rows(self, *given: Numbers) -> tuple[Any, ...]:
+        """Return the results of one step of many rows."""
+        exported = self.exported
+        whole_ = zip(exported.arguments, given, strict=True)
+        fed = {name: np.asarray(part, self.dtype) for (name, count), part in whole_ if count}
+        names = _results(exported)
+        found = dict(zip(names, self.session.run(names, fed), strict=True))
+        return tuple(found.get(name, given[-1]) for name in exported.results)
 
 
 @final
@@ -83,107 +91,92 @@ class OnnxExporter(Exporter):
     suffix: ClassVar[str] = ".onnx"
     about: ClassVar[str] = "The model's step as ONNX, memory in and out, any number of rows."
 
-    def export(
-        self,
-        spec: ModelSpec,
-        model: HybridDynamics,
-        file: Path,
-        rows: Sequence[Mapping[str, Any]],
-    ) -> Mapping[str, Any]:
-        """Write the model, its card under the key `card` of the metadata.
+    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+        """Write the graph, its card under the key `card` of the metadata.
 
         It is in float64 where float32 does not determine the track.
         """
         for package in ("onnx", "onnxscript", "onnxruntime"):
             require_package(package, "format onnx")
-        require_numbers(spec, model)
-        model = copy.deepcopy(model).eval().requires_grad_(False)
-        card = make_card(spec, model, rows, {}) | {
-            "format": "onnx",
-            "safety": "The file holds numbers and operations; onnxruntime runs no code of it.",
-        }
-        with tempfile.TemporaryDirectory() as name:
-            partial = Path(name) / file.name
+        exported.require_numbers()
+        with tempfile.TemporaryDirectory() as folder:
+            partial = Path(folder) / file.name
+            said: list[str] = []
+
+            def attempt(dtype: torch.dtype) -> dict[str, Any]:
+                try:
+                    return _checked(exported, partial, dtype)
+                except RoundingError as error:
+                    said.append(str(error))
+                    raise
+
+            states = importlib.import_module("onnxruntime.capi.onnxruntime_pybind11_state")
             try:
-                parity = _checked(spec, copy.deepcopy(model).float(), partial, torch.float32)
-            except Apart as error:
-                parity = _in_double(spec, model, partial, error)
-                card |= {"dtype": "float64"}
-            card |= {"parity": parity}
+                dtype, parity = in_precision(exported, attempt)
+            except (states.NotImplemented, states.InvalidGraph) as error:
+                lacks = str(error).strip().splitlines()[0]
+                raise ExportError(
+                    f"{'; '.join([*said, exported.what])}: onnxruntime says: {lacks}"
+                ) from None
+            card = exported.card() | {
+                "format": "onnx",
+                "dtype": name_of(dtype),
+                "safety": "The file holds numbers and operations; onnxruntime runs no code of it.",
+                "parity": parity,
+            }
             onnx = importlib.import_module("onnx")
             graph = onnx.load(str(partial))
             onnx.helper.set_model_props(graph, {"card": json.dumps(card)})
-            file.parent.mkdir(parents=True, exist_ok=True)
-            ready = file.with_name(file.name + ".partial")
-            onnx.save(graph, str(ready))
-            ready.replace(file)
+            with whole(file) as ready:
+                onnx.save(graph, str(ready))
         return card
 
 
-def _checked(
-    spec: ModelSpec, model: HybridDynamics, file: Path, dtype: torch.dtype
-) -> dict[str, Any]:
-    """Write the graph in a precision and return what a card says of its parity.
+def _checked(exported: Exported, file: Path, dtype: torch.dtype) -> dict[str, Any]:
+    """Write the graph in a precision and return what a card says of its parity."""
+    _write(exported, file, dtype)
+    loaded = OnnxModel(file, exported)
+    random = np.random.default_rng(0)
+    given = [random.uniform(0.0, 0.1, (3, count)) for _, count in exported.arguments]
+    together, alone = loaded.rows(*given), Loaded.rows(loaded, *given)
+    if not all(map(_alike, together, alone)):
+        raise ExportError(
+            f"{exported.what}: the ONNX file gives other answers for several rows at once than for"
+            " each alone"
+        )
+    return exported.check(loaded, "the ONNX file", dtype, _TOLERANCE[dtype])
+
+
+def _alike(one: Numbers, other: Numbers) -> bool:
+    return bool(np.allclose(one, other, rtol=1e-5, atol=1e-5))
+
+
+def _write(exported: Exported, file: Path, dtype: torch.dtype) -> None:
+    """Write the graph.
 
     Raises:
-        Apart: where the precision does not determine the track.
-        ExportError: where the graph is wrong otherwise.
+        ExportError: where torch cannot express the step in ONNX.
     """
-    _write(spec, model, file, dtype)
-    stepped = OnnxModel(file, spec, model)
-    tolerance = _DOUBLE if dtype == torch.float64 else contract.SINGLE
-    found = checked(spec, model, stepped, "the ONNX file", dtype, tolerance)
-    _require_rows(stepped, spec, model)
-    # onnxruntime adds up in another order than torch, which shows in double precision too
-    require_tracks(spec, model, stepped.rows, "the ONNX file", dtype, tolerance)
-    return found
-
-
-def _in_double(spec: ModelSpec, model: HybridDynamics, file: Path, single: Apart) -> dict[str, Any]:
-    """Write the graph in float64.
-
-    Raises:
-        ExportError: where onnxruntime lacks an operation in this precision: then the message is
-            that of single precision.
-    """
-    states = importlib.import_module("onnxruntime.capi.onnxruntime_pybind11_state")
-    try:
-        return _checked(spec, model.double(), file, torch.float64)
-    except (states.NotImplemented, states.InvalidGraph) as error:
-        lacks = str(error).strip().splitlines()[0]
-        raise ExportError(f"{single}; in double precision onnxruntime says: {lacks}") from None
-
-
-def _write(spec: ModelSpec, model: HybridDynamics, file: Path, dtype: torch.dtype) -> None:
-    """Write the graph; a model without a memory has neither `s` nor `s_after`.
-
-    Raises:
-        ExportError: where torch cannot express the model in ONNX.
-    """
-    kept = slice(None) if model.n_state else slice(0, 2)
-    sizes = [len(STATE), len(spec.signals.columns), model.n_state][kept]
-    step = Step(model, spec) if model.n_state else StepWithoutMemory(model, spec)
-    step = step.to(dtype)
-    results = [name for name in _OUTPUTS if model.n_state or name != "s_after"]
+    given = [(name, count) for name, count in exported.arguments if count]
     rows = {0: torch.export.Dim("rows", min=1)}
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")
             program = torch.onnx.export(
-                step.eval(),
-                tuple(torch.zeros(2, size, dtype=dtype) for size in sizes),
+                _Sized(exported, dtype).eval(),
+                tuple(torch.zeros(2, count, dtype=dtype) for _, count in given),
                 dynamo=True,
                 verbose=False,
-                input_names=list(_INPUTS[kept]),
-                output_names=results,
-                dynamic_shapes=tuple(rows for _ in sizes),
+                input_names=[name for name, _ in given],
+                output_names=_results(exported),
+                dynamic_shapes=(tuple(rows for _ in given),),
                 custom_translation_table={torch.ops.aten.scalar_tensor.default: _scalar},
             )
     except torch.onnx.OnnxExporterError as error:
         first = str(error).strip().splitlines()[0]
         raise ExportError(
-            f"model {spec.name}: ONNX cannot hold its step ({first}); export it as torchscript"
+            f"{exported.what}: ONNX cannot hold its step ({first}); export it as torchscript"
         ) from None
     assert program is not None
     program.save(str(file))
@@ -196,23 +189,3 @@ def _scalar(
     ir = importlib.import_module("onnx_ir")
     kind = ir.DataType(dtype if dtype > 0 else ir.DataType.FLOAT)
     return importlib.import_module("onnxscript").opset18.Constant(value=ir.tensor(s, dtype=kind))
-
-
-def _require_rows(stepped: OnnxModel, spec: ModelSpec, model: HybridDynamics) -> None:
-    """Refuse a graph whose rows disturb each other.
-
-    Raises:
-        ExportError: where three rows together differ from each alone.
-    """
-    generator = torch.Generator().manual_seed(0)
-    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
-    seen = low + torch.rand(3, low.numel(), generator=generator) * (high - low)
-    x = torch.cat((torch.zeros(3, 3), seen[:, :3]), dim=1).numpy()
-    w, s = seen[:, 3:].numpy(), np.zeros((3, model.n_state))
-    together = stepped.rows(x, w, s)[0]
-    alone = np.stack([stepped.step(*row)[0] for row in zip(x, w, s, strict=True)])
-    if not np.allclose(together, alone, rtol=1e-5, atol=1e-5):
-        raise ExportError(
-            f"model {spec.name}: the ONNX file gives other states for several rows at once than"
-            " for each alone"
-        )

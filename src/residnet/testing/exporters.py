@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from residnet.core.errors import UsageError
-from residnet.export import Exporter
+from residnet.export import ExportedVessel, Exporter
 from residnet.testing.examples import example_models
 from residnet.testing.require import require, require_equal
 
@@ -34,7 +34,7 @@ def check_exporter(exporter: Exporter) -> None:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "exports" / f"{spec.name}{exporter.suffix}"
             try:
-                card = exporter.export(spec, model, file, [])
+                card = exporter.export(ExportedVessel(spec, model), file)
             except UsageError as error:
                 require("\n" not in str(error), f"{who}: refuses a model in more than one line")
                 require(not file.exists(), f"{who}: leaves a file of a model that it refuses")

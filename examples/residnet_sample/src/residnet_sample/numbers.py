@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, final
 
 import numpy as np
 
-from residnet.core.errors import ExportError
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec
-from residnet.export import Exporter
+from residnet.core.errors import ExportError, UsageError
+from residnet.export import Exported, ExportedVessel, Exporter
 
 
 @final
@@ -22,17 +20,13 @@ class NumbersExporter(Exporter):
     suffix: ClassVar[str] = ".csv"
     about: ClassVar[str] = "every number of a model as a table of text (sample package)"
 
-    def export(
-        self,
-        spec: ModelSpec,
-        model: HybridDynamics,
-        file: Path,
-        rows: Sequence[Mapping[str, Any]],
-    ) -> Mapping[str, Any]:
+    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
         """Write the table, read it back, and return how many numbers it holds."""
+        if not isinstance(exported, ExportedVessel):
+            raise UsageError(f"{exported.what}: only the numbers of vessel models are written")
         numbers = [
             (f"{name},{index}", float(value))
-            for name, tensor in model.state_dict().items()
+            for name, tensor in exported.model.state_dict().items()
             for index, value in enumerate(tensor.reshape(-1).tolist())
         ]
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -40,4 +34,4 @@ class NumbersExporter(Exporter):
         back = [float(line.rsplit(",", 1)[1]) for line in file.read_text().splitlines()]
         if not np.array_equal(back, [value for _, value in numbers], equal_nan=True):
             raise ExportError(f"{file}: the table does not give the model's numbers back")
-        return {"model": spec.name, "numbers": len(numbers)}
+        return {"model": exported.name, "numbers": len(numbers)}

@@ -69,7 +69,8 @@ from residnet.documents.jervan2020.residual import (
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.export.feed_forward import RequiredForce, export_feed_forward
+from residnet.export.feed_forward import ExportedForce, RequiredForce
+from residnet.export.torchscript import TorchScriptExporter
 from residnet.heads.zero import ZeroHead
 from residnet.judge.still_fits import StillFitsConfig, Verdict, still_fits
 from residnet.judge.tracking import Tracking, mse, tracking
@@ -833,7 +834,8 @@ def write_results(config: FerryStudyConfig, found: Study, folder: RunFolder) -> 
         figures += model_figures(name, config.models[name], model.fit, found.unmodelled)
         force = RequiredForce(*model.model.parts(), mirrored=True)
         file = folder.exports / f"{name}_feed_forward.pt"
-        export_feed_forward(force, model.notes.get("lag"), ranges, file)
+        exported = ExportedForce(name, force, ranges, model.notes.get("lag"))
+        TorchScriptExporter().export(exported, file)
     forward, not_forward = _run_forward(config, found, folder)
     results = _content(config, found, not_forward) | {"forward": forward}
     folder.write_json(folder.path / FILE, results)

@@ -21,7 +21,8 @@ from residnet.control.observed.config import AnyController, ObservedConfig
 from residnet.core.progress import say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.store import rebuilt
-from residnet.export.autopilot import export_autopilot
+from residnet.export.policy import ExportedHeading
+from residnet.export.torchscript import TorchScriptExporter
 from residnet.judge.autopilots import QUANTITIES
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
@@ -196,7 +197,8 @@ def _export(
         about |= {"conditions": config.conditions.stated.model_dump(mode="json")}
     metrics = [row for row in rows if row["model"] == name]
     file = folder.exports / f"{name}.pt"
-    export_autopilot(name, policy, file, safe=config.safe, about=about, metrics=metrics)
+    exported = ExportedHeading(name, policy, safe=config.safe, about=about, metrics=metrics)
+    TorchScriptExporter().export(exported, file)
     return file
 
 

@@ -65,31 +65,34 @@ class AutopilotConfig(AutopilotSettings):
         policies = {**self.policies, **self.recurrent}
         if model not in policies:
             raise UsageError(f"{run.path}: no policy '{model}'{nearest(model, policies)}")
-        if file_format not in ("torchscript", "c"):
-            raise UsageError(
-                f"{run.path}: policies are exported as torchscript or c, not as {file_format}"
-            )
         file = run.exports / f"{model}.pt"
         if not file.is_file():
             raise UsageError(f"{file}: no such file; the run writes it at its end")
-        if file_format == "c":
-            return self._export_as_c(run, model, file, out or file.with_suffix(".c"))
+        if file_format != "torchscript":
+            return self._export_as(file_format, run, model, file, out)
         if out is None:
             return file
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, out)
         return out
 
-    def _export_as_c(self, run: RunFolder, model: str, scripted: Path, file: Path) -> Path:
-        """Write a policy as C, at the step and with the card of its TorchScript file."""
+    def _export_as(
+        self, file_format: str, run: RunFolder, model: str, scripted: Path, out: Path | None
+    ) -> Path:
+        """Write a policy at the step and with the card of its TorchScript file."""
         import torch
 
-        from residnet.export.c.policy import export_autopilot_as_c
+        from residnet.export import exporter
+        from residnet.export.policy import ExportedHeading
         from residnet.tasks.autopilot.stored import stored_policy
 
-        extra = {"card.json": ""}
+        chosen, extra = exporter(file_format), {"card.json": ""}
         torch.jit.load(str(scripted), _extra_files=extra)
         card = json.loads(extra["card.json"])
         policy = stored_policy(self, run.models, model, card["dt"])
-        export_autopilot_as_c(model, policy, file, safe=self.safe, card=card)
+        file = out or scripted.with_name(f"{model}{chosen.suffix}")
+        exported = ExportedHeading(
+            model, policy, safe=self.safe, about=card, metrics=card["metrics"]
+        )
+        chosen.export(exported, file)
         return file

@@ -20,7 +20,7 @@ from residnet.control.observed.policy import ObservedPolicy
 from residnet.control.observed.stored import RecurrentPolicy, RecurrentSpec
 from residnet.core.progress import report, say
 from residnet.dynamics.store import rebuilt
-from residnet.export.c.closed_loop import CompiledLoop
+from residnet.export.closed_loop import CompiledLoop
 from residnet.judge.conditions import QUIET_FLIGHTS, drawn, judged, swinging
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder

@@ -48,7 +48,8 @@ class CourseExport(NamedTuple):
 
     def write(self, rows: Sequence[dict[str, Any]]) -> Path:
         """Export, with the policy's rows of metrics.json in the card; returns the file."""
-        from residnet.export.course import export_course
+        from residnet.export.policy import ExportedCoursePolicy
+        from residnet.export.torchscript import TorchScriptExporter
 
         config, protocol = self.config, self.planned.protocol
         file = self.folder / f"{self.name}.pt"
@@ -60,40 +61,47 @@ class CourseExport(NamedTuple):
         metrics = [
             row for row in rows if row["protocol"] == protocol and row["model"] == config.policy
         ]
-        export_course(
+        exported = ExportedCoursePolicy(
             config.policy,
             self.policy,
             self.guidance,
             self.planned.course,
-            file,
             safe=config.safe,
             about=about,
             metrics=metrics,
         )
+        TorchScriptExporter().export(exported, file)
         return file
 
 
-def export_as_c(
-    config: CourseSettings, run: RunFolder, protocol: Protocol, scripted: Path, file: Path
+def export_as(
+    file_format: str,
+    config: CourseSettings,
+    run: RunFolder,
+    protocol: Protocol,
+    scripted: Path,
+    out: Path | None,
 ) -> Path:
-    """Write a policy with the guidance of a course, planned again, as C; returns the file.
+    """Write a policy with the guidance of a course, planned again; returns the file.
 
     Args:
+        file_format: one of `residnet list formats`.
         config: of the course.
         run: its folder.
         protocol: that the course was planned by.
-        scripted: the TorchScript file, whose card the C file takes.
-        file: where to write.
+        scripted: the TorchScript file, whose card the new file takes.
+        out: where to write; None for beside the TorchScript file.
 
     Raises:
-        ExportError: where the plan is not the one that was flown, or the C file does not reproduce
+        ExportError: where the plan is not the one that was flown, or the file does not reproduce
             policy and guidance.
     """
     import torch
 
-    from residnet.export.c.course import export_course_as_c
+    from residnet.export import exporter
+    from residnet.export.policy import ExportedCoursePolicy
 
-    extra = {"card.json": ""}
+    chosen, extra = exporter(file_format), {"card.json": ""}
     torch.jit.load(str(scripted), _extra_files=extra)
     card = json.loads(extra["card.json"])
     known = ready(config, run)
@@ -104,13 +112,15 @@ def export_as_c(
             f"{scripted}: its course has {card['length']:.3f} m, planned again {length:.3f} m;"
             " carry the run out again with this version"
         )
-    export_course_as_c(
+    file = out or scripted.with_name(f"{scripted.stem}{chosen.suffix}")
+    exported = ExportedCoursePolicy(
         scripted.stem,
         load_policy(known, config.policy),
         guidance,
         planned.course,
-        file,
         safe=config.safe,
-        card=card,
+        about=card,
+        metrics=card["metrics"],
     )
+    chosen.export(exported, file)
     return file

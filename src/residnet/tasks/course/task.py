@@ -60,7 +60,7 @@ class CourseTaskConfig(CourseSettings):
     def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
         """Return the file of a policy with the guidance of a course, named after both.
 
-        TorchScript was exported and checked when the run ended; C is written now.
+        TorchScript was exported and checked when the run ended; other formats are written now.
 
         Raises:
             UsageError: where there is no such file, or another format is given.
@@ -68,17 +68,13 @@ class CourseTaskConfig(CourseSettings):
         names = {f"{self.policy}_{protocol}": protocol for protocol in self.protocols}
         if model not in names:
             raise UsageError(f"{run.path}: no export '{model}'{nearest(model, names)}")
-        if file_format not in ("torchscript", "c"):
-            raise UsageError(
-                f"{run.path}: courses are exported as torchscript or c, not as {file_format}"
-            )
         file = run.exports / f"{model}.pt"
         if not file.is_file():
             raise UsageError(f"{file}: no such file; the run writes it at its end")
-        if file_format == "c":
-            from residnet.tasks.course.exporting import export_as_c
+        if file_format != "torchscript":
+            from residnet.tasks.course.exporting import export_as
 
-            return export_as_c(self, run, names[model], file, out or file.with_suffix(".c"))
+            return export_as(file_format, self, run, names[model], file, out)
         if out is None:
             return file
         out.parent.mkdir(parents=True, exist_ok=True)

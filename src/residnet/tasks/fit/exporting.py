@@ -7,7 +7,7 @@ from pathlib import Path
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.dynamics.store import load_model, model_names
-from residnet.export import exporter
+from residnet.export import ExportedVessel, exporter
 from residnet.runs.folder import RunFolder
 
 
@@ -34,5 +34,5 @@ def export_model(run: RunFolder, name: str, out: Path | None, file_format: str) 
     spec, model = load_model(run.models / chosen)
     rows = [row for row in metrics["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"]
     file = out or run.exports / f"{chosen}{chosen_format.suffix}"
-    chosen_format.export(spec, model, file, rows)
+    chosen_format.export(ExportedVessel(spec, model, rows), file)
     return file

@@ -1,7 +1,8 @@
 """A closed loop and its gradient as compiled C: many flights at once, and training through them.
 
-Torch records one step of the loop, and the product of a step's Jacobian with a gradient; both are
-written as C for blocks of rows, compiled for this machine and called for whole flights.
+One step of the loop becomes a CasADi function of single numbers. It and the product of its Jacobian
+with a gradient are written for blocks of rows by the vector types that gcc and clang know, compiled
+for this machine and called for whole flights.
 """
 
 from __future__ import annotations
@@ -9,21 +10,224 @@ from __future__ import annotations
 import copy
 import ctypes
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any, final
 
+import casadi as ca
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
 from residnet.dynamics.rollout import Rollout
-from residnet.export.c.kept import compiled_library
-from residnet.export.c.lanes import lanes
-from residnet.export.c.loop_source import loop_source
+from residnet.export.c_code import FUNCTIONS, Body, Tables, compiled_library, literal
+from residnet.export.lowering import in_numbers, lowered
 
 _CHECKED, _SAME = 40, 5e-3
 """Steps of the flight that the compiled loop is checked by, and how far it may be off."""
+_HANDED_ON = ("x", "s", "q")
+"""State, memory of the vessel and memory of the controller, which a step hands on."""
+_WHAT = "closed loop"
+_TWO = ("atan2", "hypot", "pow", "fmod", "copysign")
+
+
+_PRELUDE = (
+    "#include <math.h>\n#include <string.h>\n"
+    "#define ZERO ((REAL)0)\n#define ONE ((REAL)1)\n"
+    "typedef REAL V __attribute__((vector_size(sizeof(REAL) * LANES)));\n"
+    "typedef REAL U __attribute__((vector_size(sizeof(REAL) * LANES), aligned(4), may_alias));\n"
+    "typedef INT I __attribute__((vector_size(sizeof(REAL) * LANES)));\n"
+    "#define ALL(number) ((V){0} + (REAL)(number))\n"
+    "#define EACH for (int l = 0; l < LANES; l++)\n"
+    "static inline V pick(I c, V a, V b) { return (V)((c & (I)a) | (~c & (I)b)); }\n"
+    + "".join(
+        f"static __attribute__((noinline)) V v_{name}"
+        + ("(V a, V b)" if name in _TWO else "(V a)")
+        + f" {{ V o; EACH o[l] = R({name})(a[l]{', b[l]' if name in _TWO else ''}); return o; }}\n"
+        for name in sorted(set(FUNCTIONS.values()))
+    )
+)
+
+
+def prelude(dtype: torch.dtype) -> str:
+    """Return what stands at the top of a file in this precision."""
+    single = dtype == torch.float32
+    words = {
+        "LANES": lanes(dtype),
+        "REAL": "float" if single else "double",
+        "INT": "int" if single else "long long",
+        "R(name)": "name##f" if single else "name",
+        "BIG": "3e38f" if single else "1e308",
+    }
+    return "".join(f"#define {name} {text}\n" for name, text in words.items()) + _PRELUDE
+
+
+def lanes(dtype: torch.dtype) -> int:
+    """Return the number of rows of a block, which one vector of 64 bytes holds."""
+    return 64 // dtype.itemsize
+
+
+class _Lanes(Body):
+    """Writes a function of single numbers for a block of `LANES` rows.
+
+    An entry of an argument or result stands `stride` numbers behind the one before it, and the rows
+    of an entry stand side by side. Numbers `theta` are shared by all rows, and results `total` are
+    added up over all calls, for each lane by itself.
+    """
+
+    REAL, FLAG = "V", "I"
+    unrolled = math.inf
+    joined: Mapping[int, str] = {
+        ca.OP_NOT: "~{0}", ca.OP_AND: "{0} & {1}", ca.OP_OR: "{0} | {1}"
+    }  # fmt: skip
+
+    def literal(self, value: float) -> str:
+        return f"ALL({literal(value)})"
+
+    def argument(self, name: str, place: int) -> str:
+        if name == "theta":
+            return f"ALL({name}[{place}])"
+        return f"(*(const U *)({name} + {place} * stride))"
+
+    def real(self, cell: str, flag: bool) -> str:
+        return f"pick({cell}, ALL(ONE), ALL(ZERO))" if flag else cell
+
+    def truth(self, cell: str, flag: bool) -> str:
+        return cell if flag else f"({cell} != ZERO)"
+
+    def pick(self, condition: str, value: str, alternative: str) -> str:
+        return f"pick({condition}, {value}, {alternative})"
+
+    def call(self, name: str, row: Sequence[str]) -> str:
+        return f"v_{name}({', '.join(row)})"
+
+
+def _function(name: str, function: ca.Function) -> str:
+    """Return the C function of a step for a block of rows."""
+    body = _Lanes(function, Tables(""), _WHAT)
+    ends = [
+        f"*(U *)({result} + {i} * LANES) += {cell};"
+        if result == "total"
+        else f"*(U *)({result} + {i} * stride) = {cell};"
+        for result, cells in zip(function.name_out(), body.results, strict=True)
+        for i, cell in enumerate(cells)
+        if result != "total" or cell != body.zero
+    ]
+    given = [f"const REAL *restrict {argument}" for argument in body.names]
+    taken = [f"REAL *restrict {result}" for result in function.name_out()]
+    head = f"static void {name}({', '.join((*given, *taken))}, const long stride)"
+    return head + " {\n" + "\n".join(body.read(ends)) + "\n}\n"
+
+
+class _Step(nn.Module):
+    """One step of a closed loop."""
+
+    def __init__(self, rollout: Rollout) -> None:
+        super().__init__()
+        self.rollout = rollout
+
+    def forward(self, x: Tensor, w: Tensor, s: Tensor, q: Tensor) -> tuple[Tensor, ...]:
+        """Return state, memory of the vessel, memory of the controller, and what acted."""
+        acting, q = self.rollout.source(x, w, 0, q)
+        x, s = self.rollout.model.step(x, acting, s)
+        return x, s, q, acting
+
+
+def loop_source(
+    rollout: Rollout,
+    examples: Sequence[Tensor],
+    shared: Mapping[str, Tensor],
+    own: Mapping[str, Tensor],
+    sizes: Mapping[str, int],
+    dtype: torch.dtype,
+    gradient: bool,
+) -> str:
+    """Return the source file with the functions `fly` and, where it is wanted, `back`.
+
+    Args:
+        rollout: the closed loop in float64.
+        examples: x, w, s, q, shared and own numbers of a row, each [1, n].
+        shared: numbers of the loop that all rows share, as one row has them.
+        own: numbers that every row has for itself.
+        sizes: number of entries of each example, and `a` of what acts.
+        dtype: precision of the file.
+        gradient: whether the gradient for the shared numbers is written.
+    """
+    one, groups = _Step(rollout), (shared, own)
+
+    def step(x: Tensor, w: Tensor, s: Tensor, q: Tensor, *numbers: Tensor) -> Any:
+        weights = {}
+        for group, given in zip(groups, numbers, strict=True):
+            pieces = given[0].split([part.numel() for part in group.values()])
+            for (name, part), piece in zip(group.items(), pieces, strict=True):
+                weights[f"rollout.{name}"] = piece.reshape(part.shape)
+        return torch.func.functional_call(one, weights, (x, w, s, q))
+
+    arguments = [(name, sizes[name]) for name in ("x", "w", "s", "q", "theta", "own")]
+    after = [f"{name}_after" for name in (*_HANDED_ON, "a")]
+    function = in_numbers(lowered(step, arguments, after, _WHAT, examples))
+    functions = [_function("step", function)]
+    if gradient:
+        functions.append(_function("slope", _slope(function, sizes)))
+    numbers = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in sizes.items())
+    return "".join((prelude(dtype), numbers, _AT, *functions, FLY, *([BACK] if gradient else [])))
+
+
+def _slope(step: ca.Function, sizes: Mapping[str, int]) -> ca.Function:
+    """Return the product of a step's Jacobian with the slopes of what it gives."""
+    given = [ca.SX.sym(name, sizes[name]) for name in step.name_in()]
+    slopes = [ca.SX.sym(f"{name}_slope", sizes[name]) for name in (*_HANDED_ON, "a")]
+    x, _, s, q, theta, _ = given
+    known = ca.vertcat(x, s, q, theta)
+    pulled = ca.jtimes(ca.vertcat(*step.call(given)), known, ca.vertcat(*slopes), True)
+    places = np.cumsum([0, *(sizes[name] for name in (*_HANDED_ON, "theta"))]).tolist()
+    parts = [pulled[a:b] for a, b in pairwise(places)]
+    names = [*step.name_in(), *(f"{name}_slope" for name in (*_HANDED_ON, "a"))]
+    found = [*(f"{name}_before" for name in _HANDED_ON), "total"]
+    return ca.Function("slope", [*given, *slopes], ca.cse(parts), names, found)
+
+
+_AT = """
+#define AT(array, n, k) (array + (n) * (k) * width + block * LANES)
+#define ROOM(n) (((n) ? (n) : 1) * LANES)
+#define TAKE(to, n, from) for (long i = 0; i < n; i++) EACH to[i * LANES + l] = from[i * width + l];
+"""
+FLY = """
+void fly(const REAL *theta, const REAL *own, REAL *x, const REAL *w, REAL *s, REAL *q, REAL *a,
+         long steps, long width, long block) {
+    for (long k = 0; k < steps; k++)
+        step(AT(x, N_X, k), AT(w, N_W, k), AT(s, N_S, k), AT(q, N_Q, k), theta, AT(own, N_OWN, 0),
+             AT(x, N_X, k + 1), AT(s, N_S, k + 1), AT(q, N_Q, k + 1), AT(a, N_A, k), width);
+}
+"""
+BACK = """
+void back(const REAL *theta, const REAL *own, const REAL *x, const REAL *w, const REAL *s,
+          const REAL *q, REAL *gx, const REAL *ga, REAL *total,
+          long steps, long width, long block) {
+    REAL slope_s[2][ROOM(N_S)], slope_q[2][ROOM(N_Q)], at_own[ROOM(N_OWN)];
+    memset(slope_s, 0, sizeof slope_s);
+    memset(slope_q, 0, sizeof slope_q);
+    TAKE(at_own, N_OWN, AT(own, N_OWN, 0))
+    for (long k = steps - 1; k >= 0; k--) {
+        REAL slope_x[ROOM(N_X)], slope_a[ROOM(N_A)], before_x[ROOM(N_X)];
+        REAL at_x[ROOM(N_X)], at_w[ROOM(N_W)], at_s[ROOM(N_S)], at_q[ROOM(N_Q)];
+        TAKE(slope_x, N_X, AT(gx, N_X, k + 1))
+        TAKE(slope_a, N_A, AT(ga, N_A, k))
+        TAKE(at_x, N_X, AT(x, N_X, k))
+        TAKE(at_w, N_W, AT(w, N_W, k))
+        TAKE(at_s, N_S, AT(s, N_S, k))
+        TAKE(at_q, N_Q, AT(q, N_Q, k))
+        slope(at_x, at_w, at_s, at_q, theta, at_own, slope_x, slope_s[k & 1], slope_q[k & 1],
+              slope_a, before_x, slope_s[~k & 1], slope_q[~k & 1],
+              total + block * N_THETA * LANES, LANES);
+        for (long i = 0; i < N_X; i++) EACH
+            AT(gx, N_X, k)[i * width + l] += before_x[i * LANES + l];
+    }
+}
+"""
+"""The slope of the state at a step's end is what came from outside and from the steps after it."""
 
 
 @final

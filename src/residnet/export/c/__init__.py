@@ -1,1 +1,0 @@
-"""The format `c`: one C99 source file and its header, without any runtime."""

@@ -1,0 +1,254 @@
+"""The formats `fmu` and `fmu2`: co-simulation units of FMI 3.0 and 2.0 around the exported C.
+
+The archive holds the sources, and the unit compiled for this machine.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import sys
+import tempfile
+import xml.etree.ElementTree as Xml
+import zipfile
+from abc import abstractmethod
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, ClassVar, Literal, final
+
+import torch
+
+from residnet.core.errors import ExportError, UsageError
+from residnet.core.files import whole
+from residnet.export.base import Exported, Exporter
+from residnet.export.c import CompiledModel, CSource, c_source
+from residnet.export.c_code import compile_shared
+from residnet.export.vessel import ExportedVessel
+
+INPUT, STATE, START, OUTSIDE = 1, 101, 201, 300
+"""First value references; `instance.h` counts in the same way."""
+NAME = "model"
+
+
+def description(card: Mapping[str, Any], token: str, version: str) -> str:
+    """Return modelDescription.xml for `version` 3.0 or 2.0."""
+    newer = version == "3.0"
+    root = Xml.Element(
+        "fmiModelDescription",
+        {
+            "fmiVersion": version,
+            "modelName": card["model"],
+            "instantiationToken" if newer else "guid": token,
+            "generationTool": f"residnet {card['versions']['residnet']}",
+            "description": "A vessel model; units are SI and radians. resources/card.json says"
+            " more.",
+        }
+        | ({} if newer else {"variableNamingConvention": "flat", "numberOfEventIndicators": "0"}),
+    )
+    unit = {"modelIdentifier": NAME, "canHandleVariableCommunicationStepSize": "true"}
+    dt = repr(float(card["dt"]))
+    if newer:
+        unit |= {"canGetAndSetFMUState": "true", "fixedInternalStepSize": dt}
+    else:
+        unit |= {"canGetAndSetFMUstate": "true"}
+    co_simulation = Xml.SubElement(root, "CoSimulation", unit)
+    if not newer:
+        files = Xml.SubElement(co_simulation, "SourceFiles")
+        for file in ("fmi2.c", "model_code.c"):
+            Xml.SubElement(files, "File", name=file)
+    Xml.SubElement(Xml.SubElement(root, "LogCategories"), "Category", name="logStatusError")
+    Xml.SubElement(root, "DefaultExperiment", startTime="0", stepSize=dt)
+    variables = Xml.SubElement(root, "ModelVariables")
+    references = _variables(variables, card, newer)
+    structure = Xml.SubElement(root, "ModelStructure")
+    parent = structure if newer else Xml.SubElement(structure, "Outputs")
+    for reference, index in references:
+        if newer:
+            Xml.SubElement(parent, "Output", valueReference=str(reference))
+        else:
+            Xml.SubElement(parent, "Unknown", index=str(index))
+    if not newer:
+        Xml.SubElement(structure, "InitialUnknowns").extend(
+            Xml.Element("Unknown", index=str(index)) for _, index in references
+        )
+    else:
+        for reference, _ in references:
+            Xml.SubElement(structure, "InitialUnknown", valueReference=str(reference))
+    Xml.indent(root)
+    return Xml.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _variables(parent: Xml.Element, card: Mapping[str, Any], newer: bool) -> list[tuple[int, int]]:
+    """Write the variables; return reference and index of each output."""
+    listed: list[tuple[str, int, str, str, str | None, str]] = []
+    if newer:
+        listed.append(("time", 0, "independent", "continuous", None, "s"))
+    listed += [
+        (entry["name"], INPUT + i, "input", "discrete", "0", entry["unit"])
+        for i, entry in enumerate(card["inputs"])
+    ]
+    listed += [
+        (entry["name"], STATE + i, "output", "discrete", None, entry["unit"])
+        for i, entry in enumerate(card["states"])
+    ]
+    listed += [
+        (f"{entry['name']}_start", START + i, "parameter", "fixed", "0", entry["unit"])
+        for i, entry in enumerate(card["states"])
+    ]
+    outputs = []
+    for index, (name, reference, causality, variability, start, unit) in enumerate(listed, start=1):
+        if causality == "output":
+            outputs.append((reference, index))
+        common = {
+            "name": name,
+            "valueReference": str(reference),
+            "causality": causality,
+            "variability": variability,
+            "description": unit,
+        }
+        value: dict[str, str] = {} if start is None else {"start": start}
+        if newer:
+            Xml.SubElement(parent, "Float64", common | value)
+        else:
+            Xml.SubElement(Xml.SubElement(parent, "ScalarVariable", common), "Real", value)
+    common = {
+        "name": "outside",
+        "valueReference": str(OUTSIDE),
+        "causality": "output",
+        "variability": "discrete",
+        "description": "beyond the training range, or an input that is no number",
+    }
+    outputs.append((OUTSIDE, len(listed) + 1))
+    if newer:
+        Xml.SubElement(parent, "Boolean", common)
+    else:
+        Xml.SubElement(Xml.SubElement(parent, "ScalarVariable", common), "Boolean")
+    return outputs
+
+
+_BUILD = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiBuildDescription fmiVersion="3.0">
+  <BuildConfiguration modelIdentifier="model">
+    <SourceFileSet language="C99">
+      <SourceFile name="fmi3.c"/>
+      <SourceFile name="model_code.c"/>
+    </SourceFileSet>
+  </BuildConfiguration>
+</fmiBuildDescription>
+"""
+
+
+class FmuExporter(Exporter):
+    """A co-simulation unit in double precision, with its sources."""
+
+    version: ClassVar[Literal["2.0", "3.0"]]
+    suffix: ClassVar[str] = ".fmu"
+
+    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+        """Write the unit; its card stands under `resources`."""
+        if not isinstance(exported, ExportedVessel):
+            raise UsageError(f"{exported.what}: an FMU holds a vessel model; export it as c")
+        exported.require_numbers()
+        card = exported.card() | {
+            "format": self.name,
+            "dtype": "float64",
+            "safety": "The unit holds compiled code that runs when loaded: load only what you"
+            " trust.",
+        }
+        written = c_source(exported, card, "model_code.h")
+        token = "{" + hashlib.sha256(written.source.encode()).hexdigest()[:32] + "}"
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            sources = self._sources(written, token, exported.spec.dt)
+            for part, text in sources.items():
+                (folder / part).write_text(text)
+            library = compile_shared(
+                [folder / part for part in sources if part.endswith(".c")],
+                folder / f"{NAME}{_library_suffix()}",
+            )
+            loaded = CompiledModel(library, exported, torch.float64)
+            card |= {"parity": exported.check(loaded, "the FMU's code", torch.float64)}
+            with (
+                whole(file) as partial,
+                zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive,
+            ):
+                archive.writestr("modelDescription.xml", description(card, token, self.version))
+                archive.writestr("resources/card.json", json.dumps(card, indent=1))
+                for part, text in sources.items():
+                    archive.writestr(f"sources/{part}", text)
+                if self.version == "3.0":
+                    archive.writestr("sources/buildDescription.xml", _BUILD)
+                archive.write(library, f"binaries/{self.platform()}/{library.name}")
+        return card
+
+    def _sources(self, written: CSource, token: str, dt: float) -> dict[str, str]:
+        """Return the source files by name."""
+        p, upper = written.prefix, written.prefix.upper()
+        model = (
+            f'#define {upper}_DOUBLE\n#include "model_code.h"\n\n'
+            f"#define MODEL_REAL {p}_real\n#define MODEL_STATES {upper}_STATES\n"
+            f"#define MODEL_INPUTS {upper}_INPUTS\n#define MODEL_MEMORY {upper}_MEMORY\n"
+            f"#define MODEL_DT {upper}_DT\n"
+            f'#define MODEL_DT_TEXT "{dt:g}"\n#define MODEL_STEP {p}_step\n'
+            f"#define MODEL_INITIAL_STATE {p}_initial_state\n"
+            f'#define MODEL_TOKEN "{token}"\n'
+        )
+        part = f"fmi{self.version[0]}.c"
+        return {
+            part: _packaged(part),
+            "instance.h": _packaged("instance.h"),
+            "model.h": model,
+            "model_code.c": f"#define {upper}_DOUBLE\n{written.source}",
+            "model_code.h": written.header,
+        }
+
+    @abstractmethod
+    def platform(self) -> str:
+        """Return this machine as the standard names it."""
+
+
+def _packaged(name: str) -> str:
+    return resources.files("residnet.export").joinpath(name).read_text()
+
+
+def _library_suffix() -> str:
+    return {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+
+
+def _machine() -> str:
+    names = {"x86_64": "x86_64", "amd64": "x86_64", "aarch64": "aarch64", "arm64": "aarch64"}
+    machine = platform.machine().lower()
+    if machine not in names:
+        raise ExportError(
+            f"format fmu: this machine ({machine}) has no name in the standard; export as c"
+        )
+    return names[machine]
+
+
+@final
+class Fmu3Exporter(FmuExporter):
+    """A co-simulation unit of FMI 3.0."""
+
+    name: ClassVar[str] = "fmu"
+    about: ClassVar[str] = "A co-simulation unit of FMI 3.0, with its C sources."
+    version: ClassVar[Literal["2.0", "3.0"]] = "3.0"
+
+    def platform(self) -> str:
+        """Return machine and system."""
+        system = {"win32": "windows", "darwin": "darwin"}.get(sys.platform, "linux")
+        return f"{_machine()}-{system}"
+
+
+@final
+class Fmu2Exporter(FmuExporter):
+    """A co-simulation unit of FMI 2.0."""
+
+    name: ClassVar[str] = "fmu2"
+    about: ClassVar[str] = "A co-simulation unit of FMI 2.0, with its C sources."
+    version: ClassVar[Literal["2.0", "3.0"]] = "2.0"
+
+    def platform(self) -> str:
+        """Return system and bits."""
+        return {"win32": "win64", "darwin": "darwin64"}.get(sys.platform, "linux64")

@@ -1,0 +1,426 @@
+"""A module's step as a CasADi function: every format that is no graph of torch is made from it.
+
+Torch records the step for one row as a graph of its core operations. A tensor becomes a column of
+its numbers in row order, so that whatever only moves numbers becomes a list of places.
+"""
+
+from __future__ import annotations
+
+import operator
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import casadi as ca
+import torch
+from torch import Tensor
+from torch.fx import GraphModule, Node
+from torch.utils import _pytree as tree
+
+from residnet.core.errors import ExportError
+
+_MOVES: Final = {
+    **dict.fromkeys(
+        (
+            "alias", "clone", "detach", "lift_fresh_copy", "view", "_unsafe_view", "reshape",
+            "permute", "t", "transpose", "expand", "select", "slice", "unsqueeze", "squeeze",
+            "index_select", "index", "gather", "flip", "roll", "repeat", "unbind", "split",
+            "split_with_sizes", "chunk", "diagonal", "unfold", "contiguous", "cat", "stack",
+        ),
+        (0,),
+    ),
+    "slice_scatter": (0, 1), "select_scatter": (0, 1), "index_copy": (0, 3),
+}  # fmt: skip
+"""Operations that only move numbers, with the places of the arguments whose numbers are moved."""
+_LIKE: Final = frozenset(
+    (
+        "full_like", "zeros_like", "ones_like", "empty_like", "new_zeros", "new_ones", "new_full",
+        "new_empty",
+    )
+)  # fmt: skip
+"""Operations whose result depends on the shape of their argument alone."""
+_SHORT: Final = 16
+"""Rows up to which a look-up is a chain of choices, which has derivatives and can be expanded."""
+
+
+def _chosen(condition: Any, a: Any, b: Any) -> Any:
+    return ca.if_else(condition, a, b)
+
+
+def _truncated(a: Any) -> Any:
+    return ca.sign(a) * ca.floor(ca.fabs(a))
+
+
+def _number(a: Any) -> Any:
+    # CasADi takes a == a to be true
+    return ca.logic_or(a <= 0, a > 0)
+
+
+_ELEMENTWISE: Final[dict[str, Callable[..., Any]]] = {
+    **{
+        name: getattr(ca, name)
+        for name in (
+            "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh",
+            "atanh", "exp", "expm1", "log", "log1p", "log10", "sqrt", "floor", "ceil", "erf",
+            "sign", "atan2", "hypot", "fmod", "copysign", "eq", "ne", "lt", "le", "gt", "ge",
+        )
+    },
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv,
+    "neg": operator.neg, "abs": ca.fabs, "square": lambda a: a * a,
+    "reciprocal": lambda a: 1.0 / a, "rsqrt": lambda a: 1.0 / ca.sqrt(a),
+    "sigmoid": lambda a: 1.0 / (1.0 + ca.exp(-a)), "relu": lambda a: ca.fmax(a, 0.0),
+    "trunc": _truncated, "round": lambda a: ca.floor(a + 0.5), "pow": ca.power,
+    "exp2": lambda a: ca.power(2.0, a), "log2": lambda a: ca.log(a) / ca.log(2.0),
+    "remainder": lambda a, b: a - b * ca.floor(a / b),
+    # comparisons with what is no number are false, so that it stays what it is
+    "maximum": lambda a, b: _chosen(a < b, b, a), "minimum": lambda a, b: _chosen(a > b, b, a),
+    "where": _chosen, "isnan": lambda a: ca.logic_not(_number(a)),
+    "isinf": lambda a: ca.eq(ca.fabs(a), ca.inf),
+    **dict.fromkeys(("logical_not", "bitwise_not"), ca.logic_not),
+    **dict.fromkeys(("logical_and", "bitwise_and"), ca.logic_and),
+    **dict.fromkeys(("logical_or", "bitwise_or"), ca.logic_or),
+    **dict.fromkeys(("logical_xor", "bitwise_xor"), ca.ne),
+}  # fmt: skip
+"""Operations on each element, on columns of one length or single numbers."""
+_FOLDS: Final = {
+    "sum": "add", "mean": "add", "amax": "maximum", "amin": "minimum", "prod": "mul",
+    "any": "logical_or", "all": "logical_and",
+}  # fmt: skip
+"""Reductions, with the operation that joins two numbers."""
+
+
+def lowered(
+    step: Callable[..., Any],
+    arguments: Sequence[tuple[str, int]],
+    results: Sequence[str],
+    what: str,
+    examples: Sequence[Tensor] | None = None,
+) -> ca.Function:
+    """Return the CasADi function of a step for one row in float64.
+
+    Args:
+        step: of tensors [1, size], returns as many tensors as there are `results`.
+        arguments: names and sizes.
+        results: names.
+        what: is lowered, for messages.
+        examples: arguments to record with; zeros where not given.
+
+    Raises:
+        ExportError: where an operation is not known, by its name, or Python decides by values.
+    """
+    if examples is None:
+        examples = [torch.zeros(1, size, dtype=torch.float64) for _, size in arguments]
+    columns = [ca.MX.sym(name, size) for name, size in arguments]
+    values: dict[Node, Any] = {}
+    given = iter(map(_Value, examples, columns))
+    graph = _recorded(step, examples, what)
+    for node in graph.graph.nodes:
+        if node.op == "placeholder":
+            values[node] = next(given)
+        elif node.op == "get_attr":
+            values[node] = _Value(operator.attrgetter(str(node.target))(graph).detach())
+        elif node.op == "output":
+            found = [values[output].column for output in tree.tree_leaves(node.args[0])]
+        else:
+            args, settings = torch.fx.node.map_arg((node.args, node.kwargs), values.__getitem__)
+            values[node] = _called(node.target, args, settings, what)
+    return ca.Function("step", columns, found, [name for name, _ in arguments], list(results))
+
+
+def in_numbers(function: ca.Function) -> ca.Function:
+    """Return a function of single numbers, where no look-up in a long table keeps it from that."""
+    looks_up = range(function.n_instructions())
+    if any(function.instruction_id(k) == ca.OP_GETNONZEROS_PARAM for k in looks_up):
+        return function
+    symbols = [ca.SX.sym(name, function.numel_in(name)) for name in function.name_in()]
+    found = ca.cse([*function.call(symbols)])
+    return ca.Function("step", symbols, found, function.name_in(), function.name_out())
+
+
+def _recorded(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -> GraphModule:
+    from torch._decomp import core_aten_decompositions
+    from torch.func import functionalize
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    # make_fx counts the parameters of what it records
+    wrapped = functionalize(lambda *given: step(*given), remove="mutations")
+    try:
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter("ignore")
+            table: Any = core_aten_decompositions()
+            return make_fx(wrapped, decomposition_table=table)(*examples)
+    except (RuntimeError, TypeError, ValueError, NotImplementedError) as error:
+        first = str(error).strip().splitlines()
+        raise ExportError(
+            f"{what}: its step cannot be recorded as a fixed sequence of operations"
+            f" ({first[0] if first else type(error).__name__}); export it as torchscript"
+        ) from error
+
+
+@dataclass
+class _Value:
+    """A tensor of the graph: what it is at the examples, and its numbers in row order.
+
+    There is no column of what is the same whatever is given.
+    """
+
+    example: Tensor
+    given: Any = None
+
+    @property
+    def constant(self) -> bool:
+        return self.given is None or self.example.numel() == 0
+
+    @property
+    def column(self) -> Any:
+        if self.given is None:
+            self.given = ca.MX(ca.DM(self.example.double().reshape(-1).tolist()))
+            return self.given
+        return self.given
+
+    @property
+    def places(self) -> Tensor:
+        return torch.arange(self.example.numel()).reshape(self.example.shape)
+
+
+def _taken(column: Any, places: Tensor) -> Any:
+    """Return the numbers of a column at known places."""
+    wanted = places.reshape(-1).tolist()
+    if wanted == list(range(column.shape[0])):
+        return column
+    # a single number that is taken many times makes a row
+    return ca.vec(column[wanted]) if wanted else ca.MX(0, 1)
+
+
+def _value(given: Any) -> _Value:
+    if isinstance(given, _Value):
+        return given
+    kind = torch.bool if isinstance(given, bool) else torch.float64
+    return _Value(torch.tensor(given, dtype=kind))
+
+
+def _each(op: str, example: Tensor, *given: Any) -> _Value:
+    """Return an operation on each element of values that are brought to one shape."""
+    columns = []
+    for value in map(_value, given):
+        places = value.places.expand(torch.broadcast_shapes(value.example.shape, example.shape))
+        alone = value.example.numel() == 1
+        columns.append(value.column if alone else _taken(value.column, places))
+    out = _ELEMENTWISE[op](*columns)
+    return _Value(
+        example, out if out.shape[0] == example.numel() else ca.repmat(out, example.numel(), 1)
+    )
+
+
+def _called(target: Any, args: Any, settings: Any, what: str) -> Any:
+    if target is operator.getitem:
+        return args[0][args[1]]
+    name = target._schema.name.removeprefix("aten::").removesuffix("_copy")
+    leaves = [leaf for leaf in tree.tree_leaves((args, settings)) if isinstance(leaf, _Value)]
+
+    def plain(part: Any) -> Any:
+        return tree.tree_map(lambda leaf: leaf.example if isinstance(leaf, _Value) else leaf, part)
+
+    example = target(*plain(args), **plain(settings))
+    if name in _LIKE or all(leaf.constant for leaf in leaves):
+        return _Value(example) if isinstance(example, Tensor) else [*map(_Value, example)]
+    moved = _MOVES.get(name, ())
+    others = [
+        leaf for i, arg in enumerate(args) if i not in moved for leaf in tree.tree_leaves(arg)
+    ]
+    if moved and all(leaf.constant for leaf in others if isinstance(leaf, _Value)):
+        return _moved(target, args, plain, moved, plain(settings), example)
+    if name in _SPECIAL:
+        return _SPECIAL[name](example, *args, **settings)
+    if name in _ELEMENTWISE and not settings:
+        return _each(name, example, *args)
+    if name in _FOLDS:
+        return _folded(name, example, *args, **settings)
+    raise ExportError(
+        f"{what}: its step uses torch's operation '{name}', which this format does not have; export"
+        " it as torchscript"
+    )
+
+
+def _moved(
+    target: Any, args: Any, plain: Any, moved: Sequence[int], settings: Any, example: Any
+) -> Any:
+    """Return what an operation moves, by letting it move the places of the numbers instead."""
+    columns: list[Any] = []
+    count = 0
+
+    def placed(leaf: Any) -> Any:
+        nonlocal count
+        if not isinstance(leaf, _Value):
+            return leaf
+        columns.append(leaf.column)
+        count += leaf.example.numel()
+        return leaf.places + (count - leaf.example.numel())
+
+    given = [tree.tree_map(placed, arg) if i in moved else plain(arg) for i, arg in enumerate(args)]
+    places = target(*given, **settings)
+    whole = columns[0] if len(columns) == 1 else ca.vertcat(*columns)
+    if isinstance(example, Tensor):
+        return _Value(example, _taken(whole, places))
+    return [_Value(one, _taken(whole, at)) for one, at in zip(example, places, strict=True)]
+
+
+def _rows(given: _Value, dim: Any) -> tuple[Tensor, int]:
+    """Return the places [rows, n] of the numbers that a reduction over dimensions joins."""
+    places = given.places
+    every = list(range(places.dim()))
+    listed = [dim] if isinstance(dim, int) else dim
+    over = [d % places.dim() for d in listed] if listed else every
+    moved = places.permute(*(d for d in every if d not in over), *over)
+    size = 1
+    for d in over:
+        size *= places.shape[d]
+    return moved.reshape(-1, size), size
+
+
+def _folded(
+    name: str, example: Tensor, given: _Value, dim: Any = None, keepdim: bool = False, **_: Any
+) -> _Value:
+    rows, size = _rows(given, dim)
+    if name in ("sum", "mean"):
+        total = ca.sum2(ca.reshape(_taken(given.column, rows.T), len(rows), size))
+        return _Value(example, total / size if name == "mean" else total)
+    total = _taken(given.column, rows[:, 0])
+    for k in range(1, size):
+        total = _ELEMENTWISE[_FOLDS[name]](total, _taken(given.column, rows[:, k]))
+    return _Value(example, total)
+
+
+def _extreme(name: Literal["max", "min"], example: Any, given: _Value, dim: int) -> list[_Value]:
+    """Return the largest or smallest numbers along a dimension, and their places."""
+    rows, size = _rows(given, dim)
+    best, place = _taken(given.column, rows[:, 0]), ca.MX(ca.DM.zeros(len(rows), 1))
+    for k in range(1, size):
+        other = _taken(given.column, rows[:, k])
+        better = other > best if name == "max" else other < best
+        best, place = _chosen(better, other, best), _chosen(better, k, place)
+    return [_Value(example[0], best), _Value(example[1], place)]
+
+
+def _scaled(given: Any, factor: float) -> Any:
+    value = _value(given)
+    return given if factor == 1 else _each("mul", value.example * factor, value, float(factor))
+
+
+def _power(example: Tensor, a: Any, b: Any) -> _Value:
+    power = _value(b)
+    known = float(power.example) if power.constant and power.example.numel() == 1 else None
+    if known in (0.5, -1.0, 2.0):
+        return _each({0.5: "sqrt", -1.0: "reciprocal", 2.0: "square"}[known], example, a)
+    if known in (3.0, 4.0):
+        square = _each("square", example, a)
+        return _each("mul", example, square, a if known == 3.0 else square)
+    return _each("pow", example, a, b)
+
+
+def _divided(example: Tensor, a: Any, b: Any, rounding_mode: str | None = None) -> _Value:
+    ratio = _each("div", example, a, b)
+    return ratio if rounding_mode is None else _each(rounding_mode, example, ratio)
+
+
+def _clamped(example: Tensor, given: _Value, min: Any = None, max: Any = None) -> _Value:
+    out = given if min is None else _each("maximum", example, given, min)
+    return out if max is None else _each("minimum", example, out, max)
+
+
+def _cast(example: Tensor, given: _Value, *_: Any, **settings: Any) -> _Value:
+    """Return a value in another type; precisions are not told apart."""
+    before, after = given.example.dtype, example.dtype
+    if after == torch.bool and before != torch.bool:
+        return _each("ne", example, given, 0.0)
+    if before.is_floating_point and not after.is_floating_point:
+        return _each("trunc", example, given)
+    return _Value(example, given.column)
+
+
+def _copied(example: Tensor, given: _Value, source: _Value, *_: Any) -> _Value:
+    return _cast(example, _each("add", source.example.expand(example.shape), source, 0.0))
+
+
+def _product(
+    example: Tensor, a: _Value, b: _Value, start: Any = None, beta: float = 1, alpha: float = 1
+) -> _Value:
+    (m, k), n = a.example.shape, b.example.shape[1]
+    # columns are stored in row order, so that they are the transposed matrices
+    right = (
+        ca.MX(ca.DM(b.example.double().T.tolist())) if b.constant else ca.reshape(b.column, n, k)
+    )
+    out = _Value(example, ca.vec(ca.mtimes(right, ca.reshape(_scaled(a, alpha).column, k, m))))
+    return out if start is None else _each("add", example, out, _scaled(start, beta))
+
+
+def _products(example: Tensor, a: _Value, b: _Value) -> _Value:
+    def part(value: _Value, i: int) -> _Value:
+        column = None if value.given is None else _taken(value.column, value.places[i])
+        return _Value(value.example[i], column)
+
+    parts = [_product(example[i], part(a, i), part(b, i)).column for i in range(len(example))]
+    return _Value(example, ca.vertcat(*parts))
+
+
+def _picked(table: Any, places: Tensor, at: Any) -> Any:
+    """Return the row of a table, whose numbers are at `places` [n, k], that is known at run time.
+
+    What lies beyond the table is held to its ends.
+    """
+    rows, size = places.shape
+    if rows > _SHORT:
+        row = ca.fmin(ca.fmax(at, 0.0), rows - 1.0)
+        return ca.vec(_taken(table, places).get_nz(False, row * size + ca.DM(list(range(size)))))
+    out = _taken(table, places[0])
+    for i in range(1, rows):
+        out = _chosen(at >= i, _taken(table, places[i]), out)
+    return out
+
+
+def _looked_up(example: Tensor, given: _Value, dim: int, index: _Value) -> _Value:
+    """Return rows along a dimension; the index is that of torch's `index_select`."""
+    rows = given.places.movedim(dim, 0)
+    flat = rows.reshape(len(rows), -1)
+    parts = [_picked(given.column, flat, index.column[i]) for i in range(index.example.numel())]
+    order = torch.arange(len(parts) * flat.shape[1]).reshape(len(parts), *rows.shape[1:])
+    return _Value(example, _taken(ca.vertcat(*parts), order.movedim(0, dim)))
+
+
+def _indexed(example: Tensor, given: _Value, indices: Sequence[_Value | None]) -> _Value:
+    first = indices[0]
+    if first is None or len(indices) > 1:
+        raise ExportError(
+            "a step looks up a table by several indices at once, which this format does not have;"
+            " export it as torchscript"
+        )
+    return _looked_up(example, given, 0, first)
+
+
+def _gathered(example: Tensor, given: _Value, dim: int, index: _Value, **_: Any) -> _Value:
+    table, at = given.places.movedim(dim, -1), index.places.movedim(dim, -1)
+    table = table[tuple(slice(size) for size in at.shape[:-1])].reshape(-1, table.shape[-1])
+    parts = [
+        _picked(given.column, row[:, None], index.column[place])
+        for row, wanted in zip(table, at.reshape(-1, at.shape[-1]).tolist(), strict=True)
+        for place in wanted
+    ]
+    order = torch.arange(len(parts)).reshape(at.shape).movedim(-1, dim)
+    return _Value(example, _taken(ca.vertcat(*parts), order))
+
+
+_SPECIAL: Final[dict[str, Callable[..., Any]]] = {
+    "add": lambda e, a, b, alpha=1: _each("add", e, a, _scaled(b, alpha)),
+    "sub": lambda e, a, b, alpha=1: _each("sub", e, a, _scaled(b, alpha)),
+    "rsub": lambda e, a, b, alpha=1: _each("sub", e, b, _scaled(a, alpha)),
+    "div": _divided, "pow": _power, "clamp": _clamped, "_to": _cast, "copy": _copied,
+    "mm": _product, "bmm": _products,
+    "addmm": lambda e, start, a, b, beta=1, alpha=1: _product(e, a, b, start, beta, alpha),
+    "max": lambda e, given, dim, keepdim=False: _extreme("max", e, given, dim),
+    "min": lambda e, given, dim, keepdim=False: _extreme("min", e, given, dim),
+    "argmax": lambda e, given, dim=None, keepdim=False: _extreme("max", (e, e), given, dim)[1],
+    "argmin": lambda e, given, dim=None, keepdim=False: _extreme("min", (e, e), given, dim)[1],
+    "index_select": _looked_up, "index": _indexed, "gather": _gathered,
+}  # fmt: skip
+"""Operations with settings of their own."""

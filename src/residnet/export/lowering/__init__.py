@@ -1,1 +1,0 @@
-"""A module's step as a short program over single numbers, from which source code is made."""

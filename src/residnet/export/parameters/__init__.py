@@ -1,1 +1,0 @@
-"""The format `parameters`: a baseline's coefficients in the forms of other simulators."""
