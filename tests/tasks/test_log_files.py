@@ -33,5 +33,5 @@ def test_folders_hold_tables_recordings_or_other_logs(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"holds no csv or Parquet file$"):
         log_files([boxes])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UsageError, match="and no log of another format"):
+    with pytest.raises(UsageError, match="holds no log of a format"):
         log_files([tmp_path / "empty"], folders=True)
