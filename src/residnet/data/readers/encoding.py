@@ -63,55 +63,45 @@ def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
         DataError: where the text is not of this encoding.
     """
     name = codecs.lookup(encoding or encoding_of(path)).name
-    filled = 0 if name.startswith(("utf-16", "utf-32")) else _zeros_at_end(path)
-    if name in ("utf-8", "utf-8-sig", "ascii") and not filled:
+    wide = name.startswith(("utf-16", "utf-32"))
+    size = path.stat().st_size - (0 if wide else _zeros_at_end(path))
+    if name in ("utf-8", "utf-8-sig", "ascii") and size == path.stat().st_size:
         yield path
         return
+    with path.open("rb") as stream:
+        content = stream.read(size)
+    try:
+        # half a sign at the end is left out
+        text = codecs.getincrementaldecoder(name)().decode(content)
+    except UnicodeError as error:
+        at = getattr(error, "start", 0)
+        raise DataError(
+            f"{path}: not {name.upper()} text (near byte {at}); save the file as UTF-8, or give its"
+            " `encoding`"
+        ) from error
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
-        _copy(path, copy, name, path.stat().st_size - filled)
+        copy.write_bytes(text.encode("utf-8"))
         yield copy
 
 
-def _copy(path: Path, copy: Path, encoding: str, size: int) -> None:
-    """Write the first `size` bytes of `path` as UTF-8; half a sign at their end is left."""
-    decoder = codecs.getincrementaldecoder(encoding)()
-    done = 0
-    with path.open("rb") as stream, copy.open("wb") as out:
-        while block := stream.read(min(_BLOCK, size - done)):
-            try:
-                out.write(decoder.decode(block).encode("utf-8"))
-            except UnicodeError as error:
-                at = done + getattr(error, "start", 0)
-                raise DataError(
-                    f"{path}: not {encoding.upper()} text (near byte {at}); save the file as UTF-8,"
-                    " or give its `encoding`"
-                ) from error
-            done += len(block)
-
-
 def _zeros_at_end(path: Path) -> int:
-    """Return how many bytes at the end of a file are zero."""
-    count, size = 0, path.stat().st_size
     with path.open("rb") as stream:
-        while count < size:
-            stream.seek(max(0, size - count - _HEAD))
-            block = stream.read(min(_HEAD, size - count))
-            zeros = len(block) - len(block.rstrip(b"\0"))
-            count += zeros
-            if zeros < len(block):
-                break
-    return count
+        size = at = stream.seek(0, 2)
+        while at:
+            at = max(0, at - _HEAD)
+            stream.seek(at)
+            filled = stream.read(_HEAD).rstrip(b"\0")
+            if filled:
+                return size - at - len(filled)
+    return size
 
 
 def _told(head: bytes) -> str | None:
-    """Return the encoding that a mark or the zeros of wide signs tell; None for neither."""
-    marked = next((name for mark, name in _MARKS.items() if head.startswith(mark)), None)
-    return marked or _without_mark(head)
-
-
-def _without_mark(head: bytes) -> str | None:
-    """Return UTF-16 in one of its orders where every other byte is zero; None for other text."""
+    """Return the encoding that a mark, or the zeros of wide signs, tell; None for neither."""
+    for mark, name in _MARKS.items():
+        if head.startswith(mark):
+            return name
     if len(head) < 4 or b"\x00" not in head:
         return None
     values = np.frombuffer(head[: len(head) // 2 * 2], dtype=np.uint8).reshape(-1, 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
@@ -124,16 +125,31 @@ def _unix_scale(values: np.ndarray) -> int | None:
     return next((s for s in _SCALES if _EPOCH_FROM * s <= typical <= _EPOCH_TO * s), None)
 
 
+def _parts(cells: pd.Series) -> pd.DataFrame:
+    """Return the parts of dates and times; pandas' own `extract` takes twice the time."""
+    import pandas as pd
+
+    form = re.compile(_FORM)
+    none = (None,) * form.groups
+    rows = [found.groups() if found else none for found in map(form.match, cells.tolist())]
+    columns = zip(*rows, strict=True) if rows else [()] * form.groups
+    texts = {
+        name: pd.Series(list(column), dtype=object)
+        for name, column in zip(form.groupindex, columns, strict=True)
+    }
+    return pd.DataFrame(texts).set_axis(cells.index)
+
+
 def looks_dated(texts: pd.Series) -> bool:
     """Return whether the cells are dates or times of day."""
     filled = texts.dropna().astype("string")
-    parts = filled.str.extract(_FORM)
+    parts = _parts(filled)
     return len(filled) > 0 and bool((parts["hour"].notna() | parts["date"].notna()).all())
 
 
 def date_order(texts: pd.Series) -> Order | None:
     """Return the order of day, month and year in dates; None where it cannot be told."""
-    return _order_of(texts.dropna().astype("string").str.extract(_FORM))
+    return _order_of(_parts(texts.dropna().astype("string")))
 
 
 def _order_of(cells: pd.DataFrame) -> Order | None:
@@ -215,14 +231,15 @@ def _digits(cells: pd.Series) -> Stamps:
 
 
 def _dated(cells: pd.Series, zone: str | None, order: Order | None) -> Stamps:
-    parts = cells.str.extract(_FORM)
+    parts = _parts(cells)
     dated = bool(parts["date"].notna().all())
     _require(cells, (parts["date" if dated else "hour"].isna()).to_numpy(), "date or time")
     hour, minute, second = (
         parts[name].fillna("0").astype("int64").to_numpy() for name in ("hour", "minute", "second")
     )
-    half = parts["half"].str.lower().str.slice(0, 1).fillna("")
-    hour = np.where(half == "p", hour % 12 + 12, np.where(half == "a", hour % 12, hour))
+    if parts["half"].notna().any():
+        half = parts["half"].fillna("").str.lower().str.slice(0, 1)
+        hour = np.where(half == "p", hour % 12 + 12, np.where(half == "a", hour % 12, hour))
     whole = (hour * 60 + minute) * 60 + second
     whole += (
         _days(cells, parts["date"], order or _order_of(parts) or "dmy") * 86_400 if dated else 0
