@@ -77,7 +77,7 @@ class ImportConfig(Task):
         for number, path in enumerate(paths):
             report("reading recordings", number, len(paths))
             log = reader.read(path).replace(name=names[path])
-            _write(log, folder)
+            log.save(folder.path / "logs" / f"{log.name}.parquet")
             findings[log.name] = log.meta.get("findings", [])
             lines += _lines(log)
         report("reading recordings", len(paths), len(paths))
@@ -124,12 +124,7 @@ def _globbed(root: Path, pattern: str) -> list[Path]:
         ) from error
 
 
-def _write(log: Log, folder: RunFolder) -> None:
-    log.save(folder.path / "logs" / f"{log.name}.parquet")
-
-
 def _lines(log: Log) -> list[str]:
-    """Return what the terminal shows of one log."""
     findings = log.meta.get("findings", [])
     usual = (log.t[-1] - log.t[0]) / (len(log) - 1)
     lost = sum(int(mask.sum()) for reason, mask in log.masks.items() if reason.startswith("hard:"))

@@ -116,7 +116,6 @@ def _step_of(series: Series) -> float:
 
 
 def _standard(recording: Recording, log: Log | None, plan: Plan) -> _Sources:
-    """Return what standard messages tell."""
     poses = [source for source in (plan.position, plan.heading) if source is not None]
     taken = {(entry.topic or "", entry.field) for entry in plan.channels.values()}
     taken |= {(source.topic or "", field) for source in poses for field in source.fields}
@@ -268,7 +267,6 @@ def _positions(recording: Recording) -> Iterator[PositionConfig]:
 
 
 def _headings(recording: Recording) -> Iterator[HeadingConfig]:
-    """Yield the headings that a recording may hold, in both frames."""
     for series in _measured(recording):
         for whole in [field[:-2] for field in series.fields if field.endswith((".w", "_w"))]:
             if all(series.has(f"{whole}.{axis}") for axis in "xyz") and series[f"{whole}.w"].any():

@@ -165,7 +165,6 @@ def _letters(columns: Sequence[str]) -> dict[str, str]:
 
 
 def _copy(column: str) -> str:
-    """Return the name that stands more than once in a header."""
     return re.sub(r"\.\d+$", "", column)
 
 
@@ -184,7 +183,6 @@ def _words(sheet: Sheet) -> list[str]:
 def _raw(
     sheets: Sequence[Sheet], names: Mapping[str, str], left_out: dict[Path, ResidnetError]
 ) -> list[Raw]:
-    """Return the columns of the tables that were looked at."""
     logs = []
     for sheet in sheets:
         try:
@@ -202,7 +200,6 @@ def _raw(
 
 
 def _unused(sheet: Sheet, names: Mapping[str, str], clock: Clock, marks: Marks) -> None:
-    """Note the columns that no channel takes."""
     used = {*names.values(), *clock.columns}
     idle = [name for name in sheet.numbers if name not in used]
     if idle:

@@ -224,7 +224,6 @@ _COMPASS = ("gyro", "compass", "gyro compass", "gyrocompass")
 
 
 def _place(w: Words) -> str | None:
-    """Return x, y or psi."""
     if (w.has("heading") and w.lacks("ground")) or w.text in _COMPASS:
         return "psi"
     if w.lacks("speed", "angle", "force"):

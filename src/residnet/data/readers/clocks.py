@@ -8,7 +8,7 @@ senders'.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -38,59 +38,48 @@ def align_clocks(
             with stamp and arrival.
     """
     series = {name: _plausible(topic) for name, topic in recording.series.items()}
-    offsets = {
-        name: _offset(topic)
+    late = {
+        name: topic.arrival - topic.stamp
         for name, topic in series.items()
         if topic.stamp is not None and topic.arrival is not None and len(topic)
     }
-    shift, remarks = _recorder(offsets, zone)
-    late = [
-        float(np.median(series[name].arrival - series[name].stamp)) - shift  # type: ignore[operator]
-        for name in offsets
-    ]
-    usual = max(0.0, float(np.median(late))) if late else 0.0
+    # of the messages that arrive at once
+    prompt = {name: float(np.quantile(delay, _PROMPT)) for name, delay in late.items()}
+    shift, remarks = _recorder(list(prompt.values()), zone)
+    usual = [float(np.median(delay)) - shift for delay in late.values()]
+    latency = max(0.0, float(np.median(usual))) if usual else 0.0
     out = {}
     for name, topic in series.items():
-        arrival = None if topic.arrival is None else topic.arrival - shift
-        topic = dataclasses.replace(topic, arrival=arrival)
-        if name in offsets:
-            topic = topic.noting(*_latency(topic, offsets[name] - shift))
-        delay = next(
-            (seconds for topic, seconds in delays.items() if same_topic(topic, [name])), 0.0
-        )
-        out[name] = _moved(
-            _ordered(topic), (usual if topic.stamp is None else 0.0) if delay is None else delay
-        )
+        if topic.arrival is not None:
+            topic = dataclasses.replace(topic, arrival=topic.arrival - shift)
+        if name in late:
+            topic = topic.noting(*_latency(name, late[name] - shift, prompt[name] - shift))
+        given = [seconds for asked, seconds in delays.items() if same_topic(asked, [name])]
+        delay = given[0] if given else 0.0
+        if delay is None:
+            delay = latency if topic.stamp is None else 0.0
+        out[name] = _moved(_ordered(topic), delay)
     return dataclasses.replace(recording, series=out, remarks=(*recording.remarks, *remarks))
 
 
 def _plausible(topic: Series) -> Series:
     """Return the series without stamps that carry no time."""
-    if topic.stamp is None or not len(topic):
+    if topic.stamp is None or topic.arrival is None or len(topic) < 2 or np.ptp(topic.stamp):
         return topic
-    if len(topic) > 1 and np.ptp(topic.stamp) == 0.0 and topic.arrival is not None:
-        text = (
-            f"topic {topic.name}: all {len(topic)} header stamps are the same; arrival times are"
-            " used"
-        )
-        return dataclasses.replace(topic, stamp=None).noting(
-            remark("note", "empty_stamps", text, rows=len(topic))
-        )
-    return topic
+    rows = len(topic)
+    text = f"topic {topic.name}: all {rows} header stamps are the same; arrival times are used"
+    found = remark("note", "empty_stamps", text, rows=rows)
+    return dataclasses.replace(topic, stamp=None).noting(found)
 
 
-def _offset(topic: Series) -> float:
-    """Return the arrival less stamp of the promptest messages, s."""
-    assert topic.stamp is not None
-    assert topic.arrival is not None
-    return float(np.quantile(topic.arrival - topic.stamp, _PROMPT))
+def _recorder(prompt: Sequence[float], zone: float | None) -> tuple[float, list[Remark]]:
+    """Return the seconds that the recorder's clock is ahead of the senders', and remarks.
 
-
-def _recorder(offsets: Mapping[str, float], zone: float | None) -> tuple[float, tuple[Remark, ...]]:
-    """Return the seconds that the recorder's clock is ahead of the senders', and a remark."""
-    if not offsets:
-        return zone or 0.0, ()
-    common = float(np.median(list(offsets.values())))
+    `prompt` is arrival less stamp of the promptest messages of each topic, s.
+    """
+    if not prompt:
+        return zone or 0.0, []
+    common = float(np.median(prompt))
     zone = _QUARTER * round(common / _QUARTER) if zone is None else zone
     rest = common - zone
     remarks = []
@@ -100,42 +89,32 @@ def _recorder(offsets: Mapping[str, float], zone: float | None) -> tuple[float, 
             " arrivals are moved by it"
         )
         remarks.append(remark("note", "time_zone", text, offset=zone))
-    if abs(rest) <= _TELLING and rest >= 0.0:
-        return zone, tuple(remarks)
+    if 0.0 <= rest <= _TELLING:
+        return zone, remarks
     text = (
-        f"the recorder's clock is {rest:+.3f} s from the header stamps of {len(offsets)} topics;"
+        f"the recorder's clock is {rest:+.3f} s from the header stamps of {len(prompt)} topics;"
         " arrivals are moved by it"
     )
-    return common, (
-        *remarks,
-        remark("note", "clock_offset", text, offset=rest, topics=len(offsets)),
-    )
+    return common, [*remarks, remark("note", "clock_offset", text, offset=rest, topics=len(prompt))]
 
 
-def _latency(topic: Series, offset: float) -> list[Remark]:
-    """Return the latency of a topic with stamps and arrivals.
-
-    Arrivals are on the senders' clock.
-    """
-    assert topic.stamp is not None
-    assert topic.arrival is not None
-    late = topic.arrival - topic.stamp
+def _latency(name: str, late: np.ndarray, offset: float) -> list[Remark]:
+    """Return what the delays [T] of a topic tell, s, arrivals being on the senders' clock."""
     usual, worst = float(np.median(late)), float(late.max())
-    out = []
     if abs(offset) > _TELLING:
         text = (
-            f"topic {topic.name}: stamps are {offset:+.3f} s from those of the other topics (of"
-            " messages that arrive at once); its sender has another clock or stamps late: correct"
-            " it with `delays`"
+            f"topic {name}: stamps are {offset:+.3f} s from those of the other topics (of messages"
+            " that arrive at once); its sender has another clock or stamps late: correct it with"
+            " `delays`"
         )
-        out.append(remark("will mislead", "clock_offset", text, offset=offset))
-    elif worst > _TELLING:
+        return [remark("will mislead", "clock_offset", text, offset=offset)]
+    if worst > _TELLING:
         text = (
-            f"topic {topic.name}: receive latency is {usual:.4f} s (median) and reaches {worst:.3f}"
-            " s; header stamps are used"
+            f"topic {name}: receive latency is {usual:.4f} s (median) and reaches {worst:.3f} s;"
+            " header stamps are used"
         )
-        out.append(remark("note", "latency", text, median=usual, maximum=worst))
-    return out
+        return [remark("note", "latency", text, median=usual, maximum=worst)]
+    return []
 
 
 def _ordered(topic: Series) -> Series:
@@ -160,14 +139,8 @@ def _ordered(topic: Series) -> Series:
     # of rows with one time the last is the newest
     kept = topic.where(np.append(~same[1:], True))
     if copies:
-        kept = kept.noting(
-            remark(
-                "note",
-                "duplicate_rows",
-                f"topic {topic.name}: {copies} rows repeat the row before; left out",
-                rows=copies,
-            )
-        )
+        text = f"topic {topic.name}: {copies} rows repeat the row before; left out"
+        kept = kept.noting(remark("note", "duplicate_rows", text, rows=copies))
     if others:
         text = (
             f"topic {topic.name}: {others} rows have the time of the row before but other values"

@@ -461,7 +461,6 @@ def _attitude(
 def _velocity_part(
     recording: Recording, config: EarthFixed | CourseSpeed, longest_gap: float
 ) -> Part:
-    """Return the northward and eastward velocity of the antenna, m/s."""
     series = recording[config.topic]
     if isinstance(config, CourseSpeed):
         course = _numbers(recording, series, config.course, config.course_unit)

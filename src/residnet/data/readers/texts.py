@@ -424,7 +424,6 @@ def _lines(block: bytes) -> list[bytes]:
 
 
 def _comments(block: bytes) -> list[int]:
-    """Return which lines of a block are comments."""
     if not any(sign in block for sign in _COMMENT):
         return []
     return [i for i, line in enumerate(_lines(block)) if line.lstrip().startswith(_COMMENT)]

@@ -319,7 +319,6 @@ def _relative(path: Path, folder: Path) -> str:
 def _long_enough(
     split: dict[str, Any], splits: dict[str, list[Log]], length: float, marks: Marks
 ) -> tuple[dict[str, Any], dict[str, list[Log]]]:
-    """Move logs that are too short to be judged to the training."""
     shortest = 1.2 * min(
         float(entry["length"].split()[0]) for entry in recipe.protocols(length).values()
     )

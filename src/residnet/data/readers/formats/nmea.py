@@ -223,7 +223,6 @@ def _between(number: np.ndarray, ticks: np.ndarray) -> np.ndarray:
 
 
 def _date(message: Any) -> datetime.date | None:
-    """Return the date that a sentence tells."""
     if message.sentence_type == "RMC":
         day = message.datestamp
         return day if isinstance(day, datetime.date) else None

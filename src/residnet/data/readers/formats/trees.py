@@ -166,7 +166,6 @@ def _mat_leaves(path: Path) -> dict[str, _Vector]:
 
 
 def _below(node: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the paths and arrays below a struct."""
     if isinstance(node, dict):
         for name, value in node.items():
             if not name.startswith("__"):
@@ -357,7 +356,6 @@ def _time_axis(values: _Vector, length: int) -> int | None:
 
 
 def _columns(name: str, values: _Vector, length: int) -> dict[str, np.ndarray]:
-    """Return the fields of one array."""
     if values.dtype.kind not in "biuf":
         return {}
     table = np.moveaxis(np.asarray(values), _time_axis(values, length) or 0, 0)

@@ -100,7 +100,6 @@ def _boot_time(messages: list[dict[str, np.ndarray]]) -> int | None:
 
 
 def _fields(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the numbers of a message as float64."""
     out = {}
     for name, values in data.items():
         if name != "timestamp":
