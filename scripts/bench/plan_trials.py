@@ -28,7 +28,7 @@ from residnet.core.errors import ResidnetError
 from residnet.data.prepare import Prepared, samples
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.data.windows import WindowStore
-from residnet.dynamics.gear import InputShare
+from residnet.dynamics.actuated import InputShare
 from residnet.identification.fit import fit
 from residnet.identification.models import FittedModel
 from residnet.identification.planning import Aim, TrialLimits, candidates, moments, plan, spread

@@ -33,8 +33,7 @@ import torch
 from residnet.core.errors import ExportError, ResidnetError
 from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.learned import chosen_model
-from residnet.dynamics.store import ModelSpec, load_model
+from residnet.dynamics.store import ModelSpec, chosen_model, load_model
 from residnet.export import ExportedVessel, exporter, vessel
 from residnet.export.aoti import AotiModel
 from residnet.export.base import DOUBLE, SINGLE, Loaded

@@ -31,8 +31,7 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.arrays.heap import keep_freed_memory
 from residnet.data.windows import WindowBatches
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.scripted import scripted
+from residnet.dynamics.rollout import Rollout, scripted
 from residnet.heads import LstmConfig, ResidualHead
 from residnet.physics.signals import SignalsConfig
 

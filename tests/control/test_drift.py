@@ -21,8 +21,8 @@ from residnet.control.heading.following import Following
 from residnet.control.heading.heading_pid import HeadingPID
 from residnet.control.heading.steering import SteeredPlant
 from residnet.core.errors import ConfigError
-from residnet.dynamics.ambient_current import InAmbientCurrent
 from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.physics.vessel import load_vessel
 
 DT, LIMIT, SPEED, LEG = 0.1, math.radians(5), 3.2, 0.7

@@ -21,9 +21,8 @@ from residnet.control import (
     SimulatedPredictor,
 )
 from residnet.core.errors import ConfigError
-from residnet.dynamics.nomoto import NomotoDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.simulated import NomotoDynamics, PlantDynamics
 from residnet.physics.nomoto import SteeringVessel
 from residnet.physics.patrol import PatrolVessel
 from residnet.physics.vessel import load_vessel

@@ -21,8 +21,7 @@ from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import Craft, Flight, Sea, fly
 from residnet.data.simulated.sensors import SensorNoise
 from residnet.data.simulated.trials import SimulatedTrials, simulate
-from residnet.dynamics.actuated import ActuatedDynamics
-from residnet.dynamics.gear import GivenGear, InputShare, PlantGear
+from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
@@ -63,7 +62,7 @@ def test_the_gear_is_the_plants_whatever_its_kind(vessel: str) -> None:
     """Actuator states equal those of the plant that is given the same commands."""
     plant = load_vessel(vessel).build()
     step, substeps = 0.1, 2
-    gear = PlantGear(plant, step, substeps)
+    gear = PlantActuators(plant, step, substeps)
     random = np.random.default_rng(0)
     demands = torch.from_numpy(random.uniform(-1, 1, (2, 2, 12))).repeat_interleave(5, dim=-1)
     commands = gear.demand(demands[0], demands[1])
@@ -94,7 +93,7 @@ def test_given_gear_by_hand() -> None:
         "n": InputShare(drive="600 rpm", limit="480 rpm"),
         "delta": InputShare(steer="35 deg", rate="5 deg/s"),
     }
-    gear = GivenGear(shares, ("wind_speed", "wind_dir"), 0.5)
+    gear = GivenActuators(shares, ("wind_speed", "wind_dir"), 0.5)
     assert gear.inputs == ("cmd_n", "cmd_delta", "wind_speed", "wind_dir")
     assert gear.state == ("delta",)
     command = gear.demand(torch.tensor([1.0, 0.5]), torch.tensor([-1.0, 2.0]))
@@ -114,7 +113,7 @@ def test_given_gear_by_hand() -> None:
         {"steer": 0.5, "limit": 0},
     ):
         with pytest.raises(ConfigError, match=r"inputs\.delta"):
-            GivenGear({"delta": InputShare(**wrong)}, (), 0.1)  # type: ignore[arg-type]
+            GivenActuators({"delta": InputShare(**wrong)}, (), 0.1)  # type: ignore[arg-type]
 
 
 class Take(ResidualHead):
@@ -129,7 +128,7 @@ class Take(ResidualHead):
 )
 def test_inputs_are_held_as_in_the_fit(hold: Any, expected: list[float]) -> None:
     """An input that moves by 1 per second: from each step's start, or its mean over the step."""
-    gear = GivenGear({"n": InputShare(drive=9.0, rate=1.0)}, (), 1.0)
+    gear = GivenActuators({"n": InputShare(drive=9.0, rate=1.0)}, (), 1.0)
     hybrid = still(("n",), 1.0)
     model = ActuatedDynamics(
         HybridDynamics(hybrid.signals, hybrid.baseline, Take(), 1.0), ("n",), hold, gear
@@ -173,7 +172,7 @@ def flights() -> list[tuple[Flight, Flight]]:
     built = signals.build()
     hybrid = HybridDynamics(built, StillConfig().build(built.names), head, step).double().eval()
     plant = load_vessel("wam_v_cal").build()
-    gear = PlantGear(plant, step, 1)
+    gear = PlantActuators(plant, step, 1)
     actuated = ActuatedDynamics(hybrid, signals.columns, "mean", gear)
     sea = Sea(plant, Disturbance(), SensorNoise(), 0)
     ship = Craft(

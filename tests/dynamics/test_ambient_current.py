@@ -9,8 +9,8 @@ import torch
 
 from residnet.control.heading.steering import SteeredPlant
 from residnet.core.frames import to_body
-from residnet.dynamics.ambient_current import InAmbientCurrent
 from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.physics.vessel import load_vessel
 
 

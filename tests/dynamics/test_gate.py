@@ -84,7 +84,7 @@ def test_members_that_disagree_lose_their_say() -> None:
     head = GatedHead(MeanHead(members), len(NAMES))
     head.calibrate(samples)
     z = samples.z[:20]
-    mean, spread, _ = head.inner.told_apart(z, z[:, :0])
+    mean, spread, _ = head.inner.with_spread(z, z[:, :0])
     torch.testing.assert_close(mean, head.inner(z, z[:, :0])[0])
     told = torch.stack([member(z, z[:, :0])[0] for member in members])
     torch.testing.assert_close(spread, told.std(dim=0, correction=0), rtol=1e-4, atol=1e-7)

@@ -4,8 +4,8 @@ import torch
 from kinds import of_kind
 
 from residnet.baselines import RegressorBaseline
+from residnet.dynamics.ensemble import SampledDynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.parameter_samples import SampledDynamics
 from residnet.heads import ZeroHead
 from residnet.physics.signals import SignalsConfig
 

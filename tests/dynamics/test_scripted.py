@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.scripted import MANY, scripted
+from residnet.dynamics.rollout import MANY, Rollout, Source, scripted
 
 DT = 0.1
 

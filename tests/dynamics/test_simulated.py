@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from kinds import of_kind
 from scipy.integrate import solve_ivp
+from staged_plant import StagedPlantDynamics
 
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics, StagedPlantDynamics
+from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.actuators import DifferentialThrust
 from residnet.physics.vessel import load_vessel
 

@@ -12,7 +12,7 @@ from mutations import at, put
 from tiny_tasks import TINY_TASKS
 
 from residnet.core.errors import ConfigError
-from residnet.dynamics.steps import MOST_STEPS, check_steps
+from residnet.dynamics.simulated import MOST_STEPS, check_steps
 from residnet.tasks.loading import load_task
 
 

@@ -10,8 +10,7 @@ import torch
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.layout import HEADING_AND_VELOCITIES, POSITION
 from residnet.dynamics.base import Integrator
-from residnet.dynamics.disturbance import DisturbanceConfig
-from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads import LstmConfig, ResidualHead
 from residnet.physics.signals import SignalsConfig

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.dynamics.band import BandTable
+from residnet.dynamics.store import BandTable
 from residnet.export import ExportedVessel, exporter, vessel
 from residnet.export.c_code import compile_shared
 from residnet.export.vessel import ExportedModel

@@ -33,9 +33,8 @@ from residnet.control import (
     SimulatedPredictor,
 )
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.nomoto import NomotoDynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import NomotoDynamics, TracedPlantDynamics
 from residnet.manoeuvres import Helm, Zigzag
 from residnet.manoeuvres.base import ScheduleSource
 from residnet.physics.nomoto import NomotoConfig, SteeringVessel

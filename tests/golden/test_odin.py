@@ -18,10 +18,10 @@ import pytest
 import torch
 from golden_tables import table, tensor
 from scipy.signal import square
+from staged_plant import StagedPlantDynamics
 from torch import Tensor
 
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import StagedPlantDynamics
 from residnet.physics.actuators import WaterJets
 from residnet.physics.odin import OdinVessel
 from residnet.physics.vessel import load_vessel

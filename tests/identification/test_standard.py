@@ -16,8 +16,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
 from residnet.core.log import Log
 from residnet.data.prepare import samples
-from residnet.dynamics.disturbance import DisturbanceConfig
-from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.heads import LstmConfig, ZeroHead
 from residnet.identification.fit import Identified, fit
 from residnet.identification.prepared import PreparedSplits, prepare_logs

@@ -13,9 +13,8 @@ from scipy.signal import TransferFunction, lsim
 
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
-from residnet.dynamics.nomoto import NomotoDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.simulated import NomotoDynamics, PlantDynamics
 from residnet.physics.nomoto import SteeringVessel
 from residnet.physics.vessel import VesselConfig, load_vessel, vessel_files
 

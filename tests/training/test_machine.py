@@ -14,8 +14,7 @@ from residnet.baselines import RegressorsConfig
 from residnet.core.errors import UsageError
 from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
-from residnet.dynamics.disturbance import DisturbanceConfig
-from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.heads import LstmConfig, MlpConfig
 from residnet.training.config import TrainingConfig
 from residnet.training.machine import MachineConfig

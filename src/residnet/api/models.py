@@ -16,10 +16,8 @@ from residnet.core.errors import UsageError
 from residnet.core.files import read_json
 from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.learned import chosen_model
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.scripted import scripted
-from residnet.dynamics.store import ModelSpec, load_model, save_model
+from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model
 from residnet.export import ExportedVessel, exporter
 from residnet.identification.models import FittedModel
 from residnet.judge.bands.band import Band

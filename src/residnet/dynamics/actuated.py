@@ -1,18 +1,180 @@
-"""A learned model with actuators in front, flown by commands like the vessel itself."""
+"""A learned model with steering and propulsion in front, flown by commands like the vessel."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Literal, final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from residnet.core.config import Config, Quantity
 from residnet.core.errors import ConfigError
 from residnet.core.layout import actuators, motion
-from residnet.core.names import STATE, nearest
+from residnet.core.names import CHANNEL_UNITS, STATE, nearest
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.gear import Gear, commanded
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.physics.plant import Plant
+
+_HULL = {*STATE, "phi", "p"}
+_RATES = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
+
+
+class Actuators(nn.Module, ABC):
+    """A set of actuators whose states do not depend on the motion of the hull.
+
+    Attributes:
+        state: names of the states a [B, k].
+        inputs: names of the inputs w [B, m]: commands, then what nobody commands.
+        commands: how many of the inputs are commands.
+    """
+
+    state: tuple[str, ...]
+    inputs: tuple[str, ...]
+    commands: int
+
+    @abstractmethod
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Return commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
+
+    @abstractmethod
+    def move(self, a: Tensor, w: Tensor) -> Tensor:
+        """Return the states [B, k] one step later under inputs w [B, m]."""
+
+    @abstractmethod
+    def approach(self, rows: int) -> Tensor:
+        """Return the state [rows, 6 + k] of hull and gear that trials start from, float64."""
+
+
+@final
+class PlantActuators(Actuators):
+    """A gear made of a plant's actuators, whatever their kind.
+
+    The plant itself moves them, and what its hull would do is thrown away.
+    """
+
+    def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
+        super().__init__()
+        self.plant = plant
+        self.inputs, self.commands = plant.inputs, plant.commands
+        self.columns = [i for i, name in enumerate(plant.state) if name not in _HULL]
+        self.state = tuple(plant.state[i] for i in self.columns)
+        self.dynamics = TracedPlantDynamics(plant, dt, substeps) if self.columns else None
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Return the commands [..., c] of the plant."""
+        return self.plant.demand(drive, steer)
+
+    def move(self, a: Tensor, w: Tensor) -> Tensor:
+        """Return the states [B, k] one step later.
+
+        The hull is where trials start; the actuators do not feel its motion.
+        """
+        if self.dynamics is None:
+            return a
+        x = self.plant.approach(a.shape[0])
+        x[:, self.columns] = a
+        return self.dynamics.step(x, w, x[:, :0])[0][:, self.columns]
+
+    def approach(self, rows: int) -> Tensor:
+        """Return the state that the plant's trials start from."""
+        x = self.plant.approach(rows)
+        return x[:, [*map(self.plant.state.index, STATE), *self.columns]]
+
+
+class InputShare(Config):
+    """A rule by which one input of a learned model follows the demands of a manoeuvre.
+
+    All values are in the input's SI unit, or text with a unit.
+
+    Attributes:
+        drive: value at full drive.
+        steer: value at full steer to starboard.
+        centre: value without demand.
+        limit: largest deviation from `centre` of either sign; None: the sum of both shares.
+        rate: change per second at most; None: at once.
+    """
+
+    drive: float | str = 0.0
+    steer: float | str = 0.0
+    centre: float | str = 0.0
+    limit: float | str | None = None
+    rate: float | str | None = None
+
+
+@final
+class GivenActuators(Actuators):
+    """A gear whose inputs follow the demands within limits and rates.
+
+    Args:
+        shares: by the name of the model's input; its command is that name after `cmd_`.
+        exogenous: further inputs of the model, which nobody commands.
+        dt: step in s.
+
+    Raises:
+        ConfigError: where a value has a wrong unit.
+    """
+
+    def __init__(
+        self, shares: Mapping[str, InputShare], exogenous: tuple[str, ...], dt: float
+    ) -> None:
+        super().__init__()
+        self.inputs, self.commands = (*map(commanded, shares), *exogenous), len(shares)
+        rows = [_numbers(name, share) for name, share in shares.items()]
+        self.drive, self.steer, self.centre, self.limit, self.rate = torch.tensor(
+            rows, dtype=torch.float64
+        ).unbind(-1)
+        self.limited = [i for i, row in enumerate(rows) if row[4] != float("inf")]
+        # what can jump to its command needs no state
+        self.state = tuple(list(shares)[i] for i in self.limited)
+        self.dt = dt
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Return the commands [..., c], within their limits."""
+        both = drive.unsqueeze(-1) * self.drive.to(drive.dtype) + steer.unsqueeze(
+            -1
+        ) * self.steer.to(drive.dtype)
+        limit = self.limit.to(drive.dtype)
+        return self.centre.to(drive.dtype) + torch.minimum(torch.maximum(both, -limit), limit)
+
+    def move(self, a: Tensor, w: Tensor) -> Tensor:
+        """Return the states [B, k] one step later, towards their commands by at most the rate."""
+        step = self.rate[self.limited].to(a.dtype) * self.dt
+        return a + torch.minimum(torch.maximum(w[:, self.limited] - a, -step), step)
+
+    def approach(self, rows: int) -> Tensor:
+        """Return the state at rest, the inputs without demand."""
+        hull = torch.zeros(rows, len(STATE), dtype=torch.float64)
+        return torch.cat((hull, self.centre[self.limited].expand(rows, -1)), dim=-1)
+
+
+def commanded(name: str) -> str:
+    """Return the name of the command that an input follows."""
+    return name if name.startswith("cmd_") else f"cmd_{name}"
+
+
+def _numbers(name: str, share: InputShare) -> list[float]:
+    unit = CHANNEL_UNITS.get(name, "-")
+    value, rate = Quantity(unit), Quantity(_RATES[unit]) if unit in _RATES else None
+    try:
+        drive, steer, centre = (
+            value.convert(given) for given in (share.drive, share.steer, share.centre)
+        )
+        limit = abs(drive) + abs(steer) if share.limit is None else value.convert(share.limit)
+        if share.rate is None:
+            fastest = float("inf")
+        else:
+            fastest = rate.convert(share.rate) if rate is not None else float(share.rate)
+    except ValueError as error:
+        raise ConfigError(f"inputs.{name}: {error}") from None
+    if limit <= 0 or fastest <= 0:
+        raise ConfigError(
+            f"inputs.{name}: limit and rate must be above zero, and a share given of drive or"
+            f" steer; {limit:g}, {fastest:g}"
+        )
+    return [drive, steer, centre, limit, fastest]
 
 
 @final
@@ -41,7 +203,7 @@ class ActuatedDynamics(Dynamics):
         model: HybridDynamics,
         columns: tuple[str, ...],
         hold: Literal["start", "mean"],
-        gear: Gear,
+        gear: Actuators,
     ) -> None:
         super().__init__(model.dt, model.integrator)
         self.model = model

@@ -77,12 +77,12 @@ class GatedHead(ResidualHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the residual [B, 3] at channels z [B, nz] and the memory for the next step."""
-        rho, spread, s = self.inner.told_apart(z, s)
+        rho, spread, s = self.inner.with_spread(z, s)
         return self.kept(z, rho, spread), s
 
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, 3] along channels [B, T, nz], from an empty memory."""
-        rho, spread = self.inner.sequence_told_apart(z)
+        rho, spread = self.inner.sequence_with_spread(z)
         return self.kept(z, rho, spread)
 
     def warms_by_steps(self) -> bool:
@@ -117,7 +117,7 @@ class GatedHead(ResidualHead):
         with torch.no_grad():
             spread = torch.cat(
                 [
-                    self.inner.sequence_told_apart(z)[1][0]
+                    self.inner.sequence_with_spread(z)[1][0]
                     for z in _by_manoeuvre(samples.z, samples.group)
                 ]
             )
@@ -219,12 +219,12 @@ class _HeldHead(ResidualHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inner head's residual [B, 3] at the held channels, and its memory."""
-        rho, _, s = self.told_apart(z, s)
+        rho, _, s = self.with_spread(z, s)
         return rho, s
 
-    def told_apart(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def with_spread(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what the inner head does at the held channels."""
-        return self.inner.told_apart(self.held(z), s)
+        return self.inner.with_spread(self.held(z), s)
 
     def warms_by_steps(self) -> bool:
         """Return what the inner head says."""

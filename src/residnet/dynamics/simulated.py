@@ -1,14 +1,42 @@
-"""A plant as `Dynamics`: the truth that simulated trials are made with."""
+"""Plants as `Dynamics`, the truth of simulated trials; exact steps of steering; a current."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, final
 
 import torch
 from torch import Tensor
 
+from residnet.core.errors import ConfigError
+from residnet.core.frames import to_earth
+from residnet.core.layout import heading, surge
 from residnet.dynamics.base import Dynamics
+from residnet.physics.actuators.servo import Immediate, RateLimited
+from residnet.physics.nomoto import SteeringVessel
 from residnet.physics.plant import Plant
+
+MOST_STEPS = 2_000_000
+"""Steps of the longest simulation: more than two days at ten steps a second."""
+
+
+def check_steps(duration: float, step: float, what: str = "duration") -> None:
+    """Refuse a simulation of so many steps that it can only be a slip.
+
+    Args:
+        duration: of the simulation in s.
+        step: of the simulation in s.
+        what: name of the duration in the message.
+
+    Raises:
+        ValueError: where there are more steps than `MOST_STEPS`.
+    """
+    count = duration / step
+    if count > MOST_STEPS:
+        raise ValueError(
+            f"{what} of {duration:g} s has {count:.3g} steps of {step:g} s; at most {MOST_STEPS:,}"
+            " are simulated: shorten it or take a larger step"
+        )
 
 
 @final
@@ -40,34 +68,6 @@ class PlantDynamics(Dynamics):
 
 
 @final
-class StagedPlantDynamics(Dynamics):
-    """A plant stepped by RK4 under inputs that move during a step, taken at each stage's time.
-
-    Inputs w [B, 3 m] hold those at the start, the middle and the end of the step side by side.
-    """
-
-    def __init__(self, plant: Plant, dt: float) -> None:
-        super().__init__(dt, "rk4")
-        self.plant = plant
-
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, nx] of the plant under the inputs p [B, m] of one stage."""
-        return self.plant.rate(x, p)
-
-    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state after a step; the memory passes through."""
-        start, middle, end = torch.chunk(w, 3, dim=-1)
-        k1 = self.rate(x, start, s)
-        k2 = self.rate(x + 0.5 * self.dt * k1, middle, s)
-        k3 = self.rate(x + 0.5 * self.dt * k2, middle, s)
-        k4 = self.rate(x + self.dt * k3, end, s)
-        return (
-            self.plant.end_step(x + self.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), end, self.dt),
-            s,
-        )
-
-
-@final
 class TracedPlantDynamics(Dynamics):
     """A `PlantDynamics` whose step is recorded once as TorchScript.
 
@@ -94,3 +94,112 @@ class TracedPlantDynamics(Dynamics):
         """Return the state after a step of the log; the memory passes through."""
         after: tuple[Tensor, Tensor] = self.recorded.step(x, w, s)
         return after
+
+
+@final
+class NomotoDynamics(Dynamics):
+    """An exact step of heading, sway and yaw of a `SteeringVessel`, then of its rudder.
+
+    The motion is stepped by the matrix exponential.
+
+    The position is the integral of the exact velocities by Simpson's rule over the step: its error
+    is O(dt^4), that of heading and velocities is rounding at any dt.
+
+    Raises:
+        ConfigError: where the rudder lags, and so moves within a step.
+    """
+
+    def __init__(self, plant: SteeringVessel, dt: float) -> None:
+        super().__init__(dt, "rk4")
+        if not isinstance(plant.servo.response, Immediate | RateLimited):
+            raise ConfigError(
+                "an exact step holds the rudder: give the rudder the response 'immediate' (with or"
+                " without a rate), or step by RK4"
+            )
+        self.plant = plant
+        size = plant.free + 2
+        # psi, then v, r and internal states, then the rudder angle, which is constant
+        system = torch.zeros(size, size, dtype=torch.float64)
+        system[0, 2] = 1.0
+        system[1:-1, 1:-1] = plant.a
+        system[1:-1, -1] = plant.b
+        self.register_buffer(
+            "to_middle",
+            torch.linalg.matrix_exp(0.5 * dt * system)[:-1].T.contiguous(),
+            persistent=False,
+        )
+        self.register_buffer(
+            "to_end", torch.linalg.matrix_exp(dt * system)[:-1].T.contiguous(), persistent=False
+        )
+        self.register_buffer(
+            "simpson",
+            torch.tensor([1.0, 4.0, 1.0], dtype=torch.float64) * dt / 6.0,
+            persistent=False,
+        )
+        self.to_middle: Tensor
+        self.to_end: Tensor
+        self.simpson: Tensor
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return x_dot [B, nx] of the plant; steps do not need it."""
+        return self.plant.rate(x, p)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state after a step; the memory passes through."""
+        plant = self.plant
+        speed, rudder = surge(x), x[:, plant.rudder_columns]
+        start = torch.cat(
+            (
+                heading(x).unsqueeze(-1),
+                x[:, plant.turning_columns],
+                plant.delta(x, w).unsqueeze(-1),
+            ),
+            dim=-1,
+        )
+        middle, end = start @ self.to_middle.to(x.dtype), start @ self.to_end.to(x.dtype)
+        # psi and v stand first in the linear system
+        psi, v = torch.stack((start[:, :2], middle[:, :2], end[:, :2]), dim=1).unbind(-1)
+        north, east = to_earth(speed.unsqueeze(-1), v, psi)
+        simpson = self.simpson.to(x.dtype)
+        north, east = x[:, 0] + north @ simpson, x[:, 1] + east @ simpson
+        after = torch.cat(
+            (torch.stack((north, east, end[:, 0], speed), dim=-1), end[:, 1:], rudder), dim=-1
+        )
+        return plant.end_step(after, w, self.dt), s
+
+
+@final
+class InAmbientCurrent(Dynamics):
+    """A model in an ambient current that is steady and each row's own.
+
+    u and v are velocities through the water, x and y the place over ground.
+
+    In a current that is the same everywhere and always, a vessel moves through the water as it does
+    in water at rest (T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control,
+    section 8.3, irrotational ocean currents); only its position is carried away. Memory s [B, 2 +
+    k]: current to the north and to the east in m/s, then the model's.
+
+    Args:
+        model: whose steps do not depend on the position.
+        state: names of its state.
+    """
+
+    def __init__(self, model: Dynamics, state: Sequence[str]) -> None:
+        super().__init__(model.dt, model.integrator)
+        self.model = model
+        self.n_state = 2 + model.n_state
+        places = torch.zeros(2, len(state), dtype=torch.float64)
+        places[0, state.index("x")] = places[1, state.index("y")] = 1.0
+        self.register_buffer("places", places, persistent=False)
+        self.places: Tensor
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return x_dot of the model, through the water."""
+        return self.model.rate(x, p, rho)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state and the memory one step later."""
+        moved, memory = self.model.step(x, w, s[:, 2:])
+        return moved + self.dt * s[:, :2] @ self.places.to(x.dtype), torch.cat(
+            (s[:, :2], memory), dim=-1
+        )

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
@@ -22,14 +22,50 @@ from residnet.core.errors import UsageError
 from residnet.core.files import read_json, whole
 from residnet.core.names import VELOCITY, nearest
 from residnet.core.version import __version__
-from residnet.dynamics.band import BandTable
 from residnet.dynamics.base import Integrator
-from residnet.dynamics.disturbance import DisturbanceConfig
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.gate import GatedHead
-from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.heads import HeadConfig, ZeroHead
 from residnet.physics.signals import SignalsConfig
+
+
+class BandTable(Config):
+    """Half widths of a model's free runs against the horizon, whatever the run is like.
+
+    Attributes:
+        level: share of the samples that they are to hold.
+        steps: horizons, numbers of steps from 1 on, ascending.
+        u: half widths in m/s.
+        v: half widths in m/s.
+        r: half widths in rad/s.
+        heading: half widths in rad.
+        position: radius about the predicted position in m.
+        logs: number of logs that calibrated them.
+        cautions: whole sentences about what they do not promise.
+    """
+
+    level: float = Field(gt=0, lt=1)
+    steps: tuple[int, ...] = Field(min_length=1)
+    u: tuple[float, ...]
+    v: tuple[float, ...]
+    r: tuple[float, ...]
+    heading: tuple[float, ...]
+    position: tuple[float, ...]
+    logs: int = Field(ge=1)
+    cautions: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_length(self) -> BandTable:
+        if any(len(column) != len(self.steps) for column in self.columns):
+            raise ValueError("u, v, r, heading and position need one half width for each of steps")
+        return self
+
+    @property
+    def columns(self) -> tuple[tuple[float, ...], ...]:
+        """The half widths of u, v, r, heading and position."""
+        return self.u, self.v, self.r, self.heading, self.position
+
 
 _DESCRIPTION, _WEIGHTS = "model.json", "model.safetensors"
 
@@ -278,3 +314,29 @@ def _description_sum(content: Mapping[str, Any]) -> str:
 def model_names(folder: Path) -> Sequence[str]:
     """Return the names of the models in a run's `models` folder, whatever their kind."""
     return sorted(path.parent.name for path in folder.glob(f"*/{_DESCRIPTION}"))
+
+
+def chosen_model(run: Path, name: str) -> str:
+    """Return the name of a model in its run; `selected` is the one that validation chose.
+
+    Raises:
+        UsageError: where there is no such folder or no such model in it.
+    """
+    if not run.is_dir():
+        raise UsageError(
+            f"{run}: no such folder; run the fit first that identifies the model (residnet run"
+            f" CONFIG --out {run})"
+        )
+    names = model_names(run / "models")
+    if name != "selected" and name in names:
+        return name
+    metrics = run / "metrics.json"
+    selected = (
+        str(read_json(metrics).get("selected")) if name == "selected" and metrics.is_file() else ""
+    )
+    if selected not in names:
+        raise UsageError(
+            f"{run}: no model"
+            f" '{name}'{nearest(name, names) if names else '; not the folder of a finished fit'}"
+        )
+    return selected

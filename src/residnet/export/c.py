@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 import torch
 
-from residnet.dynamics.band import BandTable
+from residnet.dynamics.store import BandTable
 from residnet.export.base import (
     Exported,
     Exporter,

@@ -20,8 +20,7 @@ from residnet.core.layout import RANGE_INPUTS, SURGE, motion
 from residnet.core.names import STATE
 from residnet.core.version import __version__
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.scripted import scripted
+from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec
 from residnet.export import base
 from residnet.export.base import Exported, Loaded, Numbers, RoundingError

@@ -49,7 +49,7 @@ class ResidualHead(nn.Module, ABC):
         """
         return self.forward(z, z[..., :0])[0]
 
-    def told_apart(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def with_spread(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return residual [B, 3], how far members of this head disagree [B, 3], and the memory.
 
         A head without members agrees with itself.
@@ -57,7 +57,7 @@ class ResidualHead(nn.Module, ABC):
         rho, s = self.forward(z, s)
         return rho, torch.zeros_like(rho), s
 
-    def sequence_told_apart(self, z: Tensor) -> tuple[Tensor, Tensor]:
+    def sequence_with_spread(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return what `sequence` does [B, T, 3], and how far members disagree [B, T, 3]."""
         rho = self.sequence(z)
         return rho, torch.zeros_like(rho)

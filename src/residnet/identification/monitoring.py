@@ -29,8 +29,7 @@ from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.scripted import scripted
+from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec
 from residnet.physics.signals import SignalsConfig
 

@@ -20,8 +20,7 @@ from residnet.core.names import STATE
 from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import Craft, Flight, Sea, fly
 from residnet.data.simulated.sensors import SensorNoise
-from residnet.dynamics.actuated import ActuatedDynamics
-from residnet.dynamics.gear import GivenGear, InputShare, commanded
+from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, commanded
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.models import FittedModel
@@ -345,7 +344,7 @@ def _greedy(trials: Sequence[Trial], covariance: Tensor, goal: Tensor, count: in
 
 def _flights(fitted: FittedModel, shares: Mapping[str, InputShare], aim: Aim) -> list[Flight]:
     spec, model = fitted.spec, fitted.model.double()
-    gear = GivenGear(shares, spec.signals.exogenous, spec.dt)
+    gear = GivenActuators(shares, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.columns, spec.hold, gear)
     start = gear.approach(1)
     # trials begin at a speed in the middle of what the model knows

@@ -23,7 +23,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
-from residnet.dynamics.disturbance import DisturbanceConfig
+from residnet.dynamics.hybrid import DisturbanceConfig
 from residnet.heads import ForceHead, HeadConfig
 from residnet.identification.recipe import PARTS, TIED, Facts, portfolio
 from residnet.judge.bands.config import BandsConfig

@@ -14,7 +14,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.simulated.flying import Flight
-from residnet.dynamics.gear import InputShare
+from residnet.dynamics.actuated import InputShare
 from residnet.manoeuvres import Manoeuvre, ManoeuvreConfig
 from residnet.manoeuvres.indices import IN_LENGTHS, UNITS
 

@@ -14,8 +14,7 @@ from residnet.core.names import STATE, VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.scripted import scripted
+from residnet.dynamics.rollout import Rollout, scripted
 from residnet.judge.bands.band import Band
 from residnet.judge.protocol import Window
 

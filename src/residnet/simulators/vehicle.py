@@ -12,10 +12,9 @@ from residnet.core.errors import UsageError
 from residnet.core.layout import SURGE
 from residnet.core.names import STATE
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.dynamics.store import load_model
+from residnet.dynamics.store import chosen_model, load_model
 from residnet.export.guard import GuardedDynamics
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel

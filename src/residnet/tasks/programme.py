@@ -17,12 +17,9 @@ from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import Craft, Flight, Sea, fly, log_names, source_of
 from residnet.data.simulated.sensors import SensorNoise
-from residnet.dynamics.actuated import ActuatedDynamics
-from residnet.dynamics.gear import GivenGear, InputShare, PlantGear
-from residnet.dynamics.learned import chosen_model
-from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.dynamics.steps import check_steps
-from residnet.dynamics.store import load_model
+from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
+from residnet.dynamics.simulated import TracedPlantDynamics, check_steps
+from residnet.dynamics.store import chosen_model, load_model
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre, ManoeuvreConfig, Replay
 from residnet.physics.vessel import load_vessel
 
@@ -236,17 +233,17 @@ class Programme(Config):
         vessel = choice.actuators or self.vessel
         # waves and forces do not reach a learned model
         calm = self.disturbance.model_copy(update={"waves": None})
-        gear: GivenGear | PlantGear
+        gear: GivenActuators | PlantActuators
         forces: Callable[[Tensor], Tensor] | None = None
         if choice.inputs:
             gear, sea = (
-                GivenGear(choice.inputs, spec.signals.exogenous, step),
+                GivenActuators(choice.inputs, spec.signals.exogenous, step),
                 Sea(None, calm, self.noise, self.seed),
             )
         elif vessel is not None:
             plant = load_vessel(vessel).build()
             gear, sea = (
-                PlantGear(plant, step, self.substeps),
+                PlantActuators(plant, step, self.substeps),
                 Sea(plant, calm, self.noise, self.seed),
             )
             forces = Helm.from_plant(plant).forces

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from residnet.core.layout import velocities
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.scripted import FreeRun
+from residnet.dynamics.rollout import FreeRun
 
 Shared = Callable[[Tensor], Tensor]
 """A sum over this process's windows to the mean of the sums of all processes."""

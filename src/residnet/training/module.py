@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from residnet.core.layout import POSE, VELOCITIES
 from residnet.data.windows import WindowBatches, WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.scripted import MANY, FreeRun, scripted
+from residnet.dynamics.rollout import MANY, FreeRun, Rollout, scripted
 from residnet.training.config import TrainingConfig
 from residnet.training.epochs import EpochTraining
 from residnet.training.losses import one_step_loss, rollout_loss

@@ -11,7 +11,7 @@ from residnet.baselines import RegressorsConfig
 from residnet.core.errors import DataError, UsageError
 from residnet.data.prepare import envelope, samples
 from residnet.data.windows import WindowStore
-from residnet.dynamics.gear import InputShare
+from residnet.dynamics.actuated import InputShare
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.models import FittedModel
 from residnet.identification.planning import (

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
-from residnet.dynamics.steps import check_steps
+from residnet.dynamics.simulated import check_steps
 from residnet.physics.environment.waves import JonswapSpectrum
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]

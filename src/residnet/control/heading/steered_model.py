@@ -10,8 +10,8 @@ from torch import Tensor
 from residnet.control.heading.steering import SteeredPlant, SteeredVessel
 from residnet.core.errors import ConfigError
 from residnet.core.names import STATE, nearest
+from residnet.dynamics.actuated import commanded
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.gear import commanded
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.steering_variation import VariedModel
 

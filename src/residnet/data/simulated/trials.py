@@ -25,8 +25,7 @@ from residnet.data.simulated.flying import (
     source_of,
 )
 from residnet.data.simulated.sensors import SensorNoise
-from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
-from residnet.dynamics.steps import check_steps
+from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics, check_steps
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre
 from residnet.physics.vessel import VesselName, load_vessel
 

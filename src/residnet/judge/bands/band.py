@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from residnet.dynamics.band import BandTable
+from residnet.dynamics.store import BandTable
 from residnet.judge.bands.activity import MEASURES, Activity
 from residnet.judge.bands.channels import CHANNELS
 

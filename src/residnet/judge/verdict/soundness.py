@@ -20,8 +20,7 @@ from residnet.core.layout import POSE, RANGE_VELOCITIES, SURGE, VELOCITIES
 from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.scripted import scripted
+from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec
 from residnet.judge.verdict.sanity_points import acceleration
 

@@ -17,7 +17,7 @@ from residnet.core.config import Config, MetresPerSecond, Radians, Seconds
 from residnet.core.names import nearest
 from residnet.data.simulated.environment import Disturbance, WindField
 from residnet.documents.gouletas2020.config import PredictiveConfig
-from residnet.dynamics.steps import check_steps
+from residnet.dynamics.simulated import check_steps
 from residnet.physics.environment.waves import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.runs.task import ComputingTask

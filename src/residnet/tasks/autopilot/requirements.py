@@ -9,8 +9,7 @@ from residnet.control.heading.steered_model import SteeredModel
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.heading.turning import Turning
 from residnet.core.errors import ConfigError, FitError
-from residnet.dynamics.learned import chosen_model
-from residnet.dynamics.store import load_model
+from residnet.dynamics.store import chosen_model, load_model
 from residnet.physics.vessel import load_vessel
 from residnet.tasks.autopilot.config import AutopilotSettings, PolicyConfig
 from residnet.tasks.autopilot.pace import least_time, paced

@@ -11,7 +11,7 @@ from residnet.control.courses.course_check import Protocol
 from residnet.control.guidance.line_of_sight import AnyLineOfSight
 from residnet.control.observed.config import AnyController
 from residnet.core.config import ExistingPath, MetresPerSecond, Seconds
-from residnet.dynamics.steps import check_steps
+from residnet.dynamics.simulated import check_steps
 from residnet.runs.task import ComputingTask
 from residnet.tasks.course.flights import CourseSpreadConfig
 

@@ -15,8 +15,8 @@ from residnet.control.courses.config import PlannedCourse
 from residnet.control.guidance.course_guidance import CourseGuidance
 from residnet.control.heading.controllers import Steering
 from residnet.core.config import Config, MetresPerSecond, Radians
-from residnet.dynamics.ambient_current import InAmbientCurrent
 from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.judge.courses import CourseFlight
 
 

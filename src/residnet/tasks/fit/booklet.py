@@ -17,9 +17,8 @@ from residnet.data.prepare import Prepared
 from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import Craft, Flight, Sea, fly, source_of
 from residnet.data.simulated.sensors import SensorNoise
-from residnet.dynamics.actuated import ActuatedDynamics
-from residnet.dynamics.gear import GivenGear, InputShare
-from residnet.dynamics.parameter_samples import SampledDynamics
+from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare
+from residnet.dynamics.ensemble import SampledDynamics
 from residnet.identification.models import FittedModel
 from residnet.judge.booklet import BookletConfig, Page, contents
 from residnet.manoeuvres import Helm, Manoeuvre, Zigzag
@@ -110,7 +109,7 @@ def require_flyable(config: BookletConfig, fitted: FittedModel) -> None:
 def _craft(config: BookletConfig, fitted: FittedModel, inputs: Mapping[str, InputShare]) -> Craft:
     """Return the model behind the gear of its inputs; its rows are draws."""
     spec, model = fitted.spec, fitted.model.double()
-    gear = GivenGear(inputs, spec.signals.exogenous, spec.dt)
+    gear = GivenActuators(inputs, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.columns, spec.hold, gear)
     start = gear.approach(1)
     for name, value in config.initial.items():
