@@ -12,13 +12,15 @@ Each function takes a part and raises an `AssertionError` of one line where it b
 from __future__ import annotations
 
 from residnet.testing.bad_inputs import check_bad_inputs
-from residnet.testing.baselines import check_baseline
+from residnet.testing.checks import (
+    check_baseline,
+    check_exporter,
+    check_head,
+    check_manoeuvre,
+    check_reader,
+    check_vessel,
+)
 from residnet.testing.examples import example_models, example_samples
-from residnet.testing.exporters import check_exporter
-from residnet.testing.heads import check_head
-from residnet.testing.manoeuvres import check_manoeuvre
-from residnet.testing.readers import check_reader
-from residnet.testing.vessels import check_vessel
 
 __all__ = [
     "check_bad_inputs",

@@ -12,7 +12,7 @@ from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.guard import GuardedDynamics
-from residnet.testing.require import require, require_equal, require_finite
+from residnet.testing.checks import require, require_equal, require_finite
 
 _PAST, _STEPS = 6, 8
 _BAD_STEP = 3

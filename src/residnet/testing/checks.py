@@ -1,0 +1,480 @@
+"""Contracts of heads, baselines, vessels, manoeuvres, readers and export formats.
+
+Each complaint is one line that names the part, what it does, and what it should do.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import tempfile
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from residnet.baselines import BaselineConfig, IdentifiedConfig
+from residnet.core.config import Config, validate
+from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.log import Log
+from residnet.core.names import si_unit
+from residnet.core.registry import kind_of
+from residnet.core.samples import Samples
+from residnet.data.readers import LogReader
+from residnet.data.simulated.environment import Disturbance
+from residnet.data.simulated.flying import Craft, Flight, Sea, fly, source_of
+from residnet.data.simulated.sensors import SensorNoise
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.store import load_model, save_model
+from residnet.export import ExportedVessel, Exporter
+from residnet.heads import HeadConfig
+from residnet.heads.base import FeatureConfig
+from residnet.manoeuvres import Helm, Manoeuvre, ManoeuvreConfig
+from residnet.physics.plant import Plant
+from residnet.physics.vessel import load_vessel
+from residnet.testing.examples import example_model, example_models, example_samples, example_spec
+
+_ROWS, _STEPS = 4, 12
+_STEP = 0.1
+_SHORT = 4
+
+
+def require(condition: bool, message: str) -> None:
+    """Stop where a contract is broken.
+
+    Raises:
+        AssertionError: with the message, where the condition does not hold.
+    """
+    if not condition:
+        raise AssertionError(message)
+
+
+def require_equal(found: Tensor, expected: Tensor, tolerance: float, message: str) -> None:
+    """Stop where two tensors of one shape differ by more than a share of the larger number.
+
+    Raises:
+        AssertionError: with the message and the largest difference.
+    """
+    require(found.shape == expected.shape, f"{message} (shapes {found.shape}, {expected.shape})")
+    if found.numel():
+        difference = float((found - expected).abs().max()) / (1.0 + float(expected.abs().max()))
+        require(difference <= tolerance, f"{message} (largest difference {difference:.2g})")
+
+
+def require_finite(values: Tensor, message: str) -> None:
+    """Stop where a tensor holds what is no number.
+
+    Raises:
+        AssertionError: with the message.
+    """
+    require(bool(torch.isfinite(values).all()), message)
+
+
+def _scripted(module: nn.Module, who: str) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return torch.jit.script(module)
+        except Exception as error:  # the compiler raises whatever it likes
+            lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+            raise AssertionError(f"{who}: TorchScript cannot compile it: {lines[0]}") from error
+
+
+def _read_back(config: Config, union: Any, who: str) -> None:
+    written = config.model_dump(mode="json")
+    try:
+        again, known = (validate(written, kind, "written") for kind in (type(config), union))
+    except Exception as error:  # also of a validator that the part brings
+        raise AssertionError(f"{who}: its config cannot be read back: {error}") from error
+    require(again == config, f"{who}: its config changes when it is written and read back")
+    require(type(known) is type(config), f"{who}: its name leads to {type(known).__name__} instead")
+
+
+def check_head(config: FeatureConfig) -> None:
+    """Check everything that residnet relies on in a head.
+
+    Shapes and precision, a residual that is not zero, equal answers for equal questions, rows of a
+    batch that do not see each other, sequences that equal steps, the memory of a past, TorchScript,
+    finite answers far outside of the training range, gradients, and a model that is stored and
+    loaded without a change.
+
+    Args:
+        config: of the head; it must work with the channels of `example_samples`.
+
+    Raises:
+        AssertionError: one line that says which contract is broken.
+    """
+    who, spec = f"head {kind_of(type(config))}", example_spec(config)
+    _read_back(config, HeadConfig, who)
+    model, samples = example_model(spec), example_samples().z
+    head = model.head.eval()
+    # channels [4, 12, 8] from the middle of the example samples
+    begin = torch.arange(_ROWS) * (len(samples) // _ROWS) + 30
+    z = samples[begin[:, None] + torch.arange(_STEPS)[None]]
+
+    def empty(rows: int, dtype: torch.dtype) -> Tensor:
+        return torch.zeros(rows, head.n_state, dtype=dtype)
+
+    def stepped(module: Any, given: Tensor) -> tuple[Tensor, Tensor]:
+        s, residuals = empty(len(given), given.dtype), []
+        for k in range(given.shape[1]):
+            rho, s = module(given[:, k], s)
+            residuals.append(rho)
+        return torch.stack(residuals, dim=1), s
+
+    with torch.no_grad():
+        for dtype in (torch.float32, torch.float64):
+            first, s = z[:, 0].to(dtype), empty(_ROWS, dtype)
+            (rho, after), (again, _) = (head.to(dtype)(first, s) for _ in range(2))
+            shapes = {"residual": (rho.shape, 3), "memory": (after.shape, head.n_state)}
+            for name, (shape, n) in shapes.items():
+                wanted = "[B, 3]" if name == "residual" else f"[B, n_state = {n}]"
+                message = f"{who}: the {name} has the shape {shape}, not {wanted}"
+                require(shape == (_ROWS, n), message)
+            require(
+                rho.dtype == after.dtype == dtype,
+                f"{who}: answers {rho.dtype} and {after.dtype} where it is asked in {dtype}",
+            )
+            require_finite(rho, f"{who}: the residual at a training sample is not finite")
+            require(float(rho.abs().max()) > 0, f"{who}: the residual is zero everywhere")
+            message = f"{who}: two answers to one question differ; is it in eval?"
+            require(torch.equal(rho, again), message)
+        residuals, memory = stepped(head, z)
+        whole = head.sequence(z)
+        require_equal(whole, residuals, 1e-9, f"{who}: sequence differs from steps")
+        require_equal(head.warmup(z), memory, 1e-9, f"{who}: warmup differs from the steps' memory")
+        message = f"{who}: the memory without a past is not zeros [B, {head.n_state}]"
+        require_equal(head.warmup(z[:, :0]), empty(_ROWS, z.dtype), 0.0, message)
+        message = f"{who}: the answer for a row depends on the other rows of the batch"
+        for i in range(_ROWS):
+            alone = z[i : i + 1]
+            require_equal(head.sequence(alone), whole[i : i + 1], 1e-9, message)
+            require_equal(stepped(head, alone)[0], residuals[i : i + 1], 1e-9, message)
+        single = z.float()
+        (rho, memory), (same, after) = (
+            stepped(module, single) for module in (head.float(), _scripted(head, who))
+        )
+        require_equal(same, rho, 1e-5, f"{who}: the scripted head gives other residuals")
+        require_equal(after, memory, 1e-5, f"{who}: the scripted head keeps another memory")
+        head.double()
+        far, further = (samples.mean(0) + times * samples.std(0) for times in (1e6, 1e9))
+        rho, memory = head(far[None], empty(1, z.dtype))
+        beyond, _ = head(further[None], empty(1, z.dtype))
+        held = head.sequence(far.expand(1, 200, -1))
+    require_finite(torch.cat((rho, beyond)), f"{who}: not finite far outside of the training range")
+    require_finite(memory, f"{who}: its memory is not finite far outside of the training range")
+    require_finite(held, f"{who}: not finite after 200 steps outside of the training range")
+    inside, largest = float(whole.abs().max()), float(held.abs().max())
+    require(
+        largest < 50 * inside + 10,
+        f"{who}: runs away outside of the training range ({largest:.3g}, inside {inside:.3g});"
+        " hold the features at its edge (residnet.heads.base.Features)",
+    )
+    first = z[:, 0].clone().requires_grad_()
+    head(first, empty(_ROWS, z.dtype))[0].sum().backward()
+    slope = first.grad
+    require(slope is not None, f"{who}: cannot be differentiated with respect to the channels")
+    assert slope is not None
+    require_finite(slope, f"{who}: its gradient with respect to the channels is not finite")
+    require(float(slope.abs().max()) > 0, f"{who}: its gradient is zero everywhere")
+    counts, spread = head.parameter_count(), head.residual_std()
+    require(
+        len(counts) == 3 and all(count >= 0 for count in counts),
+        f"{who}: parameter_count gives {counts}, not one number for each of three axes",
+    )
+    require(
+        spread.shape == (3,) and bool((spread > 0).all()),
+        f"{who}: residual_std gives {spread.tolist()}, not three positive numbers",
+    )
+    model = example_model(spec)
+    with tempfile.TemporaryDirectory() as folder:
+        save_model(Path(folder) / "example", spec, model)
+        stored_spec, stored = load_model(Path(folder) / "example")
+    require(stored_spec == spec, f"{who}: its description changes when it is stored")
+    state = model.state_dict()
+    for name, value in stored.state_dict().items():
+        same_number = value.dtype == state[name].dtype and torch.equal(value, state[name])
+        require(same_number, f"{who}: '{name}' changes when the model is stored")
+    with torch.no_grad():
+        kept, given = (part.head.double().eval().sequence(z) for part in (stored, model))
+    require_equal(kept, given, 0.0, f"{who}: the stored model gives other residuals")
+
+
+def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> None:
+    """Check everything that residnet relies on in a baseline.
+
+    It is identified from samples, twice with the same result; its accelerations have the right
+    shape and precision, are finite, do not depend on the company of a row, can be differentiated
+    and compiled by TorchScript; its numbers survive a state dict, its config a file.
+
+    Args:
+        config: of the baseline.
+        samples: whose target is the measured acceleration [N, 3]; those of a catamaran with two
+            propellers (`example_samples`) where None.
+
+    Raises:
+        AssertionError: one line that says which contract is broken.
+    """
+    who = f"baseline {kind_of(type(config))}"
+    known = example_samples() if samples is None else samples
+    resolved = config.resolved()
+    baseline, again = (resolved.build(known.names) for _ in range(2))
+    table = resolved.fit(baseline, known)
+    require(resolved.fit(again, known) == table, f"{who}: two fits give different coefficients")
+    z = known.z[:: max(len(known) // 40, 1)]
+    with torch.no_grad():
+        accelerations = baseline(z)
+        require(
+            accelerations.shape == (len(z), 3),
+            f"{who}: the accelerations have the shape {accelerations.shape}, not [N, 3]",
+        )
+        require_finite(accelerations, f"{who}: its accelerations are not finite")
+        require_equal(again(z), accelerations, 0.0, f"{who}: two fits give different answers")
+        together = baseline(z[None].expand(2, -1, -1))
+        require_equal(together[1], accelerations, 1e-12, f"{who}: fails for channels [B, T, nz]")
+        message = f"{who}: the answer for a row depends on the other rows of the batch"
+        require_equal(baseline(z[3:4]), accelerations[3:4], 1e-9, message)
+        single = copy.deepcopy(baseline).float()(z.float())
+        require(single.dtype == torch.float32, f"{who}: answers {single.dtype} in float32")
+        require_equal(single.double(), accelerations, 1e-3, f"{who}: float32 differs too much")
+    moving = z.clone().requires_grad_()
+    # a baseline that knows nothing may answer with a constant
+    (baseline(moving).sum() + 0.0 * moving.sum()).backward()
+    gradient = torch.zeros_like(z) if moving.grad is None else moving.grad
+    require_finite(gradient, f"{who}: its gradient with respect to the channels is not finite")
+    compiled = _scripted(baseline, who)
+    with torch.no_grad():
+        require_equal(compiled(z), accelerations, 1e-9, f"{who}: scripted, it answers otherwise")
+    counts = baseline.parameter_count()
+    require(len(counts) == 3, f"{who}: parameter_count gives {counts}, not one for each axis")
+    empty = resolved.build(known.names)
+    empty.load_state_dict(baseline.state_dict())
+    with torch.no_grad():
+        require_equal(empty(z), accelerations, 0.0, f"{who}: its state dict does not hold it all")
+    _read_back(resolved, BaselineConfig, who)
+
+
+def check_vessel(name: str, step: float = 0.1) -> None:
+    """Check that a vessel can be built and stepped.
+
+    Its description is one line, its length positive, its motion under half drive finite, and equal
+    for a vessel alone and one of several.
+
+    Args:
+        name: of the vessel, or path of its file.
+        step: of the simulation in s.
+
+    Raises:
+        AssertionError: one line that says which contract is broken.
+    """
+    who = f"vessel {name}"
+    vessel = load_vessel(name)
+    require("\n" not in vessel.description.strip(), f"{who}: its description is not one line")
+    require(vessel.length.value > 0, f"{who}: its length is not positive")
+    plant = vessel.build()
+    require(plant.commands > 0, f"{who}: has no commands")
+    dynamics = PlantDynamics(plant, step)
+    x = plant.approach(3)
+    w = torch.zeros(3, len(plant.inputs), dtype=torch.float64)
+    half = torch.full((3,), 0.5, dtype=torch.float64)
+    w[:, : plant.commands] = plant.demand(half, 0.2 * half)
+    start, memory = x.clone(), dynamics.initial_state(3).to(x.dtype)
+    with torch.no_grad():
+        for _ in range(100):
+            x, memory = dynamics.step(x, w, memory)
+        require_finite(x, f"{who}: its motion is not finite")
+        first, _ = dynamics.step(start, w, dynamics.initial_state(3).to(x.dtype))
+        alone, _ = dynamics.step(start[:1], w[:1], dynamics.initial_state(1).to(x.dtype))
+    require_equal(alone, first[:1], 1e-12, f"{who}: moves otherwise beside other vessels")
+
+
+def check_manoeuvre(
+    manoeuvre: Manoeuvre, vessel: str = "wam_v_cal", duration: float = 30.0
+) -> Flight:
+    """Check everything that residnet relies on in a manoeuvre, and return a flight of it.
+
+    It is written and read back, flown alone and beside another of its kind with equal results, with
+    a finite motion; inputs that are not commands pass through it; its indices are asked for, of the
+    whole flight and of one that is too short for any.
+
+    Args:
+        manoeuvre: what to fly.
+        vessel: name of the vessel that flies it.
+        duration: in s, where the manoeuvre gives none.
+
+    Raises:
+        AssertionError: one line that says which contract is broken.
+    """
+    who = f"manoeuvre {kind_of(type(manoeuvre))}"
+    read = validate(manoeuvre.model_dump(mode="json"), ManoeuvreConfig, "written")
+    require(read == manoeuvre, f"{who}: changes when it is written and read back")
+    plant = load_vessel(vessel).build()
+    duration = manoeuvre.lasts(duration)
+    _check_batch(manoeuvre, plant, duration, who)
+    helm, length = Helm.from_plant(plant), load_vessel(vessel).length.value
+    craft = Craft(vessel, PlantDynamics(plant, _STEP), helm, plant.commands, plant.approach(1))
+    sea = Sea(plant, Disturbance(), SensorNoise(), 0)
+    flight = fly(craft, [manoeuvre], sea, duration, _STEP)[0]
+    _check_indices(manoeuvre.indices(flight.motion, length), who)
+    motion = flight.motion
+    few = {name: values[:_SHORT] for name, values in motion.channels.items()}
+    short = Log(motion.name, motion.t[:_SHORT], few, motion.units)
+    _check_indices(manoeuvre.indices(short, None), who)
+    limits = manoeuvre.limits(helm, length, 1.0)
+    require(all(math.isfinite(limit) for limit in limits.values()), f"{who}: a limit is not finite")
+    return flight
+
+
+def _flown(manoeuvres: list[Manoeuvre], plant: Plant, seconds: float) -> tuple[Tensor, Tensor]:
+    """Return states [B, T+1, nx] and inputs [B, T, m] of manoeuvres of one kind side by side."""
+    helm = Helm.from_plant(plant)
+    t = torch.arange(max(round(seconds / _STEP), 2), dtype=torch.float64) * _STEP
+    start = torch.stack([m.begin(plant.approach(1)[0], helm.state) for m in manoeuvres])
+    w = torch.zeros(len(manoeuvres), len(t), len(plant.inputs), dtype=torch.float64)
+    w[:, :, plant.commands :] = 0.01
+    source = source_of(manoeuvres, helm, t)
+    with torch.no_grad():
+        states, inputs, _ = Rollout(PlantDynamics(plant, _STEP), source)(start, w, start[:, :0])
+    return states, inputs
+
+
+def _check_batch(manoeuvre: Manoeuvre, plant: Plant, seconds: float, who: str) -> None:
+    alone, inputs = _flown([manoeuvre], plant, seconds)
+    pair, commands = _flown([manoeuvre, manoeuvre], plant, seconds)
+    require_finite(alone, f"{who}: the motion is not finite")
+    require_finite(inputs, f"{who}: a command is not finite")
+    count = plant.commands
+    require(
+        bool((inputs[:, :, count:] == 0.01).all()),
+        f"{who}: changes inputs that are no commands, such as wind and current",
+    )
+    for row in range(2):
+        message = f"{who}: flown beside another one it does something else"
+        require_equal(pair[row], alone[0], 1e-9, message)
+        require_equal(commands[row, :, :count], inputs[0, :, :count], 1e-9, message)
+
+
+def _check_indices(indices: dict[str, Any], who: str) -> None:
+    for name, value in indices.items():
+        numbers = np.atleast_1d(np.asarray(value))
+        require(
+            numbers.dtype.kind in "fiub" and bool(np.isfinite(numbers.astype(float)).all()),
+            f"{who}: its index '{name}' is {value!r}, not finite numbers; leave it out instead",
+        )
+
+
+def check_reader(config: Config, file: Path) -> Log:
+    """Check everything that residnet relies on in a reader, and return the log that it read.
+
+    Time that strictly increases, channels in SI units as float64, a heading without jumps, the
+    file's identity, the same log twice, and one-line errors for a file that is missing, a folder,
+    an empty file and a damaged one.
+
+    Args:
+        config: of the reader.
+        file: a recording that the reader can read.
+
+    Raises:
+        AssertionError: one line that says which contract is broken.
+    """
+    who = f"reader {kind_of(type(config))}"
+    reader: LogReader = getattr(config, "build")()  # noqa: B009  readers have no common base
+    require(isinstance(reader, LogReader), f"{who}: build gives no LogReader")
+    file = Path(file)
+    log, again = reader.read(file), reader.read(file)
+    _check_log(log, file, who)
+    require(
+        list(log.channels) == list(again.channels)
+        and all(
+            np.array_equal(values, again.channels[name], equal_nan=True)
+            for name, values in log.channels.items()
+        ),
+        f"{who}: reads the same file twice with different results",
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        _check_refusals(reader, Path(folder), file, who)
+    return log
+
+
+def _check_log(log: Log, file: Path, who: str) -> None:
+    require(log.name == file.stem, f"{who}: names the log '{log.name}', not '{file.stem}'")
+    require(bool(log.channels), f"{who}: the log has no channels")
+    require(log.t.dtype == np.float64, f"{who}: time is {log.t.dtype}, not float64")
+    require(log.t.size >= 2, f"{who}: the log has {log.t.size} samples, at least 2 are needed")
+    require(bool((np.diff(log.t) > 0).all()), f"{who}: time does not strictly increase")
+    for name, values in log.channels.items():
+        require(values.dtype == np.float64, f"{who}: {name} is {values.dtype}, not float64")
+        unit = log.units[name]
+        require(si_unit(unit) == unit, f"{who}: {name} is in {unit}, not in SI units")
+    if "psi" in log.channels:
+        psi = log["psi"][np.isfinite(log["psi"])]
+        require(bool((np.abs(np.diff(psi)) < np.pi).all()), f"{who}: psi jumps by half a circle")
+    missing = [key for key in ("source", "sha256") if key not in log.meta]
+    require(not missing, f"{who}: the log's meta lacks {', '.join(missing)}")
+
+
+def _check_refusals(reader: LogReader, folder: Path, file: Path, who: str) -> None:
+    empty, damaged = (folder / f"{name}{file.suffix}" for name in ("empty", "damaged"))
+    empty.write_bytes(b"")
+    damaged.write_bytes(np.random.default_rng(0).bytes(4096))
+    _require_refusal(reader, folder / f"absent{file.suffix}", "missing", UsageError, who)
+    nothing = folder / "nothing"
+    nothing.mkdir()
+    for path, what in ((nothing, "an empty folder"), (empty, "empty"), (damaged, "random bytes")):
+        _require_refusal(reader, path, what, ResidnetError, who)
+
+
+def _require_refusal(
+    reader: LogReader, path: Path, what: str, kind: type[ResidnetError], who: str
+) -> None:
+    try:
+        reader.read(path)
+    except kind as error:
+        text = str(error)
+        require("\n" not in text and str(path) in text, f"{who}: its error does not name the file")
+    except Exception as error:
+        raise AssertionError(
+            f"{who}: a file that is {what} raises {type(error).__name__}, not {kind.__name__}"
+        ) from error
+    else:
+        raise AssertionError(f"{who}: reads a file that is {what}")
+
+
+def check_exporter(exporter: Exporter) -> None:
+    """Check everything that residnet relies on in an export format.
+
+    It writes the file that it is given, in a folder that does not exist yet, returns a card, leaves
+    the model's numbers as they are, and refuses with one line what it cannot hold.
+
+    Args:
+        exporter: the format.
+
+    Raises:
+        AssertionError: one line that says which contract is broken.
+    """
+    who = f"export format {exporter.name}"
+    require(bool(exporter.about) and "\n" not in exporter.about, f"{who}: `about` is not one line")
+    require(exporter.suffix.count(".") >= 1, f"{who}: the suffix {exporter.suffix!r} has no ending")
+    for spec, model in example_models():
+        before = {name: value.clone() for name, value in model.state_dict().items()}
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "exports" / f"{spec.name}{exporter.suffix}"
+            try:
+                card = exporter.export(ExportedVessel(spec, model), file)
+            except UsageError as error:
+                require("\n" not in str(error), f"{who}: refuses a model in more than one line")
+                require(not file.exists(), f"{who}: leaves a file of a model that it refuses")
+                continue
+            require(file.exists(), f"{who}: writes no {file.name}")
+            require(isinstance(card, Mapping) and bool(card), f"{who}: returns no card")
+            left = [path.name for path in file.parent.iterdir() if path.name.endswith(".partial")]
+            require(not left, f"{who}: leaves {', '.join(left)} behind")
+        for name, value in model.state_dict().items():
+            wanted = before[name].to(torch.float64)
+            message = f"{who}: changes '{name}' of the model"
+            require_equal(value.to(torch.float64), wanted, 1e-6, message)
