@@ -82,7 +82,7 @@ ONCE: dict[str, Any] = {
 }
 
 
-@settings(max_examples=1650, **ONCE)
+@settings(max_examples=800, **ONCE)
 @given(
     seed=st.integers(0, 2**32),
     which=st.lists(st.sampled_from(DAMAGES), min_size=1, max_size=2),
@@ -126,7 +126,7 @@ OTHER_TYPES: dict[str, Callable[[np.ndarray], pa.Array]] = {
 }
 
 
-@settings(max_examples=400, **ONCE)
+@settings(max_examples=200, **ONCE)
 @given(
     seed=st.integers(0, 2**32),
     how=st.sampled_from(

@@ -52,8 +52,9 @@ def align_clocks(
     for name, topic in series.items():
         if topic.arrival is not None:
             topic = dataclasses.replace(topic, arrival=topic.arrival - shift)
-        if name in late:
-            topic = topic.noting(*_latency(name, late[name] - shift, prompt[name] - shift))
+        if name in late and topic.arrival is not None and topic.stamp is not None:
+            moved = topic.arrival - topic.stamp
+            topic = topic.noting(*_latency(name, moved, prompt[name] - shift))
         given = [seconds for asked, seconds in delays.items() if same_topic(asked, [name])]
         delay = given[0] if given else 0.0
         if delay is None:
