@@ -91,12 +91,19 @@ def draft_recordings(
     sources = _standard(some[0], log, plan)
     if by_name := _named_fields(some, marks):
         sources = by_name
-    elif log is None or not whole or not _sound(log, marks) or sources.step > _SLOW:
+    elif log is None or not whole or not _sound(log, marks):
         found = _fitting(some[0], marks, _COHERENT if whole else 0.0)
         if found is None and whole:
             text = "position, heading and velocities fit together badly: check the frames"
             marks.guess(READER, text)
         sources = found or sources
+    elif sources.step > _SLOW:
+        others = Marks()
+        found = _fitting(some[0], others, _COHERENT)
+        # the same pose again would lose the velocities that stand beside it
+        if found is not None and found.step < 0.9 * sources.step:
+            marks.extend(others)
+            sources = found
     content |= sources.content
     content["clock"] = {"kind": "uniform", "step": f"{float(f'{sources.step:.2g}'):g} s"}
     marks.note((*READER, "clock"), "as often as the heading or the position comes")
