@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from kinds import of_kind
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
@@ -63,18 +62,6 @@ def truth() -> np.ndarray:
     return solution.y[:, -1]
 
 
-def test_the_run_keeps_clear_of_kinks() -> None:
-    """Orders can be measured only where u, v and r keep their sign."""
-    model = SmoothPlant(0.05, "rk4")
-    x0 = torch.tensor([START], dtype=torch.float64)
-    with torch.no_grad():
-        states, _, _ = Rollout(model)(
-            x0, torch.zeros(1, round(SECONDS / 0.05), 0, dtype=torch.float64), x0[:, :0]
-        )
-    sign = torch.sign(states[0, :, 3:6])
-    assert bool((sign == sign[0]).all()), states[0, :, 3:6]
-
-
 @pytest.mark.parametrize(
     ("integrator", "order", "steps"),
     [
@@ -89,10 +76,6 @@ def test_order(
 ) -> None:
     coarse, fine = (np.abs(run(integrator, dt) - truth)[:6] for dt in steps)
     assert np.log2(np.linalg.norm(coarse) / np.linalg.norm(fine)) == pytest.approx(order, abs=0.25)
-
-
-def test_rk4_equals_dop853(truth: np.ndarray) -> None:
-    np.testing.assert_allclose(run("rk4", 0.02), truth, atol=2e-8)
 
 
 def test_plant_with_held_commands_equals_dop853() -> None:
@@ -162,27 +145,3 @@ def test_semi_implicit_euler_keeps_an_undamped_oscillation_bounded() -> None:
         reach[integrator] = float(states[0, -200:, 1].abs().max())
     assert reach["euler"] > 1e3
     assert reach["semi_implicit_euler"] == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.parametrize("integrator", ["rk4", "heun", "euler", "semi_implicit_euler"])
-def test_every_integrator_is_scriptable(integrator: Integrator) -> None:
-    from residnet.baselines import RegressorBaseline, RegressorsConfig
-    from residnet.dynamics.hybrid import HybridDynamics
-    from residnet.heads import ZeroHead
-    from residnet.physics.signals import SignalsConfig
-
-    signals = SignalsConfig(inputs=("delta",)).build()
-    model = HybridDynamics(
-        signals,
-        RegressorsConfig(terms=("u", "delta")).build(signals.names),
-        ZeroHead(),
-        0.1,
-        integrator,
-    )
-    theta = of_kind(model.baseline, RegressorBaseline).theta
-    with torch.no_grad():
-        theta.copy_(torch.tensor([[-0.5, 0.1], [0.0, 0.2], [0.0, 0.3]]))
-    x, w, s = torch.ones(2, 6), torch.ones(2, 5, 1), torch.zeros(2, 0)
-    torch.testing.assert_close(
-        torch.jit.script(Rollout(model))(x, w, s)[0], Rollout(model)(x, w, s)[0], rtol=0, atol=0
-    )

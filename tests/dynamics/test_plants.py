@@ -7,79 +7,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from residnet.dynamics.base import Dynamics, Integrator
+from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
-
-# away from every kink: nothing saturates, no rate limit is reached, and u, v, r keep their sign
-STARTS = {
-    "example_rudder_boat": ([0.0, 0.0, 0.3, 3.0, -0.25, 0.12, 0.14, 14.0], [0.15, 14.0]),
-    "mariner": ([0.0, 0.0, 0.3, 7.4, -0.4, 0.006, 0.10], [0.12]),
-}
-STEPS = {
-    "example_rudder_boat": {"rk4": 0.1, "semi_implicit_euler": 0.01},
-    "mariner": {"rk4": 0.4, "semi_implicit_euler": 0.1},
-}
-SECONDS = {"example_rudder_boat": 2.0, "mariner": 8.0}
-
-
-class Held(Dynamics):
-    """A plant under commands that never change, by any integrator."""
-
-    def __init__(self, name: str, dt: float, integrator: Integrator) -> None:
-        super().__init__(dt, integrator)
-        self.plant = load_vessel(name).build()
-        self.w = torch.zeros(1, len(self.plant.inputs), dtype=torch.float64)
-        command = torch.tensor(STARTS[name][1], dtype=torch.float64)
-        self.w[0, : len(command)] = command
-        for key, value in (
-            ("current_north", 0.2),
-            ("force_east", 50.0),
-            ("wind_speed", 6.0),
-            ("wind_dir", 1.0),
-        ):
-            if key in self.plant.inputs:
-                self.w[0, self.plant.inputs.index(key)] = value
-
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        return self.plant.rate(x, self.w)
-
-    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return self.integrate(x, w, s), s
-
-
-def end(name: str, integrator: Integrator, dt: float) -> np.ndarray:
-    x0 = torch.tensor([STARTS[name][0]], dtype=torch.float64)
-    with torch.no_grad():
-        states, _, _ = Rollout(Held(name, dt, integrator))(
-            x0, torch.zeros(1, round(SECONDS[name] / dt), 0, dtype=torch.float64), x0[:, :0]
-        )
-    sign = torch.sign(states[0, :, 3:6])
-    assert bool((sign == sign[0]).all()), "the run crosses a kink"
-    return states[0, -1].numpy()
-
-
-@pytest.mark.parametrize("name", STARTS)
-@pytest.mark.parametrize(("integrator", "order"), [("rk4", 4), ("semi_implicit_euler", 1)])
-def test_order_on_plants(name: str, integrator: Integrator, order: int) -> None:
-    model = Held(name, 0.1, "rk4")
-
-    def rate(_: float, x: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return model.plant.rate(torch.from_numpy(x)[None], model.w)[0].numpy()
-
-    truth = solve_ivp(
-        rate, (0.0, SECONDS[name]), STARTS[name][0], method="DOP853", rtol=1e-13, atol=1e-14
-    ).y[:, -1]
-    dt = STEPS[name][integrator]
-    coarse, fine = (np.linalg.norm(end(name, integrator, step) - truth) for step in (dt, dt / 2))
-    assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
-
 
 VESSELS = ["wam_v_cal", "wam_v_vrx", "example_rudder_boat", "mariner"]
 

@@ -102,15 +102,6 @@ def test_a_run_in_two_parts_is_the_whole_run() -> None:
     assert torch.equal(end, last)
 
 
-def test_shapes_and_no_steps_at_all() -> None:
-    model, x0 = linear(), starts(2)
-    states, applied, s = Rollout(model)(x0, inputs(2, 7), x0[:, :0])
-    assert (states.shape, applied.shape, s.shape) == ((2, 8, 6), (2, 7, 2), (2, 0))
-    states, applied, _ = Rollout(model)(x0, inputs(2, 0), x0[:, :0])
-    assert (states.shape, applied.shape) == ((2, 1, 6), (2, 0, 2))
-    assert torch.equal(states[:, 0], x0)
-
-
 def test_the_head_is_asked_once_per_step_and_held() -> None:
     class Counting(ResidualHead):
         calls = 0
@@ -204,13 +195,3 @@ def test_warm_up_is_the_memory_that_the_past_leaves() -> None:
             _, s = model.step(y[:, k], w[:, k], s)
         torch.testing.assert_close(model.warmup(y, w), s, rtol=1e-9, atol=1e-12)
         assert torch.equal(model.warmup(y[:, :0], w[:, :0]), torch.zeros_like(s))
-
-
-def test_compiled_rollout_gives_the_same() -> None:
-    model, x0, w = lstm_model(), starts(3), inputs(3, 20)
-    s = model.initial_state(3).double()
-    rollout = Rollout(model)
-    compiled = torch.jit.script(rollout)
-    with torch.no_grad():
-        for a, b in zip(rollout(x0, w, s), compiled(x0, w, s), strict=True):
-            torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)

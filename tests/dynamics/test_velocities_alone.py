@@ -12,9 +12,8 @@ from residnet.core.layout import HEADING_AND_VELOCITIES, POSITION
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads import LstmConfig, ResidualHead
+from residnet.heads import LstmConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.physics.terms import TermLibrary
 
 DT = 0.05
 TERMS = {"linear": ["u", "v", "r", "a", "b"], "nonlinear": ["u", "v|v|", "r", "a", "u b"]}
@@ -51,50 +50,3 @@ def test_heading_and_velocities_do_not_hang_on_positions(
     torch.testing.assert_close(alone, whole, rtol=0, atol=1e-13)
     torch.testing.assert_close(*slopes, rtol=0, atol=1e-13)
     assert torch.equal(states[1][..., POSITION], x0[:, None, POSITION].expand(5, 41, 2))
-
-
-def test_the_steps_of_the_integrators_are_those_written_out() -> None:
-    signals = SignalsConfig(inputs=("a",)).build()
-    terms = ["u|u|", "v", "r", "a"]
-    baseline = RegressorBaseline([terms] * 3, signals.names)
-    theta = torch.tensor(
-        [[-0.5, 0.0, 0.0, 1.0], [0.0, -0.8, 0.2, 0.1], [0.0, 0.1, -1.0, 0.5]], dtype=torch.float64
-    )
-    baseline.theta.data.copy_(theta)
-    x = torch.tensor([[3.0, 4.0, 0.5, 1.0, -0.2, 0.3]], dtype=torch.float64)
-    w = torch.tensor([[0.7]], dtype=torch.float64)
-    library = TermLibrary(terms, signals.names)
-
-    def rate(nu: torch.Tensor) -> torch.Tensor:
-        return library(torch.cat((nu, w), dim=-1)) @ theta.T
-
-    nu = x[:, 3:]
-    k1 = rate(nu)
-    k2 = rate(nu + 0.5 * DT * k1)
-    k3 = rate(nu + 0.5 * DT * k2)
-    k4 = rate(nu + DT * k3)
-    ends = {
-        "rk4": nu + DT / 6 * (k1 + 2 * k2 + 2 * k3 + k4),
-        "heun": nu + DT / 2 * (k1 + rate(nu + DT * k1)),
-        "euler": nu + DT * k1,
-        "semi_implicit_euler": nu + DT * k1,
-    }
-    turned = {
-        "rk4": 0.3 + DT / 6 * (k1 + k2 + k3)[0, 2],
-        "heun": 0.3 + DT / 2 * k1[0, 2],
-        "euler": torch.tensor(0.3, dtype=torch.float64),
-        "semi_implicit_euler": ends["euler"][0, 2],
-    }
-    for integrator in get_args(Integrator):
-        model = HybridDynamics(signals, baseline, _nothing(), DT, integrator).double().eval()
-        model.positions = False
-        after = model.step(x, w, model.initial_state(1).double())[0]
-        torch.testing.assert_close(after[:, 3:], ends[integrator], rtol=0, atol=1e-14)
-        torch.testing.assert_close(after[0, 2], 0.5 + DT * turned[integrator], rtol=0, atol=1e-14)
-
-
-def _nothing() -> ResidualHead:
-    """Return a head whose residual is zero."""
-    head = LstmConfig(hidden_size=2).build(("u", "v", "r", "a"))
-    head.silence()
-    return head

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from exported_models import NAMES, VARIANTS, fill, spec_of
 
+from residnet.baselines import BaselineConfig
+from residnet.core.config import validate
 from residnet.core.samples import Samples
 from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.export import ExportedVessel, exporter, vessel
+from residnet.physics.signals import SignalsConfig
+from residnet.testing import example_samples
 
 
 def gated() -> tuple[ModelSpec, HybridDynamics]:
@@ -37,18 +42,43 @@ def gated() -> tuple[ModelSpec, HybridDynamics]:
     return spec, model.eval()
 
 
+def ship() -> tuple[ModelSpec, HybridDynamics]:
+    """A physical model without a head, which holds numbers in parameters alone."""
+    content = {
+        "kind": "mmg",
+        "hull": {"length": 6, "beam": 2, "draught": 0.4, "mass": 1500, "x_G": 0},
+        "propeller": {"diameter": 0.3, "x": -0.48, "thrust": [0.29, -0.28, -0.14]},
+        "rudder": {"area": 0.1, "aspect": 1.5, "race": 0.6},
+    }
+    signals = SignalsConfig(inputs=("n", "delta"))
+    samples = example_samples("example_rudder_boat", signals)
+    config = validate(content, BaselineConfig, "here").resolved()
+    spec = spec_of(
+        None,
+        role="baseline",
+        signals=signals.resolved().model_dump(),
+        baseline=config.model_dump(),
+        low=samples.z[:, :5].min(0).values.tolist(),
+        high=samples.z[:, :5].max(0).values.tolist(),
+    )
+    model = spec.build()
+    config.fit(model.baseline, samples)
+    assert not list(model.buffers())
+    return spec, model
+
+
 @pytest.mark.exporters
+@pytest.mark.parametrize("make", [gated, ship])
 @pytest.mark.parametrize("name", ["torchscript", "c", "onnx", "casadi"])
-def test_every_format_holds_a_gate(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_every_format_holds_a_gate_and_a_hull(
+    name: str, make: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
-    spec, model = gated()
-    kind = exporter(name)
-    file = tmp_path / f"gate{kind.suffix}"
-    card = kind.export(ExportedVessel(spec, model), file)
+    spec, model = make()
+    file = tmp_path / f"boat{exporter(name).suffix}"
+    card = exporter(name).export(ExportedVessel(spec, model), file)
     assert file.is_file()
-    assert card["gated"] is True
+    assert card["gated"] is spec.gated
 
 
 def test_a_gated_model_is_stored_and_loaded(tmp_path: Path) -> None:
