@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from residnet.core.units import to_si, units
+from residnet.core.units import si_unit, to_si, units
 
 _WINDOW = 1.0
 """Shortest time in s over which positions are differentiated."""
@@ -71,16 +71,11 @@ class Fit(NamedTuple):
 
     def unit(self, expected: str) -> str | None:
         """Return the unit whose factor this is; None where no unit comes near."""
-        known = [name for name in units() if _measures(name, expected)]
+        odd = ("rad/min", "m/min", "cm/s")
+        known = [n for n in units() if si_unit(n) == expected and n not in odd]
         best = min(known, key=lambda name: abs(np.log(abs(self.factor) / to_si(name))))
         ratio = abs(self.factor) / to_si(best)
         return best if 1.0 / _FITS < ratio < _FITS else None
-
-
-def _measures(name: str, expected: str) -> bool:
-    from residnet.core.units import si_unit
-
-    return si_unit(name) == expected and name not in ("rad/min", "m/min", "cm/s")
 
 
 class Motion(NamedTuple):

@@ -22,7 +22,7 @@ from residnet.data.readers.angles import Form, LetterO, degrees_of, side_signs
 from residnet.data.readers.base import require_file
 from residnet.data.readers.tables import excel_sheet, json_rows, parquet_rows, sheet_names
 from residnet.data.readers.texts import first_rows
-from residnet.data.readers.times import date_order, looks_dated, parse_texts
+from residnet.data.readers.times import date_order, looks_dated, parse_texts, unix_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -221,9 +221,8 @@ def _time_unit(values: np.ndarray) -> tuple[str, str]:
     """Return the unit of times without one, and why it is a guess."""
     known = values[np.isfinite(values)]
     step, size = float(np.median(np.diff(known))), float(np.median(np.abs(known)))
-    for unit, scale in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
-        if 6.3e8 * scale <= size <= 3.8e9 * scale:
-            return unit, f"times of this size are Unix time in {unit}"
+    if unix := unix_unit(known):
+        return unix, f"times of this size are Unix time in {unix}"
     if step < 1e-3 and (2e4 < size < 7e4 or 6.5e5 < size < 8e5):
         return "day", "times of this size are days as Excel and MATLAB count them"
     for unit, longest in (("s", 5.0), ("ms", 5e3), ("us", 5e6)):

@@ -69,7 +69,8 @@ def draft_tables(
     if "psi" not in names:
         names |= levelled(attitudes, [one.numbers for one in sheets])
     logs = _raw(sheets, names, left_out)
-    channels = drafted_channels(names, logs, marks, _words(first))
+    cells = [str(text) for texts in first.texts.values() for text in texts.unique()[:20]]
+    channels = drafted_channels(names, logs, marks, [*first.header, *cells])
     for entry in channels.values():
         settings = written.get(entry["column"], {})
         entry |= {"column": first.column(entry["column"]), **settings}
@@ -118,7 +119,9 @@ def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, ResidnetErro
 
 def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
     """Return channel -> column, by what the columns are called."""
-    if pair := _letters(columns):
+    alone = {re.sub(r"\W*[\[(].*", "", column).strip().lower(): column for column in columns}
+    if {"n", "e"} <= set(alone):
+        pair = {"x": alone["n"], "y": alone["e"]}
         rest = Marks()
         others = named([name for name in columns if name not in pair.values()], rest)
         if not {"x", "y", "latitude", "longitude"} & set(others):
@@ -130,10 +133,12 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
     names: dict[str, str] = {}
     speeds: list[str] = []
     about = {column: words_of(column) for column in columns}
+    copied = re.compile(r"\.\d+$")
     # shorter names first: `heading` before `heading of the second compass`
     for column in sorted(columns, key=lambda name: len(about[name].about)):
         channel = state_channel(about[column]) or input_channel(about[column])
-        other = _other_unit(column, channel)
+        si = CHANNEL_UNITS.get(channel or "")
+        other = other_dimension(column, si) if si else None
         if channel == "n" and other == "m":
             channel = "x"
         elif channel and re.match(r"(cmd_)?n(_|$)", channel) and other in ("-", "%", "us"):
@@ -146,7 +151,7 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
             speeds.append(column)
         elif channel is not None and channel not in names:
             names[channel] = column
-        elif channel is not None and _copy(column) == _copy(names[channel]):
+        elif channel is not None and copied.sub("", column) == copied.sub("", names[channel]):
             text = f"the header names it more than once; '{names[channel]}' is the first of them"
             marks.guess((*CHANNELS, channel), text)
         elif channel is not None:
@@ -156,28 +161,6 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
     order = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
     return {name: names[name] for name in order if name in names}
-
-
-def _letters(columns: Sequence[str]) -> dict[str, str]:
-    """Return x and y -> columns that are called N and E and no more, none without both."""
-    alone = {re.sub(r"\W*[\[(].*", "", column).strip().lower(): column for column in columns}
-    return {"x": alone["n"], "y": alone["e"]} if {"n", "e"} <= set(alone) else {}
-
-
-def _copy(column: str) -> str:
-    return re.sub(r"\.\d+$", "", column)
-
-
-def _other_unit(column: str, channel: str | None) -> str | None:
-    """Return the unit in the brackets of a name where it cannot be that of a channel."""
-    si = CHANNEL_UNITS.get(channel or "")
-    return None if si is None else other_dimension(column, si)
-
-
-def _words(sheet: Sheet) -> list[str]:
-    """Return the names of a table's columns, and the texts in its first rows."""
-    texts = (str(text) for cells in sheet.texts.values() for text in cells.unique()[:20])
-    return [*sheet.header, *texts]
 
 
 def _raw(

@@ -21,9 +21,9 @@ Order = Literal["dmy", "mdy", "ymd"]
 
 _NS = 10**9
 _DAY = 86_400 * _NS
-# Unix time in s, ms, us, ns between 1990 and 2090
+# Unix time of 1990 and 2090, s
 _EPOCH_FROM, _EPOCH_TO = 631_152_000, 3_786_912_000
-_SCALES = (1, 10**3, 10**6, 10**9)
+_UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 _MONTHS = {
     word: number
     for number, words in enumerate(
@@ -112,17 +112,20 @@ def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
     """
     if not np.isfinite(values).all():
         raise DataError(f"{int((~np.isfinite(values)).sum())} rows have no time")
-    scale = _unix_scale(values) if factor is None else None
-    if scale is None:
+    unit = unix_unit(values) if factor is None else None
+    if unit is None:
         return Stamps(np.rint(values * ((factor or 1.0) * _NS)).astype(np.int64), False)
+    scale = _UNITS[unit]
     whole = values if values.dtype.kind in "iu" else np.floor(values)
     rest = np.rint((values - whole) * (_NS // scale)).astype(np.int64)
     return Stamps(whole.astype(np.int64) * (_NS // scale) + rest, True)
 
 
-def _unix_scale(values: np.ndarray) -> int | None:
-    typical = abs(float(np.median(values))) if values.size else 0.0
-    return next((s for s in _SCALES if _EPOCH_FROM * s <= typical <= _EPOCH_TO * s), None)
+def unix_unit(values: np.ndarray) -> str | None:
+    """Return the unit in which numbers [T] are Unix time between 1990 and 2090; None for others."""
+    size = abs(float(np.median(values))) if values.size else 0.0
+    units = (unit for unit, one in _UNITS.items() if _EPOCH_FROM <= size / one <= _EPOCH_TO)
+    return next(units, None)
 
 
 def _parts(cells: pd.Series) -> pd.DataFrame:
@@ -225,9 +228,10 @@ def _digits(cells: pd.Series) -> Stamps:
     whole = parts["whole"].astype("int64").to_numpy()
     fraction, remarks = _fractions(parts["fraction"], whole)
     fraction = np.where(cells.str.startswith("-").to_numpy(dtype=bool), -fraction, fraction)
-    scale = _unix_scale(whole)
-    ns = whole * (_NS // (scale or 1)) + fraction // (scale or 1)
-    return Stamps(ns, scale is not None, None, remarks)
+    unit = unix_unit(whole)
+    scale = _UNITS[unit or "s"]
+    ns = whole * (_NS // scale) + fraction // scale
+    return Stamps(ns, unit is not None, None, remarks)
 
 
 def _dated(cells: pd.Series, zone: str | None, order: Order | None) -> Stamps:
