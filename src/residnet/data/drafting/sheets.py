@@ -169,6 +169,8 @@ def clock_of(sheet: Sheet) -> Clock:
         name
         for name, values in sheet.numbers.items()
         if values.size > 1 and bool((np.diff(values[np.isfinite(values)]) > 0.0).all())
+        # pandas writes the number of each row under no name
+        and not name.startswith("Unnamed: ")
     ]
     called = [name for name in named if name in sheet.numbers]
     # one that is called time and does not increase is refused where it is read; a counter is none
