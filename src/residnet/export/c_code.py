@@ -368,6 +368,18 @@ class Body:
                     cells.append(self.number(_sum(terms)))
             return _Column(cells)
         a, b = self.array(left), self.array(right)
+        if rows == columns == 1:
+            # eight sums side by side, which compilers vectorise
+            name, whole = self.new(), inner - inner % 8
+            text = (
+                f"REAL {name} = {start.cells[0]}; {{ REAL p[8] = {{ZERO}};"
+                f" for (i = 0; i < {whole}; i += 8) for (j = 0; j < 8; j++)"
+                f" p[j] += {a}[i + j] * {b}[i + j];"
+                f" for (i = {whole}; i < {inner}; i++) p[0] += {a}[i] * {b}[i];"
+                f" for (j = 0; j < 8; j++) {name} += p[j]; }}"
+            )
+            self.lines.append((name, text))
+            return _Column([name])
         made = self.looped(rows * columns, f"{self.array(start)}[i]", False)
         name, text = self.lines.pop()
         outer = f"for (h = 0; h < {columns}; h++) " if columns > 1 else ""

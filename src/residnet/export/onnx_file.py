@@ -116,7 +116,8 @@ class OnnxExporter(Exporter):
             except (states.NotImplemented, states.InvalidGraph) as error:
                 lacks = str(error).strip().splitlines()[0]
                 raise ExportError(
-                    f"{'; '.join([*said, exported.what])}: onnxruntime says: {lacks}"
+                    f"{'; '.join([*said, exported.what])}: onnxruntime says: {lacks}; export it as"
+                    " c or casadi"
                 ) from None
             card = exported.card() | {
                 "format": "onnx",
