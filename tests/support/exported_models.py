@@ -110,13 +110,13 @@ class AsTensors:
         ]
         found = (torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
         after, memory, outside = found
-        return after, memory, outside.bool().reshape(-1)
+        return after.float(), memory.float(), outside.bool().reshape(-1)
 
     def warmup(self, y: Tensor, w: Tensor) -> Tensor:
         rows = zip(y.numpy(), w.numpy(), strict=True)
         return torch.from_numpy(
             np.stack([self.exported.memory(self.loaded, *row, "the file") for row in rows])
-        )
+        ).float()
 
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         states, flags, x = [self.guard.accept_state(x0)], [], x0
