@@ -36,10 +36,9 @@ from symbolic import FORCE, FORCES, JET, JETS, MSD, SPRING, regress, right
 
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.candidates import CandidatesConfig
-from residnet.regression.expressions.algebra import Algebra
-from residnet.regression.expressions.text import term
-from residnet.regression.genetic.config import limits_of
-from residnet.regression.genetic.equations import Bred, breed
+from residnet.regression.expressions import Algebra
+from residnet.regression.genetic import Bred, breed, limits_of
+from residnet.regression.writing import term
 
 Log = dict[str, np.ndarray]
 Answer = tuple[dict[str, float], Bred, float]

@@ -18,7 +18,7 @@ import torch
 from sklearn.cross_decomposition import PLSRegression
 from threadpoolctl import threadpool_limits
 
-from residnet.regression.moments import FoldMoments
+from residnet.regression.shrinkage import FoldMoments
 from residnet.regression.surface import surface
 
 FOLDS = 5

@@ -48,9 +48,8 @@ from residnet.data.derivatives import SavitzkyGolay
 from residnet.heads import SymbolicConfig
 from residnet.physics.candidates import CandidatesConfig
 from residnet.physics.terms import TermLibrary
-from residnet.regression.delay import delay_profile
-from residnet.regression.sparse import SearchConfig, find
-from residnet.regression.sparse_reduction import reduce
+from residnet.regression.equation_rows import delay_profile
+from residnet.regression.sparse import SearchConfig, find, reduce
 
 Log = dict[str, np.ndarray]
 Truth = Mapping[str, Mapping[str, float]]

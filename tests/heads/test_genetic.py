@@ -24,12 +24,9 @@ from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.terms import TermLibrary
-from residnet.regression.expressions.algebra import Algebra, Limits, Sum
-from residnet.regression.expressions.library import ExpressionLibrary, tables
-from residnet.regression.expressions.notation import LATEX, SYMPY, C
-from residnet.regression.expressions.text import term, total
-from residnet.regression.genetic.config import limits_of
-from residnet.regression.genetic.equations import breed
+from residnet.regression.expressions import Algebra, ExpressionLibrary, Limits, Sum, tables
+from residnet.regression.genetic import breed, limits_of
+from residnet.regression.writing import equation, symbolic_sum, term
 
 FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
 
@@ -167,17 +164,12 @@ def test_tables_and_writing_say_the_same(tmp_path: Path) -> None:
             )
     read, same = library.read(algebra.channels)
     assert [term(read, p) for p in same] == [term(algebra, p) for p in products]
-    symbols = sympy.symbols("u v r")
-    called = sympy.lambdify(
-        symbols, sympy.sympify(total(algebra, products, weights, SYMPY)), "numpy"
-    )
+    value = symbolic_sum(algebra, list(zip(products, weights, strict=True)))
+    written = equation("total", "", value, algebra.channels)
+    called = sympy.lambdify(sympy.symbols("u v r"), sympy.sympify(written["sympy"]), "numpy")
     np.testing.assert_allclose(called(*z.T), wanted, rtol=1e-12)
-    written = total(algebra, products, weights, C)
     if shutil.which("gcc"):
-        (tmp_path / "total.c").write_text(
-            f"#include <math.h>\ndouble total(double u, double v, double r) {{ return {written};"
-            " }\n"
-        )
+        (tmp_path / "total.c").write_text("#include <math.h>\n" + written["c"])
         subprocess.run(
             ["gcc", "-std=c99", "-O2", "-shared", "-fPIC", "total.c", "-o", "total.so", "-lm"],
             cwd=tmp_path,
@@ -186,7 +178,7 @@ def test_tables_and_writing_say_the_same(tmp_path: Path) -> None:
         function = ctypes.CDLL(str(tmp_path / "total.so")).total
         function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double] * 3
         np.testing.assert_allclose([function(*row) for row in z], wanted, rtol=1e-12)
-    assert r"\sqrt{\left|v\right|}" in total(algebra, products, weights, LATEX)
+    assert r"\sqrt{\left|{v}\right|}" in written["latex"]
 
 
 def test_terms_are_written_as_the_term_language_reads_them() -> None:

@@ -18,7 +18,7 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 from residnet.heads import KernelConfig
 from residnet.heads.kernel import KernelHead
-from residnet.regression.kernel.functions import Polynomial, Rbf, spread_out
+from residnet.regression.kernel import Polynomial, Rbf, spread_out
 
 SAMPLES = made(300)
 NEW = torch.from_numpy(channels(200, seed=9))

@@ -14,7 +14,7 @@ from residnet.core.errors import FitError
 from residnet.heads import ClosedFormHead, KernelConfig, PlsrConfig, RidgeConfig
 from residnet.heads.basis import BasisHead
 from residnet.heads.plsr import PlsrHead
-from residnet.regression.pls_path import pls_path
+from residnet.regression.shrinkage import pls_path
 
 
 def sklearn_fit(x: np.ndarray, y: np.ndarray, order: int) -> PLSRegression:

@@ -22,11 +22,9 @@ from residnet.data.windows import WindowStore
 from residnet.identification.fit import fit
 from residnet.identification.prepared import prepare_logs, shortened, through_currents
 from residnet.identification.settings import FitSettings
-from residnet.regression.estimator import Estimator
+from residnet.regression.estimator import Estimator, Pieces
 from residnet.regression.least_squares import LeastSquares
-from residnet.regression.pieces import Pieces
-from residnet.regression.plsr import PLSR
-from residnet.regression.ridge import Ridge
+from residnet.regression.shrinkage import PLSR, Ridge
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from residnet.core.errors import FitError
-from residnet.regression.delay import delay_profile
+from residnet.regression.equation_rows import delay_profile
 
 
 def refits(

@@ -17,18 +17,14 @@ from sklearn.linear_model import LinearRegression
 from sklearn.linear_model import Ridge as ReferenceRidge
 
 from residnet.core.errors import FitError
-from residnet.regression.elastic_net import ElasticNet
 from residnet.regression.estimator import Estimator
-from residnet.regression.genetic.config import EquationSearchConfig, EvolutionConfig
-from residnet.regression.genetic.equations import GeneticEquations
-from residnet.regression.kernel.functions import Polynomial, Rbf
-from residnet.regression.kernel.ridge import KernelRidge
-from residnet.regression.least_squares import CentredLeastSquares, LeastSquares
-from residnet.regression.plsr import PLSR
-from residnet.regression.ridge import Ridge
+from residnet.regression.genetic import EquationSearchConfig, EvolutionConfig, GeneticEquations
+from residnet.regression.kernel import KernelRidge, Polynomial, Rbf
+from residnet.regression.least_squares import CentredLeastSquares, ElasticNet, LeastSquares
+from residnet.regression.shrinkage import PLSR, Ridge
 from residnet.regression.solutions import Solution
-from residnet.regression.sparse_regression import SparseRegression
-from residnet.regression.surface_plsr import SurfacePLSR
+from residnet.regression.sparse import SparseRegression
+from residnet.regression.surface import SurfacePLSR
 
 Make = Callable[[int, int], Estimator]
 LINEAR: dict[str, Make] = {
@@ -36,7 +32,6 @@ LINEAR: dict[str, Make] = {
     "ridge penalties": lambda j, n: LeastSquares((1e-8, 1e-2)),
     "centred": lambda j, n: CentredLeastSquares(),
     "plsr": lambda j, n: PLSR(folds=2),
-    "nipals": lambda j, n: PLSR(min(2, j), folds=2, algorithm="nipals"),
     "ridge": lambda j, n: Ridge((1e-10, 1e-3), folds=2, alternatives=True),
     "elastic net": lambda j, n: ElasticNet(0.5, folds=2),
     "surface": lambda j, n: SurfacePLSR("least"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sympy
 
-from residnet.regression.expressions.algebra import (
+from residnet.regression.expressions import (
     FUNCTIONS,
     ONE,
     Algebra,

@@ -12,10 +12,15 @@ import numpy as np
 import pytest
 
 from residnet.core.errors import FitError, UsageError
-from residnet.regression.expressions.algebra import Algebra, Limits, Product
-from residnet.regression.genetic.config import EvolutionConfig, limits_of
-from residnet.regression.genetic.evolution import Found, evolve, require_deap
-from residnet.regression.genetic.fitness import Fitness
+from residnet.regression.expressions import Algebra, Limits, Product
+from residnet.regression.genetic import (
+    EvolutionConfig,
+    Fitness,
+    Found,
+    evolve,
+    limits_of,
+    require_deap,
+)
 
 NAMES = ("a", "b", "c")
 DATA = {name: np.random.default_rng(i).normal(size=200) for i, name in enumerate(NAMES)}

@@ -7,7 +7,7 @@ import torch
 
 from residnet.core.errors import FitError
 from residnet.regression.estimator import fold_numbers
-from residnet.regression.moments import FoldMoments
+from residnet.regression.shrinkage import FoldMoments
 
 
 def test_a_group_is_never_split_between_folds() -> None:

@@ -8,7 +8,7 @@ import torch
 from sklearn.cross_decomposition import PLSRegression
 
 from residnet.core.errors import FitError
-from residnet.regression.moments import FoldMoments
+from residnet.regression.shrinkage import FoldMoments
 from residnet.regression.surface import surface
 
 

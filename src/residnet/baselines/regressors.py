@@ -18,8 +18,8 @@ from residnet.core.samples import Samples
 from residnet.physics.bounds import VelocityBound
 from residnet.physics.symmetry import dissipates, mirrored_terms, wrong_parity
 from residnet.physics.terms import TermLibrary
+from residnet.regression.estimator import chosen, regressors
 from residnet.regression.least_squares import LeastSquares
-from residnet.regression.pieces import chosen, regressors
 from residnet.regression.solutions import Coefficient, Solution
 
 _BEYOND = 0.5

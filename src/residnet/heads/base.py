@@ -16,7 +16,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import ACCELERATION, nearest
 from residnet.core.samples import Samples
-from residnet.regression.moments import CONSTANT
+from residnet.regression.shrinkage import CONSTANT
 from residnet.regression.solutions import Solution
 
 _LEAST_STD = 1e-9

@@ -18,8 +18,13 @@ from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary, polynomial_terms
-from residnet.regression.estimator import Estimator, fold_numbers, require_finite, usual_folds
-from residnet.regression.pieces import regressors
+from residnet.regression.estimator import (
+    Estimator,
+    fold_numbers,
+    regressors,
+    require_finite,
+    usual_folds,
+)
 from residnet.regression.solutions import Solution
 
 

@@ -14,7 +14,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.physics.terms import TermLibrary, parse_term
-from residnet.regression.delay import delay_profile
+from residnet.regression.equation_rows import delay_profile
 
 _PRECISION = 1e-14
 """Share of the energy of a target that rounding leaves."""

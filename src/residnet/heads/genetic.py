@@ -12,11 +12,10 @@ from torch import Tensor
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
-from residnet.regression.expressions.library import ExpressionLibrary, Weights
-from residnet.regression.expressions.text import term
-from residnet.regression.genetic.config import EquationSearchConfig
-from residnet.regression.genetic.equations import GeneticEquations
+from residnet.regression.expressions import ExpressionLibrary, Weights
+from residnet.regression.genetic import EquationSearchConfig, GeneticEquations
 from residnet.regression.solutions import Solution
+from residnet.regression.writing import term
 
 
 class GeneticConfig(FeatureConfig, EquationSearchConfig):

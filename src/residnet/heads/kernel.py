@@ -18,11 +18,8 @@ from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary
 from residnet.regression.equation_rows import step_of, unbroken_stretches
 from residnet.regression.estimator import fold_numbers, usual_folds
-from residnet.regression.kernel.functions import Polynomial, Rbf
-from residnet.regression.kernel.path import Path
-from residnet.regression.kernel.recursion import Recursion
-from residnet.regression.kernel.ridge import KernelRidge
-from residnet.regression.moments import CONSTANT
+from residnet.regression.kernel import KernelRidge, Path, Polynomial, Rbf, Recursion
+from residnet.regression.shrinkage import CONSTANT
 from residnet.regression.solutions import Solution
 
 

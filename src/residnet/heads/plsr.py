@@ -11,7 +11,7 @@ from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
 from residnet.heads.force import in_space
 from residnet.regression.estimator import Estimator
-from residnet.regression.plsr import PLSR
+from residnet.regression.shrinkage import PLSR
 
 
 class PlsrConfig(BasisConfig):

@@ -28,17 +28,9 @@ from residnet.regression.equation_rows import (
     step_of,
     unbroken_stretches,
 )
-from residnet.regression.expressions.equations import (
-    Factor,
-    Written,
-    c_function,
-    latex,
-    plain,
-    sympy_text,
-)
 from residnet.regression.solutions import Coefficient, Solution
-from residnet.regression.sparse import SearchConfig
-from residnet.regression.sparse_regression import SparseRegression
+from residnet.regression.sparse import SearchConfig, SparseRegression
+from residnet.regression.writing import equation, symbolic, total
 
 _GAMMAS = (0.0, 0.5, 1.0)
 """Weights of the number of candidates that are offered where free runs choose: from BIC up."""
@@ -241,23 +233,17 @@ class SymbolicHead(EquationHead):
     def _written(self, name: str, terms: Sequence[Coefficient], steps: int) -> dict[str, str]:
         """Return one equation in writing."""
         channels = self.features.names
+        weights = [entry.value for entry in terms]
         factors = [
             [
-                Factor("abs" if factor.magnitude else factor.function, factor.name, factor.power)
+                ("abs" if factor.magnitude else factor.function, factor.name, factor.power)
                 for factor in parse_term(entry.term, channels)
             ]
             for entry in terms
         ]
-        written = Written(
-            name, [c.term for c in terms], factors, [c.value for c in terms], channels
-        )
         late = ""
         if self.line.count:
             late = f"; {', '.join(self.line.channels)}: {steps} steps earlier"
         comment = f"{name} in SI units, valid within the range of the training data{late}"
-        return {
-            "text": plain(written),
-            "latex": latex(written),
-            "sympy": sympy_text(written),
-            "c": c_function(written, comment),
-        }
+        text = total([entry.term for entry in terms], weights)
+        return equation(name, text, symbolic(factors, weights), channels, comment)

@@ -7,18 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, final
 
 import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.regression.moments import CONSTANT, FoldMoments
-from residnet.regression.pls_path import LEAST_ENERGY
-
-_EXPLAINED = 1e-26
-"""Share of a covariance's energy up to which nothing is left to explain."""
-_TINY = 1e-300
-"""Least length that a vector is divided by."""
+from residnet.regression.estimator import Estimator, Regressors, fold_numbers, whole
+from residnet.regression.shrinkage import CONSTANT, FoldMoments, pls_path
+from residnet.regression.solutions import Solution
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,14 @@ def surface(moments: FoldMoments, test: Sequence[int] = (), orders: int | None =
     for count in range(j, 1, -1):
         # columns are sorted by order: those that may still have `count` basis functions come first
         active = int((order <= count).sum())
-        coefficients = problems.coefficients(mask[:, :active], axis[:active], order[:active])
+        path = pls_path(
+            problems.gram,
+            problems.covariance[:, :, axis[:active]],
+            order[:active],
+            joint=False,
+            mask=mask[:, :active],
+        )
+        coefficients = path[-1] if len(path) else torch.zeros_like(problems.covariance[:, :, axis])
         error[count, :active], standard_error[count, :active] = problems.errors(
             coefficients, axis[:active]
         )
@@ -169,48 +173,6 @@ class _Problems:
             judged,
         )
 
-    def coefficients(self, mask: Tensor, axis: Tensor, order: Tensor) -> Tensor:
-        """Return PLS1 coefficients on standardised columns [P, J, C] of C models.
-
-        Their basis functions are [J, C], outputs [C] and orders [C], ascending.
-
-        Kernel algorithm of Dayal and MacGregor (1997) with one output, all models at once; a model
-        is left alone once its order is reached.
-        """
-        covariance = self.covariance[:, :, axis] * mask
-        rest, b = covariance.clone(), torch.zeros_like(covariance)
-        least = _EXPLAINED * covariance.square().sum(1)
-        steps = int(order.max())
-        least_energy = LEAST_ENERGY * float(self.gram.diagonal(dim1=1, dim2=2).max())
-        loadings, rotations = (
-            covariance.new_zeros(steps, *covariance.shape),
-            covariance.new_zeros(steps, *covariance.shape),
-        )
-        for step in range(steps):
-            first = int((order <= step).sum())
-            c = rest[:, :, first:]
-            w = c / c.square().sum(1, keepdim=True).sqrt().clamp(min=_TINY)
-            r = w
-            if step:
-                known = (loadings[:step, :, :, first:] * w).sum(2, keepdim=True)
-                r = w - (known * rotations[:step, :, :, first:]).sum(0)
-            image = (self.gram @ r) * mask[:, first:]
-            energy = (r * image).sum(1, keepdim=True)
-            alive = (c.square().sum(1, keepdim=True) > least[:, None, first:]) & (
-                energy > least_energy
-            )
-            share = torch.where(
-                alive,
-                (r * covariance[:, :, first:]).sum(1, keepdim=True) / energy,
-                torch.zeros_like(energy),
-            )
-            p = torch.where(alive, image / energy, torch.zeros_like(image))
-            b[:, :, first:] += r * share
-            rest[:, :, first:] -= p * (share * energy)
-            loadings[step, :, :, first:] = p
-            rotations[step, :, :, first:] = r
-        return b
-
     def errors(self, coefficients: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean squared error [C] where judged, and its standard error over folds [C]."""
         count, j = len(self.judged), self.gram.shape[1]
@@ -233,3 +195,81 @@ class _Problems:
             by_fold.std(0) / count**0.5 if count > 1 else torch.full_like(by_fold[0], torch.nan)
         )
         return squares.sum(0) / n.sum(), standard_error
+
+
+@final
+class SurfacePLSR(Estimator):
+    """PLSR of each output by itself, chosen by surface analysis (document 002 section 4.5.1).
+
+    Args:
+        choose: `simplest`, the one-standard-error rule; or `least`, the bare minimum of the error.
+        test: groups whose samples judge the models and fit none, as the document has it; empty for
+            cross-validation over all groups.
+    """
+
+    def __init__(
+        self, choose: Literal["simplest", "least"] = "simplest", *, test: Sequence[int] = ()
+    ) -> None:
+        self.choose = choose
+        self.test = tuple(test)
+
+    def fit(
+        self,
+        x: Regressors,
+        y: Tensor,
+        groups: Tensor | None = None,
+        *,
+        names: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+    ) -> list[Solution]:
+        """Return the chosen solution; its `choice` has the order and the number of terms kept.
+
+        See `Estimator.fit`.
+
+        Raises:
+            FitError: with fewer than two groups or basis functions, or one that is constant.
+        """
+        x = whole(x)
+        found = self.surface(x, y, groups, names=names, outputs=outputs)
+        return [self.chosen(found, x, y, groups)]
+
+    def surface(
+        self,
+        x: Tensor,
+        y: Tensor,
+        groups: Tensor | None,
+        *,
+        names: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+    ) -> Surface:
+        """Return the errors of all models; arguments and errors as of `fit`."""
+        fold_numbers(groups, None)
+        moments = FoldMoments.checked(x, y, groups, None, names, outputs)
+        return surface(moments, test=self.test)
+
+    def chosen(self, found: Surface, x: Tensor, y: Tensor, groups: Tensor | None) -> Solution:
+        """Return the solution that the surface of `x` and `y` leads to."""
+        if groups is not None and self.test:
+            train = ~torch.isin(groups, torch.tensor(self.test))
+            x, y = x[train], y[train]
+        outputs = range(y.shape[1])
+        pick = found.simplest if self.choose == "simplest" else found.least
+        std_x, std_y = x.std(0), y.std(0)
+        varies = (std_y > CONSTANT * y.abs().amax(0)).tolist()
+        # an output that is constant but for rounding needs no basis function
+        picks = [pick(output) if varies[output] else (0, 0) for output in outputs]
+        coefficients = y.new_zeros(x.shape[1], y.shape[1])
+        for output, (order, count) in zip(outputs, picks, strict=True):
+            if order == 0:
+                continue
+            kept = found.kept(output, order, count)
+            e = (x[:, kept] - x[:, kept].mean(0)) / std_x[kept]
+            f = (y[:, [output]] - y[:, output].mean()) / std_y[output]
+            best = pls_path(e.T @ e, e.T @ f, order)[-1, :, 0]
+            coefficients[kept, output] = best / std_x[kept] * std_y[output]
+        choice = {"order": [order for order, _ in picks], "terms": [count for _, count in picks]}
+        state = {
+            "coefficients": coefficients,
+            "intercept": y.mean(0) - x.mean(0) @ coefficients,
+        }
+        return Solution(choice, state)

@@ -15,10 +15,9 @@ from residnet.core.files import read_json
 from residnet.documents.cells import pictures
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.mass_spring_damper import MassSpringDamperConfig
-from residnet.regression.expressions.algebra import Algebra
-from residnet.regression.expressions.text import term
-from residnet.regression.genetic.config import limits_of
-from residnet.regression.genetic.equations import breed, validating
+from residnet.regression.expressions import Algebra
+from residnet.regression.genetic import breed, limits_of, validating
+from residnet.regression.writing import term
 from residnet.report.blocks import Cell, Section, Table, Text, table_of
 from residnet.report.figure import COLORS, Case, Figure, Look, Panel, names_of, write_figure
 from residnet.report.format import DASH, number
@@ -228,7 +227,7 @@ class BreedingTaskConfig(Task):
         )
 
     def check(self) -> None:
-        from residnet.regression.genetic.evolution import require_deap
+        from residnet.regression.genetic import require_deap
 
         require_deap()
 

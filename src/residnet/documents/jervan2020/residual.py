@@ -37,14 +37,10 @@ from residnet.physics.force_model import (
 )
 from residnet.physics.signals import FORCE_CHANNELS
 from residnet.physics.terms import TermLibrary, parse_term
-from residnet.regression.elastic_net import ElasticNet
 from residnet.regression.estimator import Estimator, require_data
-from residnet.regression.least_squares import CentredLeastSquares
-from residnet.regression.pls_path import pls_path
-from residnet.regression.plsr import PLSR
-from residnet.regression.ridge import Ridge
-from residnet.regression.surface import Surface
-from residnet.regression.surface_plsr import SurfacePLSR
+from residnet.regression.least_squares import CentredLeastSquares, ElasticNet
+from residnet.regression.shrinkage import PLSR, Ridge, pls_path
+from residnet.regression.surface import Surface, SurfacePLSR
 from residnet.report import figure as drawing
 from residnet.report.blocks import Section, Table, Text
 from residnet.report.figure import (
@@ -215,15 +211,13 @@ class PlsrRegression(_ScaledRegression):
 
     Attributes:
         order: number of latent variables; null takes the least error over left-out folds.
-        algorithm: `kernel`, from moments alone, or `nipals`, as the document prints it.
     """
 
     kind: Literal["plsr"]
     order: int | None = Field(default=None, ge=1)
-    algorithm: Literal["kernel", "nipals"] = "kernel"
 
     def estimator(self) -> Estimator:
-        return PLSR(self.order, max_order=None, folds=None, scale=False, algorithm=self.algorithm)
+        return PLSR(self.order, max_order=None, folds=None, scale=False)
 
     def fixed(self) -> bool:
         return self.order is not None

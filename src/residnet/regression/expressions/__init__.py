@@ -1,1 +1,0 @@
-"""Expressions in normal form, how they are written and evaluated."""

@@ -1,1 +1,0 @@
-"""Genetic programming of equations."""

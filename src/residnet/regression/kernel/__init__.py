@@ -1,1 +1,0 @@
-"""Kernel ridge regression: kernels, fits with every penalty, and the estimator."""
