@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from golden_tables import table, tensor
+from golden_tables import over_its_length, table, tensor
 from torch import Tensor
 
 from residnet.control import (
@@ -106,7 +106,7 @@ def vessel(scale: float) -> FossenVessel:
 
 
 @cache
-def flights(folder: Path, scale: float, disturbed: bool) -> dict[str, pd.DataFrame]:
+def flights(folder: Path, scale: float, disturbed: bool, seconds: float) -> dict[str, pd.DataFrame]:
     """Every file of one vessel and weather, flown side by side, with all columns of the golden
     files at their rows.
     """
@@ -120,7 +120,8 @@ def flights(folder: Path, scale: float, disturbed: bool) -> dict[str, pd.DataFra
         for path, case in cases.items()
         if (case.scale, case.disturbed) == (scale, disturbed)
     }
-    steps = round(max(case.guidance.duration for case in cases.values()) / DT) + 1
+    longest = max(case.guidance.duration for case in cases.values())
+    steps = round(min(longest, seconds) / DT) + 1
     plant = vessel(scale)
     if not disturbed:
         plant.in_calm_water()
@@ -182,16 +183,17 @@ class Watched(Reference):
         return desired, s
 
 
-def simulated(path: Path) -> pd.DataFrame:
+def simulated(path: Path, seconds: float) -> pd.DataFrame:
     """The columns of a file as residnet has them."""
     case = case_of(path)
     if isinstance(case, Flight):
-        return flights(path.parent, case.scale, case.disturbed)[path.name]
+        return flights(path.parent, case.scale, case.disturbed, seconds)[path.name]
     plant = vessel(1.0)
     x0 = torch.zeros(1, len(plant.state), dtype=torch.float64)
     x0[0, 3:6] = torch.tensor(case.nu, dtype=torch.float64)
     # as body forces, which act at once; the thrusters rest
-    w = torch.zeros(1, round(100.0 / OPEN_DT), len(plant.inputs), dtype=torch.float64)
+    steps = round(min(100.0, seconds + OPEN_DT) / OPEN_DT)
+    w = torch.zeros(1, steps, len(plant.inputs), dtype=torch.float64)
     w[..., 3:6] = torch.tensor(case.force, dtype=torch.float64)
     assert plant.inputs[3:6] == ("force_x", "force_y", "force_n")
     with torch.no_grad():
@@ -199,9 +201,11 @@ def simulated(path: Path) -> pd.DataFrame:
     return pd.DataFrame(states[0, :: EVERY["open"], :6].numpy(), columns=STATE[:6])
 
 
-def test_every_column_along_the_run(golden_file: Path) -> None:
+@over_its_length
+def test_every_column_along_the_run(golden_file: Path, seconds: float) -> None:
     """To 1e-6 of its range; parts of the command of the largest range among them."""
-    truth, found = table(golden_file), simulated(golden_file)
+    truth, found = table(golden_file), simulated(golden_file, seconds)
+    truth = truth[truth["t"] <= seconds + 1e-9]
     step = (
         EVERY["closed"] * DT
         if isinstance(case_of(golden_file), Flight)

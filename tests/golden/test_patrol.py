@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from golden_tables import table
+from golden_tables import over_its_length, table
 from kinds import of_kind
 
 from residnet.dynamics.rollout import Rollout, Source
@@ -119,7 +119,7 @@ def source_of(runs: list[Run], plant: PatrolVessel, t: torch.Tensor) -> Source:
 
 @cache
 def trajectories(
-    parameters: str, rudder: str, folder: Path
+    parameters: str, rudder: str, folder: Path, seconds: float
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """States [T+1, 9] and rudder commands [T] of every file of one vessel, flown side by side."""
     files = [
@@ -128,7 +128,8 @@ def trajectories(
         if (case_of(path).parameters, case_of(path).rudder) == (parameters, rudder)
     ]
     files.sort(key=lambda path: case_of(path).run.heading is not None)
-    steps = round(max(float(table(path)["t"].iloc[-1]) for path in files) / DT) + 1
+    longest = max(float(table(path)["t"].iloc[-1]) for path in files)
+    steps = round(min(longest, seconds) / DT) + 1
     t = torch.arange(steps, dtype=torch.float64) * DT
     runs = [case_of(path).run for path in files]
     plant = plant_of(case_of(files[0])).in_calm_water()
@@ -143,11 +144,12 @@ def trajectories(
     return {path.name: (states[i].numpy(), inputs[i, :, 0].numpy()) for i, path in enumerate(files)}
 
 
-def test_trajectory(golden_file: Path) -> None:
+@over_its_length
+def test_trajectory(golden_file: Path, seconds: float) -> None:
     frame, case = table(golden_file), case_of(golden_file)
-    states, commands = trajectories(case.parameters, case.rudder, golden_file.parent)[
-        golden_file.name
-    ]
+    frame = frame[frame["t"] <= seconds]
+    flown = trajectories(case.parameters, case.rudder, golden_file.parent, seconds)
+    states, commands = flown[golden_file.name]
     rows = np.rint(frame["t"].to_numpy() / DT).astype(int)
     np.testing.assert_allclose(frame["t"], rows * DT, atol=1e-9)
     np.testing.assert_array_equal(rows, EVERY * np.arange(len(frame)))

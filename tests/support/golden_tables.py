@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 import torch
 from torch import Tensor
 
@@ -17,6 +19,12 @@ def table(path: Path) -> pd.DataFrame:
     names = pd.read_csv(path, nrows=0).columns
     # every digit counts: not pandas' fast parser
     return pd.DataFrame(np.loadtxt(path, delimiter=",", skiprows=1), columns=names)
+
+
+def over_its_length(test: Callable[..., None]) -> Callable[..., None]:
+    """Run a test over the first 20 s of a run, and over all of it among the long ones."""
+    whole = pytest.param(np.inf, marks=pytest.mark.long, id="whole")
+    return pytest.mark.parametrize("seconds", [pytest.param(20.0, id="20s"), whole])(test)
 
 
 def tensor(frame: pd.DataFrame, *columns: str) -> Tensor:

@@ -212,7 +212,8 @@ class MMGConfig(IdentifiedConfig):
 
         def error(theta: Tensor) -> Tensor:
             baseline.theta[free] = theta
-            return chosen.target - baseline(chosen.z)
+            known: Tensor = baseline(chosen.z)
+            return chosen.target - known
 
         def cost(theta: Tensor) -> float:
             likelihood = 0.5 * count * error(theta).square().mean(0).log().sum()

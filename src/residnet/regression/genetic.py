@@ -726,8 +726,8 @@ def breed(
         else find(reduced, 0, config.final)
     )
     products = tuple(found.terms[names.index(name)] for name in kept.terms)
-    values, errors = tuple(kept.values.tolist()), tuple(kept.errors.tolist())
-    return Bred(found, products, values, errors, kept.summary(within))
+    numbers, errors = tuple(kept.values.tolist()), tuple(kept.errors.tolist())
+    return Bred(found, products, numbers, errors, kept.summary(within))
 
 
 def validating(group: np.ndarray, every: int) -> np.ndarray:

@@ -285,7 +285,9 @@ class Ridge(_PathEstimator):
         values, vectors = torch.linalg.eigh(xx / samples)
         projected = vectors.T @ xy / samples
         penalties = torch.tensor(self.penalties, dtype=xy.dtype)
-        return vectors @ (projected / (values.clamp(min=0.0) + penalties[:, None])[..., None])
+        shrunk = projected / (values.clamp(min=0.0) + penalties[:, None])[..., None]
+        path: Tensor = vectors @ shrunk
+        return path
 
     def choices(self, errors: Tensor | None, variance: Tensor, count: int) -> list[list[int]]:
         """Return the penalties of the least error, then each for all outputs."""
