@@ -76,7 +76,8 @@ def fly(
 def eager(folder: Path, card: dict[str, Any]) -> Any:
     """The policy without compilation: the same operations, called one by one from Python."""
     from residnet.control.heading.stored import load_heading_policy
-    from residnet.control.observed.stored import (
+
+    from residnet.control.heading.controllers import (
         NetworkPolicySpec,
         ObservedPolicySpec,
         load_recurrent,

@@ -66,8 +66,7 @@ def eager(run: Path, card: dict[str, Any]) -> Any:
     from residnet.core.config import load_config
     from residnet.export.policy import ExportedCourse
     from residnet.runs.folder import RunFolder
-    from residnet.tasks.course.autopilot_run import load_policy, ready
-    from residnet.tasks.course.running import plan_for
+    from residnet.tasks.course.running import load_policy, plan_for, ready
     from residnet.tasks.course.task import CourseTaskConfig
 
     folder = RunFolder.open(run)

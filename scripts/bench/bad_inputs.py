@@ -27,7 +27,7 @@ from residnet.baselines import BaselineConfig
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance.course_guidance import CourseGuidance
 from residnet.control.guidance.drift import DriftEstimate
-from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.policies import NetworkPolicy
 from residnet.control.heading.turning import Turning
 from residnet.core.errors import ResidnetError
 from residnet.core.registry import kinds
@@ -227,16 +227,18 @@ def ensemble() -> Model:
     return spec, mean_of([model for _, model in pairs])
 
 
-def policy(turning: Turning, limit: float, rate: float) -> HeadingPolicy:
+def policy(turning: Turning, limit: float, rate: float) -> NetworkPolicy:
     """Return a policy with random weights."""
     torch.manual_seed(0)
-    made = HeadingPolicy(tuple(COURSE), turning=turning, limit=limit, dt=0.1, rate=rate)
+    made = NetworkPolicy(
+        tuple(COURSE), turning=turning, limit=limit, dt=0.1, rate=rate, units=8
+    )
     for weights in made.network.parameters():
         torch.nn.init.normal_(weights, std=0.3)
     return made.eval().requires_grad_(False)
 
 
-def autopilot(own: HeadingPolicy, safe: Any, cases: int, seed: int) -> None:
+def autopilot(own: NetworkPolicy, safe: Any, cases: int, seed: int) -> None:
     """Check an exported heading policy."""
     module = for_export(own, safe)
     both = torch.jit.script(module)
@@ -254,7 +256,7 @@ def autopilot(own: HeadingPolicy, safe: Any, cases: int, seed: int) -> None:
     )
 
 
-def course(own: HeadingPolicy, safe: Any, cases: int, seed: int) -> None:
+def course(own: NetworkPolicy, safe: Any, cases: int, seed: int) -> None:
     """Check an exported policy with the guidance of a bend."""
     # a turn that a third of the rudder makes
     radius = 3.0 * own.speed / (own.gain * own.limit)

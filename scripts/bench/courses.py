@@ -26,15 +26,15 @@ from residnet.control.courses.config import (
     plan_course,
     smallest_turn,
 )
-from residnet.control.guidance.course_guidance import CourseGuidance
+from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
 from residnet.control.guidance.drift import DriftEstimate
+from residnet.control.heading.classical import HeadingPID
 from residnet.control.heading.controllers import Steering
-from residnet.control.heading.following import Following
-from residnet.control.heading.heading_pid import HeadingPID
-from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ResidnetError
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.course.flights import Vessels, fly
+from residnet.tasks.course.running import fly
+from residnet.tasks.course.task import Vessels
 
 
 def arguments() -> argparse.Namespace:
@@ -103,7 +103,7 @@ class Ship:
             damping=1.0,
             limit=self.limit,
         )
-        steered = Following(law, vessel.state, limit=self.limit, dt=self.dt, rate=vessel.rate)
+        steered = TrackKeeping(law, vessel.state, limit=self.limit, dt=self.dt, rate=vessel.rate)
         guidance = CourseGuidance(
             planned.course,
             self.lookahead,

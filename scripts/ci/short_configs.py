@@ -67,12 +67,8 @@ def _trained(*heads: str) -> tuple[str, ...]:
 
 
 def _policy(name: str) -> tuple[str, ...]:
-    return tuple(f"policies.{name}.training.{key}" for key in ("epochs=1", "steps=1", "batch=16"))
-
-
-def _recurrent(name: str) -> tuple[str, ...]:
     short = ("epochs=1", "steps=1", "batch=16", "validation=16", "hold=0 s", "compiled=false")
-    return tuple(f"recurrent.{name}.training.{key}" for key in short)
+    return tuple(f"policies.{name}.training.{key}" for key in short)
 
 
 def _predictor(name: str) -> tuple[str, ...]:
@@ -109,21 +105,31 @@ _SWEPT = (
     + "]",
 )
 _FERRY = ("course.interval=10 s",)
-_STEP_TEST = ("test.plants=2", "tuning_points=16")
-_PEERS = ("test.dt=0.1 s",)
-
-_CONDITIONS = (
+_STEP_TEST = ("test.plants=2", "test.dt=0.1 s")
+_STATED = (
     "conditions.flights=8",
     "conditions.stated.dt=0.1 s",
     "conditions.stated.duration=6 s",
     "conditions.stated.hold=1 s",
-    "conditions.beyond={delay: {dt: 0.1 s, duration: 6 s, hold: 1 s, delay: [0.6 s, 0.6 s]}}",
     "conditions.evolution={flights: 2, population: 2, generations: 1}",
-    *_recurrent("learned"),
-    *_recurrent("constants"),
-    "recurrent.learned.training.dt=0.1 s",
-    "recurrent.learned.training.steady={flights: 2}",
-    "recurrent.constants.training.dt=0.1 s",
+)
+_ONE_POLICY = (
+    *_STATED,
+    *_STEP_TEST,
+    *_policy("policy"),
+    "policies.policy.training.dt=0.1 s",
+    "policies.policy.training.steady={flights: 2}",
+)
+_SLOW = ("conditions.stated.duration=12 s", "test.duration=26 s", "test.bias_time=26 s")
+
+_CONDITIONS = (
+    *_STATED,
+    "conditions.beyond={delay: {dt: 0.1 s, duration: 6 s, hold: 1 s, delay: [0.6 s, 0.6 s]}}",
+    *_policy("learned"),
+    *_policy("constants"),
+    "policies.learned.training.dt=0.1 s",
+    "policies.learned.training.steady={flights: 2}",
+    "policies.constants.training.dt=0.1 s",
     "test.dt=0.1 s",
     "test.plants=2",
     "test.bias_time=20 s",
@@ -176,14 +182,14 @@ SHORT: dict[str, Short] = {
     ),
     "esso_osaka_no_wind": Short(_TANKER, data="esso_osaka"),
     "milliampere_raw": Short(data="milliampere"),
-    "autopilot_nomoto": Short((*_policy("policy"), *_predictor("document"), *_STEP_TEST, *_PEERS)),
-    "autopilot_nomoto_rate": Short((*_policy("policy"), *_STEP_TEST, *_PEERS)),
+    "autopilot_nomoto": Short((*_ONE_POLICY, *_predictor("document"))),
+    "autopilot_nomoto_rate": Short(_ONE_POLICY),
     "autopilot_conditions": Short(
         (
             *_CONDITIONS,
-            *_recurrent("network"),
-            "recurrent.network.training.dt=0.1 s",
-            "recurrent.network.training.steady={flights: 2}",
+            *_policy("network"),
+            "policies.network.training.dt=0.1 s",
+            "policies.network.training.steady={flights: 2}",
             *_predictor("document"),
         )
     ),
@@ -193,33 +199,32 @@ SHORT: dict[str, Short] = {
         (
             *_CONDITIONS,
             "conditions.stated.duration=12 s",
-            "recurrent.learned.training.duration=12 s",
-            "recurrent.constants.training.duration=12 s",
+            "policies.learned.training.duration=12 s",
+            "policies.constants.training.duration=12 s",
             "test.sea_time=10 s",
         )
     ),
     "autopilot_patrol": Short(
         (
-            *_policy("policy"),
+            *_ONE_POLICY,
             *_predictor("document"),
-            *_STEP_TEST,
-            "policies.policy.training.horizon=8 s",
-            "test.dt=0.2 s",
-            "test.duration=26 s",
-            "test.bias_time=26 s",
+            *_SLOW,
+            "policies.policy.training.duration=12 s",
             "test.sea_time=10 s",
         )
     ),
     "autopilot_patrol_learned": Short(
         (
+            *_STATED,
+            *_STEP_TEST,
+            *_SLOW,
             *_policy("on_vessel"),
             *_policy("on_model"),
-            "policies.on_vessel.training.horizon=8 s",
-            "policies.on_model.training.horizon=8 s",
+            "policies.on_vessel.training.duration=12 s",
+            "policies.on_model.training.duration=12 s",
+            "policies.on_vessel.training.steady={flights: 2}",
+            "policies.on_model.training.steady={flights: 2}",
             "policies.on_model.learned.run={runs}/patrol_identified",
-            "test.dt=0.2 s",
-            "test.duration=26 s",
-            *_STEP_TEST,
         ),
         after="patrol_identified",
     ),
@@ -237,23 +242,18 @@ SHORT: dict[str, Short] = {
     ),
     "studies/gouletas2020/heading_nomoto": Short(
         (
-            *_policy("like_pd"),
             "predictive={mlp_printed: {horizon: 0.01 s, training: {states: 300, epochs: 5}},"
             " mlp_3s_linear: {horizon: 3 s, linear: true, training: {states: 300, epochs: 5}}}",
             *_STEP_TEST,
-            *_PEERS,
         )
     ),
     "studies/gouletas2020/heading_patrol": Short(
         (
-            *_policy("like_pd"),
             "predictive={mlp_10s: {horizon: 10 s, hidden: [30],"
             " training: {states: 300, epochs: 5}}}",
-            "policies.like_pd.training.horizon=8 s",
             "test.plants=2",
             "test.dt=0.25 s",
             "test.duration=30 s",
-            "tuning_points=16",
         )
     ),
     "studies/gouletas2020/table_6_3": Short(

@@ -11,18 +11,20 @@ import torch
 from pydantic import ValidationError
 
 from residnet.control.base import Policy
-from residnet.control.conditions.config import ConditionsConfig, gauss_markov, wave_motion
-from residnet.control.conditions.evolution import EvolutionConfig, evolve
-from residnet.control.conditions.flights import (
+from residnet.control.heading.conditions import (
     ConditionedFlights,
     ConditionedLoop,
     ConditionedRun,
+    ConditionsConfig,
     fly_under,
+    gauss_markov,
+    quiet,
+    wave_motion,
 )
-from residnet.control.conditions.quiet import quiet
 from residnet.control.heading.controllers import PdConfig, Steering
-from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.tuning import TuningConfig, tune
 from residnet.control.heading.turning import Turning
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
@@ -179,8 +181,8 @@ def test_ranges_are_in_order(wrong: dict[str, tuple[float, float]]) -> None:
 
 def test_evolution_finds_better_gains_than_a_grid_of_guesses_and_again_the_same() -> None:
     config = ConditionsConfig(dt=0.1, duration=8.0, hold=0.0, delay=(0.0, 0.2))
-    settings = EvolutionConfig(flights=8, population=4, generations=5)
-    found = evolve(PdConfig(), STEERING, config, settings, 5)
+    settings = TuningConfig(flights=8, population=4, generations=5)
+    found = tune(PdConfig(), STEERING, config, settings, 5)
     changes = config.draw(8, 0.1, torch.Generator().manual_seed(5))
     gains: dict[str, Any] = dict(found.parameters)
     again = fly_under(VESSEL, PdConfig(**gains).build(STEERING), changes)
@@ -190,7 +192,7 @@ def test_evolution_finds_better_gains_than_a_grid_of_guesses_and_again_the_same(
             law = PdConfig(kp=kp, damping_time=damping).build(STEERING)
             guess = fly_under(VESSEL, law, changes).measured(config)["cost"].mean()
             assert found.cost < float(guess) * 1.01
-    assert evolve(PdConfig(), STEERING, config, settings, 5) == found
+    assert tune(PdConfig(), STEERING, config, settings, 5) == found
 
 
 def test_the_loop_keeps_the_controllers_memory_behind_the_late_commands() -> None:

@@ -21,11 +21,10 @@ from residnet.control.courses.config import (
 )
 from residnet.control.courses.course_plan import Course
 from residnet.control.courses.turns import TurnMaker, steady_turn, turning_step
-from residnet.control.guidance.course_guidance import CourseGuidance
-from residnet.control.heading.following import Following
-from residnet.control.heading.heading_pid import HeadingPID
-from residnet.control.heading.steering import SteeredPlant
+from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
+from residnet.control.heading.classical import HeadingPID
 from residnet.control.heading.turning import Turning
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.physics.vessel import load_vessel
@@ -218,7 +217,8 @@ def test_a_vessel_beside_the_course_comes_back_to_it(vessel: SteeredPlant) -> No
     x, w = vessel.start(torch.ones(2, dtype=torch.float64))
     x[:, vessel.column("y")] = torch.tensor([2.0, -2.0], dtype=torch.float64)
     loop = Rollout(
-        vessel.model(0.05), ClosedLoop(Following(law, vessel.state, limit=LIMIT, dt=0.05), guidance)
+        vessel.model(0.05),
+        ClosedLoop(TrackKeeping(law, vessel.state, limit=LIMIT, dt=0.05), guidance),
     )
     states, _, _ = loop(
         x,
@@ -250,7 +250,7 @@ def test_a_vessel_that_sways_and_rolls_follows_turns_that_join_each_other() -> N
     law = HeadingPID.placed(
         patrol.state, gain=turning.gain, time=turning.time, frequency=0.8, damping=1.0, limit=LIMIT
     )
-    follower = Following(law, patrol.state, limit=LIMIT, dt=0.1, rate=patrol.rate)
+    follower = TrackKeeping(law, patrol.state, limit=LIMIT, dt=0.1, rate=patrol.rate)
     guidance = CourseGuidance(planned.course, wanted.lookahead, patrol.state)
     x, w = patrol.start(torch.ones(1, dtype=torch.float64))
     x[:, patrol.column("psi")] = float(planned.course.heading[0])

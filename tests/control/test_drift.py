@@ -13,13 +13,12 @@ from scipy.optimize import brentq
 
 from residnet.control.base import ClosedLoop, Policy, Reference
 from residnet.control.courses.course_plan import Course
-from residnet.control.guidance.course_guidance import CourseGuidance
+from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
 from residnet.control.guidance.drift import DriftEstimate
 from residnet.control.guidance.line_of_sight import IntegralLookAhead, LineOfSight, LookAhead
 from residnet.control.guidance.waypoints import WaypointGuidance
-from residnet.control.heading.following import Following
-from residnet.control.heading.heading_pid import HeadingPID
-from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.classical import HeadingPID
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import InAmbientCurrent
@@ -69,7 +68,7 @@ def sailed(
     return end[:, 2] - LEG, end[:, 1] * math.cos(LEG) - end[:, 0] * math.sin(LEG)
 
 
-FOLLOWER = Following(LAW, VESSEL.state, limit=LIMIT, dt=DT)
+FOLLOWER = TrackKeeping(LAW, VESSEL.state, limit=LIMIT, dt=DT)
 CROSS = [0.8, -1.6, 0.0]
 
 

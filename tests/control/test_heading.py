@@ -13,14 +13,12 @@ from torch import Tensor
 from residnet.control import (
     BangBangHeading,
     ClosedLoop,
-    DocumentAutopilot,
     GivenReference,
     HeadingPID,
     Policy,
-    Predictor,
-    SimulatedPredictor,
 )
 from residnet.core.errors import ConfigError
+from residnet.documents.gouletas2020.law import DocumentAutopilot, Predictor, SimulatedPredictor
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import NomotoDynamics, PlantDynamics
 from residnet.physics.nomoto import SteeringVessel

@@ -9,14 +9,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.control.conditions.config import ConditionsConfig
-from residnet.control.conditions.flights import fly_under
-from residnet.control.heading.controllers import Steering
-from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.conditions import ConditionsConfig, fly_under
+from residnet.control.heading.controllers import (
+    NetworkPolicySpec,
+    ObservedLqrConfig,
+    ObservedPolicySpec,
+    PtosConfig,
+    Steering,
+)
+from residnet.control.heading.policies import ObservedPolicy
 from residnet.control.heading.turning import Turning
-from residnet.control.observed.config import ObservedLqrConfig, PtosConfig
-from residnet.control.observed.policy import ObservedPolicy
-from residnet.control.observed.stored import NetworkPolicySpec, ObservedPolicySpec
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.physics.vessel import load_vessel
 

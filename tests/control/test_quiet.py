@@ -6,12 +6,16 @@ import math
 
 import torch
 
-from residnet.control.conditions.config import ConditionsConfig
-from residnet.control.conditions.flights import ConditionedRun
-from residnet.control.conditions.quiet import SteadyConfig, SteadyTest, nominal, too_many
-from residnet.control.heading.controllers import PdConfig, Steering
-from residnet.control.heading.steering import SteeredPlant
-from residnet.control.observed.config import PtosConfig
+from residnet.control.heading.conditions import (
+    ConditionedRun,
+    ConditionsConfig,
+    SteadinessLimits,
+    SteadyTest,
+    nominal,
+    too_many,
+)
+from residnet.control.heading.controllers import PdConfig, PtosConfig, Steering
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.physics.vessel import load_vessel
 
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
@@ -23,20 +27,20 @@ STEEP = PtosConfig(
 )  # fmt: skip
 
 
-def refused(controller: PdConfig | PtosConfig, limits: SteadyConfig) -> int:
+def refused(controller: PdConfig | PtosConfig, limits: SteadinessLimits) -> int:
     run = ConditionedRun(VESSEL, controller.build(STEERING), 0.1)
     return SteadyTest(limits, CONDITIONS, 1).refused(run)
 
 
 def test_flights_that_swing_are_counted() -> None:
-    limits = SteadyConfig(flights=8)
+    limits = SteadinessLimits(flights=8)
     # late commands are too late for a steep law; the nominal vessel of sixteen flights has none
     assert refused(STEEP, limits) >= 8
     assert refused(PdConfig(kp=1.4, damping_time=1.4), limits) == 0
 
 
 def test_overshoot_of_the_nominal_vessel_is_counted() -> None:
-    limits = SteadyConfig(flights=2, overshoot=math.radians(0.3))
+    limits = SteadinessLimits(flights=2, overshoot=math.radians(0.3))
     hasty = PdConfig(kp=1.5, damping_time=1.1)
     assert refused(hasty, limits) > refused(hasty, limits.model_copy(update={"overshoot": 1.0}))
 

@@ -11,8 +11,7 @@ import torch
 from made_models import nomoto_model
 
 from residnet.control.heading.controllers import PdConfig, Steering
-from residnet.control.heading.steered_model import SteeredModel
-from residnet.control.heading.steering import SteeredPlant, fly
+from residnet.control.heading.vessels import SteeredModel, SteeredPlant, fly
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.physics.vessel import load_vessel

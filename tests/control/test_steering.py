@@ -11,9 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
 from residnet.control import Policy
-from residnet.control.heading.bang_bang_rate import RatedBangBangHeading
+from residnet.control.heading.classical import RatedBangBangHeading
 from residnet.control.heading.controllers import BangBangConfig, Steering
-from residnet.control.heading.steering import Flights, SteeredPlant, fly
+from residnet.control.heading.vessels import Flights, SteeredPlant, fly
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180

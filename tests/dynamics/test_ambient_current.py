@@ -7,7 +7,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.frames import to_body
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import InAmbientCurrent

@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from residnet.control.heading.policy import HeadingPolicy
-from residnet.control.heading.steering import SteeredPlant
-from residnet.control.observed.config import PtosConfig
-from residnet.control.observed.stored import ObservedPolicySpec
+from residnet.control.heading.controllers import ObservedPolicySpec, PtosConfig
+from residnet.control.heading.policies import NetworkPolicy
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.dynamics.store import save_model
 from residnet.export import exporter
 from residnet.export.policy import ExportedHeading
@@ -59,7 +58,9 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     vessel = SteeredPlant(load_vessel("nomoto_oceanos").build())
     limit = math.radians(5)
     torch.manual_seed(0)
-    own = HeadingPolicy(vessel.state, turning=vessel.turning(limit, 60.0), limit=limit, dt=DT)
+    own = NetworkPolicy(
+        vessel.state, turning=vessel.turning(limit, 60.0), limit=limit, dt=DT, units=4
+    )
     with torch.no_grad():
         own.network[-1].weight.copy_(0.05 * torch.randn_like(own.network[-1].weight))  # type: ignore[union-attr, arg-type, operator]
     file = tmp_path_factory.mktemp("policy") / "policy.pt"

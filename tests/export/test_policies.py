@@ -16,9 +16,8 @@ from torch import Tensor
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance.course_guidance import CourseGuidance
 from residnet.control.guidance.drift import DriftEstimate
-from residnet.control.observed.config import PtosConfig
-from residnet.control.observed.policy import FIXED, ObservedPolicy
-from residnet.control.observed.stored import NetworkPolicySpec, ObservedPolicySpec
+from residnet.control.heading.controllers import NetworkPolicySpec, ObservedPolicySpec, PtosConfig
+from residnet.control.heading.policies import FIXED, ObservedPolicy
 from residnet.core.errors import ExportError, UsageError
 from residnet.export import exporter, policy
 from residnet.export.base import Loaded

@@ -26,12 +26,11 @@ from torch import Tensor
 from residnet.control import (
     BangBangHeading,
     ClosedLoop,
-    DocumentAutopilot,
     GivenReference,
     HeadingPID,
     Policy,
-    SimulatedPredictor,
 )
+from residnet.documents.gouletas2020.law import DocumentAutopilot, SimulatedPredictor
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import NomotoDynamics, TracedPlantDynamics

@@ -154,7 +154,12 @@ def flown(folder: Path) -> dict[str, Any]:
 
 def autopilot(folder: Path) -> dict[str, Any]:
     """One small policy beside a tuned controller."""
-    training = {"epochs": 1, "steps": 1, "batch": 16, "dt": "0.2 s", "horizon": "4 s"}
+    training = {
+        "epochs": 1, "steps": 1, "batch": 8, "dt": "0.2 s", "hold": "0 s", "validation": 4,
+        "compiled": False, "steady": None,
+    }  # fmt: skip
+    stated = {"dt": "0.2 s", "duration": "6 s", "hold": "0 s"}
+    search = {"flights": 2, "population": 2, "generations": 1}
     return {
         "task": "autopilot",
         "name": "small",
@@ -162,10 +167,10 @@ def autopilot(folder: Path) -> dict[str, Any]:
         "rudder": "5 deg",
         "turning_time": "40 s",
         "test": {"dt": "0.2 s", "duration": "6 s", "plants": 1, "bias_time": "6 s"},
-        "policies": {"policy": {"hidden": [4], "training": training}},
+        "conditions": {"stated": stated, "flights": 4, "evolution": search},
+        "policies": {"policy": {"start": None, "units": 2, "training": training}},
         "peers": {"pd": {"kind": "pd"}, "bang_bang": {"kind": "bang_bang"}},
         "floor": "bang_bang",
-        "tuning_points": 16,
     }
 
 

@@ -13,12 +13,11 @@ import yaml
 from read_page import plain
 from tiny import call
 
-from residnet.control.observed.config import PtosConfig
+from residnet.control.heading.controllers import PtosConfig
 from residnet.core.config import load_config
 from residnet.report.sections.autopilot import cost_verdict
-from residnet.tasks.autopilot.stored import stored_policy
-from residnet.tasks.autopilot.task import AutopilotConfig
-from residnet.tasks.autopilot.tuned import tuned_before
+from residnet.tasks.autopilot.running import stored_policy
+from residnet.tasks.autopilot.task import AutopilotConfig, tuned_before
 
 pytestmark = pytest.mark.long
 
@@ -40,7 +39,7 @@ SMALL: dict[str, Any] = {
         "beyond": {"late": {**STATED, "delay": ["0.6 s", "0.6 s"]}},
         "evolution": {"flights": 4, "population": 2, "generations": 1},
     },
-    "recurrent": {
+    "policies": {
         "learned": {"start": "ptos", "units": 3, "training": TRAINING},
         "constants": {"start": "ptos", "units": 0, "training": TRAINING},
         "network": {"start": None, "units": 3, "training": TRAINING},
@@ -159,8 +158,8 @@ def test_a_run_takes_the_constants_that_another_tuned(
     [
         ({"conditions": None}, "give 'conditions' to train it under"),
         ({"peers": {"ptos": {"kind": "pd"}}}, "must name a peer of kind ptos"),
-        ({"recurrent": {}, "policies": {}}, "give at least one policy"),
-        ({"recurrent": {"n": {"start": None, "units": 0}}}, "without a law needs a network"),
+        ({"policies": {}}, "give at least one policy"),
+        ({"policies": {"n": {"start": None, "units": 0}}}, "without a law needs a network"),
         ({"conditions": {"stated": {**STATED, "dt": "0.05 s"}}}, "dt must be that of test"),
         ({"conditions": {"stated": {**STATED, "duration": "1 s"}}}, "takes this vessel 2.14 s"),
         ({"rudder": "1.5 deg"}, "leave nothing of a rudder of 1.5 deg"),

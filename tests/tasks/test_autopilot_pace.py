@@ -9,8 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from residnet.control.heading.turning import Turning
-from residnet.tasks.autopilot.pace import least_time, paced
-from residnet.tasks.autopilot.task import AutopilotConfig
+from residnet.tasks.autopilot.task import AutopilotConfig, least_time, paced
 
 CONFIG: dict[str, Any] = {
     "task": "autopilot",
@@ -19,7 +18,7 @@ CONFIG: dict[str, Any] = {
     "rudder": "20 deg",
     "test": {"duration": "14 s"},
     "conditions": {"beyond": {"late": {"delay": ["0.6 s", "0.6 s"]}}},
-    "recurrent": {"learned": {"start": "ptos"}},
+    "policies": {"learned": {"start": "ptos"}},
     "peers": {"ptos": {"kind": "ptos"}},
 }
 
@@ -44,7 +43,7 @@ def test_times_follow_the_pace_and_delays_do_not() -> None:
         assert (conditions.duration, conditions.dt, conditions.hold) == (112.0, 0.16, 40.0)
         assert conditions.overshoot_weight == 4.0
     assert slow.conditions.stated.delay == (0.0, 0.4)
-    assert slow.recurrent["learned"].training.dt == 0.32
+    assert slow.policies["learned"].training.dt == 0.32
     assert paced(slow) == slow
 
 
@@ -54,6 +53,7 @@ def test_the_pace_of_a_vessel_is_measured() -> None:
 
 
 def test_a_pace_belongs_to_conditions() -> None:
-    without = CONFIG | {"pace": 2.0, "policies": {"policy": {}}}
-    with pytest.raises(ValidationError, match="pace: only runs under 'conditions'"):
+    without = CONFIG | {"pace": 2.0, "conditions": None, "policies": {}, "peers": {}}
+    without |= {"predictive": {"document": {"horizon": 2.0}}}
+    with pytest.raises(ValidationError, match="pace: give 'conditions'"):
         AutopilotConfig.model_validate(without)

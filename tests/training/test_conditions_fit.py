@@ -7,16 +7,17 @@ import math
 import pytest
 import torch
 
-from residnet.control.conditions.config import ConditionsConfig
-from residnet.control.conditions.flights import ConditionedFlights
-from residnet.control.conditions.quiet import SteadyConfig
-from residnet.control.heading.steering import SteeredPlant
-from residnet.control.observed.config import PtosConfig
-from residnet.control.observed.policy import ObservedPolicy
-from residnet.control.observed.stored import ObservedPolicySpec
+from residnet.control.heading.conditions import (
+    ConditionedFlights,
+    ConditionsConfig,
+    SteadinessLimits,
+)
+from residnet.control.heading.controllers import ObservedPolicySpec, PtosConfig
+from residnet.control.heading.policies import ObservedPolicy
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.physics.vessel import load_vessel
-from residnet.training.policies.conditions_config import ConditionsTraining
-from residnet.training.policies.conditions_fit import ConditionsFit, train_under_conditions
+from residnet.training.policies.config import PolicyTraining
+from residnet.training.policies.fit import PolicyFit, train_policy
 
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
 CONDITIONS = ConditionsConfig(dt=0.1, duration=6.0, hold=0.0, delay=(0.0, 0.3))
@@ -33,7 +34,7 @@ def trained(units: int, rate: float) -> tuple[ObservedPolicy, dict[str, object]]
         state=VESSEL.state, gain=3.47, time=3.94, speed=3.2, limit=math.radians(5), rate=None,
         dt=0.1, trained_at=0.1, law=STEEP, units=units,
     ).build()  # fmt: skip
-    settings = ConditionsTraining(
+    settings = PolicyTraining(
         epochs=2,
         steps=4,
         batch=32,
@@ -44,7 +45,7 @@ def trained(units: int, rate: float) -> tuple[ObservedPolicy, dict[str, object]]
         quiet=0.0,
         steady=None,
     )
-    notes = train_under_conditions("policy", policy, VESSEL, settings, CONDITIONS, 3, None)
+    notes = train_policy("policy", policy, VESSEL, settings, CONDITIONS, 3, None)
     return policy, notes
 
 
@@ -65,16 +66,16 @@ def test_a_start_that_training_only_spoils_is_kept() -> None:
     assert float(policy.network.out.weight.abs().max()) == 0.0
 
 
-def fitted(settings: ConditionsTraining) -> ConditionsFit:
+def fitted(settings: PolicyTraining) -> PolicyFit:
     policy = ObservedPolicySpec(
         state=VESSEL.state, gain=3.47, time=3.94, speed=3.2, limit=math.radians(5), rate=None,
         dt=0.1, trained_at=0.1, law=STEEP, units=2,
     ).build()  # fmt: skip
-    return ConditionsFit(policy, VESSEL, settings, CONDITIONS, 0, None)
+    return PolicyFit(policy, VESSEL, settings, CONDITIONS, 0, None)
 
 
 def test_the_last_epochs_take_the_step_of_the_conditions() -> None:
-    fit = fitted(ConditionsTraining(dt=0.2, hold=0.0, validation=4, epochs=10, fine=0.3))
+    fit = fitted(PolicyTraining(dt=0.2, hold=0.0, validation=4, epochs=10, fine=0.3))
     steps = []
     for epoch in range(10):
         fit.history = [{}] * epoch
@@ -86,7 +87,7 @@ def test_the_last_epochs_take_the_step_of_the_conditions() -> None:
 
 
 def test_epochs_far_from_the_start_ease_the_charge() -> None:
-    settings = ConditionsTraining(dt=0.1, hold=0.0, validation=4, nominal=0.05, spread=0.15)
+    settings = PolicyTraining(dt=0.1, hold=0.0, validation=4, nominal=0.05, spread=0.15)
     fit = fitted(settings.model_copy(update={"epochs": 10, "stricter": 1.5}))
     fit.start_score, fit.best_state = 6.0, {"any": torch.zeros(1)}
     # the first two epochs fly less than the full conditions; the third swings only
@@ -101,7 +102,7 @@ def test_epochs_far_from_the_start_ease_the_charge() -> None:
 
 
 def test_epochs_that_swing_come_after_those_that_do_not() -> None:
-    settings = ConditionsTraining(dt=0.1, hold=0.0, validation=4, steady=SteadyConfig(flights=4))
+    settings = PolicyTraining(dt=0.1, hold=0.0, validation=4, steady=SteadinessLimits(flights=4))
     fit = fitted(settings)
     # five of twenty-four flights are beyond the limits: they count twice
     fit.best_state, fit.best_score, fit.best_diverged = {"any": torch.zeros(1)}, 6.0, 5
@@ -115,7 +116,7 @@ def test_epochs_that_swing_come_after_those_that_do_not() -> None:
 
 
 def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:
-    fit = fitted(ConditionsTraining(dt=0.1, hold=0.0, validation=4, calm=0.5, exact=2.0))
+    fit = fitted(PolicyTraining(dt=0.1, hold=0.0, validation=4, calm=0.5, exact=2.0))
     changes = CONDITIONS.draw(16, 0.1, torch.Generator().manual_seed(0))
     time = 0.1 * torch.arange(changes.push.shape[1])
     wave = torch.sin(2.0 * math.pi * time)
@@ -137,18 +138,18 @@ def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:
 
 
 def test_overshoot_beyond_the_limit_of_one_in_twenty_costs() -> None:
-    limits = SteadyConfig(flights=4, overshoot_p95=math.radians(0.5))
-    settings = ConditionsTraining(dt=0.1, hold=0.0, validation=4, excess=2.0, steady=limits)
+    limits = SteadinessLimits(flights=4, overshoot_p95=math.radians(0.5))
+    settings = PolicyTraining(dt=0.1, hold=0.0, validation=4, excess=2.0, steady=limits)
     overshoot = torch.deg2rad(torch.tensor([0.0, 0.4, 0.7, 1.5]))
     assert float(fitted(settings)._beyond(overshoot)) == pytest.approx(2.0 * (0.2 + 1.0) / 4.0)
     assert fitted(settings.model_copy(update={"steady": None}))._beyond(overshoot) == 0.0
 
 
 def test_the_conditions_and_the_guide_follow_the_progress() -> None:
-    assert ConditionsTraining().share(0.0) == 1.0
+    assert PolicyTraining().share(0.0) == 1.0
     with pytest.raises(ValueError, match=r"nominal \(0.1\) must not be larger than spread \(0\)"):
-        ConditionsTraining(nominal=0.1)
-    settings = ConditionsTraining(nominal=0.05, spread=0.15)
+        PolicyTraining(nominal=0.1)
+    settings = PolicyTraining(nominal=0.05, spread=0.15)
     assert [settings.share(p) for p in (0.0, 0.05, 0.15, 1.0)] == [0.0, 0.0, 1.0, 1.0]
     assert settings.share(0.1) == pytest.approx(0.5)
     assert settings.guiding(0.0) == settings.guide

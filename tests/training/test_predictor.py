@@ -10,12 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from residnet.control.heading.controllers import DocumentConfig, Steering
-from residnet.control.heading.document_autopilot import NetworkPredictor
-from residnet.control.heading.steering import SteeredPlant, fly
+from residnet.control.heading.controllers import Steering
+from residnet.control.heading.vessels import SteeredPlant, fly
+from residnet.documents.gouletas2020.autopilot import simulate_answers, train_predictor
+from residnet.documents.gouletas2020.law import DocumentConfig, NetworkPredictor, PredictorTraining
 from residnet.physics.vessel import load_vessel
-from residnet.training.policies.predictor import simulate_answers, train_predictor
-from residnet.training.policies.predictor_config import PredictorTraining
 
 DEG = math.pi / 180
 LIMIT = 5 * DEG

@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 from residnet.control.base import ClosedLoop, GivenReference, Policy, Reference
-from residnet.control.heading.bang_bang import BangBangHeading
-from residnet.control.heading.document_autopilot import (
-    DocumentAutopilot,
-    Predictor,
-    SimulatedPredictor,
-)
-from residnet.control.heading.heading_pid import HeadingPID
+from residnet.control.heading.classical import BangBangHeading, HeadingPID
 from residnet.control.motion.pid import (
     Allocated,
     FeedForward,
@@ -24,7 +18,6 @@ __all__ = [
     "Allocated",
     "BangBangHeading",
     "ClosedLoop",
-    "DocumentAutopilot",
     "FeedForward",
     "GivenReference",
     "HeadingPID",
@@ -33,9 +26,7 @@ __all__ = [
     "MotionPIDConfig",
     "NoFeedForward",
     "Policy",
-    "Predictor",
     "Reference",
     "ReferenceFilter",
     "ReferenceFilterConfig",
-    "SimulatedPredictor",
 ]

@@ -18,9 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.courses.course_plan import Course
-from residnet.control.guidance.course_guidance import CourseGuidance
-from residnet.control.heading.following import Following
-from residnet.control.heading.keeper import HeadingKeeper
+from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
+from residnet.control.heading.policies import HeadingPolicy
 from residnet.core.errors import ExportError
 from residnet.core.version import __version__
 from residnet.export.base import Exported, Loaded, RoundingError
@@ -59,7 +58,7 @@ class _Controller(nn.Module):
         self,
         limits: Sequence[tuple[float, float]],
         memory: Sequence[tuple[float, float]],
-        policy: HeadingKeeper,
+        policy: HeadingPolicy,
         safe: Safe,
         dtype: torch.dtype,
     ) -> None:
@@ -115,7 +114,7 @@ class ExportedPolicy(_Controller):
 
     def __init__(
         self,
-        policy: HeadingKeeper,
+        policy: HeadingPolicy,
         limits: Sequence[tuple[float, float]],
         safe: Safe,
         dtype: torch.dtype = torch.float32,
@@ -177,7 +176,7 @@ class ExportedCourse(_Controller):
     shape are refused, never broadcast; other precisions are converted.
     """
 
-    def __init__(self, policy: HeadingKeeper, guidance: CourseGuidance, safe: Safe) -> None:
+    def __init__(self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Safe) -> None:
         policy = copy.deepcopy(policy).double().eval().requires_grad_(False)
         policy.read_from(tuple(COURSE))
         guidance = copy.deepcopy(guidance).double()
@@ -199,7 +198,7 @@ class ExportedCourse(_Controller):
         ]
         super().__init__(limits, memory, policy, safe, torch.float64)
         rate = None if math.isinf(policy.rate) else policy.rate
-        self.follower = Following(
+        self.follower = TrackKeeping(
             policy, tuple(COURSE), limit=policy.limit, dt=policy.dt, rate=rate
         )
         self.travel = self.follower.travel
@@ -262,7 +261,7 @@ class _Answer(nn.Module):
 
 
 def for_export(
-    policy: HeadingKeeper, safe: Safe, dtype: torch.dtype = torch.float32
+    policy: HeadingPolicy, safe: Safe, dtype: torch.dtype = torch.float32
 ) -> ExportedPolicy:
     """Return the policy with its checks.
 
@@ -295,7 +294,7 @@ class ExportedController(Exported):
     def __init__(
         self,
         name: str,
-        policy: HeadingKeeper,
+        policy: HeadingPolicy,
         *,
         safe: Safe,
         about: Mapping[str, Any],
@@ -460,7 +459,7 @@ class ExportedCoursePolicy(ExportedController):
     def __init__(
         self,
         name: str,
-        policy: HeadingKeeper,
+        policy: HeadingPolicy,
         guidance: CourseGuidance,
         course: Course,
         *,

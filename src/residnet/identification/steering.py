@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from residnet.control.heading.response import Record, SteeringResponse, fit_response
+from residnet.control.heading.turning import Record, SteeringResponse, fit_response
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 

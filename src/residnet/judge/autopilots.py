@@ -1,15 +1,21 @@
-"""Measures of heading controllers: one definition for all, with spreads over random vessels."""
+"""Measures of heading controllers: steps over many vessels, and flights under conditions."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
 from residnet.control.base import Policy
-from residnet.control.heading.steering import Flights, SteeredPlant, SteeredVessel, fly
+from residnet.control.heading.conditions import (
+    ConditionedRun,
+    ConditionsConfig,
+    HeadingChanges,
+)
+from residnet.control.heading.vessels import Flights, SteeredPlant, SteeredVessel, fly
 from residnet.data.simulated.environment import Disturbance
 from residnet.physics.environment.waves import WavesConfig
 from residnet.physics.plant import Plant
@@ -49,7 +55,9 @@ def distribution(values: Tensor) -> dict[str, float]:
     }
 
 
-def row(controller: str, kind: str, protocol: str, flights: Flights, band: float) -> dict[str, Any]:
+def step_row(
+    controller: str, kind: str, protocol: str, flights: Flights, band: float
+) -> dict[str, Any]:
     """Return a row of metrics.json: distributions, flights not settled at the end, flights."""
     found = measure(flights, band)
     finite = torch.isfinite(flights.states).all(dim=2).all(dim=1)
@@ -68,49 +76,40 @@ def row(controller: str, kind: str, protocol: str, flights: Flights, band: float
     }
 
 
+def corners(effect: tuple[float, float], time: tuple[float, float]) -> Tensor:
+    """Return effect, time and zero bias [9, 3]: nominal first, then ends and middles."""
+    return torch.tensor([(e, t, 0.0) for e in (1.0, *effect) for t in (1.0, *time)]).double()
+
+
 def random_variations(
     effect: tuple[float, float], time: tuple[float, float], count: int, seed: int
 ) -> Tensor:
     """Return effect and time drawn evenly from their ranges, no bias: [count, 3]."""
     drawn = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     low, high = torch.tensor([effect, time], dtype=torch.float64).T
-    return torch.cat(
-        (low + (high - low) * drawn, torch.zeros(count, 1, dtype=torch.float64)), dim=1
-    )
+    return torch.cat((low + (high - low) * drawn, torch.zeros(count, 1).double()), dim=1)
 
 
 def step_flights(
     vessel: SteeredVessel,
     policy: Policy,
-    variations: Tensor,
     heading: float,
     dt: float,
     duration: float,
-    speed: Tensor | None = None,
+    variations: Tensor,
 ) -> Flights:
-    """Run steps of the reference, to starboard and to port in turn.
-
-    `speed` holds multiples [B] of the service speed.
-    """
+    """Run steps of the reference, to starboard and to port in turn."""
     side = torch.where(torch.arange(len(variations)) % 2 == 0, 1.0, -1.0)
-    return fly(vessel, policy, heading * side, variations, dt=dt, duration=duration, speed=speed)
+    return fly(vessel, policy, heading * side, variations, dt=dt, duration=duration)
 
 
 def wind_flights(
-    vessel: SteeredVessel, policy: Policy, speed: float, heading: float, dt: float, duration: float
+    plant: Plant, policy: Policy, speed: float, heading: float, dt: float, duration: float
 ) -> Flights:
     """Run steps of the reference with the nominal vessel in wind from eight directions."""
-    direction = torch.arange(8) * (torch.pi / 4.0)
-    weather: dict[str, float | Tensor] = {"wind_speed": speed, "wind_dir": direction}
-    return fly(
-        vessel,
-        policy,
-        torch.full((8,), heading),
-        _nominal(8),
-        dt=dt,
-        duration=duration,
-        weather=weather,
-    )
+    weather = {"wind_speed": speed, "wind_dir": torch.arange(8) * (torch.pi / 4.0)}
+    vessel, headings = SteeredPlant(plant, calm=False), torch.full((8,), heading)
+    return fly(vessel, policy, headings, _nominal(8), dt=dt, duration=duration, weather=weather)
 
 
 def sea_flights(
@@ -161,3 +160,88 @@ def sea_row(controller: str, kind: str, flights: Flights, start: float) -> dict[
 
 def _nominal(rows: int) -> Tensor:
     return torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(rows, -1)
+
+
+def series(name: str, flights: Flights, variations: Tensor) -> pd.DataFrame:
+    """Return heading, yaw rate and rudder every 0.05 s, all turned to starboard."""
+    every = max(round(0.05 / flights.dt), 1)
+    parts = []
+    for i, variation in enumerate(variations):
+        side = 1.0 if i % 2 == 0 else -1.0
+        parts.append(
+            pd.DataFrame(
+                {
+                    "controller": name,
+                    "effect": float(variation[0]),
+                    "time": float(variation[1]),
+                    "t": torch.arange(0, flights.inputs.shape[1], every).numpy() * flights.dt,
+                    "psi": side * flights.state("psi")[i, :-1:every].numpy(),
+                    "r": side * flights.state("r")[i, :-1:every].numpy(),
+                    "rudder": side * flights.inputs[i, ::every, 0].numpy(),
+                }
+            )
+        )
+    return pd.concat(parts, ignore_index=True)
+
+
+QUIET_FLIGHTS = 100
+
+
+def drawn(conditions: ConditionsConfig, flights: int, seed: int) -> HeadingChanges:
+    """Return flights that no tuning or training has seen, the same for all controllers."""
+    random = torch.Generator().manual_seed(seed + 2_000_003)
+    return conditions.draw(flights, conditions.dt, random)
+
+
+def judged(
+    controller: str,
+    kind: str,
+    protocol: str,
+    run: ConditionedRun,
+    conditions: ConditionsConfig,
+    changes: HeadingChanges,
+) -> tuple[dict[str, Any], pd.DataFrame]:
+    """Return a row of metrics.json, and a table with a line for each flight, in SI units.
+
+    A flight whose heading is no number counts as diverged, and with a heading error of 180 deg all
+    the time in the means.
+    """
+    flown = run.fly(changes)
+    finite = torch.isfinite(flown.psi).all(1) & torch.isfinite(flown.command).all(1)
+    worst = conditions.duration + 0.5 * 180.0
+    found = {
+        name: torch.where(finite, values, worst if name == "cost" else torch.nan)
+        for name, values in flown.measured(conditions).items()
+    }
+    row = {"model": controller, "kind": kind, "split": "simulated", "protocol": protocol}
+    kept = {name: values if name == "cost" else values[finite] for name, values in found.items()}
+    figures = {name: distribution(values) for name, values in kept.items() if len(values)}
+    table = pd.DataFrame(
+        {
+            "controller": controller,
+            "protocol": protocol,
+            "flight": range(len(finite)),
+            **{name: values.numpy() for name, values in found.items()},
+        }
+    )
+    return {**row, **figures, "n": len(finite), "diverged": int((~finite).sum())}, table
+
+
+def swinging(
+    controller: str, kind: str, run: ConditionedRun, changes: HeadingChanges, after: float
+) -> dict[str, Any]:
+    """Return the row of metrics.json of flights without noise: what still swings at their end.
+
+    `after` is the time in s from the change on from which they are looked at.
+    """
+    flown = run.fly(changes)
+    heading, rudder = flown.swing(after)
+    return {
+        "model": controller,
+        "kind": kind,
+        "split": "simulated",
+        "protocol": "quiet",
+        "heading_swing": distribution(heading),
+        "rudder_swing": distribution(rudder),
+        "n": len(heading),
+    }

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from residnet.control.guidance.line_of_sight import LookAhead
 from residnet.control.guidance.waypoints import WaypointGuidance
-from residnet.control.heading.heading_pid import HeadingPID
+from residnet.control.heading.classical import HeadingPID
 from residnet.core.config import Metres, Seconds
 from residnet.core.log import Log
 from residnet.dynamics.rollout import Source

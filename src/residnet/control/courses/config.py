@@ -21,8 +21,8 @@ from residnet.control.courses.dubins import dubins_length
 from residnet.control.courses.outline import Circle
 from residnet.control.courses.turn_table import Turns, arcs, simulated_turns
 from residnet.control.courses.turns import SteadyTurn, TurnMaker, steady_turn, turning_step
-from residnet.control.heading.steering import SteeredVessel
 from residnet.control.heading.turning import Turning
+from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError
 

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PPoly
 
-from residnet.control.heading.steering import SteeredVessel
 from residnet.control.heading.turning import Turning
+from residnet.control.heading.vessels import SteeredVessel
 from residnet.dynamics.rollout import Rollout
 
 Array = NDArray[np.float64]

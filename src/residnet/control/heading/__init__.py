@@ -1,1 +1,1 @@
-"""Heading controllers: classical laws, the neural policy, and the vessels that they steer."""
+"""Heading controllers: laws, learned policies, their vessels and conditions."""

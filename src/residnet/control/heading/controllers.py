@@ -1,30 +1,26 @@
-"""Classical heading controllers as configs: gains given, or left out to be tuned."""
+"""Heading controllers as configs: constants given, or left out to be tuned."""
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from typing import ClassVar, Literal, NamedTuple, final
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, NamedTuple, final
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from residnet.control.base import Policy
-from residnet.control.heading.bang_bang import BangBangHeading
-from residnet.control.heading.bang_bang_rate import RatedBangBangHeading
-from residnet.control.heading.document_autopilot import (
-    DocumentAutopilot,
-    Predictor,
-    SimulatedPredictor,
-)
-from residnet.control.heading.heading_pid import HeadingPID
-from residnet.control.heading.laws import regulator_gains
-from residnet.control.heading.steering import NominalSteering, SteeredVessel
+from residnet.control.heading.classical import BangBangHeading, HeadingPID, RatedBangBangHeading
+from residnet.control.heading.laws import HeadingLaw, RegulatorLaw, StoppingLaw, regulator_gains
+from residnet.control.heading.policies import CONSTANTS, NetworkPolicy, ObservedPolicy
 from residnet.control.heading.turning import Turning
+from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.frames import wrap
+from residnet.dynamics.store import Stored, read_spec, read_weights
 
 
 class Steering(NamedTuple):
@@ -36,7 +32,7 @@ class Steering(NamedTuple):
     dt: float
 
 
-class Axis(NamedTuple):
+class SearchRange(NamedTuple):
     """A range of a parameter that tuning searches, by its logarithm."""
 
     low: float
@@ -91,7 +87,7 @@ class TunableConfig(ControllerConfig, ABC):
         """Return the parameters by name; None where they are to be tuned."""
 
     @abstractmethod
-    def axes(self, turning: Turning) -> dict[str, Axis]:
+    def axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return the ranges that tuning searches, by parameter."""
 
     @abstractmethod
@@ -160,11 +156,11 @@ class PdConfig(TunedConfig):
         """Return kp and damping_time; None where they are to be tuned."""
         return {"kp": self.kp, "damping_time": self.damping_time}
 
-    def axes(self, turning: Turning) -> dict[str, Axis]:
+    def axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return the ranges: two decades of kp, damping_time from a twentieth of T to twice T."""
         return {
-            "kp": Axis(0.3, 60.0),
-            "damping_time": Axis(0.05 * turning.time, 2.0 * turning.time),
+            "kp": SearchRange(0.3, 60.0),
+            "damping_time": SearchRange(0.05 * turning.time, 2.0 * turning.time),
         }
 
     def gains(
@@ -200,10 +196,10 @@ class PidConfig(TunedConfig):
             "integral_time": self.integral_time,
         }
 
-    def axes(self, turning: Turning) -> dict[str, Axis]:
+    def axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return the ranges of a PD law, and an integral_time from T to 50 T."""
         pd = PdConfig().axes(turning)
-        return {**pd, "integral_time": Axis(turning.time, 50.0 * turning.time)}
+        return {**pd, "integral_time": SearchRange(turning.time, 50.0 * turning.time)}
 
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
@@ -234,9 +230,12 @@ class LqrConfig(TunedConfig):
         """Return heading_weight and rate_weight; None where they are to be tuned."""
         return {"heading_weight": self.heading_weight, "rate_weight": self.rate_weight}
 
-    def axes(self, turning: Turning) -> dict[str, Axis]:
+    def axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return both weights over decades."""
-        return {"heading_weight": Axis(0.1, 3600.0), "rate_weight": Axis(1e-3, 3600.0)}
+        return {
+            "heading_weight": SearchRange(0.1, 3600.0),
+            "rate_weight": SearchRange(1e-3, 3600.0),
+        }
 
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
@@ -277,35 +276,235 @@ class BangBangConfig(ControllerConfig):
         )
 
 
-class DocumentConfig(ControllerConfig):
-    """The predictive law of document 004 with an exact predictor of the nominal vessel.
+Positive = Annotated[float, Field(gt=0)]
+
+
+class ObservedConfig(TunableConfig, ABC):
+    """A law on the estimates of a disturbance observer, with a predictor of pending commands.
 
     Attributes:
-        horizon: of the prediction; the source's 0.01 s cannot settle (corrections of document 004).
-        candidates: rudder angles.
-        weight: of the choice for the heading error.
+        lag: time in s between a command and its rudder that the predictor bridges; 0 for no
+            predictor.
+        heading_rate: how fast the estimated heading follows the measured one, in 1/s; null to tune
+            it, as with all that follow.
+        yaw_rate_rate: how fast the estimated yaw rate follows the measured one, in 1/s.
+        push_rate: how fast the estimated push follows the yaw rate's surprises, in 1/s.
+        cross_rate: how fast the estimated yaw rate follows the heading's surprises, in 1/s^2.
     """
 
-    kind: Literal["document"] = "document"
-    horizon: Seconds = Field(gt=0)
-    candidates: int = Field(default=41, ge=3, le=10_001)
-    weight: float = Field(default=0.2, ge=0, le=1)
+    lag: Seconds = Field(default=0.0, ge=0, le=60.0)
+    heading_rate: Positive | None = None
+    yaw_rate_rate: Positive | None = None
+    push_rate: Positive | None = None
+    cross_rate: Positive | None = None
 
-    def predictor(self, steering: Steering) -> SimulatedPredictor:
-        """Return the exact predictor: a simulation of the nominal vessel.
+    own: ClassVar[tuple[str, ...]] = ("constants",)
 
-        Long horizons are predicted in steps of at most a twentieth of T.
-        """
-        steps = math.ceil(self.horizon / max(steering.turning.time / 20.0, steering.dt))
-        model = NominalSteering(steering.vessel, self.horizon / steps)
-        return SimulatedPredictor(model, steering.vessel.state, steps, model.others)
+    @abstractmethod
+    def law(self, limit: float, rate: float | None) -> HeadingLaw:
+        """Return the law for a rudder with a limit in rad and a rate in rad/s, None for none."""
 
-    def law(self, predictor: Predictor, steering: Steering) -> DocumentAutopilot:
-        """Return the controller with some predictor of this horizon."""
-        return DocumentAutopilot(
-            predictor, limit=steering.limit, candidates=self.candidates, weight=self.weight
-        )
+    @abstractmethod
+    def law_axes(self) -> dict[str, SearchRange]:
+        """Return the ranges of the law's own constants."""
+
+    def parameters(self) -> dict[str, float | None]:
+        """Return the constants of law and observer; None where they are to be tuned."""
+        return {name: getattr(self, name) for name in (*self.law_axes(), *CONSTANTS)}
+
+    def axes(self, turning: Turning) -> dict[str, SearchRange]:
+        """Return the ranges of all constants; those of the observer go with 1/T."""
+        once = 1.0 / turning.time
+        return {
+            **self.law_axes(),
+            "heading_rate": SearchRange(once, 120.0 * once),
+            "yaw_rate_rate": SearchRange(once, 120.0 * once),
+            "push_rate": SearchRange(0.08 * once, 30.0 * once),
+            "cross_rate": SearchRange(0.15 * once**2, 150.0 * once**2),
+        }
+
+    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> Policy:
+        """Return the law with constants of its own for every row."""
+        return self.policy(parameters, steering)
 
     def build(self, steering: Steering) -> Policy:
-        """Return the controller with the exact predictor."""
-        return self.law(self.predictor(steering), steering)
+        """Return the law with its constants."""
+        return self.policy(self.complete(), steering)
+
+    def policy(self, constants: Mapping[str, float | Tensor], steering: Steering) -> ObservedPolicy:
+        """Return the policy without a network; each constant is one number or [B]."""
+        vessel = steering.vessel
+        return ObservedPolicy(
+            vessel.state,
+            turning=steering.turning,
+            law=self.law(steering.limit, vessel.rate),
+            constants=constants,
+            limit=steering.limit,
+            dt=steering.dt,
+            rate=vessel.rate,
+            lag=self.lag,
+        )
+
+
+class ObservedLqrConfig(ObservedConfig):
+    """A linear-quadratic regulator with a disturbance observer.
+
+    Attributes:
+        heading_weight: weight of the squared heading error, dimensionless.
+        rate_weight: weight of the squared yaw rate times T, dimensionless.
+    """
+
+    kind: Literal["lqr_observer"] = "lqr_observer"
+    heading_weight: Positive | None = None
+    rate_weight: Positive | None = None
+
+    def law(self, limit: float, rate: float | None) -> HeadingLaw:
+        """Return the linear regulator with this rudder limit in rad."""
+        return RegulatorLaw(limit)
+
+    def law_axes(self) -> dict[str, SearchRange]:
+        """Return both weights over decades."""
+        return {
+            "heading_weight": SearchRange(0.01, 3600.0),
+            "rate_weight": SearchRange(1e-3, 3600.0),
+        }
+
+
+class PtosConfig(ObservedConfig):
+    """The proximate time-optimal law with a disturbance observer.
+
+    Attributes:
+        steepness: errors per rad that full rudder answers.
+        share: of the rudder's braking that is counted on.
+        damping: relative damping near the reference.
+    """
+
+    kind: Literal["ptos"] = "ptos"
+    steepness: Positive | None = None
+    share: Positive | None = None
+    damping: Positive | None = None
+
+    def law(self, limit: float, rate: float | None) -> HeadingLaw:
+        """Return the time-optimal law."""
+        return StoppingLaw(0.0 if rate is None else limit / rate)
+
+    def law_axes(self) -> dict[str, SearchRange]:
+        """Return the ranges of steepness, share and damping."""
+        return {
+            "steepness": SearchRange(3.0, 600.0),
+            "share": SearchRange(0.2, 1.2),
+            "damping": SearchRange(0.3, 3.0),
+        }
+
+
+AnyObserved = Annotated[ObservedLqrConfig | PtosConfig, Field(discriminator="kind")]
+
+ClassicalController = Annotated[
+    PdConfig | PidConfig | LqrConfig | ObservedLqrConfig | PtosConfig | BangBangConfig,
+    Field(discriminator="kind"),
+]
+
+
+class _PolicySpec(Stored):
+    """What descriptions of learned heading policies share.
+
+    Attributes:
+        state: names of the state of the vessel that it was trained on.
+        gain: K of that vessel about straight ahead in 1/s.
+        time: T of that vessel in s.
+        speed: at which K and T hold, in m/s.
+        limit: of the rudder in rad.
+        rate: of the rudder in rad/s; None where it stands at its command at once.
+        dt: step in s that it runs with.
+        trained_at: step of its training in s.
+    """
+
+    state: tuple[str, ...]
+    gain: float
+    time: float = Field(gt=0)
+    speed: float
+    limit: float = Field(gt=0)
+    rate: float | None = Field(gt=0)
+    dt: float = Field(gt=0)
+    trained_at: float = Field(gt=0)
+
+    @property
+    def turning(self) -> Turning:
+        """K, T and speed of that vessel."""
+        return Turning(self.gain, self.time, self.speed)
+
+
+class ObservedPolicySpec(_PolicySpec):
+    """A description of a heading policy with observer, predictor and recurrent network.
+
+    Attributes:
+        schema_name: kind and version of the format.
+        law: with the constants that its training began with.
+        units: of the network; 0 for none.
+    """
+
+    schema_name: Literal["residnet.observed_policy/1"] = Field(
+        default="residnet.observed_policy/1", alias="schema"
+    )
+    law: AnyObserved
+    units: int = Field(ge=0, le=10_000)
+
+    def build(self) -> ObservedPolicy:
+        """Return the policy with its network not yet trained."""
+        return ObservedPolicy(
+            self.state,
+            turning=self.turning,
+            law=self.law.law(self.limit, self.rate),
+            constants=self.law.complete(),
+            limit=self.limit,
+            dt=self.dt,
+            rate=self.rate,
+            lag=self.law.lag,
+            units=self.units,
+            trained_at=self.trained_at,
+        )
+
+
+class NetworkPolicySpec(_PolicySpec):
+    """A description of a heading policy that is a recurrent network alone.
+
+    Attributes:
+        schema_name: kind and version of the format.
+        units: of the network.
+    """
+
+    schema_name: Literal["residnet.network_policy/1"] = Field(
+        default="residnet.network_policy/1", alias="schema"
+    )
+    units: int = Field(ge=1, le=10_000)
+
+    def build(self) -> NetworkPolicy:
+        """Return the policy with its network not yet trained."""
+        return NetworkPolicy(
+            self.state,
+            turning=self.turning,
+            limit=self.limit,
+            dt=self.dt,
+            rate=self.rate,
+            units=self.units,
+            trained_at=self.trained_at,
+        )
+
+
+RecurrentSpec = ObservedPolicySpec | NetworkPolicySpec
+RecurrentPolicy = ObservedPolicy | NetworkPolicy
+
+
+def load_recurrent(folder: Path, kind: type[RecurrentSpec]) -> RecurrentPolicy:
+    """Read a trained recurrent policy, frozen and in float64.
+
+    Args:
+        folder: of the policy.
+        kind: of its description.
+
+    Raises:
+        UsageError: where the folder holds none, or one that is not as it was written.
+    """
+    policy = read_spec(folder, kind).build()
+    read_weights(folder, policy)
+    return policy.eval().requires_grad_(False).double()

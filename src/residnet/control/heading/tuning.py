@@ -1,161 +1,202 @@
-"""Tuning of linear heading controllers over a spread of vessels.
-
-The gains are the fastest in the worst case among those that keep an overshoot limit.
-"""
+"""Tuning of heading controllers by differential evolution, under stated conditions."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol, final
 
+import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from residnet.control.heading.controllers import LinearRows, Steering, TunedConfig
-from residnet.control.heading.steering import fly
-from residnet.core.errors import FitError
+from residnet.control.heading.conditions import (
+    ConditionedFlights,
+    ConditionedRun,
+    ConditionsConfig,
+    HeadingChanges,
+)
+from residnet.control.heading.controllers import Steering, TunableConfig
+from residnet.core.config import Config
+from residnet.core.errors import ExportError, FitError
+from residnet.dynamics.rollout import Rollout
+
+_ROWS = 4096
+_LOST = 1e3
 
 
-@dataclass(frozen=True)
-class TuningTask:
-    """What controllers are tuned for.
+class TuningConfig(Config):
+    """Settings of the search for the parameters of classical controllers.
 
     Attributes:
-        heading: change [rad].
-        variations: of the vessel [V, 3], nominal first.
-        overshoot: limit [rad] over all variations.
-        band: that the change ends within [rad].
-        duration: of a flight [s].
-        bias, bias_error, bias_time: under a constant rudder bias [rad] the error [rad] of
-            controllers with an integral after this time [s].
+        flights: that every candidate flies, the same for all.
+        population: candidates of a generation per parameter.
+        generations: at most.
+        tolerance: the search ends where the costs of a generation differ by less than this share.
     """
 
-    heading: float
-    variations: Tensor
-    overshoot: float
-    band: float
-    duration: float
-    bias: float
-    bias_error: float
-    bias_time: float
+    flights: int = Field(default=64, ge=2, le=1_000_000)
+    population: int = Field(default=8, ge=2, le=10_000)
+    generations: int = Field(default=25, ge=1, le=10_000)
+    tolerance: float = Field(default=1e-4, ge=0)
+
+
+class RowsFlying(Protocol):
+    """Flights of a closed loop whose rows have numbers of their own."""
+
+    def of(self, rollout: Rollout) -> RowsFlying:
+        """Return the flights of a closed loop that differs in its numbers alone."""
+
+    def __call__(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return states and what acted."""
+
+
+class RowsCompiler(Protocol):
+    """Makes flights quick whose rows have numbers of their own; raises ExportError if it cannot."""
+
+    def __call__(
+        self,
+        rollout: Rollout,
+        x: Tensor,
+        w: Tensor,
+        s: Tensor,
+        *,
+        own: Sequence[str],
+    ) -> RowsFlying:
+        """Return the flights, given examples of what they are flown with."""
 
 
 @dataclass(frozen=True)
-class Tuned:
-    """Tuned parameters with their gains, worst settling time [s] and overshoot [rad].
-
-    It counts the candidates that were tried.
-    """
+class TuningResult:
+    """Tuned parameters, their mean cost [s] over the tuning flights, and the candidates tried."""
 
     parameters: dict[str, float]
-    gains: dict[str, float]
-    settling: float
-    overshoot: float
+    cost: float
     tried: int
 
 
 def tune(
-    config: TunedConfig, steering: Steering, task: TuningTask, points: int = 400, rounds: int = 6
-) -> Tuned:
-    """Search the missing parameters on grids around the best so far.
+    config: TunableConfig,
+    steering: Steering,
+    conditions: ConditionsConfig,
+    settings: TuningConfig,
+    seed: int,
+    compiler: RowsCompiler | None = None,
+) -> TuningResult:
+    """Return the missing parameters of least mean cost, by differential evolution.
 
-    Each grid is a fifth of the one before.
+    `compiler` makes the flights of the search quick.
+
+    Source: R. Storn and K. Price, 1997; scipy's implementation, over the logarithms.
 
     Raises:
-        FitError: where no candidate keeps the limits.
+        FitError: where no candidate gives a finite cost.
     """
-    missing = [name for name, value in config.parameters().items() if value is None]
-    span = {
-        name: (torch.tensor(axis.low).log(), torch.tensor(axis.high).log())
-        for name, axis in config.axes(steering.turning).items()
-    }
-    count = max(round(points ** (1.0 / max(len(missing), 1))), 2) if missing else 1
-    best: tuple[float, dict[str, float], float, float] | None = None
-    tried = 0
-    for _ in range(rounds if missing else 1):
-        grid = (
-            torch.meshgrid(
-                *[
-                    torch.linspace(float(span[name][0]), float(span[name][1]), count)
-                    for name in missing
-                ],
-                indexing="ij",
-            )
-            if missing
-            else ()
-        )
-        parameters = {
-            name: values.double().exp().flatten()
-            for name, values in zip(missing, grid, strict=True)
+    # scipy.optimize takes a third of a second to import
+    from scipy.optimize import differential_evolution
+
+    random = torch.Generator().manual_seed(seed)
+    changes = conditions.draw(settings.flights, conditions.dt, random)
+    given = config.parameters()
+    fixed = {name: value for name, value in given.items() if value is not None}
+    names = [name for name, value in given.items() if value is None]
+    steering = steering._replace(dt=conditions.dt)
+    trials = Trials(config, steering, conditions, changes, compiler)
+
+    def costs(points: np.ndarray, /) -> Any:
+        searched = torch.from_numpy(np.exp(points.reshape(len(names), -1).T))
+        candidates = {name: searched[:, j] for j, name in enumerate(names)}
+        candidates |= {
+            name: torch.full((len(searched),), value, dtype=torch.float64)
+            for name, value in fixed.items()
         }
-        size = count ** len(missing)
-        fixed = {
-            name: torch.full((size,), value, dtype=torch.float64)
-            for name, value in config.parameters().items()
-            if value is not None
-        }
-        cost, settling, over = _judge(config, steering, task, parameters | fixed)
-        tried += size
-        place = int(cost.argmin())
-        if torch.isfinite(cost[place]) and (best is None or float(cost[place]) < best[0]):
-            found = {name: float(values[place]) for name, values in (parameters | fixed).items()}
-            best = (float(cost[place]), found, float(settling[place]), float(over[place]))
-        if best is None:
-            count = round(1.5 * count)
-            continue
-        for name in missing:
-            low, high = span[name]
-            middle, half = torch.tensor(best[1][name]).log(), 0.1 * (high - low)
-            span[name] = (middle - half, middle + half)
-    if best is None:
+        return trials.costs(candidates).numpy()
+
+    if not names:
+        alone = {name: torch.tensor([value]).double() for name, value in fixed.items()}
+        cost = float(trials.costs(alone)[0])
+        return TuningResult(fixed, cost, 1)
+    axes = config.axes(steering.turning)
+    bounds: Any = [(math.log(axes[name].low), math.log(axes[name].high)) for name in names]
+    found = differential_evolution(
+        costs,
+        bounds,
+        vectorized=True,
+        updating="deferred",
+        popsize=settings.population,
+        maxiter=settings.generations,
+        tol=settings.tolerance,
+        init="sobol",
+        polish=False,
+        rng=seed,
+    )
+    if not found.fun < _LOST:
         raise FitError(
-            f"no {config.model_dump()['kind']} controller of {tried} tried keeps the overshoot"
-            f" within {task.overshoot:.3g} rad over the spread; allow more overshoot or narrow the"
-            " spread"
+            f"no {config.model_dump()['kind']} controller of {found.nfev} tried holds the vessel"
+            " under these conditions; widen the rudder's limit or narrow the conditions"
         )
-    kp, kd, ki = config.gains(
-        {name: torch.tensor(value) for name, value in best[1].items()}, steering.turning
-    )
-    return Tuned(
-        best[1], {"kp": float(kp), "kd": float(kd), "ki": float(ki)}, best[2], best[3], tried
-    )
+    best = dict(zip(names, (math.exp(value) for value in found.x), strict=True))
+    ordered = {name: best.get(name, fixed.get(name, 0.0)) for name in given}
+    return TuningResult(ordered, float(found.fun), int(found.nfev))
 
 
-def _judge(
-    config: TunedConfig, steering: Steering, task: TuningTask, parameters: dict[str, Tensor]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the cost, worst settling time [s] and worst overshoot [rad] of each candidate [C].
+@final
+class Trials:
+    """Flights of candidates for the parameters of a controller, all over the same changes.
 
-    An infinite cost breaks a limit.
+    Args:
+        config: of the controller.
+        steering: its task, at the step of the changes.
+        conditions: with the cost.
+        changes: what every candidate flies.
+        compiler: of the flights; None to fly them as they are.
     """
-    gains = config.gains(parameters, steering.turning)
-    vessels, size = len(task.variations), len(gains[0])
-    repeated = tuple(gain.repeat_interleave(vessels) for gain in gains)
-    rows = LinearRows(steering, (repeated[0], repeated[1], repeated[2]))
-    heading = torch.full((size * vessels,), task.heading)
-    flights = fly(
-        steering.vessel,
-        rows,
-        heading,
-        task.variations.repeat(size, 1),
-        dt=steering.dt,
-        duration=task.duration,
-    )
-    settled, over = (
-        values.reshape(size, vessels)
-        for values in (flights.settled(task.band).double(), flights.overshoot())
-    )
-    cost = settled.amax(1) + 0.01 * settled.mean(1)
-    cost = torch.where(over.amax(1) <= task.overshoot, cost, torch.inf)
-    if bool((gains[2] > 0).any()):
-        bias = torch.tensor([[1.0, 1.0, task.bias]]).expand(size, -1)
-        slow = LinearRows(steering._replace(dt=0.1), gains)
-        pushed = fly(
-            steering.vessel,
-            slow,
-            torch.full((size,), task.heading),
-            bias,
-            dt=0.1,
-            duration=task.bias_time,
-        )
-        cost = torch.where(pushed.error[:, -1].abs() <= task.bias_error, cost, torch.inf)
-    return cost, settled.amax(1), over.amax(1)
+
+    def __init__(
+        self,
+        config: TunableConfig,
+        steering: Steering,
+        conditions: ConditionsConfig,
+        changes: HeadingChanges,
+        compiler: RowsCompiler | None = None,
+    ) -> None:
+        self.config, self.steering, self.conditions = config, steering, conditions
+        self.changes, self.compiler = changes, compiler
+        self.loop: RowsFlying | None = None
+
+    def costs(self, candidates: dict[str, Tensor]) -> Tensor:
+        """Return the mean cost [C] in s of candidates, parameters [C] by name.
+
+        One that diverges costs a thousand seconds.
+        """
+        flights = len(self.changes.heading)
+        count = len(next(iter(candidates.values())))
+        at_once = max(_ROWS // flights, 1)
+        out = []
+        for first in range(0, count, at_once):
+            some = {name: values[first : first + at_once] for name, values in candidates.items()}
+            size = len(next(iter(some.values())))
+            rows = {name: values.repeat_interleave(flights) for name, values in some.items()}
+            flown = self._flown(rows, self.changes.repeated(size))
+            cost = flown.measured(self.conditions)["cost"].reshape(size, flights)
+            out.append(cost.double().nan_to_num(_LOST, _LOST).clamp(max=_LOST).mean(1))
+        return torch.cat(out)
+
+    def _flown(self, rows: dict[str, Tensor], changes: HeadingChanges) -> ConditionedFlights:
+        policy = self.config.rows(rows, self.steering).float().requires_grad_(False)
+        run = ConditionedRun(self.steering.vessel, policy, changes.dt, "heun", torch.float32)
+        if self.compiler is None:
+            return run.fly(changes)
+        rollout = run.rollout(max(int(changes.delay.max()), 1))
+        given = run.given(changes)
+        try:
+            if self.loop is None:
+                own = [f"source.policy.{name}" for name in self.config.own]
+                self.loop = self.compiler(rollout, *given, own=own)
+        except ExportError:
+            # what cannot be compiled is flown as it is
+            self.compiler = None
+            return run.fly(changes)
+        return run.flights(changes, *self.loop.of(rollout)(*given))

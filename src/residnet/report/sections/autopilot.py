@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from residnet.control.conditions.quiet import quiet_after
+from residnet.control.heading.conditions import quiet_after
 from residnet.report.blocks import Block, Code, Column, Section, Table, Text, bad_where, table_of
 from residnet.report.figure import (
     ZERO,
@@ -60,7 +60,7 @@ def _figures(run: RunFiles) -> Iterator[Figure]:
     conditioned = run.frame(CONDITIONS)
     if conditioned is not None:
         yield _costs(conditioned, kinds, run.title)
-    fits = {name: run.fit(name) for name in run.resolved.get("recurrent") or {}}
+    fits = {name: run.fit(name) for name in run.resolved.get("policies") or {}}
     if fits:
         yield _learning(fits, run.title)
 
@@ -330,10 +330,9 @@ def _definition(config: Mapping[str, Any]) -> list[str]:
         f" {test['plants']} vessels drawn from it. Overshoot: the largest over both. Bias: largest"
         f" error after {test['bias_time']:g} s under {math.degrees(test['bias']):.3g} deg of"
         " constant rudder bias. Not settled: number of changes outside the band at their end.",
-        "Linear controllers are tuned by the cost under the stated conditions."
+        "Peers are tuned by the cost under the stated conditions."
         if config.get("conditions")
-        else "Linear controllers are tuned for the least worst settling time with at most"
-        f" {math.degrees(test['overshoot']):.3g} deg of overshoot at the corners of the spread.",
+        else "The constants of the peers are given.",
     ]
 
 

@@ -8,22 +8,48 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 
 from residnet.control.base import Policy
-from residnet.control.heading.controllers import Steering, TunedConfig
-from residnet.control.heading.keeper import HeadingKeeper
-from residnet.control.heading.policy import HeadingPolicy
-from residnet.control.heading.steering import SteeredPlant
-from residnet.control.heading.stored import HeadingPolicySpec
-from residnet.control.heading.tuning import TuningTask, tune
-from residnet.control.observed.config import AnyController, ObservedConfig
-from residnet.core.progress import say
+from residnet.control.heading.conditions import (
+    ConditionedRun,
+    ConditionsConfig,
+    quiet,
+    quiet_after,
+)
+from residnet.control.heading.controllers import (
+    ObservedConfig,
+    RecurrentPolicy,
+    Steering,
+    TunableConfig,
+    load_recurrent,
+)
+from residnet.control.heading.policies import ObservedPolicy
+from residnet.control.heading.tuning import tune
+from residnet.control.heading.vessels import SteeredPlant, fly
+from residnet.core.progress import report, say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.store import rebuilt
+from residnet.export.closed_loop import CompiledLoop
 from residnet.export.policy import ExportedHeading
 from residnet.export.torchscript import TorchScriptExporter
-from residnet.judge.autopilots import QUANTITIES
+from residnet.judge.autopilots import (
+    QUANTITIES,
+    QUIET_FLIGHTS,
+    corners,
+    drawn,
+    judged,
+    measure,
+    random_variations,
+    sea_flights,
+    sea_row,
+    series,
+    step_flights,
+    step_row,
+    swinging,
+    wind_flights,
+)
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
 from residnet.report.sections.autopilot import (
@@ -38,92 +64,76 @@ from residnet.report.sections.autopilot import (
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome
-from residnet.tasks.autopilot.comparison import compare
-from residnet.tasks.autopilot.config import AutopilotSettings, PolicyConfig
-from residnet.tasks.autopilot.pace import paced
-from residnet.tasks.autopilot.requirements import learned_vessel
-from residnet.tasks.autopilot.scores import CommandDifference, SettlingScore
-from residnet.tasks.autopilot.under_conditions import (
-    companions,
-    completed,
-    judge_all,
-    trained_policy,
+from residnet.tasks.autopilot.task import (
+    AnyController,
+    AutopilotConfig,
+    JudgedConditions,
+    paced,
+    school_of,
+    tuned_before,
 )
-from residnet.training.policies.autopilot import train_autopilot
+from residnet.training.policies.fit import train_policy
+
+Controllers = dict[str, tuple[str, Policy]]
+"""Kind (policy, classical, floor and others) and controller by name."""
 
 
-def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
+def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
     """Tune, train and compare."""
     config = paced(config)
-    vessel = SteeredPlant(load_vessel(config.vessel).build())
+    vessel = config.steered
     turning = vessel.turning(config.rudder, config.turning_time)
     say(
         f"{config.name}: {config.vessel} answers {config.rudder:.3g} rad of rudder with K ="
         f" {turning.gain:.4g} 1/s, T = {turning.time:.4g} s"
     )
     steering = Steering(vessel, turning, config.rudder, config.test.dt)
-    controllers: dict[str, tuple[str, Policy]] = {}
+    controllers: Controllers = {}
     notes: dict[str, Any] = {}
     complete: dict[str, AnyController] = {}
     for name, peer in config.peers.items():
-        complete[name], notes[name] = _peer(name, peer, steering, config)
-        controllers[name] = (
-            "floor" if name == config.floor else "classical",
-            complete[name].build(steering),
-        )
+        complete[name], notes[name] = _complete(name, peer, steering, config)
+        kind = "floor" if name == config.floor else "classical"
+        controllers[name] = (kind, complete[name].build(steering))
     for name, settings in config.predictive.items():
         built, notes[name] = predictive(name, settings, steering, config.seed, folder)
         controllers[name] = ("predictive", built)
+    judged_too: Controllers = {}
     for name, wanted in config.policies.items():
-        school = _school(name, wanted, steering, config)
-        teacher = None if wanted.imitate is None else complete[wanted.imitate]
-        policy, notes[name] = _policy(name, wanted, school, config, folder, teacher)
-        policy.read_from(vessel.state)
-        controllers = {name: ("policy", policy), **controllers}
-    judged = dict(controllers)
-    if config.conditions is not None:
-        for name, learner in config.recurrent.items():
-            start = None if learner.start is None else complete[learner.start]
-            assert start is None or isinstance(start, ObservedConfig)
-            spec, observed, found = trained_policy(
-                name, learner, start, steering, config, config.conditions, folder
-            )
-            notes[name] = {key: value for key, value in found.items() if key != "curve"}
-            learned = {name: (learner.kind, observed)}
-            controllers = {**learned, **controllers}
-            judged = {**learned, **companions(name, learner, spec, observed), **judged}
+        start = None if wanted.start is None else complete[wanted.start]
+        assert start is None or isinstance(start, ObservedConfig)
+        policy, notes[name], untrained = _policy(name, start, steering, config, folder)
+        controllers = {name: (wanted.kind, policy), **controllers}
+        # what it is compared with: itself untrained, and without its network
+        if wanted.units > 0:
+            judged_too[f"{name} untrained"] = ("untrained", untrained)
+            if isinstance(policy, ObservedPolicy):
+                judged_too[f"{name} network off"] = ("network_off", policy.without_network())
     folder.write_json(
         folder.path / "controllers.json",
         {"schema": "residnet.controllers/1", "turning": vars(turning), "controllers": notes},
     )
-    rows, series, plants = compare(controllers, vessel, config)
+    rows, flown, plants = _compare(controllers, vessel, config)
     if config.conditions is not None:
-        more, flown = judge_all(judged, config, config.conditions)
+        more, conditioned = _judge(judged_too | controllers, config, config.conditions)
         rows += more
-        folder.write_table(folder.path / CONDITIONS, flown)
+        folder.write_table(folder.path / CONDITIONS, conditioned)
+    channels = {**QUANTITIES, "cost": "s", "time_outside": "s"} | dict.fromkeys(
+        ("heading_swing", "rudder_swing", "error_end", "heading_rms", "rudder_rms", "heel_rms"),
+        "rad",
+    )
     folder.write_json(
         folder.metrics,
         {
             "schema": SCHEMA,
             "run": config.name,
-            "channels": {
-                **QUANTITIES,
-                "cost": "s",
-                "time_outside": "s",
-                "heading_swing": "rad",
-                "rudder_swing": "rad",
-                "error_end": "rad",
-                "heading_rms": "rad",
-                "rudder_rms": "rad",
-                "heel_rms": "rad",
-            },
+            "channels": channels,
             "floor": config.floor,
             "rows": rows,
         },
     )
-    folder.write_table(folder.path / FLIGHTS, series)
+    folder.write_table(folder.path / FLIGHTS, flown)
     folder.write_table(folder.path / PLANTS, plants)
-    policies = {name: controllers[name][1] for name in (*config.policies, *config.recurrent)}
     tables = [settling_table(rows, config.floor), effort_table(rows)]
     if config.conditions is not None:
         tables.insert(0, cost_table(rows))
@@ -132,23 +142,204 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
         _main_figures(config, rows),
         "\n\n".join(table.text() for table in tables),
         exports={
-            name: partial(_export, config, folder, name, policies[name], rows) for name in policies
+            name: partial(_export, config, folder, name, controllers[name][1], rows)
+            for name in config.policies
         },
     )
 
 
-def _settling(
-    config: AutopilotSettings, rows: list[dict[str, Any]]
-) -> dict[str, tuple[float, float]]:
-    """Return the settling times of each policy in s: nominal vessel, and worst corner."""
-    found = {(row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row}
-    return {
-        name: (found[name, "nominal"]["max"], found[name, "corners"]["max"])
-        for name in (*config.policies, *config.recurrent)
+def _complete(
+    name: str, peer: AnyController, steering: Steering, config: AutopilotConfig
+) -> tuple[AnyController, dict[str, Any]]:
+    """Return a peer ready to fly, tuned by the cost where it lacks constants, and notes on it."""
+    stated = config.conditions
+    if not isinstance(peer, TunableConfig) or None not in peer.parameters().values():
+        return peer, {"config": peer.model_dump(mode="json")}
+    assert stated is not None
+    if before := tuned_before(name, peer, config):
+        return before
+    started = time.time()
+    steering = steering._replace(vessel=_in_weather(config, stated))
+    found = tune(peer, steering, stated.stated, stated.evolution, config.seed + 11, CompiledLoop)
+    constants = ", ".join(f"{key} {value:.4g}" for key, value in found.parameters.items())
+    say(f"  tuned {name}: {constants}, cost {found.cost:.3f} s")
+    complete = type(peer).model_validate(peer.model_dump() | found.parameters)
+    return complete, {
+        "config": complete.model_dump(mode="json"),
+        "cost": found.cost,
+        "tried": found.tried,
+        "seconds": round(time.time() - started, 1),
     }
 
 
-def _verdict(config: AutopilotSettings, rows: list[dict[str, Any]]) -> list[str]:
+def _in_weather(config: AutopilotConfig, stated: JudgedConditions) -> SteeredPlant:
+    """Return the vessel as the conditions need it: in calm water, or in wind and current."""
+    calm = not any(conditions.weather for conditions in stated.flown.values())
+    return SteeredPlant(load_vessel(config.vessel).build(), calm=calm)
+
+
+def _policy(
+    name: str,
+    start: ObservedConfig | None,
+    steering: Steering,
+    config: AutopilotConfig,
+    folder: RunFolder,
+) -> tuple[RecurrentPolicy, dict[str, Any], RecurrentPolicy]:
+    """Return a policy trained under the conditions, notes, and the policy as it began.
+
+    `start` is the law that its network stands beside; None for none.
+    """
+    wanted, stated = config.policies[name], config.conditions
+    assert stated is not None
+    school, turning = school_of(config, name), steering.turning
+    if wanted.learned is not None:
+        turning = school.turning(config.rudder, config.turning_time, wanted.training.dt)
+        say(
+            f"  {name} learns on {wanted.learned.model} of {wanted.learned.run}: K ="
+            f" {turning.gain:.4g} 1/s, T = {turning.time:.4g} s"
+        )
+    torch.manual_seed(config.seed)
+    spec = wanted.spec.model_validate(
+        {
+            "state": school.state,
+            "gain": turning.gain,
+            "time": turning.time,
+            "speed": turning.speed,
+            "limit": steering.limit,
+            "rate": school.rate,
+            "dt": steering.dt,
+            "trained_at": wanted.training.dt,
+            "units": wanted.units,
+            **({} if start is None else {"law": start.model_dump()}),
+        }
+    )
+    policy, store = spec.build(), FolderStore(folder)
+    notes, started = store.finished_module(name, policy), time.time()
+    if notes is None:
+        say(f"  training {name}")
+        compiler = partial(CompiledLoop, most=wanted.training.outlying)
+        notes = train_policy(
+            name,
+            policy,
+            school,
+            wanted.training,
+            stated.stated,
+            config.seed,
+            folder.path,
+            compiler if wanted.training.compiled else None,
+        )
+        notes |= {"seconds": round(time.time() - started, 1), "constants": policy.values()}
+        store.keep_module(name, spec, policy, notes)
+        # as a resumed run reads it
+        policy = rebuilt(spec, policy)
+    untrained = spec.build().eval().requires_grad_(False).double()
+    policy.at(steering.dt)
+    for built in (policy, untrained):
+        built.read_from(steering.vessel.state)
+    say(
+        f"  {name}: cost {notes['best_validation']:.3f} s, {notes['start_validation']:.3f} s at the"
+        f" start, after {notes['seconds']:.0f} s of training"
+    )
+    notes = {key: value for key, value in notes.items() if key != "curve"}
+    return policy.double(), notes, untrained
+
+
+def stored_policy(config: AutopilotConfig, models: Path, name: str, dt: float) -> RecurrentPolicy:
+    """Return a trained policy of a finished run, at a step of dt seconds.
+
+    Raises:
+        UsageError: where the run lacks it, or it is not as it was written.
+    """
+    policy = load_recurrent(models / name, config.policies[name].spec)
+    policy.at(dt)
+    return policy
+
+
+def _compare(
+    controllers: Controllers, vessel: SteeredPlant, config: AutopilotConfig
+) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
+    """Return the rows of metrics.json, and two tables: flights of the corners, random vessels."""
+    test, stated = config.test, _stated(config)
+    ends = corners(stated.effect, stated.time)
+    spread = random_variations(stated.effect, stated.time, test.plants, config.seed + 1)
+    pushed = torch.tensor([[1.0, 1.0, test.bias], [1.0, 1.0, -test.bias]], dtype=torch.float64)
+    plant = load_vessel(config.vessel).build()
+    rows: list[dict[str, Any]] = []
+    flown, plants = [], []
+    for name, (kind, policy) in controllers.items():
+        step = partial(step_flights, vessel, policy, test.heading, test.dt, test.duration)
+        tests = {"nominal": step(ends[:1]), "corners": step(ends), "random": step(spread)}
+        rows += [
+            step_row(name, kind, protocol, flights, test.band)
+            for protocol, flights in tests.items()
+        ]
+        flown.append(series(name, tests["corners"], ends))
+        found = {key: value.numpy() for key, value in measure(tests["random"], test.band).items()}
+        given = {"effect": spread[:, 0].numpy(), "time": spread[:, 1].numpy()}
+        plants.append(pd.DataFrame({"controller": name, **given, **found}))
+        times = {"dt": test.dt, "duration": test.bias_time}
+        disturbed = {"bias": fly(vessel, policy, torch.full((2,), test.heading), pushed, **times)}
+        if test.wind is not None:
+            disturbed["wind"] = wind_flights(plant, policy, test.wind, test.heading, **times)
+        rows += [
+            step_row(name, kind, key, flights, test.band)
+            | {"error_end": float(flights.error[:, -1].abs().max())}
+            for key, flights in disturbed.items()
+        ]
+        if test.sea is not None:
+            duration = test.duration + test.sea_time
+            kept = sea_flights(
+                plant, policy, test.sea, test.heading, test.dt, duration, config.seed + 2
+            )
+            rows.append(sea_row(name, kind, kept, test.duration))
+    return rows, pd.concat(flown, ignore_index=True), pd.concat(plants, ignore_index=True)
+
+
+def _stated(config: AutopilotConfig) -> ConditionsConfig:
+    return ConditionsConfig() if config.conditions is None else config.conditions.stated
+
+
+def _judge(
+    controllers: Controllers, config: AutopilotConfig, stated: JudgedConditions
+) -> tuple[list[dict[str, Any]], pd.DataFrame]:
+    """Return the rows of metrics.json and the table of flights under the conditions."""
+    vessel = _in_weather(config, stated)
+    tests = {
+        "conditions" if name == "stated" else f"beyond_{name}": conditions
+        for name, conditions in stated.flown.items()
+    }
+    flown = {
+        name: (conditions, drawn(conditions, stated.flights, config.seed))
+        for name, conditions in tests.items()
+    }
+    still = drawn(quiet(stated.stated), min(QUIET_FLIGHTS, stated.flights), config.seed)
+    longest = max(1, *(int(changes.delay.max()) for _, changes in flown.values()))
+    rows, tables = [], []
+    for place, (name, (kind, policy)) in enumerate(controllers.items()):
+        report("judging", place, len(controllers))
+        run = ConditionedRun(
+            vessel, policy.double(), stated.stated.dt, compiler=CompiledLoop, longest=longest
+        )
+        for protocol, (conditions, changes) in flown.items():
+            found, table = judged(name, kind, protocol, run, conditions, changes)
+            rows.append(found)
+            tables.append(table)
+        rows.append(swinging(name, kind, run, still, quiet_after(stated.stated.duration)))
+    return rows, pd.concat(tables, ignore_index=True)
+
+
+def _settling(
+    config: AutopilotConfig, rows: list[dict[str, Any]]
+) -> dict[str, tuple[float, float]]:
+    """Return the settling times of what was trained in s: nominal vessel, and worst corner."""
+    found = {(row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row}
+    return {
+        name: (found[name, "nominal"]["max"], found[name, "corners"]["max"])
+        for name in (config.policies or config.predictive)
+    }
+
+
+def _verdict(config: AutopilotConfig, rows: list[dict[str, Any]]) -> list[str]:
     step = math.degrees(config.test.heading)
     sentences = [
         f"'{name}' settles on a new heading {step:.3g} deg away in {nominal:.2f} s on the nominal"
@@ -168,152 +359,33 @@ def _verdict(config: AutopilotSettings, rows: list[dict[str, Any]]) -> list[str]
     return [*cost_verdict(rows), *sentences]
 
 
-def _main_figures(config: AutopilotSettings, rows: list[dict[str, Any]]) -> dict[str, MainFigure]:
+def _main_figures(config: AutopilotConfig, rows: list[dict[str, Any]]) -> dict[str, MainFigure]:
     figures = {}
     for name, (nominal, worst) in _settling(config, rows).items():
         figures[f"{name}_settling_nominal"] = MainFigure(nominal, "s")
         figures[f"{name}_settling_worst"] = MainFigure(worst, "s")
     for row in rows:
-        if row["protocol"] == "conditions" and row["model"] in config.recurrent:
+        if row["protocol"] == "conditions" and row["model"] in config.policies:
             figures[f"{row['model']}_cost"] = MainFigure(row["cost"]["mean"], "s")
     return figures
 
 
 def _export(
-    config: AutopilotSettings,
+    config: AutopilotConfig,
     folder: RunFolder,
     name: str,
-    policy: Policy,
+    policy: RecurrentPolicy,
     rows: list[dict[str, Any]],
 ) -> Path:
     """Export a policy, with its rows of metrics.json in the card; returns the file."""
-    assert isinstance(policy, HeadingKeeper)
-    about: dict[str, Any] = {"vessel": config.vessel}
-    if name in config.policies:
-        learned = config.policies[name].learned
-        about |= {"spread": config.spread.model_dump(mode="json")}
-        about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
-    elif config.conditions is not None:
-        about |= {"conditions": config.conditions.stated.model_dump(mode="json")}
+    about = {
+        "vessel": config.vessel,
+        "conditions": _stated(config).model_dump(mode="json"),
+    }
+    learned = config.policies[name].learned
+    about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
     metrics = [row for row in rows if row["model"] == name]
     file = folder.exports / f"{name}.pt"
     exported = ExportedHeading(name, policy, safe=config.safe, about=about, metrics=metrics)
     TorchScriptExporter().export(exported, file)
     return file
-
-
-def _peer(
-    name: str, peer: AnyController, steering: Steering, config: AutopilotSettings
-) -> tuple[AnyController, dict[str, Any]]:
-    """Return a peer with all its gains, and notes on its tuning."""
-    if config.conditions is not None:
-        return completed(name, peer, steering, config, config.conditions)
-    if not isinstance(peer, TunedConfig):
-        return peer, {"config": peer.model_dump(mode="json")}
-    test = config.test
-    task = TuningTask(
-        test.heading,
-        config.spread.corners(),
-        test.overshoot,
-        test.band,
-        test.duration,
-        test.bias,
-        test.bias_error,
-        test.bias_time,
-    )
-    started = time.time()
-    tuned = tune(peer, steering, task, config.tuning_points)
-    say(
-        f"  tuned {name}: "
-        + ", ".join(f"{k} {v:.4g}" for k, v in (tuned.parameters | tuned.gains).items())
-        + f", worst {tuned.settling:.2f} s"
-    )
-    complete = peer.model_copy(update=tuned.parameters)
-    return complete, {
-        "config": complete.model_dump(mode="json"),
-        "gains": tuned.gains,
-        "worst_settling": tuned.settling,
-        "worst_overshoot": tuned.overshoot,
-        "tried": tuned.tried,
-        "seconds": round(time.time() - started, 1),
-    }
-
-
-def _school(
-    name: str, wanted: PolicyConfig, steering: Steering, config: AutopilotSettings
-) -> Steering:
-    """Return what a policy is trained on: the vessel, or a learned model of it.
-
-    The vessel is in wind and current where the spread has them.
-
-    Raises:
-        FitError: where the learned model does not turn steadily.
-        ConfigError: where its inputs are not those of the vessel.
-    """
-    if wanted.learned is None:
-        return (
-            steering._replace(vessel=SteeredPlant(load_vessel(config.vessel).build(), calm=False))
-            if config.spread.weather
-            else steering
-        )
-    assert isinstance(steering.vessel, SteeredPlant)
-    vessel = learned_vessel(name, wanted, steering.vessel, config)
-    turning = vessel.turning(config.rudder, config.turning_time, wanted.training.dt)
-    say(
-        f"  {name} learns on {wanted.learned.model} of {wanted.learned.run}: K ="
-        f" {turning.gain:.4g} 1/s, T = {turning.time:.4g} s"
-    )
-    return steering._replace(vessel=vessel, turning=turning)
-
-
-def _policy(
-    name: str,
-    wanted: PolicyConfig,
-    steering: Steering,
-    config: AutopilotSettings,
-    folder: RunFolder,
-    teacher: AnyController | None,
-) -> tuple[HeadingPolicy, dict[str, Any]]:
-    torch.manual_seed(config.seed)
-    spec = HeadingPolicySpec(
-        state=tuple(steering.vessel.state),
-        gain=steering.turning.gain,
-        time=steering.turning.time,
-        speed=steering.turning.speed,
-        limit=steering.limit,
-        rate=steering.vessel.rate,
-        dt=wanted.training.dt,
-        hidden=tuple(wanted.hidden),
-        observer=wanted.observer,
-    )
-    policy, store = spec.build(), FolderStore(folder)
-    started = time.time()
-    notes = store.finished_module(name, policy)
-    if notes is None:
-        say(f"  training {name}")
-        # a controller with a memory knows its step: one teaches at the step of training, its like
-        # is compared at that of flights
-        shown = None if teacher is None else teacher.build(steering._replace(dt=wanted.training.dt))
-        score = (
-            SettlingScore(steering, config)
-            if teacher is None
-            else CommandDifference(steering, config, teacher.build(steering))
-        )
-        notes = train_autopilot(
-            name,
-            policy,
-            steering.vessel,
-            wanted.training,
-            config.spread,
-            score,
-            config.seed,
-            folder.path,
-            shown,
-        )
-        notes |= {"seconds": round(time.time() - started, 1), "imitates": wanted.imitate}
-        store.keep_module(name, spec, policy, notes)
-        # as a resumed run reads it
-        policy = rebuilt(spec, policy)
-    policy.dt = steering.dt
-    say(f"  {name}: score {notes['best_validation']:.3f} after {notes['seconds']:.0f} s")
-    return policy.double(), {key: value for key, value in notes.items() if key != "curve"}

@@ -3,37 +3,300 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, Literal, final
+from typing import Annotated, Any, ClassVar, Literal, Self, final
 
-from residnet.core.errors import UsageError
+import torch
+from pydantic import Field, model_validator
+
+from residnet.control.heading.conditions import ConditionsConfig
+from residnet.control.heading.controllers import (
+    BangBangConfig,
+    ClassicalController,
+    NetworkPolicySpec,
+    ObservedConfig,
+    ObservedPolicySpec,
+    TunableConfig,
+)
+from residnet.control.heading.tuning import TuningConfig
+from residnet.control.heading.turning import Turning
+from residnet.control.heading.vessels import SteeredModel, SteeredPlant
+from residnet.core.config import (
+    Config,
+    MetresPerSecond,
+    Radians,
+    Seconds,
+    load_mapping,
+    validate,
+)
+from residnet.core.errors import ConfigError, FitError, UsageError
+from residnet.core.files import read_json
 from residnet.core.names import nearest
+from residnet.core.progress import say
+from residnet.data.simulated.environment import Disturbance, WindField
+from residnet.documents.gouletas2020.law import DocumentConfig, PredictiveConfig
+from residnet.dynamics.simulated import check_steps
+from residnet.dynamics.store import chosen_model, load_model
+from residnet.physics.environment.waves import WavesConfig
+from residnet.physics.vessel import VesselName, load_vessel
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import Outcome
-from residnet.tasks.autopilot.config import AutopilotSettings
+from residnet.runs.task import ComputingTask, Outcome
+from residnet.training.policies.config import PolicyTraining
+
+_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]
+
+
+class LearnedConfig(Config):
+    """A model of the vessel that an earlier run (task `fit`) identified from logs.
+
+    Attributes:
+        run: folder of that run.
+        model: name of the model; `selected` is the one chosen on validation data.
+    """
+
+    run: Path
+    model: str = "selected"
+
+
+class PolicyConfig(Config):
+    """A recurrent heading policy, trained under the run's conditions.
+
+    Attributes:
+        start: name of a peer with an observer, of kind `ptos` or `lqr_observer`: the network stands
+            beside its law, whose constants as tuned are where training begins, and they are trained
+            too. Null for a network alone, without law, observer or predictor.
+        units: of the recurrent network; 0 trains the constants of a law alone.
+        learned: a learned model to train on instead of the vessel itself; the policy is then
+            compared on the vessel.
+        training: how it is trained.
+    """
+
+    start: _Name | None
+    units: int = Field(default=16, ge=0, le=10_000)
+    learned: LearnedConfig | None = None
+    training: PolicyTraining = PolicyTraining()
+
+    @property
+    def spec(self) -> type[ObservedPolicySpec | NetworkPolicySpec]:
+        """The kind of description that the policy is stored with."""
+        return NetworkPolicySpec if self.start is None else ObservedPolicySpec
+
+    @property
+    def kind(self) -> str:
+        """What the rows of metrics.json call it: policy, network, or constants."""
+        if self.start is None:
+            return "network"
+        return "policy" if self.units else "constants"
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if self.start is None and self.units == 0:
+            raise ValueError("units: a policy without a law needs a network, at least one unit")
+        return self
+
+
+class JudgedConditions(Config):
+    """The conditions that all controllers of a run are tuned, trained and judged under.
+
+    Attributes:
+        stated: the conditions themselves, with the cost of a flight.
+        flights: number of judged flights, which no tuning or training sees.
+        beyond: further conditions by name, outside of those of tuning and training, that
+            controllers are judged under only.
+        evolution: the search for the constants of peers.
+        tuned_in: folder of a finished run of the same vessel, rudder, conditions and search, whose
+            constants peers of the same name and kind take, so that runs with several seeds are
+            compared with the same laws; null to tune them here.
+    """
+
+    stated: ConditionsConfig = ConditionsConfig()
+    flights: int = Field(default=1500, ge=2, le=1_000_000)
+    beyond: dict[_Name, ConditionsConfig] = Field(default_factory=dict)
+    evolution: TuningConfig = TuningConfig()
+    tuned_in: Path | None = None
+
+    @property
+    def flown(self) -> dict[str, ConditionsConfig]:
+        """All conditions by name, the stated ones first."""
+        return {"stated": self.stated, **self.beyond}
+
+
+class StepTestConfig(Config):
+    """The one test of all controllers: a step of the heading reference, from straight ahead.
+
+    Attributes:
+        heading: change of the reference in rad; no prefilter smooths it.
+        band: heading error in rad; the change has settled at the last entry into this band.
+        dt: step of simulation and controllers in s.
+        duration: of a flight in s.
+        plants: number of random vessels of the spread, beside its corners.
+        bias: constant rudder angle of the steady-error test in rad.
+        bias_time: duration of the steady-error test in s.
+        wind: mean wind speed in m/s of the same test in wind, from eight directions and without
+            bias; null for none.
+        sea: waves in which the course is kept after the step; null for none.
+        sea_time: how long in s, counted from the end of the step's flight.
+    """
+
+    heading: Radians = Field(default=0.5235987755982988, gt=0, lt=3.1)
+    band: Radians = Field(default=0.017453292519943295, gt=0)
+    dt: Seconds = Field(default=0.02, gt=0)
+    duration: Seconds = Field(gt=0)
+    plants: int = Field(default=200, ge=1, le=100_000)
+    bias: Radians = Field(default=0.017453292519943295, ge=0)
+    bias_time: Seconds = Field(default=60.0, gt=0)
+    wind: MetresPerSecond | None = Field(default=None, gt=0)
+    sea: WavesConfig | None = None
+    sea_time: Seconds = Field(default=120.0, gt=0)
+
+    @model_validator(mode="after")
+    def _flown_in_time(self) -> Self:
+        for name in ("duration", "bias_time", "sea_time"):
+            check_steps(getattr(self, name), self.dt, name)
+        return self
 
 
 @final
-class AutopilotConfig(AutopilotSettings):
-    """Heading policies trained through the vessel, beside tuned classical controllers."""
+class AutopilotConfig(ComputingTask):
+    """Heading policies trained through the vessel, beside tuned classical controllers.
+
+    Attributes:
+        seed: of weights, batches and random vessels.
+        vessel: name or file of the vessel.
+        rudder: largest rudder angle in rad that controllers may use.
+        turning_time: time in s until the turn at that angle is steady.
+        pace: multiple of all times in `test`, `conditions` and the trainings of `policies`, delays
+            aside; `vessel` for how many times as long as that of document 004 the vessel takes for
+            a heading change.
+        test: the step of the heading reference that all controllers fly, over the vessels of
+            `conditions.stated`.
+        conditions: that all controllers are tuned, trained and judged under; null to compare peers
+            whose constants are given, by `test` alone.
+        policies: learned policies by name.
+        predictive: the document's own autopilots, by name.
+        peers: by name; constants that are left out are tuned.
+        floor: peer that knows the vessel exactly: the others are measured in multiples of its
+            settling time.
+        safe: what an exported policy commands while its inputs are wrong: the last good command, or
+            rudder amidships.
+    """
 
     task: Literal["autopilot"]
+    seed: int = Field(default=0, ge=0)
+    vessel: VesselName
+    rudder: Radians = Field(gt=0, lt=1.5)
+    turning_time: Seconds = Field(default=100.0, gt=0)
+    pace: Literal["vessel"] | Annotated[float, Field(gt=0, le=1_000)] = 1.0
+    test: StepTestConfig
+    conditions: JudgedConditions | None = None
+    policies: dict[_Name, PolicyConfig] = Field(default_factory=dict)
+    predictive: dict[_Name, PredictiveConfig] = Field(default_factory=dict)
+    peers: dict[_Name, AnyController] = Field(default_factory=dict)
+    floor: _Name | None = None
+    safe: Literal["hold", "amidships"] = "amidships"
 
     verbs: ClassVar[tuple[str, ...]] = ("report", "export")
 
+    @model_validator(mode="after")
+    def _names(self) -> Self:
+        names = [*self.policies, *self.predictive, *self.peers]
+        if not self.policies and not self.predictive:
+            raise ValueError("policies: give at least one policy here or under 'predictive'")
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"'{twice[0]}' names two controllers; names are unique in a run")
+        if self.floor is not None and not isinstance(self.peers.get(self.floor), BangBangConfig):
+            raise ValueError(f"floor: '{self.floor}' must name a peer of kind bang_bang")
+        for name, wanted in self.policies.items():
+            if self.conditions is None:
+                raise ValueError(f"policies.{name}: give 'conditions' to train it under")
+            if wanted.start is None:
+                continue
+            if not isinstance(self.peers.get(wanted.start), ObservedConfig):
+                raise ValueError(
+                    f"policies.{name}.start: '{wanted.start}' must name a peer of kind ptos or"
+                    " lqr_observer"
+                )
+        if self.conditions is None:
+            for name, peer in self.peers.items():
+                if isinstance(peer, TunableConfig) and None in peer.parameters().values():
+                    raise ValueError(
+                        f"peers.{name}: give all constants, or 'conditions' to tune them under"
+                    )
+            if self.pace != 1.0:
+                raise ValueError("pace: give 'conditions', whose times have a pace")
+            return self
+        if self.pace != 1.0 and self.predictive:
+            raise ValueError("pace: give the times of 'predictive' as the vessel needs them")
+        for name, conditions in self.conditions.flown.items():
+            if conditions.dt != self.test.dt:
+                raise ValueError(
+                    f"conditions.{name}: dt must be that of test, {self.test.dt:g} s, given"
+                    f" {conditions.dt:g} s"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _felt(self) -> Self:
+        plant = load_vessel(self.vessel).build()
+        one = torch.ones(1, dtype=torch.float64)
+        most = float(plant.demand(one, one)[0, 0])
+        if self.rudder > (1.0 + 1e-6) * most:
+            raise ValueError(
+                f"rudder: vessel '{self.vessel}' has {most:.4g} rad at most, given"
+                f" {self.rudder:.4g}"
+            )
+        wind = None if self.test.wind is None else WindField(speed=self.test.wind, direction=0.0)
+        Disturbance(wind=wind, waves=self.test.sea).check(plant, self.vessel)
+        flown = {} if self.conditions is None else self.conditions.flown
+        for name in (name for conditions in flown.values() for name in conditions.needs()):
+            if name not in plant.inputs:
+                raise ValueError(
+                    f"conditions: vessel '{self.vessel}' has no input '{name}'; it has"
+                    f" {', '.join(plant.inputs)}"
+                )
+        return self
+
+    @property
+    def steered(self) -> SteeredPlant:
+        """The vessel in calm water."""
+        return SteeredPlant(load_vessel(self.vessel).build())
+
+    def recorded_seed(self) -> int:
+        """Return the seed of weights, batches and random vessels."""
+        return self.seed
+
     def check(self) -> None:
-        """Check that the vessel and the learned models of it are there and turn steadily.
+        """Check that the vessel turns steadily and can do what is asked, and so for learned models.
 
         Raises:
-            ResidnetError: where one is missing, does not fit, or does not hold its turn.
+            UsageError: where a run or a model is missing, that of `tuned_in` too.
+            FitError: where a learned model does not turn towards the rudder and stay there.
+            ConfigError: where the vessel does not, has no time for its changes of heading or no
+                rudder left to hold its course, or where the inputs of a learned model are not its
+                own.
         """
-        from residnet.tasks.autopilot.requirements import check_vessels
-
-        check_vessels(self)
+        learned = [
+            (school_of(self, name), wanted.training.dt)
+            for name, wanted in self.policies.items()
+            if wanted.learned is not None
+        ]
+        vessel = self.steered
+        try:
+            turning = vessel.turning(self.rudder, self.turning_time)
+        except FitError as error:
+            raise ConfigError(f"vessel '{self.vessel}' cannot be steered: {error}") from error
+        config = paced(self)
+        _check_flights(config, turning, vessel.rate)
+        if config.conditions is not None and config.conditions.tuned_in is not None:
+            _tuned_earlier(config, config.conditions.tuned_in)
+        for model, dt in learned:
+            model.turning(self.rudder, self.turning_time, dt)
 
     def carry_out(self, folder: RunFolder) -> Outcome:
         """Train, tune and compare.
@@ -57,42 +320,212 @@ class AutopilotConfig(AutopilotSettings):
     def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
         """Return the file of a policy, which was exported and checked when the run ended.
 
-        As C it is written from the stored policy now.
+        In other formats it is written from the stored policy now.
 
         Raises:
             UsageError: where there is no such policy, or another format is given.
         """
-        policies = {**self.policies, **self.recurrent}
-        if model not in policies:
-            raise UsageError(f"{run.path}: no policy '{model}'{nearest(model, policies)}")
+        if model not in self.policies:
+            raise UsageError(f"{run.path}: no policy '{model}'{nearest(model, self.policies)}")
         file = run.exports / f"{model}.pt"
         if not file.is_file():
             raise UsageError(f"{file}: no such file; the run writes it at its end")
         if file_format != "torchscript":
-            return self._export_as(file_format, run, model, file, out)
+            from residnet.export import exporter
+            from residnet.export.policy import ExportedHeading
+            from residnet.tasks.autopilot.running import stored_policy
+
+            # at the step and with the card of the TorchScript file
+            chosen, extra = exporter(file_format), {"card.json": ""}
+            torch.jit.load(str(file), _extra_files=extra)
+            card = json.loads(extra["card.json"])
+            policy = stored_policy(self, run.models, model, card["dt"])
+            out = out or file.with_name(f"{model}{chosen.suffix}")
+            exported = ExportedHeading(
+                model, policy, safe=self.safe, about=card, metrics=card["metrics"]
+            )
+            chosen.export(exported, out)
+            return out
         if out is None:
             return file
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, out)
         return out
 
-    def _export_as(
-        self, file_format: str, run: RunFolder, model: str, scripted: Path, out: Path | None
-    ) -> Path:
-        """Write a policy at the step and with the card of its TorchScript file."""
-        import torch
 
-        from residnet.export import exporter
-        from residnet.export.policy import ExportedHeading
-        from residnet.tasks.autopilot.stored import stored_policy
+def school_of(config: AutopilotConfig, name: str) -> SteeredPlant | SteeredModel:
+    """Return what a policy is trained on: the vessel under the conditions, or a learned model.
 
-        chosen, extra = exporter(file_format), {"card.json": ""}
-        torch.jit.load(str(scripted), _extra_files=extra)
-        card = json.loads(extra["card.json"])
-        policy = stored_policy(self, run.models, model, card["dt"])
-        file = out or scripted.with_name(f"{model}{chosen.suffix}")
-        exported = ExportedHeading(
-            model, policy, safe=self.safe, about=card, metrics=card["metrics"]
+    Raises:
+        UsageError: where the run or the model is missing.
+        ConfigError: where its inputs are not those of the vessel, or the conditions have weather,
+            which a learned model does not feel.
+    """
+    assert config.conditions is not None
+    wanted = config.policies[name].learned
+    weather = any(conditions.weather for conditions in config.conditions.flown.values())
+    if wanted is None:
+        return SteeredPlant(load_vessel(config.vessel).build(), calm=not weather)
+    if weather:
+        raise ConfigError(
+            f"policies.{name}.learned: a learned model feels no wind or current; leave them out of"
+            " conditions"
         )
-        chosen.export(exported, file)
-        return file
+    spec, model = load_model(wanted.run / "models" / chosen_model(wanted.run, wanted.model))
+    return SteeredModel(model, spec.signals.columns, spec.hold, config.steered)
+
+
+_PUSHED = 2.0
+"""Standard deviations of the slow push that the rudder must be able to hold."""
+
+
+def _check_flights(config: AutopilotConfig, turning: Turning, rate: float | None) -> None:
+    """Check that changes of heading can end in their time, and that the rudder can hold a course.
+
+    Raises:
+        ConfigError: with the key, what is needed and what is given.
+    """
+    asked = {"test": (config.test.heading, config.test.duration)}
+    if config.conditions is not None:
+        stated = config.conditions.stated
+        asked["conditions.stated"] = (stated.heading[0], stated.duration)
+        for name, conditions in config.conditions.flown.items():
+            if conditions.bias + _PUSHED * conditions.push >= config.rudder:
+                raise ConfigError(
+                    f"conditions.{name}: a bias of {math.degrees(conditions.bias):.3g} deg and a"
+                    f" push of {math.degrees(conditions.push):.3g} deg leave nothing of a rudder of"
+                    f" {math.degrees(config.rudder):.3g} deg to steer with; give more rudder, or"
+                    " less of them"
+                )
+    for key, (change, duration) in asked.items():
+        least = least_time(turning, config.rudder, rate, change)
+        if least > duration:
+            raise ConfigError(
+                f"{key}.duration: a change of heading of {math.degrees(change):.3g} deg takes this"
+                f" vessel {least:.3g} s at least, given {duration:.3g} s; give more time, or more"
+                " rudder"
+            )
+
+
+_STEP = math.radians(30.0)
+_REFERENCE = Turning(3.47, 3.94, 3.2), math.radians(5.0)
+"""K, T and rudder of the vessel of document 004, whose times configs state at a pace of one."""
+
+
+def least_time(turning: Turning, limit: float, rate: float | None, change: float = _STEP) -> float:
+    """Return the least time in s of a change of heading [rad] by T r_dot + r = K delta.
+
+    Full rudder is held until full counter-rudder stops the yaw rate on the new heading; each way of
+    the rudder to one side takes its time beside that.
+    """
+    steady, time = abs(turning.gain) * limit, turning.time
+
+    def turned(first: float) -> tuple[float, float]:
+        second = time * math.log1p(1.0 - math.exp(-first / time))
+        return steady * (first - second), first + second
+
+    low, high = 0.0, time
+    while turned(high)[0] < change:
+        high *= 2.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if turned(middle)[0] > change else (middle, high)
+    return turned(high)[1] + (0.0 if rate is None else 2.0 * limit / rate)
+
+
+def paced(config: AutopilotConfig) -> AutopilotConfig:
+    """Return the config with its times multiplied by its pace, the pace itself being one.
+
+    Delays, which are those of the electronics, stay as they are. What a degree costs grows as the
+    time does.
+
+    Raises:
+        FitError: where the vessel does not turn steadily.
+    """
+    pace = config.pace
+    if pace == "vessel":
+        vessel = config.steered
+        turning = vessel.turning(config.rudder, config.turning_time)
+        slow = least_time(turning, config.rudder, vessel.rate)
+        # two digits are enough, and steps stay numbers that can be read
+        pace = float(f"{slow / least_time(*_REFERENCE, None):.2g}")
+        say(f"  pace {pace:g}: a change of 30 deg takes {slow:.3g} s at least")
+    if pace == 1.0 or config.conditions is None:
+        return config
+
+    def longer(part: Any, *names: str) -> Any:
+        given = {name: getattr(part, name) for name in names}
+        return part.model_copy(
+            update={name: pace * value for name, value in given.items() if value is not None}
+        )
+
+    def slower(conditions: ConditionsConfig) -> ConditionsConfig:
+        times = ("hold", "duration", "push_time", "dt", "overshoot_weight", "travel_weight")
+        changed: ConditionsConfig = longer(conditions, *times)
+        return changed
+
+    flown = {name: slower(one) for name, one in config.conditions.flown.items()}
+    conditions = {"stated": flown.pop("stated"), "beyond": flown}
+    policies = {
+        name: one.model_copy(update={"training": longer(one.training, "dt", "hold", "duration")})
+        for name, one in config.policies.items()
+    }
+    changed = {
+        "pace": 1.0,
+        "test": longer(config.test, "dt", "duration", "bias_time"),
+        "conditions": config.conditions.model_copy(update=conditions),
+        "policies": policies,
+    }
+    return config.model_copy(update=changed)
+
+
+def tuned_before(
+    name: str, peer: TunableConfig, config: AutopilotConfig
+) -> tuple[TunableConfig, dict[str, Any]] | None:
+    """Return a peer with the constants that an earlier run found for it, and notes; None for none.
+
+    Args:
+        name: of the peer in both runs.
+        peer: with constants that are to be tuned.
+        config: of this run, at its pace.
+
+    Raises:
+        UsageError: where the run that the config names is not there or not finished.
+        ConfigError: where it is no autopilot run, or of other conditions.
+    """
+    assert config.conditions is not None
+    run = config.conditions.tuned_in
+    if run is None:
+        return None
+    earlier, found = _tuned_earlier(config, run)
+    if earlier.peers.get(name) != peer or name not in found:
+        return None
+    complete = type(peer).model_validate(found[name]["config"])
+    return complete, {**found[name], "tuned_in": str(run)}
+
+
+def _tuned_earlier(config: AutopilotConfig, run: Path) -> tuple[AutopilotConfig, dict[str, Any]]:
+    """Return config and notes on the controllers of an earlier run under the same conditions."""
+    key = "conditions.tuned_in"
+    if not (run / "controllers.json").is_file():
+        raise UsageError(
+            f"{key}: {run} is not the folder of a finished autopilot run; run it first, or leave"
+            " this key out to tune peers here"
+        )
+    data = load_mapping(run / "resolved.yaml")
+    if data.get("task") != "autopilot" or data.get("conditions") is None:
+        raise ConfigError(f"{key}: {run} is no autopilot run under conditions")
+    earlier = paced(validate(data, AutopilotConfig, str(run / "resolved.yaml")))
+    assert config.conditions is not None
+    assert earlier.conditions is not None
+    pairs = {name: (getattr(config, name), getattr(earlier, name)) for name in ("vessel", "rudder")}
+    for name in ("stated", "evolution"):
+        own, other = (getattr(one.conditions, name) for one in (config, earlier))
+        pairs[f"conditions.{name}"] = own, other
+    for name, (own, other) in pairs.items():
+        if own != other:
+            raise ConfigError(
+                f"{key}: {run} tuned its peers for another '{name}'; constants are taken from runs"
+                " of the same vessel, rudder, conditions and search alone"
+            )
+    return earlier, read_json(run / "controllers.json")["controllers"]

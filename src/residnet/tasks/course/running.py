@@ -2,39 +2,49 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
+import torch
+from pydantic import TypeAdapter
+from torch import Tensor
 
-from residnet.control.base import Policy, Reference
+from residnet.control.base import ClosedLoop, Policy, Reference
 from residnet.control.courses.config import (
     PlannedCourse,
+    plan_course,
     report_feasibility,
+    smallest_turn,
 )
+from residnet.control.courses.course_check import Protocol
+from residnet.control.courses.turns import SteadyTurn
+from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
+from residnet.control.guidance.drift import DriftEstimate
 from residnet.control.guidance.line_of_sight import AnyLineOfSight
 from residnet.control.guidance.waypoints import WaypointGuidance
 from residnet.control.guidance.wheel_over import WheelOver
 from residnet.control.heading.controllers import Steering
-from residnet.control.heading.following import Following
+from residnet.control.heading.policies import HeadingPolicy
+from residnet.control.heading.turning import Turning
+from residnet.core.errors import ExportError
+from residnet.core.files import read_json
 from residnet.core.progress import say
+from residnet.documents.gouletas2020.autopilot import load_predictive
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.judge.courses import CourseFlight, row, spread_row
 from residnet.judge.metrics import SCHEMA
 from residnet.report.sections.course import COURSES, SPREAD, TRACKS, text_of
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome
-from residnet.tasks.course.autopilot_run import (
-    autopilot_of,
-    load_policy,
-    ready,
-)
-from residnet.tasks.course.config import CourseSettings
-from residnet.tasks.course.exporting import CourseExport
-from residnet.tasks.course.flights import NOMINAL, Vessels, fly
-from residnet.tasks.course.guided import guidance_along, plan_for
-from residnet.tasks.course.peers import load_peers
-from residnet.tasks.course.tables import plan_table, spread_table, track_table
+from residnet.tasks.autopilot.running import stored_policy
+from residnet.tasks.autopilot.task import AnyController, AutopilotConfig
+from residnet.tasks.course.task import NOMINAL, CourseTaskConfig, Vessels
 
 _UNITS = {
     "course_time": "s",
@@ -49,10 +59,10 @@ _UNITS = {
 }
 
 
-def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
+def run_course(config: CourseTaskConfig, folder: RunFolder) -> Outcome:
     """Train where there is no trained policy yet, plan, fly and compare."""
     if not config.autopilot.is_dir() and not RunFolder(folder.path / "autopilot").finished:
-        autopilot_of(config).run(
+        config.autopilot_config().run(
             source=config.autopilot, out=folder.path / "autopilot", resume=True
         )
     known = ready(config, folder)
@@ -103,7 +113,7 @@ def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
     )
 
 
-def _nominal(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _nominal(config: CourseTaskConfig, rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return the policy's row of the nominal vessel along the plan, by protocol."""
     return {
         row["protocol"]: row
@@ -112,7 +122,7 @@ def _nominal(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> dict[str
     }
 
 
-def _verdict(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> list[str]:
+def _verdict(config: CourseTaskConfig, rows: Sequence[dict[str, Any]]) -> list[str]:
     sentences = []
     for protocol, flight in _nominal(config, rows).items():
         if not flight["finished"]:
@@ -129,13 +139,114 @@ def _verdict(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> list[str
     return sentences
 
 
-def _main_figures(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> dict[str, MainFigure]:
+def _main_figures(
+    config: CourseTaskConfig, rows: Sequence[dict[str, Any]]
+) -> dict[str, MainFigure]:
     figures = {}
     for protocol, flight in _nominal(config, rows).items():
         figures[f"{protocol}_course_time"] = MainFigure(flight["course_time"], "s")
         figures[f"{protocol}_ratio"] = MainFigure(flight["ratio"])
         figures[f"{protocol}_cross_track_rms"] = MainFigure(flight["cross_track_rms"], "m")
     return figures
+
+
+class AutopilotRun(NamedTuple):
+    """The finished autopilot run that courses are planned and flown with.
+
+    Attributes:
+        autopilot: config of the autopilot run.
+        run: its folder.
+        steering: vessel, K and T, rudder limit and step.
+        steady: the smallest turn.
+        controllers: configs of its peers as tuned, by name.
+    """
+
+    autopilot: AutopilotConfig
+    run: RunFolder
+    steering: Steering
+    steady: SteadyTurn
+    controllers: dict[str, Any]
+
+
+def ready(config: CourseTaskConfig, folder: RunFolder) -> AutopilotRun:
+    """Read the finished autopilot run: the given one, or the one in the folder of the course.
+
+    Raises:
+        UsageError: where it is not finished.
+    """
+    autopilot = config.autopilot_config()
+    run = RunFolder.open(
+        config.autopilot if config.autopilot.is_dir() else folder.path / "autopilot"
+    )
+    notes = read_json(run.path / "controllers.json")
+    steering = Steering(
+        autopilot.steered,
+        Turning(**notes["turning"]),
+        autopilot.rudder,
+        config.dt,
+    )
+    return AutopilotRun(
+        autopilot,
+        run,
+        steering,
+        smallest_turn(config.course, steering.vessel, steering.turning, steering.limit),
+        notes["controllers"],
+    )
+
+
+def load_policy(known: AutopilotRun, name: str) -> HeadingPolicy:
+    """Return a trained policy of the autopilot's run, at the step of the course.
+
+    Raises:
+        UsageError: where the run lacks it, or it is not as it was written.
+    """
+    steering = known.steering
+    policy = stored_policy(known.autopilot, known.run.models, name, steering.dt)
+    policy.read_from(steering.vessel.state)
+    return policy
+
+
+def plan_for(
+    config: CourseTaskConfig, known: AutopilotRun, protocol: Protocol
+) -> tuple[PlannedCourse, CourseGuidance]:
+    """Return the plan of a protocol, and the guidance along it.
+
+    Raises:
+        ConfigError: where no course fits the vessel's turns.
+    """
+    steering = known.steering
+    planned = plan_course(
+        config.course, protocol, steering.vessel, steering.turning, steering.limit, known.steady
+    )
+    return planned, guidance_along(config, planned, steering)
+
+
+def guidance_along(
+    config: CourseTaskConfig, planned: PlannedCourse, steering: Steering
+) -> CourseGuidance:
+    """Return the guidance along the plan."""
+    lookahead = config.course.lookahead
+    drift = (
+        None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)
+    )
+    return CourseGuidance(planned.course, lookahead, steering.vessel.state, drift)
+
+
+def load_peers(config: CourseTaskConfig, known: AutopilotRun) -> dict[str, Policy]:
+    """Return the peers as the autopilot run tuned or trained them, then the others."""
+    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
+    built: dict[str, Policy] = {}
+    for name in config.peers:
+        if name in known.autopilot.predictive:
+            built[name] = load_predictive(
+                name, known.autopilot.predictive[name], known.steering, known.run
+            )
+        else:
+            built[name] = reader.validate_python(known.controllers[name]["config"]).build(
+                known.steering
+            )
+    built |= {name: law.build(known.steering) for name, law in config.others.items()}
+    return {name: law.double() for name, law in built.items()}
 
 
 class _Flown(NamedTuple):
@@ -147,7 +258,7 @@ class _Flown(NamedTuple):
 
 
 def _fly(
-    config: CourseSettings,
+    config: CourseTaskConfig,
     planned: PlannedCourse,
     steering: Steering,
     name: str,
@@ -182,7 +293,7 @@ def _fly(
 
 
 def _steered(
-    config: CourseSettings,
+    config: CourseTaskConfig,
     planned: PlannedCourse,
     steering: Steering,
     law: Policy,
@@ -191,7 +302,7 @@ def _steered(
     """Return controller and guidance along the plan, or by line of sight from buoy to buoy."""
     vessel = steering.vessel
     if sight is None:
-        return Following(
+        return TrackKeeping(
             law, vessel.state, limit=steering.limit, dt=steering.dt, rate=vessel.rate
         ), guidance_along(config, planned, steering)
     points, acceptance = (
@@ -204,3 +315,230 @@ def _steered(
         else None
     )
     return law, WaypointGuidance(points, acceptance, sight.build(steering.dt), vessel.state, over)
+
+
+def fly(
+    steering: Steering,
+    policy: Policy,
+    reference: Reference,
+    planned: PlannedCourse,
+    lookahead: float,
+    duration: float,
+    vessels: Vessels,
+) -> list[CourseFlight]:
+    """Fly each vessel once, from the plan's first point and heading.
+
+    Args:
+        steering: vessel and step.
+        policy: that steers.
+        reference: what it follows.
+        planned: course that cross-track errors are measured from.
+        lookahead: of the plan's guidance in m.
+        duration: in s, after which a flight that has not ended is given up.
+        vessels: that fly.
+    """
+    vessel, count, steps = steering.vessel, len(vessels.variation), round(duration / steering.dt)
+    place = [vessel.column("x"), vessel.column("y")]
+    x, w = vessel.start(torch.ones(count, dtype=torch.float64))
+    x[:, place] = torch.from_numpy(planned.course.track[0])
+    x[:, vessel.column("psi")] = float(planned.course.heading[0])
+    model = InAmbientCurrent(vessel.model(steering.dt), vessel.state)
+    loop = Rollout(model, ClosedLoop(policy, reference))
+    memory = torch.cat((vessels.current, vessel.memory(vessels.variation)), dim=-1)
+    with torch.no_grad():
+        states, inputs, _ = loop(x, w.unsqueeze(1).expand(-1, steps, -1), memory)
+        moves = (states.diff(dim=1)[:, :, place].abs().sum(dim=-1) > 0).numpy()
+        ends = [int(np.flatnonzero(row)[-1]) + 1 for row in moves]
+        aside = _aside(
+            CourseGuidance(planned.course, lookahead, vessel.state), states[:, : max(ends) + 1]
+        )
+    speed = torch.hypot(states[:, :, vessel.column("u")], states[:, :, vessel.column("v")])
+    psi = states[:, :, vessel.column("psi")]
+    return [
+        CourseFlight(
+            states[row, : end + 1, place].numpy(),
+            psi[row, : end + 1].numpy(),
+            inputs[row, : end + 1, 0].numpy(),
+            speed[row, : end + 1].numpy(),
+            aside[row, : end + 1].numpy(),
+            steering.dt,
+            end < steps,
+        )
+        for row, end in enumerate(ends)
+    ]
+
+
+def _aside(plan: CourseGuidance, states: Tensor) -> Tensor:
+    """Return the cross-track errors [B, T] in m of states [B, T, nx]."""
+    place, errors = plan.initial_state(states[:, 0]), []
+    for k in range(states.shape[1]):
+        _, place = plan(states[:, k], k, place)
+        errors.append(plan.error(states[:, k], place[:, 0])[1])
+    return torch.stack(errors, dim=1)
+
+
+_KEPT = 0.1
+"""Seconds between the stored samples of a track."""
+
+
+def spread_table(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
+    """Return one line for each flight of the spread."""
+    columns = (
+        "model",
+        "guidance",
+        "protocol",
+        "finished",
+        "passed",
+        "course_time",
+        "ratio",
+        "margin",
+        "cross_track_rms",
+    )
+    drawn = {
+        "effect": vessels.variation[:, 0],
+        "time": vessels.variation[:, 1],
+        "bias": vessels.variation[:, 2],
+    }
+    drawn |= {"current_north": vessels.current[:, 0], "current_east": vessels.current[:, 1]}
+    return pd.DataFrame(
+        {name: [row[name] for row in rows] for name in columns}
+        | {name: values.numpy() for name, values in drawn.items()}
+    )
+
+
+def track_table(name: str, guidance: str, protocol: str, flight: CourseFlight) -> pd.DataFrame:
+    """Return the track of one flight, a sample every 0.1 s: positions in m, angles in rad."""
+    every = max(round(_KEPT / flight.dt), 1)
+    count = len(flight.track)
+    columns = {
+        "controller": name,
+        "guidance": guidance,
+        "protocol": protocol,
+        "t": flight.dt * np.arange(count)[::every],
+        "north": flight.track[::every, 0],
+        "east": flight.track[::every, 1],
+        "psi": flight.heading[::every],
+        "rudder": np.resize(flight.rudder, count)[::every],
+        "speed": flight.speed[::every],
+        "cross_track": flight.cross_track[::every],
+    }
+    return pd.DataFrame(columns)
+
+
+def plan_table(planned: PlannedCourse) -> pd.DataFrame:
+    """Return the planned course up to its end: positions in m, heading and rudder in rad."""
+    course = planned.course
+    within = course.step * np.arange(len(course.track)) <= course.length
+    columns = {
+        "north": course.track[within, 0],
+        "east": course.track[within, 1],
+        "heading": course.heading[within],
+        "rudder": course.rudder[within],
+    }
+    return pd.DataFrame({"protocol": planned.protocol, **columns})
+
+
+_SAME = 1e-6
+"""Largest difference of a course planned again from the one that was flown, as a share."""
+
+
+class CourseExport(NamedTuple):
+    """A policy with the guidance along one plan, to be exported when the run ends.
+
+    Attributes:
+        folder: where files go.
+        config: of the course.
+        planned: the plan of one protocol.
+        guidance: along it.
+        policy: at the step of the course.
+        autopilot: config of the policy's own run.
+    """
+
+    folder: Path
+    config: CourseTaskConfig
+    planned: PlannedCourse
+    guidance: CourseGuidance
+    policy: HeadingPolicy
+    autopilot: AutopilotConfig
+
+    @property
+    def name(self) -> str:
+        """Name of the file without its ending."""
+        return f"{self.config.policy}_{self.planned.protocol}"
+
+    def write(self, rows: Sequence[dict[str, Any]]) -> Path:
+        """Export, with the policy's rows of metrics.json in the card; returns the file."""
+        from residnet.export.policy import ExportedCoursePolicy
+        from residnet.export.torchscript import TorchScriptExporter
+
+        config, protocol = self.config, self.planned.protocol
+        file = self.folder / f"{self.name}.pt"
+        about = {
+            "vessel": self.autopilot.vessel,
+            "course": config.course.model_dump(mode="json"),
+            "protocol": protocol,
+        }
+        metrics = [
+            row for row in rows if row["protocol"] == protocol and row["model"] == config.policy
+        ]
+        exported = ExportedCoursePolicy(
+            config.policy,
+            self.policy,
+            self.guidance,
+            self.planned.course,
+            safe=config.safe,
+            about=about,
+            metrics=metrics,
+        )
+        TorchScriptExporter().export(exported, file)
+        return file
+
+
+def export_as(
+    file_format: str,
+    config: CourseTaskConfig,
+    run: RunFolder,
+    protocol: Protocol,
+    scripted: Path,
+    out: Path | None,
+) -> Path:
+    """Write a policy with the guidance of a course, planned again; returns the file.
+
+    Args:
+        file_format: one of `residnet list formats`.
+        config: of the course.
+        run: its folder.
+        protocol: that the course was planned by.
+        scripted: the TorchScript file, whose card the new file takes.
+        out: where to write; None for beside the TorchScript file.
+
+    Raises:
+        ExportError: where the plan is not the one that was flown, or the file does not reproduce
+            policy and guidance.
+    """
+    from residnet.export import exporter
+    from residnet.export.policy import ExportedCoursePolicy
+
+    chosen, extra = exporter(file_format), {"card.json": ""}
+    torch.jit.load(str(scripted), _extra_files=extra)
+    card = json.loads(extra["card.json"])
+    known = ready(config, run)
+    planned, guidance = plan_for(config, known, protocol)
+    length = planned.course.length
+    if not abs(length - card["length"]) <= _SAME * length:
+        raise ExportError(
+            f"{scripted}: its course has {card['length']:.3f} m, planned again {length:.3f} m;"
+            " carry the run out again with this version"
+        )
+    file = out or scripted.with_name(f"{scripted.stem}{chosen.suffix}")
+    exported = ExportedCoursePolicy(
+        scripted.stem,
+        load_policy(known, config.policy),
+        guidance,
+        planned.course,
+        safe=config.safe,
+        about=card,
+        metrics=card["metrics"],
+    )
+    chosen.export(exported, file)
+    return file

@@ -2,28 +2,184 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, Literal, final
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self, final
 
-from residnet.core.errors import UsageError
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.control.courses.config import BuoyCourseConfig, plan_course, smallest_turn
+from residnet.control.courses.course_check import Protocol
+from residnet.control.guidance.line_of_sight import AnyLineOfSight
+from residnet.core.config import (
+    Config,
+    ExistingPath,
+    MetresPerSecond,
+    Radians,
+    Seconds,
+    load_config,
+)
+from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import nearest
+from residnet.dynamics.simulated import check_steps
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import Outcome
-from residnet.tasks.course.autopilot_run import autopilot_of
-from residnet.tasks.course.config import CourseSettings
+from residnet.runs.task import ComputingTask, Outcome
+from residnet.tasks.autopilot.task import AnyController, AutopilotConfig
+
+_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+
+
+class Vessels(NamedTuple):
+    """The variation of B vessels and the current that each runs in.
+
+    Attributes:
+        variation: of the steering, [B, 3] (`dynamics.steering_variation.VARIATION`).
+        current: to the north and to the east, [B, 2] in m/s.
+    """
+
+    variation: Tensor
+    current: Tensor
+
+
+NOMINAL = Vessels(
+    torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
+)
+"""The vessel that the course is planned with, in water at rest."""
+
+
+class CourseSpreadConfig(Config):
+    """Random vessels, each in a steady current from a random direction.
+
+    Every controller and guidance flies the same ones.
+
+    Attributes:
+        flights: number of vessels.
+        seed: of the random numbers.
+        effect: least and largest effect of the rudder, as a multiple of the nominal one (K of
+            Nomoto's model).
+        time: least and largest time constants of sway and yaw, as a multiple of the nominal ones (T
+            of Nomoto's model).
+        bias: largest constant angle that is added to the rudder's, in rad.
+        current: speed of the current in m/s.
+    """
+
+    flights: int = Field(default=50, ge=2, le=1_000_000)
+    seed: int = Field(default=0, ge=0)
+    effect: tuple[float, float] = (0.9, 1.1)
+    time: tuple[float, float] = (0.9, 1.1)
+    bias: Radians = Field(default=0.0, ge=0)
+    current: MetresPerSecond = Field(default=0.0, ge=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for name, (low, high) in {"effect": self.effect, "time": self.time}.items():
+            if not 0 < low <= high:
+                raise ValueError(
+                    f"{name}: low and high must be positive and in order, given {low:g}, {high:g}"
+                )
+        return self
+
+    def draw(self) -> Vessels:
+        """Draw the vessels, evenly spread over their ranges."""
+        generator = np.random.default_rng(self.seed)
+        effect, time, bias = (
+            generator.uniform(*limits, self.flights)
+            for limits in (self.effect, self.time, (-self.bias, self.bias))
+        )
+        towards = generator.uniform(-math.pi, math.pi, self.flights)
+        variation, current = (
+            np.stack((effect, time, bias), axis=-1),
+            self.current * np.stack((np.cos(towards), np.sin(towards)), axis=-1),
+        )
+        return Vessels(torch.from_numpy(variation), torch.from_numpy(current))
 
 
 @final
-class CourseTaskConfig(CourseSettings):
-    """A course past buoys, flown by a heading policy, its peers and laws of line of sight."""
+class CourseTaskConfig(ComputingTask):
+    """A course past buoys, the controllers that fly it, and the guidance laws beside the plan.
+
+    Attributes:
+        autopilot: folder of a finished autopilot run, or the config of one, which is then carried
+            out first, in this run's own folder. Vessel, rudder, policy and tuned peers come from
+            there.
+        policy: its name there.
+        peers: names of tuned peers and of the document's own autopilots there.
+        others: further controllers, for example the document's law with another horizon.
+        course: start, buoys and how the course is planned.
+        protocols: what passing a buoy means: `enter` its circle of acceptance, or leave it on its
+            side and outside its circle (`sides`).
+        integral: gain in m/s of integral action against a steady current in the guidance along the
+            plan; null for none.
+        line_of_sight: laws that are also flown without a plan, on straight legs from way-point to
+            way-point, as the source did it; for the protocol `enter`.
+        legs_change: where they do: in the circle of acceptance, as in the source, or at the
+            wheel-over before it.
+        spread: of vessels and currents that all fly the course too, beside the nominal vessel in
+            water at rest; null for none.
+        dt: step of simulation and controllers in s.
+        duration: time in s after which a flight that has not ended is given up.
+        safe: what the exported policy commands while its inputs are wrong: the last good command,
+            or rudder amidships.
+    """
+
+    task: Literal["course"]
+    autopilot: ExistingPath
+    policy: _Name = "policy"
+    peers: tuple[_Name, ...] = ("pid",)
+    others: dict[_Name, AnyController] = Field(default_factory=dict)
+    course: BuoyCourseConfig
+    protocols: tuple[Protocol, ...] = Field(default=("enter", "sides"), min_length=1)
+    integral: MetresPerSecond | None = Field(default=None, gt=0)
+    line_of_sight: tuple[AnyLineOfSight, ...] = ()
+    legs_change: Literal["circle", "wheel_over"] = "circle"
+    spread: CourseSpreadConfig | None = None
+    dt: Seconds = Field(default=0.02, gt=0)
+    duration: Seconds = Field(gt=0)
+    safe: Literal["hold", "amidships"] = "amidships"
+
+    @model_validator(mode="after")
+    def _laws_differ(self) -> Self:
+        kinds = [law.kind for law in self.line_of_sight]
+        if len(set(kinds)) < len(kinds):
+            raise ValueError(f"line_of_sight: each kind once, given {', '.join(kinds)}")
+        check_steps(self.duration, self.dt)
+        return self
+
+    def recorded_seed(self) -> int:
+        """Return the seed of the random vessels."""
+        return self.spread.seed if self.spread else 0
 
     verbs: ClassVar[tuple[str, ...]] = ("report", "export")
 
-    task: Literal["course"]
+    def autopilot_config(self) -> AutopilotConfig:
+        """Return the config of the autopilot, from its run folder or its file.
+
+        Raises:
+            UsageError: where the folder is not that of a finished autopilot run.
+            ConfigError: where the file is no config of an autopilot, or has no such policy or peer.
+        """
+        given = self.autopilot
+        file = RunFolder.open(given).resolved if given.is_dir() else given
+        found = load_config(file, [], AutopilotConfig)
+        if self.policy not in found.policies:
+            raise ConfigError(
+                f"policy: '{self.policy}' is none of {given}{nearest(self.policy, found.policies)}"
+            )
+        for name in self.peers:
+            if name not in (known := {**found.peers, **found.predictive}):
+                raise ConfigError(f"peers: '{name}' is none of {given}{nearest(name, known)}")
+        if taken := sorted({self.policy, *self.peers} & set(self.others)):
+            raise ConfigError(
+                f"others: '{taken[0]}' is a policy or peer already; names are unique in a run"
+            )
+        return found
 
     def check(self) -> None:
         """Check the autopilot's run folder or config, and that the courses can be planned.
@@ -33,9 +189,15 @@ class CourseTaskConfig(CourseSettings):
             ConfigError: where it is no config of an autopilot, or has no such policy or peer, or
                 where no course fits the vessel's turns.
         """
-        from residnet.tasks.course.planning import check_plans
-
-        check_plans(self, autopilot_of(self))
+        autopilot = self.autopilot_config()
+        vessel = autopilot.steered
+        turning = vessel.turning(autopilot.rudder, autopilot.turning_time)
+        steady = smallest_turn(self.course, vessel, turning, autopilot.rudder)
+        for protocol in self.protocols:
+            try:
+                plan_course(self.course, protocol, vessel, turning, autopilot.rudder, steady)
+            except ConfigError as error:
+                raise ConfigError(f"course.buoys, protocol {protocol}: {error}") from error
 
     def carry_out(self, folder: RunFolder) -> Outcome:
         """Train where there is no trained policy yet, plan, fly and compare.
@@ -72,7 +234,7 @@ class CourseTaskConfig(CourseSettings):
         if not file.is_file():
             raise UsageError(f"{file}: no such file; the run writes it at its end")
         if file_format != "torchscript":
-            from residnet.tasks.course.exporting import export_as
+            from residnet.tasks.course.running import export_as
 
             return export_as(file_format, self, run, names[model], file, out)
         if out is None:

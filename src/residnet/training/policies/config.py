@@ -6,12 +6,12 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from residnet.control.conditions.quiet import SteadyConfig
+from residnet.control.heading.conditions import SteadinessLimits
 from residnet.core.config import Seconds
 from residnet.training.one_stage import OneStage
 
 
-class ConditionsTraining(OneStage):
+class PolicyTraining(OneStage):
     """Settings of a training through the whole closed loop, under the conditions of the run.
 
     The loss of a batch is the mean cost of its flights, with a share of the integral of the
@@ -82,12 +82,12 @@ class ConditionsTraining(OneStage):
     exact: float = Field(default=1.0, ge=0)
     excess: float = Field(default=1.0, ge=0)
     stricter: float = Field(default=1.2, ge=1, le=10)
-    steady: SteadyConfig | None = SteadyConfig()
+    steady: SteadinessLimits | None = SteadinessLimits()
     validation: int = Field(default=512, ge=2, le=1_000_000)
     compiled: bool = True
 
     @model_validator(mode="after")
-    def _ramp(self) -> ConditionsTraining:
+    def _ramp(self) -> PolicyTraining:
         if self.nominal > self.spread:
             raise ValueError(
                 f"nominal ({self.nominal:g}) must not be larger than spread ({self.spread:g}):"

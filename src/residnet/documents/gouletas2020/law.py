@@ -1,21 +1,31 @@
-"""The predictive heading autopilot of document 004.
+"""The predictive heading autopilot of document 004 (Gouletas 2020): law, predictors, configs.
 
-Source: section 6.1.3, eqs. (6.3), (6.4), corrections of document 004.
+Source: sections 6.1.1 to 6.1.3 and 6.2, eqs. (6.3), (6.4), corrections of document 004. There is no
+Lightning here: `residnet check` must stay quick.
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import final
+from typing import Annotated, Literal, final
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.control.base import Policy
+from residnet.control.heading.controllers import ControllerConfig, Steering
+from residnet.control.heading.vessels import SteeredVessel
+from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.frames import wrap
 from residnet.dynamics.base import Dynamics
+from residnet.dynamics.store import Stored
+from residnet.training.one_stage import OneStage
+
+_Units = Annotated[int, Field(ge=1)]
 
 
 class Predictor(nn.Module, ABC):
@@ -190,3 +200,140 @@ class DocumentAutopilot(Policy):
         rudder = self.rudder.to(x.dtype)
         toward, calm = rudder[wrap(error).abs().argmin(-1)], rudder[rate.abs().argmin(-1)]
         return (self.weight * toward + (1.0 - self.weight) * calm).unsqueeze(-1), s
+
+
+@final
+class NominalSteering(Dynamics):
+    """The vessel without variation, and without memory, as predictors expect it.
+
+    Attributes:
+        others: inputs beside the rudder command at service speed [m - 1].
+    """
+
+    def __init__(self, vessel: SteeredVessel, dt: float) -> None:
+        super().__init__(dt, "rk4")
+        self.inner = vessel.model(dt)
+        self.others = vessel.start(torch.ones(1, dtype=torch.float64))[1][0, 1:]
+        nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+        self.register_buffer("nominal", vessel.memory(nominal), persistent=False)
+        self.nominal: Tensor
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return the derivative of the vessel's state; steps do not need it."""
+        return self.inner.rate(x, p, rho)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state [B, nx] after a step."""
+        return self.inner.step(x, w, self.nominal.to(x.dtype).expand(x.shape[0], -1))[0], s
+
+
+class DocumentConfig(ControllerConfig):
+    """The predictive law of document 004 with an exact predictor of the nominal vessel.
+
+    Attributes:
+        horizon: of the prediction; the source's 0.01 s cannot settle (corrections of document 004).
+        candidates: rudder angles.
+        weight: of the choice for the heading error.
+    """
+
+    kind: Literal["document"] = "document"
+    horizon: Seconds = Field(gt=0)
+    candidates: int = Field(default=41, ge=3, le=10_001)
+    weight: float = Field(default=0.2, ge=0, le=1)
+
+    def predictor(self, steering: Steering) -> SimulatedPredictor:
+        """Return the exact predictor: a simulation of the nominal vessel.
+
+        Long horizons are predicted in steps of at most a twentieth of T.
+        """
+        steps = math.ceil(self.horizon / max(steering.turning.time / 20.0, steering.dt))
+        model = NominalSteering(steering.vessel, self.horizon / steps)
+        return SimulatedPredictor(model, steering.vessel.state, steps, model.others)
+
+    def law(self, predictor: Predictor, steering: Steering) -> DocumentAutopilot:
+        """Return the controller with some predictor of this horizon."""
+        return DocumentAutopilot(
+            predictor, limit=steering.limit, candidates=self.candidates, weight=self.weight
+        )
+
+    def build(self, steering: Steering) -> Policy:
+        """Return the controller with the exact predictor."""
+        return self.law(self.predictor(steering), steering)
+
+
+class PredictorSpec(Stored):
+    """A description of a network that predicts heading and yaw rate by rudder angle.
+
+    Attributes:
+        schema_name: kind and version of the format.
+        state: names of the state of the vessel that it was trained on.
+        candidates: number of rudder angles.
+        hidden: widths of the layers.
+        linear: without activations.
+    """
+
+    schema_name: Literal["residnet.heading_predictor/1"] = Field(
+        default="residnet.heading_predictor/1", alias="schema"
+    )
+    state: tuple[str, ...]
+    candidates: int = Field(ge=1, le=10_001)
+    hidden: tuple[int, ...]
+    linear: bool
+
+    def build(self) -> NetworkPredictor:
+        """Return the network with its weights not yet trained, in float64."""
+        return NetworkPredictor(
+            self.state, candidates=self.candidates, hidden=self.hidden, linear=self.linear
+        ).double()
+
+
+class PredictorTraining(OneStage):
+    """Settings of a supervised training, from random states to what each rudder angle brings.
+
+    Document 004, 6.1.1 and 6.2.1.
+
+    Attributes:
+        states: to train on; a fifth as many are kept back to validate on.
+        wander: longest time under random rudder angles before a state is taken, from straight ahead
+            at service speed.
+        hold: mean time between these angles.
+        scatter: noise that is added to these states, as a share of each channel's standard
+            deviation.
+        batch: states.
+    """
+
+    states: int = Field(default=4000, ge=100, le=10_000_000)
+    wander: Seconds = Field(default=30.0, gt=0)
+    hold: Seconds = Field(default=4.0, gt=0)
+    scatter: float = Field(default=0.2, ge=0)
+    epochs: int = Field(default=50, ge=1, le=100_000)
+    batch: int = Field(default=100, ge=1, le=1_000_000)
+    learning_rate: float = Field(default=2e-2, gt=0)
+    final: float = Field(default=0.01, gt=0, le=1)
+    gradient_clip: float = Field(default=10.0, gt=0)
+
+
+class PredictiveConfig(Config):
+    """The predictive autopilot of document 004: a trained predictor and the control law (6.4).
+
+    The predictor is a perceptron. It says which heading error and yaw rate each candidate rudder
+    angle leads to; the law mixes the angle that is best for the one and that for the other.
+
+    Attributes:
+        horizon: how far ahead the perceptron predicts, in s; the heading cannot settle with the
+            document's 0.01 s (corrections, "The controller of document 004").
+        candidates: number of rudder angles that are compared, evenly spaced between the limits.
+        weight: weight in (6.4) of the angle that is best for the heading error, from 0 to 1; the
+            angle that is best for the yaw rate has the rest.
+        hidden: widths of the hidden layers; the document has 20 units for Nomoto's model and 30 for
+            the 4-DOF vessel.
+        linear: leave the activations out, as the document's listing does (correction G21).
+        training: how the perceptron is trained.
+    """
+
+    horizon: Seconds = Field(gt=0)
+    candidates: int = Field(default=41, ge=3, le=10_001)
+    weight: float = Field(default=0.2, ge=0, le=1)
+    hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (20,)
+    linear: bool = False
+    training: PredictorTraining = PredictorTraining()

@@ -1,4 +1,4 @@
-"""Vessels as heading controllers see them, and heading changes of many varied vessels at once."""
+"""Vessels as heading controllers see them: simulated, or a learned model of one."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from residnet.control.base import ClosedLoop, GivenReference, Policy
 from residnet.control.heading.turning import Steered, Turning, measure_turning
 from residnet.core.errors import ConfigError
 from residnet.core.frames import wrap
+from residnet.core.names import STATE, nearest
+from residnet.dynamics.actuated import commanded
 from residnet.dynamics.base import Dynamics
+from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.steering_variation import VariedPlant
+from residnet.dynamics.steering_variation import VariedModel, VariedPlant
 from residnet.physics.plant import HullPlant, Plant
 
 _LONG_STEP = 0.4
@@ -108,31 +111,6 @@ class SteeredPlant(SteeredVessel):
         )
 
 
-@final
-class NominalSteering(Dynamics):
-    """The vessel without variation, and without memory, as predictors expect it.
-
-    Attributes:
-        others: inputs beside the rudder command at service speed [m - 1].
-    """
-
-    def __init__(self, vessel: SteeredVessel, dt: float) -> None:
-        super().__init__(dt, "rk4")
-        self.inner = vessel.model(dt)
-        self.others = vessel.start(torch.ones(1, dtype=torch.float64))[1][0, 1:]
-        nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
-        self.register_buffer("nominal", vessel.memory(nominal), persistent=False)
-        self.nominal: Tensor
-
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return the derivative of the vessel's state; steps do not need it."""
-        return self.inner.rate(x, p, rho)
-
-    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state [B, nx] after a step."""
-        return self.inner.step(x, w, self.nominal.to(x.dtype).expand(x.shape[0], -1))[0], s
-
-
 def _straight(plant: Plant) -> Tensor:
     """Return the state [1, nx] of a straight course at the service speed.
 
@@ -179,37 +157,6 @@ def _rudder_rate(plant: Plant) -> float | None:
         moved = float(plant.end_step(x, w, dt)[0, column] - x[0, column]) / dt
         rates.append(moved + float(plant.rate(x, w)[0, column]))
     return rates[0] if abs(rates[0] - rates[1]) <= 1e-6 * abs(rates[0]) else None
-
-
-@final
-class Measured(Policy):
-    """A controller that sees the state through noisy sensors.
-
-    Args:
-        policy: the controller.
-        state: names of the columns of x.
-        noise: standard deviation of white noise by name, SI.
-    """
-
-    def __init__(self, policy: Policy, state: tuple[str, ...], noise: Mapping[str, float]) -> None:
-        super().__init__()
-        self.policy = policy
-        self.n_state = policy.n_state
-        self.register_buffer(
-            "spread", torch.tensor([noise.get(name, 0.0) for name in state]), persistent=False
-        )
-        self.spread: Tensor
-
-    def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory of the controller."""
-        return self.policy.initial_state(x)
-
-    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the controller's command and memory, with noise on the state that it sees."""
-        command: tuple[Tensor, Tensor] = self.policy(
-            x + torch.randn_like(x) * self.spread.to(x.dtype), reference, s
-        )
-        return command
 
 
 @dataclass(frozen=True)
@@ -316,3 +263,57 @@ def fly(
         free = Rollout(vessel.model(dt), loop if surround is None else surround(loop))
         states, inputs, _ = free(x, w.unsqueeze(1).expand(-1, steps, -1), vessel.memory(variation))
     return Flights(states, inputs, heading, dt, vessel.state)
+
+
+@final
+class SteeredModel(SteeredVessel):
+    """A learned model with the steering gear and straight courses of the vessel that it models.
+
+    Args:
+        model: hybrid model of the hull.
+        columns: names of its inputs; the rudder's is `delta` or `cmd_delta`, the others are
+            commands of the vessel.
+        hold: whether its inputs are those at a step's start or means over the step.
+        vessel: in calm water.
+
+    Raises:
+        ConfigError: where the model has no rudder, or an input that the vessel does not command.
+    """
+
+    def __init__(
+        self, model: HybridDynamics, columns: tuple[str, ...], hold: str, vessel: SteeredPlant
+    ) -> None:
+        self.hull, self.vessel, self.mean = model, vessel, hold == "mean"
+        self.state = STATE if vessel.rate is None else (*STATE, "delta")
+        self.inputs, self.rate = vessel.inputs, vessel.rate
+        if not {"delta", "cmd_delta"} & set(columns):
+            raise ConfigError(
+                "heading control needs a model that is driven by 'delta' or 'cmd_delta'; its"
+                f" inputs are {', '.join(columns)}"
+            )
+        self.any_step = model.n_state == 0
+        self.take: list[int] = []
+        for name in columns:
+            command = commanded(name)
+            if command not in vessel.inputs:
+                raise ConfigError(
+                    f"the model is driven by '{name}', which the vessel does not"
+                    f" command{nearest(command, vessel.inputs)}"
+                )
+            self.take.append(vessel.inputs.index(command))
+
+    def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
+        """Return the model, varied, with its own integrator.
+
+        One without memory takes steps of any length.
+        """
+        return VariedModel(self.hull, dt, self.take, self.mean, self.rate)
+
+    def memory(self, variation: Tensor) -> Tensor:
+        """Return the variation, then the head's memory without a past."""
+        return torch.cat((variation, variation.new_zeros(len(variation), self.hull.n_state)), dim=1)
+
+    def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the states [B, nx] and inputs [B, m] of straight courses."""
+        x, w = self.vessel.start(speed)
+        return x[:, [self.vessel.column(name) for name in self.state]], w

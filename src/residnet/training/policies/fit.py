@@ -9,21 +9,24 @@ from typing import Any, final
 import torch
 from torch import Tensor, nn
 
-from residnet.control.conditions.config import ConditionsConfig, HeadingChanges
-from residnet.control.conditions.flights import (
+from residnet.control.heading.conditions import (
     Compiler,
     ConditionedFlights,
     ConditionedRun,
+    ConditionsConfig,
     Flying,
+    HeadingChanges,
+    SteadyTest,
+    nominal,
+    too_many,
 )
-from residnet.control.conditions.quiet import SteadyTest, nominal, too_many
-from residnet.control.heading.keeper import HeadingKeeper
-from residnet.control.heading.steering import SteeredVessel
+from residnet.control.heading.policies import HeadingPolicy
+from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.errors import ExportError
 from residnet.core.progress import say
 from residnet.dynamics.rollout import Rollout
 from residnet.training.epochs import EpochTraining
-from residnet.training.policies.conditions_config import ConditionsTraining
+from residnet.training.policies.config import PolicyTraining
 from residnet.training.running import run_epochs
 
 _LATE = 1.0 / 3.0
@@ -40,7 +43,7 @@ _FREE = 0.5
 
 
 @final
-class ConditionsFit(EpochTraining):
+class PolicyFit(EpochTraining):
     """Trains a policy on heading changes that are drawn anew for every batch.
 
     Args:
@@ -54,9 +57,9 @@ class ConditionsFit(EpochTraining):
 
     def __init__(
         self,
-        policy: HeadingKeeper,
+        policy: HeadingPolicy,
         vessel: SteeredVessel,
-        settings: ConditionsTraining,
+        settings: PolicyTraining,
         conditions: ConditionsConfig,
         seed: int,
         compiler: Compiler | None,
@@ -265,11 +268,11 @@ def _flying(
     return fly
 
 
-def train_under_conditions(
+def train_policy(
     name: str,
-    policy: HeadingKeeper,
+    policy: HeadingPolicy,
     vessel: SteeredVessel,
-    settings: ConditionsTraining,
+    settings: PolicyTraining,
     conditions: ConditionsConfig,
     seed: int,
     folder: Path | None,
@@ -287,7 +290,7 @@ def train_under_conditions(
     Raises:
         FitError: where no epoch gave a finite cost.
     """
-    fit = ConditionsFit(policy.float(), vessel, settings, conditions, seed, compiler)
+    fit = PolicyFit(policy.float(), vessel, settings, conditions, seed, compiler)
     notes = run_epochs(name, fit, policy, policy, folder)
     notes |= {"unsteady": fit.best_diverged}
     policy.at(conditions.dt)

@@ -1,0 +1,627 @@
+"""The conditions that heading controllers are tuned, trained and judged under."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Annotated, final
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.control.base import Policy
+from residnet.control.heading.vessels import SteeredVessel
+from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
+from residnet.core.errors import ExportError
+from residnet.core.frames import wrap
+from residnet.dynamics.rollout import Rollout, Source
+from residnet.dynamics.simulated import check_steps
+from residnet.dynamics.steering_variation import PushedSteering
+from residnet.physics.environment.waves import JonswapSpectrum
+
+Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
+_EXTRA = ("push", "reference", "noise_psi", "noise_r", "delay")
+"""Columns that stand behind the vessel's own inputs while flights are flown."""
+_SINES = 12
+"""That a motion with the waves is made of."""
+
+
+class ConditionsConfig(Config):
+    """The conditions of heading changes, and what a change costs.
+
+    Each flight has a vessel, a delay, disturbances and a change of heading of its own. The vessel
+    holds its course first; the reference jumps at a random time, without prefilter. The cost of a
+    flight counts from the jump on: the integral of |e| / (|e| + band) in s, plus `overshoot_weight`
+    times the overshoot in deg, plus `travel_weight` times the travel of the rudder command in deg;
+    e is the true heading error.
+
+    Attributes:
+        effect: of the rudder, as a multiple (K of Nomoto's model).
+        time: constants of sway and yaw, as a multiple (T of Nomoto's model).
+        delay: shortest and longest delay in s between a command and the steering gear.
+        bias: largest constant angle in rad that is added to the rudder's.
+        push: standard deviation of a slow yaw moment in rad of rudder, a Gauss-Markov process.
+        push_time: correlation time of that process in s.
+        noise_psi: standard deviation of white noise on the measured heading in rad.
+        noise_r: standard deviation of white noise on the measured yaw rate in rad/s.
+        heading: smallest and largest change of heading in rad, to either side.
+        hold: longest time in s that the course is held before the change.
+        duration: time in s from the change to the end of what is counted.
+        wind: slowest and fastest wind in m/s from any direction; null for none.
+        current: fastest current in m/s in any direction.
+        waves: largest standard deviation in rad of the heading's motion with the waves, evenly
+            drawn from zero on. Heading and yaw rate are measured with it; the error that is
+            counted is without it, since no rudder is quick enough against it.
+        wave_period: shortest and longest peak period in s of that motion, a JONSWAP spectrum.
+        dt: step of vessel, sensors and controllers in s; with another one, as in training, the
+            noise is scaled so that its spectrum stays the same.
+        band: heading error in rad at which half of the cost of a large one is left.
+        overshoot_weight: cost of a degree of overshoot, in s.
+        travel_weight: cost of a degree of rudder travel, in s.
+    """
+
+    effect: Range = (0.8, 1.2)
+    time: Range = (0.8, 1.2)
+    delay: tuple[Seconds, Seconds] = (0.0, 0.4)
+    bias: Radians = Field(default=0.017453292519943295, ge=0)
+    push: Radians = Field(default=0.008726646259971648, ge=0)
+    push_time: Seconds = Field(default=5.0, gt=0)
+    noise_psi: Radians = Field(default=0.0017453292519943296, ge=0)
+    noise_r: RadiansPerSecond = Field(default=0.0017453292519943296, ge=0)
+    heading: tuple[Radians, Radians] = (0.08726646259971647, 1.0471975511965976)
+    hold: Seconds = Field(default=5.0, ge=0)
+    duration: Seconds = Field(default=14.0, gt=0)
+    wind: tuple[MetresPerSecond, MetresPerSecond] | None = None
+    current: MetresPerSecond = Field(default=0.0, ge=0)
+    waves: Radians = Field(default=0.0, ge=0, le=0.5)
+    wave_period: tuple[Seconds, Seconds] = (4.0, 9.0)
+    dt: Seconds = Field(default=0.02, gt=0)
+    band: Radians = Field(default=0.017453292519943295, gt=0)
+    overshoot_weight: float = Field(default=0.5, ge=0)
+    travel_weight: float = Field(default=0.01, ge=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ConditionsConfig:
+        ranges = {
+            "effect": (*self.effect, 1e-6, 10.0),
+            "time": (*self.time, 1e-6, 10.0),
+            "delay": (*self.delay, 0.0, 60.0),
+            "heading": (*self.heading, 1e-3, 3.1),
+            "wave_period": (*self.wave_period, 0.2, 60.0),
+        }
+        check_steps(self.hold + self.duration, self.dt)
+        if self.wind is not None:
+            ranges["wind"] = (*self.wind, 0.0, 60.0)
+        for name, (low, high, least, most) in ranges.items():
+            if not least <= low <= high <= most:
+                raise ValueError(
+                    f"{name}: low and high must be in order and within {least:g} and {most:g},"
+                    f" given {low:g}, {high:g}"
+                )
+        return self
+
+    @property
+    def weather(self) -> bool:
+        """Whether there is wind or current."""
+        return self.wind is not None or self.current > 0
+
+    def needs(self) -> tuple[str, ...]:
+        """Return the inputs that a vessel must have to be flown under these conditions."""
+        return (
+            *(("wind_speed", "wind_dir") if self.wind is not None else ()),
+            *(("current_north", "current_east") if self.current > 0 else ()),
+        )
+
+    def draw(
+        self, rows: int, dt: float, random: torch.Generator, share: float = 1.0
+    ) -> HeadingChanges:
+        """Draw heading changes for a number of flights, float32.
+
+        Args:
+            rows: number of flights.
+            dt: step in s.
+            random: source of all that is drawn.
+            share: part of all departures from the nominal vessel in calm water, 0 to 1.
+        """
+
+        def even(low: float, high: float) -> Tensor:
+            return low + (high - low) * torch.rand(rows, generator=random)
+
+        hold = round(self.hold / dt)
+        steps = hold + round(self.duration / dt)
+        scale = share * math.sqrt(self.dt / dt)
+        noise = torch.randn(rows, steps, 2, generator=random) * torch.tensor(
+            [scale * self.noise_psi, scale * self.noise_r]
+        )
+        sign = torch.where(torch.rand(rows, generator=random) < 0.5, -1.0, 1.0)
+        effect, time = (1.0 + share * (even(*values) - 1.0) for values in (self.effect, self.time))
+        bias = share * even(-self.bias, self.bias)
+        changes = HeadingChanges(
+            heading=sign * even(*self.heading),
+            start=torch.randint(0, hold + 1, (rows,), generator=random),
+            variation=torch.stack((effect, time, bias), dim=1),
+            delay=torch.round(share * even(*self.delay) / dt),
+            push=share * self.push * gauss_markov(rows, steps, dt / self.push_time, random),
+            noise=noise,
+            weather=self._weather(rows, random, share),
+            dt=dt,
+            count=steps - hold,
+        )
+        if self.waves > 0:
+            # drawn last, so that all else is the same with waves and without
+            size, period = even(0.0, share * self.waves), even(*self.wave_period)
+            noise += size[:, None, None] * wave_motion(period, steps, dt, random)
+        return changes
+
+    def at_corners(
+        self, changes: HeadingChanges, rows: int, random: torch.Generator, share: float = 1.0
+    ) -> HeadingChanges:
+        """Return changes whose first rows have vessels and delays at corners of their ranges.
+
+        `share` is the part of all departures from the nominal vessel, as in `draw`.
+        """
+        variation, delay = changes.variation.clone(), changes.delay.clone()
+
+        def either(low: float, high: float) -> Tensor:
+            return torch.where(torch.rand(rows, generator=random) < 0.5, low, high)
+
+        variation[:rows, 0] = 1.0 + share * (either(*self.effect) - 1.0)
+        variation[:rows, 1] = 1.0 + share * (either(*self.time) - 1.0)
+        delay[:rows] = torch.round(share * either(*self.delay) / changes.dt)
+        return replace(changes, variation=variation, delay=delay)
+
+    def _weather(self, rows: int, random: torch.Generator, share: float) -> dict[str, Tensor]:
+        drawn = torch.rand(2, rows, generator=random)
+        around = 2.0 * torch.pi * torch.rand(2, rows, generator=random)
+        out: dict[str, Tensor] = {}
+        if self.wind is not None:
+            low, high = self.wind
+            out["wind_speed"] = share * (low + (high - low) * drawn[0])
+            out["wind_dir"] = around[0]
+        if self.current > 0:
+            speed = share * self.current * drawn[1]
+            out["current_north"] = speed * torch.cos(around[1])
+            out["current_east"] = speed * torch.sin(around[1])
+        return out
+
+
+def wave_motion(period: Tensor, steps: int, dt: float, random: torch.Generator) -> Tensor:
+    """Return motions with the waves and their rates [B, T, 2], of unit variance before the rate.
+
+    Each is a sum of sines of random phase with a JONSWAP spectrum: the wave-frequency motion that
+    is added to the slow one (T. I. Fossen, Handbook of Marine Craft, 2011, section 8.2).
+
+    Args:
+        period: at the peak in s, [B].
+        steps: number T of steps.
+        dt: step in s.
+        random: source of phases and frequencies.
+    """
+    ratios = torch.linspace(0.7, 1.8, _SINES + 1)
+    # somewhere within its band each, so that the sum does not repeat itself
+    within = torch.rand(len(period), _SINES, generator=random)
+    ratio = ratios[:-1] + within * torch.diff(ratios)
+    form = JonswapSpectrum().density(ratio.numpy(), 1.0, 2.0 * math.pi)
+    power = torch.from_numpy(form).float()
+    amplitude = (2.0 * power / power.sum(1, keepdim=True)).sqrt()
+    omega = ratio * (2.0 * math.pi / period[:, None])
+    phase = 2.0 * math.pi * torch.rand(len(period), _SINES, generator=random)
+    angle = omega[:, None] * (dt * torch.arange(steps))[None, :, None] + phase[:, None]
+    motion = (amplitude[:, None] * torch.cos(angle)).sum(2)
+    rate = (-(amplitude * omega)[:, None] * torch.sin(angle)).sum(2)
+    return torch.stack((motion, rate), dim=2)
+
+
+def gauss_markov(rows: int, steps: int, step: float, random: torch.Generator) -> Tensor:
+    """Return stationary first-order processes [B, T] of unit variance, exact at their samples.
+
+    `step` is the time between samples as a multiple of the correlation time.
+    """
+    from scipy.signal import lfilter
+
+    keep = math.exp(-step)
+    drive = torch.randn(rows, steps, generator=random, dtype=torch.float64).numpy()
+    drive[:, 1:] *= math.sqrt(1.0 - keep * keep)
+    return torch.from_numpy(lfilter([1.0], [1.0, -keep], drive, axis=1)).float()
+
+
+@dataclass(frozen=True)
+class HeadingChanges:
+    """B heading changes of T steps, as they were drawn.
+
+    Attributes:
+        heading: change [B] in rad.
+        start: number [B] of the step at which the reference jumps.
+        variation: of the vessel [B, 3], `dynamics.steering_variation.VARIATION`.
+        delay: of the command [B] in steps.
+        push: angle [B, T] in rad that is added to the rudder's.
+        noise: on the measured heading and yaw rate [B, T, 2] in rad and rad/s.
+        weather: constant inputs of the vessel [B] by name, SI.
+        dt: step in s.
+        count: number of steps that are counted, from the jump on.
+    """
+
+    heading: Tensor
+    start: Tensor
+    variation: Tensor
+    delay: Tensor
+    push: Tensor
+    noise: Tensor
+    weather: dict[str, Tensor]
+    dt: float
+    count: int
+
+    def reference(self) -> Tensor:
+        """Return the reference [B, T] in rad: zero, then the new heading."""
+        steps = torch.arange(self.push.shape[1])
+        return torch.where(steps >= self.start[:, None], self.heading[:, None], 0.0)
+
+    def counted(self) -> Tensor:
+        """Return which steps [B, T] the cost counts."""
+        steps = torch.arange(self.push.shape[1])
+        begin = self.start[:, None]
+        return (steps >= begin) & (steps < begin + self.count)
+
+    def repeated(self, times: int) -> HeadingChanges:
+        """Return the same flights several times, one block after the other."""
+
+        def more(values: Tensor) -> Tensor:
+            return values.repeat(times, *[1] * (values.dim() - 1))
+
+        return HeadingChanges(
+            heading=more(self.heading),
+            start=more(self.start),
+            variation=more(self.variation),
+            delay=more(self.delay),
+            push=more(self.push),
+            noise=more(self.noise),
+            weather={name: more(values) for name, values in self.weather.items()},
+            dt=self.dt,
+            count=self.count,
+        )
+
+
+QUANTITIES = {
+    "cost": "s",
+    "time_outside": "s",
+    "overshoot": "rad",
+    "travel": "rad",
+    "iae": "rad s",
+}
+"""Of a flight, with units: the cost, its three parts, and the integral of the absolute error."""
+
+Flying = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Flights from states [B, nx], inputs [B, T, m] and memory [B, n]: states and what acted."""
+Compiler = Callable[[Rollout, Tensor, Tensor, Tensor], Flying]
+"""Makes the flights of a closed loop quick, given examples of what they are flown with; it raises
+ExportError where it cannot."""
+
+
+@final
+class ConditionedLoop(Source):
+    """A controller that sees through noisy sensors and whose commands arrive late.
+
+    Given inputs [B, m + 5]: those of the vessel, then push, reference, noise on heading and yaw
+    rate, and the delay in steps. It returns [B, m + 2]: the inputs that act, the push, and the
+    command as it was issued. Its memory holds the last commands, then that of the controller.
+
+    Args:
+        policy: the controller.
+        columns: of heading and yaw rate in the state.
+        inputs: number m of the vessel's inputs.
+        longest: delay in steps that the memory holds.
+    """
+
+    def __init__(self, policy: Policy, columns: tuple[int, int], inputs: int, longest: int) -> None:
+        super().__init__()
+        self.policy = policy
+        self.psi, self.r = columns
+        self.inputs, self.longest = inputs, longest
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Return the memory at the start: rudder amidships for as long as commands may take."""
+        late = torch.zeros(x.shape[0], self.longest, dtype=x.dtype)
+        return torch.cat((late, self.policy.initial_state(x)), dim=-1)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what acts [B, m + 2] and the memory."""
+        m = self.inputs
+        push, reference, noise_psi, noise_r, delay = w[:, m:].split(1, dim=1)
+        seen = torch.zeros_like(x)
+        seen[:, self.psi : self.psi + 1] = noise_psi
+        seen[:, self.r : self.r + 1] = noise_r
+        command, s = self.policy(x + seen, reference, memory[:, self.longest :])
+        late = torch.cat((command, memory[:, : self.longest]), dim=1)
+        arriving = late.gather(1, delay.to(torch.int64))
+        acting = torch.cat((arriving, w[:, 1:m], push, command), dim=1)
+        return acting, torch.cat((late[:, : self.longest], s), dim=1)
+
+
+@dataclass(frozen=True)
+class ConditionedFlights:
+    """B heading changes of T steps as they were flown.
+
+    Attributes:
+        changes: as they were drawn.
+        psi: heading [B, T] in rad at the start of each step.
+        r: yaw rate [B, T] in rad/s.
+        command: rudder command [B, T] in rad, as it was issued.
+    """
+
+    changes: HeadingChanges
+    psi: Tensor
+    r: Tensor
+    command: Tensor
+
+    @property
+    def error(self) -> Tensor:
+        """New heading less heading [B, T] in rad, wrapped."""
+        return wrap(self.changes.heading[:, None] - self.psi)
+
+    def swing(self, after: float) -> tuple[Tensor, Tensor]:
+        """Return how far heading and rudder command [B] in rad move, peak to peak.
+
+        Args:
+            after: time in s from the change of heading on, up to the flight's end.
+        """
+        steps = torch.arange(self.psi.shape[1])
+        late = steps >= self.changes.start[:, None] + round(after / self.changes.dt)
+
+        def between(values: Tensor) -> Tensor:
+            highest = torch.where(late, values, -torch.inf).amax(1)
+            return highest - torch.where(late, values, torch.inf).amin(1)
+
+        return between(self.psi), between(self.command)
+
+    def late_swing(self, share: float) -> Tensor:
+        """Return the variance of the rudder command [B] in rad^2 in the last share of what counts.
+
+        What counts is the time from the change on that the cost is of.
+        """
+        first = self.changes.start[:, None] + round((1.0 - share) * self.changes.count)
+        late = self.changes.counted() & (torch.arange(self.psi.shape[1]) >= first)
+        number = late.sum(1, keepdim=True).clamp(min=1)
+        mean = (self.command * late).sum(1, keepdim=True) / number
+        return ((self.command - mean).square() * late).sum(1) / number[:, 0]
+
+    def measured(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
+        """Return each of `QUANTITIES` by flight, [B]; what is no number is left so."""
+        dt, degrees = self.changes.dt, 180.0 / torch.pi
+        counted = self.changes.counted().to(self.psi.dtype)
+        error = self.error
+        size = error.abs()
+        outside = (counted * size / (size + conditions.band)).sum(1) * dt
+        beyond = -error * self.changes.heading.sign()[:, None]
+        # plus zero: no negative zero is shown
+        overshoot = (beyond * counted).amax(1).clamp(min=0.0) + 0.0
+        moved = torch.diff(self.command, dim=1, prepend=torch.zeros_like(self.command[:, :1]))
+        travel = (moved.abs() * counted).sum(1)
+        cost = (
+            outside
+            + degrees * conditions.overshoot_weight * overshoot
+            + degrees * conditions.travel_weight * travel
+        )
+        values = (cost, outside, overshoot, travel, (size * counted).sum(1) * dt)
+        return dict(zip(QUANTITIES, values, strict=True))
+
+
+@final
+class ConditionedRun:
+    """A vessel and a controller ready to fly heading changes at one step.
+
+    Args:
+        vessel: see there.
+        policy: the controller, at this step.
+        dt: step in s.
+        integrator: of the vessel.
+        dtype: of the flights.
+        compiler: of flights without gradients; None to fly them as they are, as are those that it
+            cannot compile.
+        longest: delay in steps that there is room for; None for that of each call's changes.
+    """
+
+    def __init__(
+        self,
+        vessel: SteeredVessel,
+        policy: Policy,
+        dt: float,
+        integrator: str = "rk4",
+        dtype: torch.dtype = torch.float64,
+        compiler: Compiler | None = None,
+        longest: int | None = None,
+    ) -> None:
+        self.vessel, self.dtype, self.dt = vessel, dtype, dt
+        self.columns = vessel.column("psi"), vessel.column("r")
+        self.policy, self.compiler, self.longest = policy, compiler, longest
+        self._flying: dict[int, Flying] = {}
+        self.model = PushedSteering(vessel.model(dt, integrator), len(vessel.inputs))
+        self.model.to(dtype).requires_grad_(False)
+
+    def rollout(self, longest: int) -> Rollout:
+        """Return the closed loop, with room for delays of so many steps."""
+        loop = ConditionedLoop(self.policy, self.columns, len(self.vessel.inputs), longest)
+        return Rollout(self.model, loop)
+
+    def given(self, changes: HeadingChanges) -> tuple[Tensor, Tensor, Tensor]:
+        """Return states [B, nx], inputs [B, T, m + 5] and the vessel's memory for a rollout."""
+        rows, steps = changes.push.shape
+        x, w = self.vessel.start(torch.ones(rows, dtype=self.dtype))
+        for name, value in changes.weather.items():
+            w[:, self.vessel.inputs.index(name)] = value.to(self.dtype)
+        extra = torch.stack(
+            (
+                changes.push,
+                changes.reference(),
+                changes.noise[:, :, 0],
+                changes.noise[:, :, 1],
+                changes.delay[:, None].expand(-1, steps),
+            ),
+            dim=2,
+        )
+        inputs = torch.cat((w.unsqueeze(1).expand(-1, steps, -1), extra.to(self.dtype)), dim=2)
+        return x, inputs, self.vessel.memory(changes.variation.to(self.dtype))
+
+    def flights(
+        self, changes: HeadingChanges, states: Tensor, inputs: Tensor
+    ) -> ConditionedFlights:
+        """Return what a rollout gave: states [B, T+1, nx] and inputs [B, T, m + 2]."""
+        psi, r = (states[:, :-1, column] for column in self.columns)
+        return ConditionedFlights(changes, psi, r, inputs[:, :, -1])
+
+    def fly(self, changes: HeadingChanges) -> ConditionedFlights:
+        """Fly heading changes without gradients."""
+        longest = self.longest or max(int(changes.delay.max()), 1)
+        given = self.given(changes)
+        with torch.no_grad():
+            if longest not in self._flying:
+                self._flying[longest] = self._quick(self.rollout(longest), *given)
+            return self.flights(changes, *self._flying[longest](*given))
+
+    def _quick(self, rollout: Rollout, x: Tensor, w: Tensor, s: Tensor) -> Flying:
+        """Return the flights of a closed loop, compiled where that can be."""
+        if self.compiler is not None:
+            try:
+                return self.compiler(rollout, x[:2], w[:2], s[:2])
+            except ExportError:
+                pass  # what cannot be compiled is flown as it is
+
+        def fly(x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+            states, inputs, _ = rollout(x, w, s)
+            return states, inputs
+
+        return fly
+
+
+def fly_under(
+    vessel: SteeredVessel,
+    policy: Policy,
+    changes: HeadingChanges,
+    *,
+    integrator: str = "rk4",
+    dtype: torch.dtype = torch.float64,
+) -> ConditionedFlights:
+    """Return the flights of a controller, at the step of the changes, without gradients."""
+    run = ConditionedRun(vessel, policy.to(dtype), changes.dt, integrator, dtype)
+    return run.fly(changes)
+
+
+_AFTER, _FOR = 10.0 / 7.0, 5.0 / 7.0
+"""Multiples of what the cost counts: after that time a flight without noise is looked at for
+swinging, for that long (with 14 s from 20 s on, for 10 s).
+"""
+_NOMINAL = 16
+
+
+def quiet(conditions: ConditionsConfig) -> ConditionsConfig:
+    """Return the conditions without noise, waves and slow push, with time enough to settle."""
+    return conditions.model_copy(
+        update={
+            "noise_psi": 0.0,
+            "noise_r": 0.0,
+            "push": 0.0,
+            "waves": 0.0,
+            "hold": 0.0,
+            "duration": quiet_after(conditions.duration) + _FOR * conditions.duration,
+        }
+    )
+
+
+def quiet_after(duration: float) -> float:
+    """Return the time in s after a change from which nothing should swing.
+
+    `duration` is the time in s that the cost counts.
+    """
+    return _AFTER * duration
+
+
+class SteadinessLimits(Config):
+    """What a policy must keep to without noise and slow push, for an epoch of training to be taken.
+
+    The defaults are a fifth below 0.2 deg of heading, 1 deg of rudder, 0.15 deg of overshoot, and
+    0.6 deg that one flight in twenty may exceed, since other flights judge the policy than those
+    that choose the epoch.
+
+    Attributes:
+        heading_swing: largest movement of the heading in rad, peak to peak, once a change is long
+            over: from ten sevenths of the conditions' duration on, 20 s with 14 s.
+        rudder_swing: largest movement of the rudder command in rad then, peak to peak.
+        overshoot: largest overshoot in rad of the nominal vessel without delay and bias, over
+            changes of heading of all sizes.
+        overshoot_p95: overshoot in rad that one flight in twenty may exceed under the conditions,
+            noise and slow push included.
+        flights: under the conditions that are looked at for swinging; half of them at corners of
+            the spread.
+    """
+
+    heading_swing: Radians = Field(default=0.002792526803190927, gt=0)
+    rudder_swing: Radians = Field(default=0.013962634015954637, gt=0)
+    overshoot: Radians = Field(default=0.0020943951023931953, gt=0)
+    overshoot_p95: Radians = Field(default=0.008377580409572781, gt=0)
+    flights: int = Field(default=256, ge=2, le=1_000_000)
+
+
+@final
+class SteadyTest:
+    """Counts flights without noise that a policy should not make; no training sees them.
+
+    Args:
+        limits: of swing and overshoot.
+        conditions: with noise, those of the training.
+        seed: of the flights.
+
+    Attributes:
+        flights: number of all, those of the nominal vessel included.
+    """
+
+    def __init__(self, limits: SteadinessLimits, conditions: ConditionsConfig, seed: int) -> None:
+        self.limits, self.after = limits, quiet_after(conditions.duration)
+        self.conditions = quiet(conditions)
+        random = torch.Generator().manual_seed(seed)
+        drawn = self.conditions.draw(limits.flights + _NOMINAL, conditions.dt, random)
+        # a loop swings first where delay, K and T are at their bounds, which few draws come near
+        drawn = self.conditions.at_corners(drawn, limits.flights // 2, random)
+        heading = drawn.heading.clone()
+        sides = torch.tensor([1.0, -1.0]).repeat(_NOMINAL // 2)
+        heading[limits.flights :] = sides * torch.linspace(*conditions.heading, _NOMINAL)
+        self.changes = nominal(replace(drawn, heading=heading), limits.flights, _NOMINAL)
+        self.flights = limits.flights + _NOMINAL
+
+    def refused(self, run: ConditionedRun) -> int:
+        """Return how many flights swing, or overshoot on the nominal vessel."""
+        flown = run.fly(self.changes)
+        heading, rudder = flown.swing(self.after)
+        limits, last = self.limits, self.limits.flights
+        over = flown.measured(self.conditions)["overshoot"]
+        # what is no number is not within its limit
+        steady = (heading <= limits.heading_swing) & (rudder <= limits.rudder_swing)
+        steady[last:] &= over[last:] <= limits.overshoot
+        return int((~steady).sum())
+
+
+def too_many(overshoot: Tensor, limit: float) -> int:
+    """Return how many flights more than one in twenty overshoot by more than a limit.
+
+    Args:
+        overshoot: of flights under the conditions in rad, [N]; what is no number is beyond.
+        limit: in rad.
+    """
+    beyond = int((~(overshoot <= limit)).sum())
+    return max(beyond - len(overshoot) // 20, 0)
+
+
+def nominal(changes: HeadingChanges, first: int, rows: int) -> HeadingChanges:
+    """Return changes of which some rows fly the nominal vessel in calm water, without delay."""
+
+    def with_rows(values: Tensor, new: Tensor | float) -> Tensor:
+        values = values.clone()
+        values[first : first + rows] = new
+        return values
+
+    return replace(
+        changes,
+        variation=with_rows(changes.variation, torch.tensor([1.0, 1.0, 0.0])),
+        delay=with_rows(changes.delay, 0.0),
+        weather={name: with_rows(values, 0.0) for name, values in changes.weather.items()},
+    )
