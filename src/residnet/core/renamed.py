@@ -8,7 +8,22 @@ from __future__ import annotations
 
 from fnmatch import fnmatchcase
 
-RENAMED: dict[str, str] = {}
+RENAMED: dict[str, str] = {
+    "recurrent": "policies",
+    "policies.*.hidden": "units",
+    "policies.*.observer": "start",
+    "policies.*.imitate": "start",
+    "policies.*.training.horizon": "duration",
+    "policies.*.training.margin": "steady.overshoot",
+    "policies.*.training.overshoot": "exact",
+    "policies.*.training.sharp": "conditions.stated.band",
+    "policies.*.training.slowest": "conditions.stated.time",
+    "policies.*.training.smoothness": "calm",
+    "spread": "conditions.stated",
+    "test.bias_error": "conditions.stated",
+    "test.overshoot": "conditions.stated.overshoot_weight",
+    "tuning_points": "conditions.evolution",
+}
 """For example `"free_run.lead": "warmup"`, `"baseline.kind=fossen": "hull"`."""
 
 
