@@ -75,8 +75,6 @@ def fly(
 
 def eager(folder: Path, card: dict[str, Any]) -> Any:
     """The policy without compilation: the same operations, called one by one from Python."""
-    from residnet.control.heading.stored import load_heading_policy
-
     from residnet.control.heading.controllers import (
         NetworkPolicySpec,
         ObservedPolicySpec,
@@ -84,13 +82,9 @@ def eager(folder: Path, card: dict[str, Any]) -> Any:
     )
     from residnet.export.policy import for_export
 
-    recurrent = {"observed": ObservedPolicySpec, "network": NetworkPolicySpec}
-    if card["kind"] in recurrent:
-        policy = load_recurrent(folder, recurrent[card["kind"]])
-        policy.at(card["dt"])
-    else:
-        policy = load_heading_policy(folder)
-        policy.dt = card["dt"]
+    kinds = {"observed": ObservedPolicySpec, "network": NetworkPolicySpec}
+    policy = load_recurrent(folder, kinds[card["kind"]])
+    policy.at(card["dt"])
     return for_export(policy, "hold" if "held" in card["fault"] else "amidships")
 
 
