@@ -17,28 +17,24 @@ from residnet.report.blocks import (
     Cell,
     Code,
     Facts,
-    Row,
     Section,
     Table,
     Text,
+    bad_where,
+    table_of,
 )
 from residnet.report.figure import Case, Figure, Look, Panel
+from residnet.report.format import number
 from residnet.report.page import write_page
 
 
 def table() -> Table:
-    return Table(
-        ["controller", "settling [s]", "remark"],
-        [
-            [
-                "proportional_and_derivative",
-                Cell("12.5", "best of 5"),
-                Cell("tuned at the corners", mark="text"),
-            ],
-            Row("net", [Cell("10.1", mark="best"), Cell("learned", mark="text")], selected=True),
-        ],
-        "Changes of 10 deg.",
-    )
+    out = Table(["controller", "settling [s]", "remark"], "Changes of 10 deg.")
+    remark = Cell("tuned at the corners", mark="text")
+    out.add("proportional_and_derivative", [Cell("12.5", "best of 5"), remark])
+    cells = [Cell("10.1", mark="best"), Cell("learned", mark="text")]
+    out.add("net", cells, selected=True)
+    return out
 
 
 def every_block(folder: Path) -> list[Section]:
@@ -117,11 +113,8 @@ def test_a_table_for_the_terminal_has_its_columns_below_each_other() -> None:
         "proportional_and_derivative  12.5 (best of 5)  tuned at the corners",
         "net                                      10.1  learned",
     ]
-    grouped = Table(
-        ["model", "train", "test"],
-        [["plsr", "1", Cell("2", mark="bad")]],
-        groups=[("surge u [m/s]", 2)],
-    )
+    grouped = Table(["model", "train", "test"], groups=[("surge u [m/s]", 2)])
+    grouped.add("plsr", ["1", Cell("2", mark="bad")])
     assert grouped.text().splitlines() == [
         "       surge u [m/s]",
         "model    train  test",
@@ -129,9 +122,56 @@ def test_a_table_for_the_terminal_has_its_columns_below_each_other() -> None:
     ]
 
 
+def test_a_table_is_columns_of_what_rows_hold() -> None:
+    rows = [
+        {"model": "net", "time": {"mean": 1.25}, "rms": 0.5, "kind": "policy"},
+        {"model": "pd", "time": {}, "rms": None, "kind": "law"},
+        {"model": "lqr", "time": {"mean": 2.0}, "rms": 1.0, "kind": "law"},
+    ]
+    made = table_of(
+        rows,
+        [
+            ("controller", "model"),
+            ("kind", "kind"),
+            ("time [s]", "time.mean", 2),
+            ("rms [deg]", "rms", number, 10.0),
+            ("twice", lambda row: bad_where(row["model"] * 2, row["model"] == "pd")),
+        ],
+        selected=lambda row: row["kind"] == "policy",
+        rule=lambda row: row["kind"],
+    )
+    assert [[row.label, *(cell.text for cell in row.cells)] for row in made.rows] == [
+        ["net", "policy", "1.25", "5.00", "netnet"],
+        ["pd", "law", "–", "–", "pdpd"],
+        ["lqr", "law", "2.00", "10.0", "lqrlqr"],
+    ]
+    assert [(row.rule, row.selected) for row in made.rows] == [
+        (True, True),
+        (True, False),
+        (False, False),
+    ]
+    assert made.aligned_left == [True, True, False, False, False]
+    assert made.rows[1].cells[-1].mark == "bad"
+
+
+def test_a_wide_table_stands_in_pieces_that_fit_a_sheet() -> None:
+    wide = Table(["model", *"abcdef"], "Told.", [(f"group {k}", 2) for k in range(3)])
+    wide.add("net", ["1234567890" * 2] * 6)
+    pieces = wide.pieces
+    assert [piece.columns for piece in pieces] == [
+        ["model", *"abcd"],
+        ["model", *"ef"],
+    ]
+    assert [piece.groups for piece in pieces] == [
+        [("group 0", 2), ("group 1", 2)],
+        [("group 2", 2)],
+    ]
+    assert [piece.caption for piece in pieces] == ["Told.", ""]
+
+
 def test_a_row_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match="row 'net': 1 cells for 2 columns"):
-        Table(["model", "u", "v"], [["net", "1"]])
+        Table(["model", "u", "v"]).add("net", ["1"])
 
 
 def test_words_of_the_field_are_linked_once_a_section_to_what_they_mean(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from typing import Any, ClassVar, Literal, Protocol, TypeAlias
 
@@ -129,34 +129,21 @@ class Table:
     kind: ClassVar[str] = "table"
 
     def __init__(
-        self,
-        columns: Sequence[str],
-        rows: Iterable[Row | Sequence[Cell | str]] = (),
-        caption: str = "",
-        groups: Sequence[tuple[str, int]] = (),
+        self, columns: Sequence[str], caption: str = "", groups: Sequence[tuple[str, int]] = ()
     ) -> None:
-        """Make a table; more rows can be added with `add`.
+        """Make a table without rows.
 
         Args:
             columns: titles with units, the first above the row labels.
-            rows: each a `Row`, or its label and cells in one sequence.
             caption: a sentence above the table.
             groups: titles that span several columns after the first, with how many they span.
         """
-        self.columns = list(columns)
-        self.caption = caption
-        self.groups = list(groups)
-        spanned = sum(count for _, count in self.groups)
-        if self.groups and spanned < len(self.columns) - 1:
+        self.columns, self.caption, self.groups = list(columns), caption, list(groups)
+        left = len(self.columns) - 1 - sum(count for _, count in self.groups)
+        if self.groups and left:
             # the line of groups is as long as that of columns
-            self.groups.append(("", len(self.columns) - 1 - spanned))
+            self.groups.append(("", left))
         self.rows: list[Row] = []
-        for row in rows:
-            if isinstance(row, Row):
-                self.rows.append(row)
-            else:
-                label, *cells = row
-                self.add(label.text if isinstance(label, Cell) else label, cells)
 
     def add(
         self,
@@ -177,11 +164,9 @@ class Table:
     @property
     def aligned_left(self) -> list[bool]:
         """Return for each column whether it holds words rather than numbers."""
-        left = [True]
-        for column in range(len(self.columns) - 1):
-            marks = [row.cells[column].mark for row in self.rows]
-            left.append(bool(marks) and all(mark == "text" for mark in marks))
-        return left
+        marks = zip(*([cell.mark for cell in row.cells] for row in self.rows), strict=True)
+        words = [all(mark == "text" for mark in column) for column in marks]
+        return [True, *(words or [False] * (len(self.columns) - 1))]
 
     @property
     def pieces(self) -> list[Table]:
@@ -189,62 +174,52 @@ class Table:
 
         Each piece has the labels of the rows; columns of one group stay together where they fit.
         """
-        widths = [_narrowest(texts) for texts in self._texts()]
-        spans = [count for _, count in self.groups] or [1] * (len(self.columns) - 1)
-        stretches: list[list[int]] = [[0, 0]]
-        for start, count in zip(accumulate([0, *spans]), spans, strict=False):
+        lines = [self.columns]
+        lines += [[row.label, *(f"{c.text} {c.note}" for c in row.cells)] for row in self.rows]
+        # names break after underscores and slashes
+        words = [re.split(r"[\s_/]", " ".join(column)) for column in zip(*lines, strict=True)]
+        widths = [_PADDING + _LETTER * max(map(len, column)) for column in words]
+        ends = [*accumulate(count for _, count in self.groups)] or [*range(1, len(self.columns))]
+        stretches, at = [[0, 0]], 0
+        for end in ends:
             first = stretches[-1][0]
-            if first < start and sum(widths[1 + first : 1 + start + count]) + widths[0] > _SHEET:
-                stretches.append([start, start])
-            stretches[-1][1] = start + count
-        if len(stretches) == 1:
+            if first < at and widths[0] + sum(widths[1 + first : 1 + end]) > _SHEET:
+                stretches.append([at, at])
+            stretches[-1][1] = at = end
+        if len(stretches) < 2:
             return [self]
-        return [self._piece(first, last) for first, last in stretches]
-
-    def _texts(self) -> list[list[str]]:
-        """Return for each column all texts in it, its title first."""
-        found = [[self.columns[0], *(row.label for row in self.rows)]]
-        for column, title in enumerate(self.columns[1:]):
-            cells = [row.cells[column] for row in self.rows]
-            found.append([title, *(cell.text for cell in cells), *(cell.note for cell in cells)])
-        return found
-
-    def _piece(self, first: int, last: int) -> Table:
-        """Return the columns from one to before another, the labels' column aside."""
-        groups, at = [], 0
-        for title, count in self.groups:
-            groups += [(title, count)] if first <= at < last else []
-            at += count
-        rows = [Row(row.label, row.cells[first:last], row.rule, row.selected) for row in self.rows]
-        caption = "" if first else self.caption
-        columns = [self.columns[0], *self.columns[1 + first : 1 + last]]
-        return Table(columns, rows, caption, groups)
+        out = []
+        for first, last in stretches:
+            groups = [
+                group for group, end in zip(self.groups, ends, strict=False) if first < end <= last
+            ]
+            piece = Table([self.columns[0], *self.columns[1 + first : 1 + last]], "", groups)
+            piece.caption = "" if out else self.caption
+            piece.rows = [replace(row, cells=row.cells[first:last]) for row in self.rows]
+            out.append(piece)
+        return out
 
     def text(self) -> str:
         """Return the table for a terminal: columns aligned, notes in brackets, groups above."""
         lines = [self.columns]
         lines += [[row.label, *(_plain(cell) for cell in row.cells)] for row in self.rows]
-        widths = [max(len(line[k]) for line in lines) for k in range(len(self.columns))]
-        start = 1
-        spans: list[tuple[str, int]] = []
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        spans, start = [" " * widths[0]], 1
         for title, count in self.groups:
             # a group is as wide as its columns and the gaps between them
-            wanted = len(title) - (sum(widths[start : start + count]) + 2 * (count - 1))
-            widths[start] += max(wanted, 0)
-            spans.append((title, sum(widths[start : start + count]) + 2 * (count - 1)))
+            width = sum(widths[start : start + count]) + 2 * (count - 1)
+            widths[start] += max(len(title) - width, 0)
+            spans.append(f"{title:^{width}}")
             start += count
-        left = self.aligned_left
         out = [self.caption] if self.caption else []
-        if spans:
-            out.append(
-                "  ".join([" " * widths[0], *(f"{title:^{width}}" for title, width in spans)])
+        out += ["  ".join(spans)] if self.groups else []
+        out += [
+            "  ".join(
+                f"{text:<{width}}" if left else f"{text:>{width}}"
+                for text, width, left in zip(line, widths, self.aligned_left, strict=True)
             )
-        for line in lines:
-            parts = [
-                f"{text:<{width}}" if to_left else f"{text:>{width}}"
-                for text, width, to_left in zip(line, widths, left, strict=True)
-            ]
-            out.append("  ".join(parts))
+            for line in lines
+        ]
         return "\n".join(line.rstrip() for line in out)
 
 
@@ -327,13 +302,6 @@ def nested(keys: Iterable[str], columns: Sequence[Column]) -> list[Column]:
 def bad_where(text: object, bad: object) -> Cell:
     """Return a cell that is set off where something is wrong."""
     return Cell(str(text), mark="bad" if bad else "")
-
-
-def _narrowest(texts: Iterable[str]) -> float:
-    """Return the width in pixels that the longest word of a column takes in print."""
-    # names break after underscores and slashes
-    words = [word for text in texts for word in re.split(r"[\s_/]", text)]
-    return _PADDING + _LETTER * max(map(len, words), default=0)
 
 
 def _plain(cell: Cell) -> str:

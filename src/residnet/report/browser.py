@@ -25,6 +25,8 @@ HEIGHT = "height of a cell"
 """Name of the column of a surface's heights; of their logarithms on a page where they are so."""
 _DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
 _MARKERS = {"o": "circle", "s": "square", "x": "x", "^": "triangle"}
+_TOLD = ("line", "points", "cells")
+"""Kinds of marks whose values stand beside the pointer."""
 _MOST_PANELS = 60
 """Most panels of the figures of one page, which a browser has to draw."""
 
@@ -84,24 +86,19 @@ def draw(figures: Sequence[Figure]) -> Drawn | None:
 
 def _panels(figure: Figure) -> list[Canvas]:
     """Return the panels; those of curves share their horizontal axis and a cursor."""
-    from bokeh.models import ColumnDataSource, CrosshairTool
-    from bokeh.models.annotations import Span
+    from bokeh import models
 
     groups: dict[str, Any] = {}
-    cursor = Span(dimension="height", line_dash="dotted", line_width=1)
+    cursor = models.Span(dimension="height", line_dash="dotted", line_width=1)
     out = []
     for number, panel in enumerate(figure.panels):
         # the page's own script fills in the first case: its values are there once
-        source = ColumnDataSource({name: [] for name in _columns(figure, figure.cases[0], number)})
-        own = panel.kind != "curves"
-        shared = (
-            _range(panel.x_limits)
-            if own
-            else groups.setdefault(panel.group, _range(panel.x_limits))
-        )
-        canvas = _canvas(figure, number, shared, source)
-        if not own:
-            canvas.add_tools(CrosshairTool(dimensions="height", overlay=cursor))
+        columns = {name: [] for name in _columns(figure, figure.cases[0], number)}
+        group = panel.group if panel.kind == "curves" else f"{number} alone"
+        shared = groups.setdefault(group, _range(panel.x_limits))
+        canvas = _canvas(figure, number, shared, models.ColumnDataSource(columns))
+        if panel.kind == "curves":
+            canvas.add_tools(models.CrosshairTool(dimensions="height", overlay=cursor))
         out.append(canvas)
     return out
 
@@ -114,14 +111,13 @@ def _range(limits: Sequence[float]) -> Any:
 
 
 def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource) -> Canvas:
-    from bokeh.models import BasicTicker, BoxZoomTool, FixedTicker, HoverTool, NoOverlap
-    from bokeh.models.annotations import Title
+    from bokeh import models
     from bokeh.plotting import figure as new_canvas
 
     panel, surface = figure.panels[number], figure.surface
     canvas = new_canvas(
         name=f"{figure.key}-{number}",
-        title=Title(text=panel.words, text_font_size=_FONT),
+        title=models.Title(text=panel.words, text_font_size=_FONT),
         height=380 if panel.kind == "map" else panel.height,
         sizing_mode="stretch_width",
         toolbar_location=None,
@@ -140,16 +136,24 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
     canvas.stylesheets = [":host .bk-events { touch-action: pan-y pinch-zoom; }"]
     over = [_mark(figure, name, source, panel.kind == "surface") for name in figure.names(number)]
     canvas.renderers.extend(over)
-    if panel.kind == "surface" and surface is not None:
-        canvas.add_layout(_colors(surface.log, over), "right")
-        canvas.yaxis.axis_label = panel.y_label or None
     # where places bear names, the name alone says what a mark is
     told = panel.kind == "curves" and not panel.y_names
     tips: Any = [("$name", "@$name{0.000 a}")] if told else [("", "$name")]
     if panel.kind == "surface" and surface is not None:
+        colors = next(one for one in over if one.name == "surface").glyph.fill_color.transform
+        bar = models.ColorBar(
+            color_mapper=colors,
+            ticker=models.LogTicker(mantissas=[1, 3]) if surface.log else models.BasicTicker(),
+            width=12,
+            padding=4,
+            background_fill_color=None,
+            major_label_text_font_size=_FONT,
+        )
+        canvas.add_layout(bar, "right")
+        canvas.yaxis.axis_label = panel.y_label or None
         height = f"@{{{HEIGHT}}}{{0.000 a}}"
         tips = [(panel.x_label, "$x{0}"), (panel.y_label, "$y{0}"), (surface.height, height)]
-    hover = HoverTool(
+    hover = models.HoverTool(
         renderers=[
             one for one in over if figure.looks[one.name].kind in ("line", "points", "cells")
         ],
@@ -157,44 +161,29 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
         tooltips=tips,
         point_policy="follow_mouse",
     )
-    canvas.add_tools(hover, BoxZoomTool(match_aspect=panel.kind == "map"))
+    canvas.add_tools(hover, models.BoxZoomTool(match_aspect=panel.kind == "map"))
     canvas.toolbar.active_drag = None
     canvas.xaxis.axis_label = panel.x_label or None
-    for axis in canvas.axis:
-        axis.major_label_text_font_size = _FONT
-        axis.axis_label_text_font_size = _FONT
-        axis.axis_label_text_font_style = "normal"
     for axis, names, log, count in (
-        (canvas.yaxis, panel.y_names, panel.y_log, 4),
-        (canvas.xaxis, panel.x_names, panel.x_log, 5),
+        (canvas.yaxis[0], panel.y_names, panel.y_log, 4),
+        (canvas.xaxis[0], panel.x_names, panel.x_log, 5),
     ):
+        axis.update(
+            major_label_text_font_size=_FONT,
+            axis_label_text_font_size=_FONT,
+            axis_label_text_font_style="normal",
+        )
         if names:
-            axis.ticker = FixedTicker(ticks=[float(place) for place in names])
+            axis.ticker = models.FixedTicker(ticks=[float(place) for place in names])
             axis.major_label_overrides = {float(place): text for place, text in names.items()}
         elif not log:
-            axis.ticker = BasicTicker(desired_num_ticks=count)
+            step = 1.0 if count == 5 and figure.counts(number) else 0.0
+            axis.ticker = models.BasicTicker(desired_num_ticks=count, min_interval=step)
     if panel.x_names and max(map(len, panel.x_names.values())) > 4:
         # long names stand upright, and on a phone those that have room
-        canvas.xaxis.major_label_orientation = "vertical"
-        canvas.xaxis.major_label_policy = NoOverlap(min_distance=2)
-    if not panel.x_names and not panel.x_log and figure.counts(number):
-        canvas.xaxis.ticker = BasicTicker(desired_num_ticks=5, min_interval=1.0)
+        policy = models.NoOverlap(min_distance=2)
+        canvas.xaxis[0].update(major_label_orientation="vertical", major_label_policy=policy)
     return canvas
-
-
-def _colors(log: bool, over: Sequence[Any]) -> Any:
-    """Return the bar that tells what the colours of a surface mean."""
-    from bokeh.models import BasicTicker, LogTicker
-    from bokeh.models.annotations import ColorBar
-
-    return ColorBar(
-        color_mapper=next(one for one in over if one.name == "surface").glyph.fill_color.transform,
-        ticker=LogTicker(mantissas=[1, 3]) if log else BasicTicker(),
-        width=12,
-        padding=4,
-        background_fill_color=None,
-        major_label_text_font_size=_FONT,
-    )
 
 
 def _mark(figure: Figure, name: str, source: ColumnDataSource, on_cells: bool) -> Any:

@@ -326,9 +326,10 @@ def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
 
     Other pictures of the folder stay.
     """
-    for figure in read_figures(folder):
-        for path in (*figure.stills, folder / f"{figure.stills[0].stem}.json"):
-            path.unlink(missing_ok=True)
+    for path in folder.glob("*.json"):
+        before = _read(path)
+        for file in (path, *before.stills) if before else ():
+            file.unlink(missing_ok=True)
     # the number keeps the order for whoever lists the folder
     return [
         write_figure(folder, one, f"{i:02d}_{one.name}") for i, one in enumerate(figures, start=1)
@@ -419,16 +420,12 @@ def _light(x: np.ndarray, y: np.ndarray) -> Curve:
 
 def band(x: Any, low: Any, high: Any) -> Curve:
     """Return the outline of what lies between two curves [T] over x [T], a `fill`."""
-    pieces = zip(
-        parts(x, np.add(low, 0.0 * np.asarray(high))),
-        parts(x, np.add(high, 0.0 * np.asarray(low))),
-        strict=True,
-    )
+    low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    good = np.isfinite(low) & np.isfinite(high)
+    x = np.asarray(x, dtype=float)
     return joined(
-        [
-            (np.append(a, a[::-1]), np.append(lower, upper[::-1]))
-            for (a, lower), (_, upper) in pieces
-        ]
+        (np.append(x[a:b], x[a:b][::-1]), np.append(low[a:b], high[a:b][::-1]))
+        for a, b in zip(*stretches(good), strict=True)
     )
 
 

@@ -107,12 +107,15 @@ def still(figure: Figure, cases: Sequence[Case] = (), only: Sequence[int] = ()) 
         if figure.surface:
             _colors(canvas, figure)
         canvas.align_ylabels()
-        _legend_above(canvas, handles)
+        labels = dict.fromkeys(look.label for look in figure.looks.values())
+        _legend_above(canvas, {label: handles[label] for label in labels if label in handles})
         canvas.canvas.draw()
     return canvas
 
 
 def _draw(axes: Any, figure: Figure, case: Case, number: int, handles: dict[str, Any]) -> None:
+    from matplotlib.ticker import LogFormatter
+
     panel = figure.panels[number]
     for name in figure.names(number):
         look = figure.looks[name]
@@ -137,7 +140,9 @@ def _draw(axes: Any, figure: Figure, case: Case, number: int, handles: dict[str,
     ):
         if log:
             getattr(axes, f"set_{direction}scale")("log")
-            _plain_log(axes, direction, limits)
+            axis = axes.xaxis if direction == "x" else axes.yaxis
+            axis.set_major_formatter(LogFormatter())
+            axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.6)))
         if names:
             ticks = (
                 {"rotation": 60, "ha": "right", "fontsize": 7}
@@ -213,21 +218,6 @@ def _colors(canvas: Any, figure: Figure) -> None:
     bar = canvas.colorbar(meshes[0], ax=canvas.axes)
     bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     bar.set_label(figure.surface.height if figure.surface else "")
-
-
-def _plain_log(axes: Any, direction: str, limits: Sequence[float]) -> None:
-    """Write the numbers of a logarithmic axis out, as many as have room."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    low, high = limits or getattr(axes, f"get_{direction}lim")()
-    decades = np.log10(high / low)
-    if decades > 6:
-        return
-    subs = (1.0,) if decades > 2.5 else (1.0, 3.0) if decades > 1.5 else (1.0, 2.0, 5.0)
-    axis = axes.xaxis if direction == "x" else axes.yaxis
-    axis.set_major_locator(LogLocator(subs=subs))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:

@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from residnet.core.errors import ConfigError
 from residnet.core.names import CHANNEL_UNITS
 from residnet.judge.verdict.sentences import diverged_note
 from residnet.physics.terms import parse_term
-from residnet.report.blocks import Block, Cell, Code, Mark, Section, Table, Text, table_of
-from residnet.report.figure import BLUE, VERMILLION, Case, Curve, Figure, Look, Panel, family
+from residnet.report.blocks import (
+    Block,
+    Cell,
+    Code,
+    Column,
+    Mark,
+    Section,
+    Table,
+    Text,
+    nested,
+    table_of,
+)
+from residnet.report.figure import BLUE, Case, Curve, Figure, Look, Panel, family
 from residnet.report.format import DASH, DEG, interval, number
 from residnet.report.format import whole as whole_number
 from residnet.report.run_reader import Content, RunFiles
@@ -26,6 +40,8 @@ _NAMED = 8
 """Most names given of a list."""
 _TERMS = 6
 """Most terms drawn for themselves in a panel, the largest ones; of the others the sum is drawn."""
+_PARTS = ("train", "validation")
+_RING = Look("", kind="points", size=7, hollow=True, order=5)
 _WHITE = 0.05
 """Least p-value at which residuals pass for white noise."""
 
@@ -93,38 +109,28 @@ def said_of_refit(model: str) -> str:
     )
 
 
-def log_offsets(entries: list[Content]) -> Table:
+def log_offsets(entries: Sequence[Content]) -> Table:
     """Return the constant accelerations that a refit found for each training log."""
-    axes = {entry["axis"]: float(entry["spread"]) for entry in entries}
-    speed = number(float(entries[0]["speed"]), 2)
-    logs: dict[str, list[Content]] = {}
+    axes = {entry["axis"]: number(float(entry["spread"]), 2) for entry in entries}
+    logs: dict[str, dict[str, Any]] = {}
     for entry in entries:
-        logs.setdefault(entry["log"], []).append(entry)
+        logs.setdefault(entry["log"], {"log": entry["log"]})[entry["axis"]] = entry
+    columns: list[Column] = [
+        ("value", lambda entry: _weak(entry, number(float(entry["value"]), 2))),
+        ("standard error", lambda entry: number(float(entry["standard_error"]), 2), str),
+    ]
+    at = f"at {number(float(entries[0]['speed']), 2)} m/s"
+    groups = [
+        (f"{axis.replace('_dot', '')}′ [{term_unit(axis, '1')}], spread {spread}, {at}", 2)
+        for axis, spread in axes.items()
+    ]
+    return table_of(logs.values(), [("log", "log"), *nested(axes, columns)], groups=groups)
 
-    def cells(row: tuple[str, list[Content]], place: int) -> Cell:
-        value, error = (float(row[1][place // 2][key]) for key in ("value", "standard_error"))
-        weak = place % 2 == 0 and abs(value) < 2 * error
-        return Cell(number((value, error)[place % 2], 2), mark="weak" if weak else "")
 
-    return table_of(
-        logs.items(),
-        [
-            ("log", lambda row: row[0]),
-            *(
-                (title, lambda row, place=2 * k + i: cells(row, place))
-                for k in range(len(axes))
-                for i, title in enumerate(("value", "standard error"))
-            ),
-        ],
-        groups=[
-            (
-                f"{axis.replace('_dot', '')}′ [{term_unit(axis, '1')}], spread"
-                f" {number(spread, 2)}, at {speed} m/s",
-                2,
-            )
-            for axis, spread in axes.items()
-        ],
-    )
+def _weak(entry: Content, text: str) -> Cell:
+    """Return a cell that is grey where a value cannot be told from zero."""
+    weak = abs(float(entry["value"])) < 2 * float(entry["standard_error"])
+    return Cell(text, mark="weak" if weak else "")
 
 
 def _coefficients(notes: Content, digits: int, *, weak_is_grey: bool) -> Table:
@@ -142,8 +148,8 @@ def _coefficients(notes: Content, digits: int, *, weak_is_grey: bool) -> Table:
         value, error = abs(float(entry["value"])), float(entry["standard_error"])
         if error <= 0 or (not weak_is_grey and error <= 1e-9 * value):
             return Cell(DASH if weak_is_grey else "exact")
-        weak = weak_is_grey and value < 2 * error
-        return Cell(number(value / error, 2), mark="weak" if weak else "")
+        text = number(value / error, 2)
+        return _weak(entry, text) if weak_is_grey else Cell(text)
 
     return table_of(
         notes["coefficients"],
@@ -328,38 +334,30 @@ def _some(names: list[str]) -> str:
 def terms(run: RunFiles) -> Iterator[Figure]:
     """Draw the equation of every model along a log, term by term (document 000, 6.4.2)."""
     frame = run.frame("terms.parquet")
-    if frame is None:
-        return
-    for model, rows in frame.groupby("model", sort=False):
+    for model, rows in [] if frame is None else frame.groupby("model", sort=False):
         curves: list[dict[str, Curve]] = []
-        looks: dict[str, Look] = {"target": Look("target", "#BFBFBF", width=2.2)}
         for axis in _AXES:
             of_axis = rows[rows["axis"] == axis]
-            factor = DEG if axis == "r_dot" else 1.0
-            values = {
-                str(term): factor * np.asarray(part["value"])
-                for term, part in of_axis.groupby("term", sort=False)
-            }
-            time = np.asarray(of_axis["t"])[: len(values["target"])]
-            target = values.pop("target")
-            ordered = sorted(values, key=lambda term: -float(np.square(values[term]).mean()))
-            shown = {term: values[term] for term in ordered[:_TERMS]}
-            if ordered[_TERMS:]:
-                shown["smaller terms"] = np.sum([values[term] for term in ordered[_TERMS:]], axis=0)
-            shown["sum"] = np.sum([*values.values(), np.zeros_like(time)], axis=0)
-            curves.append(
-                {name: (time, line) for name, line in ({"target": target} | shown).items()}
-            )
+            wide = of_axis.pivot_table(index="t", columns="term", values="value", sort=False)
+            wide *= DEG if axis == "r_dot" else 1.0
+            time, target = wide.index.to_numpy(), wide.pop("target")
+            order = (wide**2).mean().sort_values(ascending=False, kind="stable").index
+            shown = {"target": target} | {str(term): wide[term] for term in order[:_TERMS]}
+            if len(order) > _TERMS:
+                shown["smaller terms"] = wide[order[_TERMS:]].sum(axis=1)
+            shown["sum"] = wide.sum(axis=1)
+            curves.append({name: (time, line.to_numpy()) for name, line in shown.items()})
         names = {name for panel in curves for name in panel} - {"target", "smaller terms", "sum"}
-        looks |= family(sorted(names), width=1.0)
         looks = {
-            name: replace(
-                look, label=look.label.replace("^2", "²").replace("^3", "³").replace("^4", "⁴")
-            )
-            for name, look in looks.items()
+            "target": Look("target", "#BFBFBF", width=2.2),
+            **family(sorted(names), width=1.0),
+            "smaller terms": Look("sum of smaller terms", "#7F7F7F", "dotted", 1.0),
+            "sum": Look("sum", width=0.8, order=4),
         }
-        looks["smaller terms"] = Look("sum of smaller terms", "#7F7F7F", "dotted", 1.0)
-        looks["sum"] = Look("sum", width=0.8, order=4)
+        raised = str.maketrans({"2": "²", "3": "³", "4": "⁴"})
+        for name, look in looks.items():
+            label = re.sub(r"\^([234])", lambda found: found[1].translate(raised), look.label)  # noqa: B023
+            looks[name] = replace(look, label=label)
         yield Figure(
             f"terms_{model}",
             f"Equation of {model}, term by term",
@@ -380,105 +378,82 @@ def terms(run: RunFiles) -> Iterator[Figure]:
 def breeding(run: RunFiles) -> Iterator[Figure]:
     """Draw the best error of each generation of every model that was bred (Figures 6.2, 6.3)."""
     for model in run.heads:
-        bred = {
-            axis: row
-            for axis, row in run.fit(model).get("equations", {}).items()
-            if "history" in row
-        }
-        if not bred:
-            continue
-        curves = []
-        for row in bred.values():
-            generations = np.arange(len(row["history"]))
-            panel: dict[str, Curve] = {
-                part: (generations, np.array([entry[part] for entry in row["history"]]))
-                for part in ("train", "validation")
-            }
-            best = row["generation"]
-            panel["kept"] = (np.array([best]), np.array([row["history"][best]["validation"]]))
-            curves.append(panel)
-        yield Figure(
-            f"breeding_{model}",
-            f"Search of {model}, generation by generation",
-            "Mean square error of the best individual over the target's mean square, on the samples"
-            " that breed and on those that validate. A ring marks the generation whose equation was"
-            " kept, the least validation error. A curve that still falls at its end asks for more"
-            " generations.",
-            {
-                "train": Look("train", BLUE),
-                "validation": Look("validation", VERMILLION),
-                "kept": Look("kept", kind="points", size=7, hollow=True, order=5),
-            },
-            [
-                Panel(
-                    "share of the mean square [-]" if place == 0 else "",
-                    "generation",
-                    _AXES.get(axis, axis).split(" ")[0],
-                    height=230,
-                    y_log=True,
-                    group=axis,
-                )
-                for place, axis in enumerate(bred)
-            ],
-            [Case("", curves)],
-            columns=len(bred),
-        )
+        equations = run.fit(model).get("equations", {})
+        curves, panels = [], []
+        for axis, row in ((axis, row) for axis, row in equations.items() if "history" in row):
+            errors = pd.DataFrame(row["history"])
+            kept = errors.iloc[[row["generation"]]]
+            curves.append(
+                {part: (errors.index.to_numpy(), errors[part].to_numpy()) for part in _PARTS}
+                | {"kept": (kept.index.to_numpy(), kept["validation"].to_numpy())}
+            )
+            label, title = "" if panels else "share of the mean square [-]", _AXES.get(axis, axis)
+            panels.append(
+                Panel(label, "generation", title.split(" ")[0], height=230, y_log=True, group=axis)
+            )
+        if panels:
+            yield Figure(
+                f"breeding_{model}",
+                f"Search of {model}, generation by generation",
+                "Mean square error of the best individual over the target's mean square, on the"
+                " samples that breed and on those that validate. A ring marks the generation whose"
+                " equation was kept, the least validation error. A curve that still falls at its"
+                " end asks for more generations.",
+                family(_PARTS) | {"kept": replace(_RING, label="kept")},
+                panels,
+                [Case("", curves)],
+                columns=len(panels),
+            )
 
 
 def learning(run: RunFiles) -> Figure | None:
     """Draw loss and free-run error on validation data by epoch, a case for each trained head."""
-    looks, cases = model_looks(run), []
-    marked = {
-        "loss": Look("training loss", BLUE),
-        "validation": Look("validation", BLUE),
-        "baseline": replace(looks[run.baseline], kind="across") if run.baseline else Look(""),
-        "best": Look("best epoch", kind="points", size=7, hollow=True, order=5),
-        "stage": Look("next stage", "#7F7F7F", width=0.8, kind="upright", order=1),
-    }
+    cases = []
     reference = run.row(run.baseline, "validation", run.protocols[0])
     for model in run.heads:
-        curve = run.fit(model).get("curve")
-        if not curve:
+        points = pd.DataFrame(run.fit(model).get("curve") or [])
+        if points.empty:
             continue
-        epoch, stage, loss, validation = np.array(
-            [
-                [point["epoch"] + 1, point.get("stage", 0)]
-                + [_or_nan(point.get(key)) for key in ("loss", "validation")]
-                for point in curve
-            ],
-            dtype=float,
-        ).T
-        finite = np.isfinite(validation)
+        points = points.reindex(columns=["epoch", "stage", "loss", "validation"])
+        epoch, stage, loss, validation = points.fillna({"stage": 0}).to_numpy(float).T
+        epoch += 1
         # each stage has a loss of its own
         gap = np.flatnonzero(np.diff(stage)) + 1
         upper: dict[str, Curve] = {
             "loss": (np.insert(epoch, gap, np.nan), np.insert(loss, gap, np.nan))
         }
-        lower: dict[str, Curve] = {"validation": (epoch[finite], validation[finite])}
+        known = np.isfinite(validation)
+        lower: dict[str, Curve] = {"validation": (epoch[known], validation[known])}
         if reference is not None:
             lower["baseline"] = (epoch[:1], np.array([reference["nrmse"]["mean"]]))
-        if finite.any():
-            best = int(np.nanargmin(validation))
-            lower["best"] = (epoch[best : best + 1], validation[best : best + 1])
+        if known.any():
+            best = [int(np.nanargmin(validation))]
+            lower["best"] = (epoch[best], validation[best])
         if len(gap):
             upper["stage"] = lower["stage"] = (epoch[gap] - 0.5, np.zeros(len(gap)))
         multi = ((run.resolved.get("training") or {}).get(model) or {}).get("multi_step") or []
-        texts = []
-        for k in np.unique(stage).astype(int):
-            known = f"{multi[k - 1]['horizon']:g} s" if 1 <= k <= len(multi) else f"stage {k}"
-            texts.append(
-                (0, float(epoch[stage == k].mean()), math.nan, "one-step" if k < 1 else known)
-            )
+        words = {k + 1: f"{one['horizon']:g} s" for k, one in enumerate(multi)} | {0: "one-step"}
+        texts = [
+            (0, float(epoch[stage == k].mean()), math.nan, words.get(int(k), f"stage {k:.0f}"))
+            for k in np.unique(stage)
+        ]
         cases.append(Case(short_label(run, model), [upper, lower], texts=texts))
     if not cases:
         return None
+    baseline = model_looks(run)[run.baseline] if run.baseline else Look("")
     return Figure(
         "learning",
         "Learning curves",
         "Each stage (one-step, then free runs of the stated length) has a loss of its own,"
         " so only the slopes count. The lower panels decide: the weights of the circled"
         " epoch are kept. A curve that still falls at its end asks for more epochs.",
-        marked,
+        {
+            "loss": Look("training loss", BLUE),
+            "validation": Look("validation", BLUE),
+            "baseline": replace(baseline, kind="across"),
+            "best": replace(_RING, label="best epoch"),
+            "stage": Look("next stage", "#7F7F7F", width=0.8, kind="upright", order=1),
+        },
         [
             Panel("training loss [-]", height=200, y_log=True),
             Panel("free-run error on\nvalidation, NRMSE [-]", "epoch", height=200),
@@ -486,10 +461,6 @@ def learning(run: RunFiles) -> Figure | None:
         cases,
         "Head",
     )
-
-
-def _or_nan(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
 
 
 def goodness(run: RunFiles) -> Section | None:
