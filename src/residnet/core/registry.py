@@ -288,10 +288,11 @@ def _object_fault(found: ThirdParty, base: type[Any]) -> str:
 
 
 def _no_subclass(part: Any, base: type[Any]) -> str:
+    abstract: frozenset[str] = getattr(part, "__abstractmethods__", frozenset())
     if not (inspect.isclass(part) and issubclass(part, base)):
         return f"its entry point is no subclass of {base.__module__}.{base.__name__}"
-    if inspect.isabstract(part):
-        return f"{part.__name__} lacks {', '.join(sorted(part.__abstractmethods__))}"
+    if abstract:
+        return f"{part.__name__} lacks {', '.join(sorted(abstract))}"
     return ""
 
 

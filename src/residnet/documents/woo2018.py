@@ -18,7 +18,7 @@ from residnet.core.errors import UsageError
 from residnet.core.files import whole
 from residnet.documents import published
 from residnet.documents.cells import beside_published
-from residnet.report.blocks import Section, Table, Text, table_of
+from residnet.report.blocks import Block, Section, Table, Text, table_of
 from residnet.report.figure import (
     BLUE,
     GREY,
@@ -95,8 +95,8 @@ def sections(files: RunFiles) -> list[Section]:
     with whole(files.path / "study.json") as file:
         content = {"schema": "residnet.woo2018/1", "changes": changes}
         file.write_text(json.dumps(content, indent=1) + "\n")
-    blocks = [about, steady_table(files), figures[0], _changes_table(changes), *figures[1:]]
-    return [Section("Document 003 (Woo et al. 2018)", blocks)]
+    blocks: list[Block] = [about, steady_table(files), figures[0], _changes_table(changes)]
+    return [Section("Document 003 (Woo et al. 2018)", [*blocks, *figures[1:]])]
 
 
 def changes_of_error(files: RunFiles, model: str) -> dict[str, float | None]:

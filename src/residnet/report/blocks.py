@@ -188,7 +188,7 @@ class Table:
             stretches[-1][1] = at = end
         if len(stretches) < 2:
             return [self]
-        out = []
+        out: list[Table] = []
         for first, last in stretches:
             groups = [
                 group for group, end in zip(self.groups, ends, strict=False) if first < end <= last

@@ -87,13 +87,14 @@ def draw(figures: Sequence[Figure]) -> Drawn | None:
 def _panels(figure: Figure) -> list[Canvas]:
     """Return the panels; those of curves share their horizontal axis and a cursor."""
     from bokeh import models
+    from bokeh.models.annotations import Span
 
     groups: dict[str, Any] = {}
-    cursor = models.Span(dimension="height", line_dash="dotted", line_width=1)
+    cursor = Span(dimension="height", line_dash="dotted", line_width=1)
     out = []
     for number, panel in enumerate(figure.panels):
         # the page's own script fills in the first case: its values are there once
-        columns = {name: [] for name in _columns(figure, figure.cases[0], number)}
+        columns: dict[str, Any] = {name: [] for name in _columns(figure, figure.cases[0], number)}
         group = panel.group if panel.kind == "curves" else f"{number} alone"
         shared = groups.setdefault(group, _range(panel.x_limits))
         canvas = _canvas(figure, number, shared, models.ColumnDataSource(columns))
@@ -112,12 +113,13 @@ def _range(limits: Sequence[float]) -> Any:
 
 def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource) -> Canvas:
     from bokeh import models
+    from bokeh.models.annotations import ColorBar, Title
     from bokeh.plotting import figure as new_canvas
 
     panel, surface = figure.panels[number], figure.surface
     canvas = new_canvas(
         name=f"{figure.key}-{number}",
-        title=models.Title(text=panel.words, text_font_size=_FONT),
+        title=Title(text=panel.words, text_font_size=_FONT),
         height=380 if panel.kind == "map" else panel.height,
         sizing_mode="stretch_width",
         toolbar_location=None,
@@ -141,7 +143,7 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
     tips: Any = [("$name", "@$name{0.000 a}")] if told else [("", "$name")]
     if panel.kind == "surface" and surface is not None:
         colors = next(one for one in over if one.name == "surface").glyph.fill_color.transform
-        bar = models.ColorBar(
+        bar = ColorBar(
             color_mapper=colors,
             ticker=models.LogTicker(mantissas=[1, 3]) if surface.log else models.BasicTicker(),
             width=12,

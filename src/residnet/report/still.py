@@ -157,11 +157,12 @@ def _draw(axes: Any, figure: Figure, case: Case, number: int, handles: dict[str,
             getattr(axes, f"set_{direction}lim")(*limits)
     if not panel.x_names and not panel.x_log and figure.counts(number):
         axes.xaxis.get_major_locator().set_params(integer=True)
-    for place, x, y, words in case.texts:
+    for place, at, level, words in case.texts:
         if place == number:
-            high = not np.isfinite(y)
+            high = not np.isfinite(level)
             axes.annotate(
-                words, (x, 1.0 if high else y), (0 if high else 3, 2), fontsize=7.5, color="0.25",
+                words, (at, 1.0 if high else level), (0 if high else 3, 2),
+                fontsize=7.5, color="0.25",
                 xycoords=("data", "axes fraction") if high else "data", textcoords="offset points",
                 ha="center" if high else "left",
             )  # fmt: skip

@@ -18,7 +18,7 @@ from residnet.physics.mass_spring_damper import MassSpringDamperConfig
 from residnet.regression.expressions import Algebra
 from residnet.regression.genetic import breed, limits_of, validating
 from residnet.regression.writing import term
-from residnet.report.blocks import Cell, Section, Table, Text, table_of
+from residnet.report.blocks import Block, Cell, Section, Table, Text, table_of
 from residnet.report.figure import COLORS, Case, Figure, Look, Panel, names_of, write_figure
 from residnet.report.format import DASH, number
 from residnet.runs.folder import RunFolder
@@ -297,7 +297,7 @@ class BreedingTaskConfig(Task):
             ("seed", lambda row: Cell(str(row[1]))),
             ("equation of the acceleration", lambda row: _equation(row[2])),
         ]
-        found = [about, _table(config, rows), *pictures(run.path, "study")]
+        found: list[Block] = [about, _table(config, rows), *pictures(run.path, "study")]
         every = [table_of(equations, columns)]
         return [Section("Equations found", found), Section("All equations", every, folded=True)]
 

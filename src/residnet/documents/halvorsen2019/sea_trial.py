@@ -47,7 +47,7 @@ from residnet.manoeuvres import AccelerationDeceleration, Helm, Manoeuvre, Zigza
 from residnet.physics.froude import PHASES, froude_number, phase_of
 from residnet.physics.odin import AccelerationHull, OdinConfig
 from residnet.physics.vessel import load_vessel
-from residnet.report.blocks import Bullets, Cell, Section, Table, Text, table_of
+from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text, table_of
 from residnet.report.figure import (
     BLUE,
     COLORS,
@@ -56,6 +56,7 @@ from residnet.report.figure import (
     SOLID,
     ZERO,
     Case,
+    Curve,
     Figure,
     Look,
     Panel,
@@ -510,7 +511,9 @@ def study(settings: SeaTrialTaskConfig, config: SeaTrialConfig) -> PhaseStudy:
         ResidnetError: where the trial cannot be sailed or a model is not determined.
     """
     trial = sail(config)
-    sets = {phase: trial.phase == place for place, phase in enumerate(PHASES)}
+    sets: dict[str, np.ndarray] = {
+        phase: trial.phase == place for place, phase in enumerate(PHASES)
+    }
     sets[ALL] = np.ones(len(trial.phase), dtype=bool)
     sets = {
         name: keep
@@ -518,7 +521,8 @@ def study(settings: SeaTrialTaskConfig, config: SeaTrialConfig) -> PhaseStudy:
         if min((keep & ~trial.validates).sum(), (keep & trial.validates).sum()) >= _LEAST_SAMPLES
     }
     z, a = trial.samples.z.numpy(), trial.samples.target.numpy()
-    standard, models = {}, {}
+    standard: dict[str, StandardFit] = {}
+    models: dict[tuple[str, str], Fitted] = {}
     for name, keep in sets.items():
         train = keep & ~trial.validates
         standard[name] = found = fit(
@@ -692,7 +696,8 @@ def _parameters_figure(name: str, study: PhaseStudy) -> Figure:
     shown = [i for i, name in enumerate(NAMES) if name not in undetermined]
     scale = np.array([PARAMETERS[NAMES[i]].scale for i in shown])
     known = np.array([study.truth[NAMES[i]] for i in shown])
-    looks, curves = {"zero": ZERO}, {"zero": (np.zeros(1), np.zeros(1))}
+    looks = {"zero": ZERO}
+    curves: dict[str, Curve] = {"zero": (np.zeros(1), np.zeros(1))}
     for place, (where, found) in enumerate(study.standard.items()):
         error, spread = (found.values[shown] - known) / scale, 2 * found.errors[shown] / scale
         at = np.arange(len(shown)) + 0.16 * (place - (len(study.standard) - 1) / 2)
@@ -804,7 +809,7 @@ def _section(settings: SeaTrialTaskConfig, name: str, run: RunFolder) -> Section
         table = _goodness(where, rows, *(of.get(where, {}) for of in printed))
         title = f"Validation, {SET_NAMES[where]}"
         blocks.append(Section(title, [table, *pictures(run.path, f"{where}_{name}")]))
-    parameters = [_parameters(trial), Bullets(_notes(trial))]
+    parameters: list[Block] = [_parameters(trial), Bullets(_notes(trial))]
     parameters += pictures(run.path, f"parameters_{name}")
     blocks.append(Section("Parameters of the standard model", parameters))
     if trial["equations"]:
@@ -857,7 +862,7 @@ def _goodness(
         return lambda row: beside_published(row[key], of_document(row, printed)[place], 3)
 
     def as_printed(row: Results) -> Cell:
-        ends = list(of_document(row, absolute)[1:])
+        ends: list[Any] = list(of_document(row, absolute)[1:])
         note = "" if ends[0] is None else f"published {interval(ends)}"
         return Cell(interval(row["mae_ci95_independent"]), note)
 

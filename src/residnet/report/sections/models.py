@@ -379,7 +379,8 @@ def breeding(run: RunFiles) -> Iterator[Figure]:
     """Draw the best error of each generation of every model that was bred (Figures 6.2, 6.3)."""
     for model in run.heads:
         equations = run.fit(model).get("equations", {})
-        curves, panels = [], []
+        curves: list[Any] = []
+        panels: list[Panel] = []
         for axis, row in ((axis, row) for axis, row in equations.items() if "history" in row):
             errors = pd.DataFrame(row["history"])
             kept = errors.iloc[[row["generation"]]]

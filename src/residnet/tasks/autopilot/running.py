@@ -6,7 +6,7 @@ import math
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pandas as pd
 import torch
@@ -142,7 +142,9 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
         _main_figures(config, rows),
         "\n\n".join(table.text() for table in tables),
         exports={
-            name: partial(_export, config, folder, name, controllers[name][1], rows)
+            name: partial(
+                _export, config, folder, name, cast("RecurrentPolicy", controllers[name][1]), rows
+            )
             for name in config.policies
         },
     )
@@ -157,7 +159,7 @@ def _complete(
         return peer, {"config": peer.model_dump(mode="json")}
     assert stated is not None
     if before := tuned_before(name, peer, config):
-        return before
+        return cast("tuple[AnyController, dict[str, Any]]", before)
     started = time.time()
     steering = steering._replace(vessel=_in_weather(config, stated))
     found = tune(peer, steering, stated.stated, stated.evolution, config.seed + 11, CompiledLoop)
@@ -277,7 +279,7 @@ def _compare(
         found = {key: value.numpy() for key, value in measure(tests["random"], test.band).items()}
         given = {"effect": spread[:, 0].numpy(), "time": spread[:, 1].numpy()}
         plants.append(pd.DataFrame({"controller": name, **given, **found}))
-        times = {"dt": test.dt, "duration": test.bias_time}
+        times: dict[str, Any] = {"dt": test.dt, "duration": test.bias_time}
         disturbed = {"bias": fly(vessel, policy, torch.full((2,), test.heading), pushed, **times)}
         if test.wind is not None:
             disturbed["wind"] = wind_flights(plant, policy, test.wind, test.heading, **times)
