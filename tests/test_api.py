@@ -17,8 +17,12 @@ from tiny import TINY, call
 from written_trials import CHANNELS, write_trials
 
 import residnet
+from residnet.core.config import validate
 from residnet.core.errors import ResidnetError
-from residnet.judge.tables import metrics_table
+from residnet.data.prepare import PrepareConfig
+from residnet.judge.metrics import metrics_table
+from residnet.judge.protocol import EvaluationConfig
+from residnet.physics.signals import SignalsConfig
 from residnet.runs.folder import RunFolder
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "fifteen_lines.py"
@@ -76,11 +80,23 @@ def test_defaults_come_from_the_logs(data: residnet.Data) -> None:
     assert data.prepare.grid.step == 0.1
     table = data.table
     assert dict(table["split"].value_counts()) == {"train": 6, "validation": 2, "test": 2}
-    usable = [log.y[log.usable, 3:6] for log in data.logs("validation")]
-    spread = np.concatenate(usable).std(axis=0)
-    np.testing.assert_allclose(data.evaluation.scales.array(), spread)
-    assert list(data.evaluation.protocols) == ["T30", "manoeuvre"]
-    assert data.evaluation.selection == "T30"
+    assert data.prepare.hold == "mean"
+    assert data.evaluation.selection == next(iter(data.evaluation.protocols))
+
+
+def test_logs_have_one_recipe_whoever_asks(trials: Path) -> None:
+    draft = residnet.draft(trials, folder=trials.parent)
+    logs = residnet.read_logs(trials, reader=draft.config["data"]["reader"])
+    data = residnet.prepare(logs)
+    fitted = residnet.fit(logs, "regressors", bands=None).settings
+    for key, kind in (
+        ("prepare", PrepareConfig),
+        ("signals", SignalsConfig),
+        ("evaluation", EvaluationConfig),
+    ):
+        drafted = validate(draft.config[key], kind, key)
+        assert getattr(data, key) == drafted, key
+        assert getattr(fitted, key) == drafted, key
 
 
 @pytest.mark.long

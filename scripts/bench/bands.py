@@ -25,11 +25,8 @@ from residnet.core.names import STATE
 from residnet.identification.bands import fold_numbers
 from residnet.identification.fit import fit
 from residnet.identification.prepared import prepare_logs
-from residnet.judge.bands.band import Band, covered, interval_score, worst
-from residnet.judge.bands.calibrate import calibrate
-from residnet.judge.bands.channels import CHANNELS
-from residnet.judge.bands.errors import RunErrors, run_errors
-from residnet.judge.bands.file import read_bands
+from residnet.judge.band import CHANNELS, Band, covered, interval_score, read_bands, worst
+from residnet.judge.bands import RunErrors, calibrate, run_errors
 from residnet.tasks.fit.config import FitTaskSettings
 from residnet.tasks.fit.inputs import take_logs
 from residnet.tasks.loading import load_task

@@ -16,7 +16,7 @@ import time
 import numpy as np
 from scipy.signal import lfilter
 
-from residnet.judge.residual_series import block_interval, independent_interval
+from residnet.judge.goodness import block_interval, independent_interval
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import itertools
 import numpy as np
 import pytest
 
-from residnet.judge.bootstrap import Blocks, blocks, difference, intervals, tail
+from residnet.judge.metrics import Blocks, blocks, difference, intervals, tail
 
 
 def test_a_block_is_a_log_from_five_logs_on() -> None:

@@ -13,8 +13,7 @@ from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
-from residnet.judge.limits import kinematics, limits
-from residnet.judge.metrics import nrmse_of_windows, window_errors
+from residnet.judge.metrics import kinematics, limits, nrmse_of_windows, window_errors
 from residnet.judge.protocol import Window
 from residnet.physics.signals import SignalsConfig
 

@@ -11,7 +11,7 @@ import pytest
 from made_series import autoregressive, coverage
 from scipy import stats
 
-from residnet.judge.residual_series import (
+from residnet.judge.goodness import (
     autocovariance,
     block_interval,
     independent_interval,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from residnet.judge.verdict.selection import (
+from residnet.judge.selection import (
     Blocks,
     Contender,
     Selection,

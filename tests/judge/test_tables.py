@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from residnet.judge.tables import metrics_content, metrics_table
+from residnet.judge.metrics import metrics_content, metrics_table
 
 
 def row(model: str, rmse: float) -> dict[str, Any]:

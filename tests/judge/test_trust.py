@@ -11,10 +11,9 @@ from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
-from residnet.judge.metrics import nrmse_of_windows, window_errors
+from residnet.judge.metrics import compared, nrmse_of_windows, outside, trust, window_errors
 from residnet.judge.protocol import Windows
-from residnet.judge.verdict.selection import blocks_of, shares
-from residnet.judge.verdict.trust import compared, outside, trust
+from residnet.judge.selection import blocks_of, shares
 from residnet.physics.signals import SignalsConfig
 
 STEP, SCALES = 0.5, {"u": 0.5, "v": 0.2, "r": 0.1}

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from residnet.judge.verdict.sentences import Evidence, diverged_note, verdict
+from residnet.judge.verdict import Evidence, diverged_note, verdict
 
 
 def row(error: float, diverged: int = 0) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from made_run import made_run
 from PIL import Image
 
 from residnet.core.errors import DataError
-from residnet.judge.bootstrap import blocks, intervals
+from residnet.judge.metrics import blocks, intervals
 from residnet.report.figure import write_figures
 from residnet.report.sections.study import (
     Variant,

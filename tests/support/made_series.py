@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from residnet.judge.residual_series import block_interval, independent_interval
+from residnet.judge.goodness import block_interval, independent_interval
 
 
 def autoregressive(phi: float, count: int, length: int, seed: int) -> np.ndarray:

@@ -20,8 +20,8 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Question
 from residnet.data.readers import ReaderConfig
+from residnet.identification.recipe import window_length
 from residnet.tasks.drafting.draft import new_config
-from residnet.tasks.drafting.recipe import window_length
 from residnet.tasks.loading import load_task
 
 

@@ -6,32 +6,30 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from residnet.api.logs import LogsGiven, read_logs
 from residnet.api.values import described, hearing, plain
 from residnet.core.arrays import paged
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
-from residnet.core.names import VELOCITY, nearest
-from residnet.core.progress import ProgressCallback, report
+from residnet.core.names import nearest
+from residnet.core.progress import ProgressCallback, report, say
+from residnet.data.division import divided
+from residnet.data.drafting.questions import Marks
+from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.prepare import PrepareConfig, Prepared
 from residnet.data.prepare import prepare as prepare_log
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.data.sources import read_logs as read_splits
 from residnet.data.split import SPLITS, check_leaks
-from residnet.judge.config import EvaluationConfig
+from residnet.identification.recipe import Preparation, judging, window_length
+from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
+from residnet.tasks.drafting.inputs import driving
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_WINDOWS = (30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
-_SMOOTHING = 1.0
-_FEWEST = 5
 
 
 @dataclass(frozen=True)
@@ -88,13 +86,13 @@ def prepare(
     inputs: Sequence[str] | None = None,
     *,
     step: float | str | None = None,
-    exogenous: Sequence[str] = (),
+    exogenous: Sequence[str] | None = None,
     forces: Any = None,
     masks: Sequence[Any] = (),
     derivative: Mapping[str, Any] | None = None,
     trim: float | str = 0.0,
-    hold: str = "start",
-    held: Sequence[str] = (),
+    hold: str | None = None,
+    held: Sequence[str] | None = None,
     protocols: Mapping[str, Any] | None = None,
     selection: str | None = None,
     scales: Mapping[str, Any] | None = None,
@@ -105,25 +103,26 @@ def prepare(
 ) -> Data:
     """Bring logs to a grid, smooth and differentiate them, and say what models are judged by.
 
-    What is left out is taken from the logs: the step is their usual sampling interval; derivatives
-    come from a Savitzky-Golay filter of second order over 1 s, at least five samples; models are
-    judged over back-to-back windows of up to 30 s (as long as the shortest validation or test log
-    allows), which also choose between models, and over whole manoeuvres; scales are the standard
-    deviations of u, v and r over the usable samples of the validation logs.
+    What is left out follows from the logs, as in a config that `draft` writes: inputs by names and
+    values; step and derivative by the sampling interval and by how long the yaw rate stays alike;
+    models are judged over back-to-back windows of the length that most of the logs for judging
+    hold, and of about a third of it; scales are the standard deviations of u, v and r over training
+    and validation logs.
 
     Args:
         logs: a list of logs (of each five, in the order of their manoeuvres, the third is for
-            validation and the fifth for the test; at least three), a mapping from `train`,
+            validation and the fifth for the test; fewer are cut in time), a mapping from `train`,
             `validation` and `test` to logs, or the `data` section of a config.
         inputs: command channels that drive the model, in order; an empty list for a model without
             any.
         step: of the grid in s.
-        exogenous: channels that nobody commands: wind_speed and wind_dir.
+        exogenous: channels that nobody commands: wind_speed and wind_dir, where all logs hold them.
         forces: a vessel whose thrusters turn the inputs into tau_x, tau_y, tau_n.
         masks: rules that leave samples out, as YAML has them.
         derivative: how velocities are smoothed and differentiated, as YAML has it.
         trim: seconds left out at both ends of every log before samples are learned from.
-        hold: whether an input over a step is the sample at its `start` or the `mean` of its ends.
+        hold: whether an input over a step is the sample at its `start` or the `mean` of its ends;
+            the former where all inputs rest most of the time, as commands do.
         held: channels whose last value holds until the next; others are interpolated.
         protocols: by name, as YAML has them.
         selection: name of the protocol that chooses between models.
@@ -148,34 +147,56 @@ def prepare(
         if like is not None:
             return _external(logs, like)
         splits, source = _splits(logs)
-        every = [log for members in splits.values() for log in members]
-        if inputs is None:
+        whole = {
+            name: [complete_motion(log, MotionConfig()) for log in members]
+            for name, members in splits.items()
+        }
+        every = [log for members in whole.values() for log in members]
+        taken = driving(every, Marks()) if inputs is None else inputs
+        if inputs is None and not taken:
             raise UsageError(
-                "prepare: inputs: name the channels that drive the vessel; the first log has"
+                "prepare: inputs: no channel of the logs is a rudder, a propeller or another"
+                " command; name those that drive the vessel; the first log has"
                 f" {', '.join(every[0].channels)} (an empty list makes a model without commands)"
             )
+        known = [name for name in taken if all(name in log.channels for log in every)]
+        chosen = Preparation.of(every, known)
+        say(f"  {chosen.reason}")
         settings = {
-            "inputs": list(inputs) if not isinstance(inputs, str) else inputs,
-            "exogenous": exogenous,
+            "inputs": list(taken) if not isinstance(taken, str) else taken,
+            "exogenous": chosen.exogenous if exogenous is None else exogenous,
             "forces": forces,
         }
         signals: SignalsConfig = validate(plain(settings), SignalsConfig, "prepare")
-        interval = _interval(every) if step is None else step
+        content = chosen.content()
+        grid = content["grid"] if step is None else {**content["grid"], "step": step}
+        if held is not None:
+            grid = {**grid, "held": held}
         config: PrepareConfig = validate(
             plain(
                 {
-                    "grid": {"step": interval, "held": held},
+                    "grid": grid,
                     "masks": masks,
-                    "derivative": derivative or _smoothing(interval),
+                    "derivative": derivative or content["derivative"],
                     "trim": trim,
-                    "hold": hold,
+                    "hold": hold or content["hold"],
                 }
             ),
             PrepareConfig,
             "prepare",
         )
         prepared = _prepared(splits, signals, config)
-        evaluation = _evaluation(prepared, protocols, selection, scales, groups, divergence)
+        length = window_length([whole[name] for name in SPLITS[1:]], chosen.memory)
+        given = {"protocols": protocols, "selection": selection, "scales": scales}
+        judged = judging(whole, length) | {k: v for k, v in given.items() if v is not None}
+        if not isinstance(judged["protocols"], Mapping):
+            raise UsageError(
+                f"prepare: protocols: expected a mapping by name, given {described(protocols)}"
+            )
+        if protocols is not None and selection is None:
+            judged["selection"] = next(iter(protocols), "")
+        judged |= {"groups": groups or {}, "divergence": divergence}
+        evaluation: EvaluationConfig = validate(plain(judged), EvaluationConfig, "prepare")
     return Data(prepared, signals, config, evaluation, source)
 
 
@@ -219,89 +240,9 @@ def _splits(
             raise UsageError(f"prepare: no logs for {', '.join(missing)}")
         splits = {name: read_logs(logs[name]) for name in SPLITS}
     else:
-        splits = _divided(read_logs(logs))
+        splits = divided(read_logs(logs))
     names = [log.name for members in splits.values() for log in members]
     if twice := [name for name in names if names.count(name) > 1]:
         raise UsageError(f"prepare: two logs are named '{twice[0]}'; rename one of them")
     check_leaks(splits)
     return splits, None
-
-
-def _divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
-    if len(logs) < len(SPLITS):
-        raise UsageError(
-            f"prepare: {len(logs)} logs cannot be divided into train, validation and test; give at"
-            " least three, or a mapping from splits to logs"
-        )
-    order = sorted(range(len(logs)), key=lambda i: logs[i].manoeuvre)
-    period = min(5, len(logs))
-    kinds = {period // 2: "validation", period - 1: "test"}
-    out: dict[str, list[Log]] = {name: [] for name in SPLITS}
-    for place, i in enumerate(order):
-        out[kinds.get(place % period, "train")].append(logs[i])
-    return out
-
-
-def _interval(logs: Sequence[Log]) -> float:
-    steps = [float(np.median(np.diff(log.t))) for log in logs if len(log) > 1]
-    return float(f"{float(np.median(steps)):.6g}")
-
-
-def _smoothing(step: float | str) -> dict[str, Any]:
-    seconds = validate({"step": step}, _grid(), "prepare").step
-    samples = max(_FEWEST, 2 * round(0.5 * _SMOOTHING / seconds) + 1)
-    return {"kind": "savitzky_golay", "window": samples * seconds, "order": 2}
-
-
-def _grid() -> Any:
-    from residnet.data.align import GridConfig
-
-    return GridConfig
-
-
-def _evaluation(
-    splits: Mapping[str, Sequence[Prepared]],
-    protocols: Mapping[str, Any] | None,
-    selection: str | None,
-    scales: Mapping[str, Any] | None,
-    groups: Mapping[str, Sequence[str]] | None,
-    divergence: float,
-) -> EvaluationConfig:
-    judged = [log for split in ("validation", "test") for log in splits[split]]
-    given = _protocols(judged) if protocols is None else plain(protocols)
-    if not isinstance(given, dict):
-        raise UsageError(
-            f"prepare: protocols: expected a mapping by name, given {described(protocols)}"
-        )
-    settings = {
-        "protocols": given,
-        "selection": selection or next(iter(given), ""),
-        "scales": _scales(splits["validation"]) if scales is None else scales,
-        "groups": groups or {},
-        "divergence": divergence,
-    }
-    config: EvaluationConfig = validate(plain(settings), EvaluationConfig, "prepare")
-    return config
-
-
-def _protocols(logs: Sequence[Prepared]) -> dict[str, Any]:
-    shortest = min(float(log.log.t[-1] - log.log.t[0]) for log in logs)
-    first = min(5.0, 0.1 * shortest)
-    whole: dict[str, Any] = {"manoeuvre": {"kind": "manoeuvre"}}
-    for length in _WINDOWS:
-        if first + length < shortest:
-            windows = {"kind": "windows", "length": length, "first": first, "history": first}
-            return {f"T{length:g}": windows, **whole}
-    return whole
-
-
-def _scales(logs: Sequence[Prepared]) -> dict[str, float]:
-    measured = np.concatenate([log.y[log.usable, VELOCITIES] for log in logs])
-    spread = measured.std(axis=0)
-    out = {name: float(value) for name, value in zip(VELOCITY, spread, strict=True)}
-    if still := [name for name, value in out.items() if not value > 0]:
-        raise DataError(
-            f"prepare: {still[0]} does not vary in the validation logs, so that errors have no"
-            " scale; give scales"
-        )
-    return out

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from os import PathLike
 from typing import TYPE_CHECKING, Any, final
 
 import torch
 
-from residnet.api.data import Data
+from residnet.api.data import Data, prepare
 from residnet.api.logs import LogsGiven
 from residnet.api.models import Model
-from residnet.api.preparing import prepared_alone
 from residnet.api.runs import FreeRuns, free_run
 from residnet.api.values import PartGiven, described, hearing, named_parts, part, plain
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
+from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.processes import spread
 from residnet.core.progress import ProgressCallback
@@ -23,10 +24,10 @@ from residnet.identification.fit import fit as identify
 from residnet.identification.identified import Identified
 from residnet.identification.prepared import require_window, through_currents
 from residnet.identification.settings import FitSettings
-from residnet.judge.bands.config import BandsConfig
-from residnet.judge.tables import metrics_table
-from residnet.judge.verdict.selection import Selection
-from residnet.judge.verdict.sentences import Evidence, verdict
+from residnet.judge.band import BandsConfig
+from residnet.judge.metrics import metrics_table
+from residnet.judge.selection import Selection
+from residnet.judge.verdict import Evidence, verdict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -205,7 +206,11 @@ def fit(
         given |= {"recipe": recipe, "effort": effort}
     usual = "rk4" if recipe is None else "semi_implicit_euler"
     if not isinstance(data, Data):
-        data = prepared_alone(data)
+        if not isinstance(data, str | PathLike | Log | list | tuple | Mapping):
+            raise UsageError(
+                f"fit: expected logs, or data from residnet.prepare, given {described(data)}"
+            )
+        data = prepare(data)
     settings: FitSettings = validate(
         plain(
             {

@@ -20,8 +20,7 @@ from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model
 from residnet.export import ExportedVessel, exporter
 from residnet.identification.models import FittedModel
-from residnet.judge.bands.band import Band
-from residnet.judge.bands.file import read_bands
+from residnet.judge.band import Band, read_bands
 from residnet.runs.checksums import require_sealed, seal
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from residnet.core.progress import ProgressCallback
 from residnet.data.prepare import Prepared
 from residnet.identification.identified import Evaluation, candidates, evaluate
 from residnet.identification.prepared import velocity_limit
-from residnet.judge.tables import metrics_table
+from residnet.judge.metrics import metrics_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,7 +11,7 @@ from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.progress import ProgressCallback
 from residnet.data.simulated.flying import Flight
-from residnet.judge.index_table import index_rows
+from residnet.judge.booklet import index_rows
 from residnet.manoeuvres import Manoeuvre, ManoeuvreConfig
 from residnet.physics.vessel import load_vessel
 from residnet.physics.vessel_file import VesselFile

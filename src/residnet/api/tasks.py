@@ -16,7 +16,7 @@ from residnet.core.errors import UsageError
 from residnet.core.files import read_table
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback
-from residnet.judge.tables import metrics_table
+from residnet.judge.metrics import metrics_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
 from residnet.tasks.union import TaskConfig

@@ -17,7 +17,7 @@ import numpy as np
 from residnet.core.errors import UsageError
 from residnet.core.files import whole
 from residnet.documents import published
-from residnet.judge.residual_series import block_interval
+from residnet.judge.goodness import block_interval
 from residnet.report.blocks import Block, Cell, Section, Table, Text
 from residnet.report.figure import (
     BLUE,

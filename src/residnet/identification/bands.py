@@ -25,12 +25,16 @@ from residnet.heads.base import EquationHead
 from residnet.identification.fitter import residual_samples
 from residnet.identification.identified import Identified
 from residnet.identification.models import FittedModel, references
-from residnet.judge.bands.band import Band
-from residnet.judge.bands.calibrate import calibrate, few
-from residnet.judge.bands.channels import CHANNELS
-from residnet.judge.bands.config import BandsConfig
-from residnet.judge.bands.errors import RunErrors, run_errors
-from residnet.judge.bands.quantiles import corrected, independent, quantile, run_weights
+from residnet.judge.band import (
+    CHANNELS,
+    Band,
+    BandsConfig,
+    corrected,
+    independent,
+    quantile,
+    run_weights,
+)
+from residnet.judge.bands import RunErrors, calibrate, few, run_errors
 from residnet.judge.freerun import Candidate, free_run
 from residnet.judge.protocol import Window
 from residnet.regression.solutions import Solution

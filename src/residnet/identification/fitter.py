@@ -29,10 +29,9 @@ from residnet.identification.models import FitStore, FittedModel, NoStore
 from residnet.identification.prepared import PreparedSplits, velocity_limit
 from residnet.identification.recipe import Facts
 from residnet.identification.settings import FitSettings, ForceConfig, GateConfig
-from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.metrics import window_errors
-from residnet.judge.protocol import all_windows, overlapping
+from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
 from residnet.regression.solutions import Solution
 from residnet.training.config import TrainingConfig
 from residnet.training.module import Score

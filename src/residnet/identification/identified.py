@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -25,17 +24,12 @@ from residnet.heads import ClosedFormHead
 from residnet.heads.base import EquationHead
 from residnet.identification.models import FittedModel, references
 from residnet.identification.settings import FitSettings
-from residnet.judge.bands.band import Bands
-from residnet.judge.config import EvaluationConfig
+from residnet.judge.band import Bands
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.goodness import OneStep, table
-from residnet.judge.limits import limits
-from residnet.judge.metrics import rows
-from residnet.judge.protocol import all_windows, overlapping
-from residnet.judge.tables import metrics_table
-from residnet.judge.verdict.course_stability import SteadyRun, contradiction, steady_runs
-from residnet.judge.verdict.sanity import BOUNDED, DAMPING, STABILITY, Finding, check_model
-from residnet.judge.verdict.selection import (
+from residnet.judge.metrics import limits, metrics_table, rows
+from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
+from residnet.judge.selection import (
     Contender,
     Selection,
     blocks_of,
@@ -43,7 +37,7 @@ from residnet.judge.verdict.selection import (
     log_errors,
     shares,
 )
-from residnet.judge.verdict.soundness import TrainingPoints, runaway, training_points, wrong_damping
+from residnet.judge.soundness import Finding, Recorded, check_model
 from residnet.physics.vessel import load_vessel
 
 if TYPE_CHECKING:
@@ -72,7 +66,7 @@ class Evaluation:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """The rows as a table, see `residnet.judge.tables.metrics_table`."""
+        """The rows as a table, see `residnet.judge.metrics.metrics_table`."""
         return metrics_table(self.rows)
 
 
@@ -188,51 +182,6 @@ def _truth(data: SimulatedTrials) -> Candidate | None:
 
 _CHECKED = ("train", "validation")
 """Splits whose windows may not diverge; what the test data show comes too late for a choice."""
-
-
-def examine(
-    fitted: Iterable[FittedModel], train: Sequence[Prepared], config: EvaluationConfig, step: float
-) -> dict[str, list[Finding]]:
-    """Check the models of a fit for physical sanity, `zero` left out.
-
-    Args:
-        fitted: models of one fit.
-        train: the logs that fitted them; what a model does where they have been makes it unsound.
-        config: whose `divergence` says when a model runs away.
-        step: of the grid in s.
-    """
-    points, steady = training_points(train), steady_runs(train, step)
-    threads = torch.get_num_threads()
-    # products this small only lose time to a second thread
-    torch.set_num_threads(1)
-    try:
-        return {
-            entry.name: _examined(entry, points, steady, config.divergence)
-            for entry in fitted
-            if entry.spec.role != "zero"
-        }
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _examined(
-    entry: FittedModel, points: TrainingPoints, steady: Sequence[SteadyRun], divergence: float
-) -> list[Finding]:
-    """All findings of a model; those that make it unsound say so first."""
-    # a copy: the checks run in float64, and must not round what others hold
-    model = copy.deepcopy(entry.model).to(torch.float64).eval()
-    found = check_model(entry.spec, model, divergence=divergence)
-    faults = {
-        DAMPING: wrong_damping(model, points),
-        STABILITY: contradiction(model, steady),
-        BOUNDED: runaway(entry.spec, model, points, divergence),
-    }
-    return [
-        replace(finding, ok=False, text=f"unsound: {fault}. {finding.text}", fault=fault)
-        if (fault := faults.get(finding.check))
-        else finding
-        for finding in found
-    ]
 
 
 def select(
@@ -374,8 +323,13 @@ class Identified(Mapping[str, FittedModel]):
 
     def findings_of(self, fitted: Sequence[FittedModel]) -> dict[str, list[Finding]]:
         """Return what the checks for physical sanity find of some models."""
-        step = self.settings.prepare.grid.step
-        return examine(fitted, self.train, self.settings.evaluation, step)
+        settings = self.settings
+        recorded = Recorded.of(self.train, settings.prepare.grid.step)
+        return {
+            one.name: check_model(one.spec, one.model, recorded, settings.evaluation.divergence)
+            for one in fitted
+            if one.spec.role != "zero"
+        }
 
     def select(self, judged: Mapping[str, Evaluation]) -> Selection:
         """Choose a single model and an ensemble by their free runs.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.judge.bands.band import Band
+from residnet.judge.band import Band
 
 
 @dataclass(frozen=True)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
+from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
-from residnet.judge.config import EvaluationConfig
-from residnet.judge.protocol import Windows
+from residnet.judge.protocol import EvaluationConfig, Windows
+from residnet.physics.environment.wind import WIND_INPUTS
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
 from residnet.physics.symmetry import mirrored_channels, wrong_parity
 
@@ -366,4 +367,140 @@ def _network(facts: Facts) -> dict[str, Any]:
         "restoring": True,
         "margin": 0.0,
         "mirror": mirrored_channels(facts.names) is not None,
+    }
+
+
+_WINDOWS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """How logs are prepared for a fit, by what they hold.
+
+    Attributes:
+        interval: usual step of the logs, s.
+        memory: time after which the yaw rate (or the speed) is another, s.
+        step: of the grid, s.
+        window: of the derivative, s.
+        held: inputs that rest at one value most of the time, as commands do.
+        hold: whether an input over a step is the sample at its `start` or the `mean` of its ends.
+        exogenous: channels of the true wind, where every log holds them.
+    """
+
+    interval: float
+    memory: float
+    step: float
+    window: float
+    held: tuple[str, ...]
+    hold: str
+    exogenous: tuple[str, ...]
+
+    @classmethod
+    def of(cls, logs: Sequence[Log], inputs: Sequence[str]) -> Preparation:
+        """Return how logs that hold velocities are prepared for models with these inputs."""
+        interval = float(np.median([np.median(np.diff(log.t)) for log in logs]))
+        memories = [_memory(log) for log in logs]
+        memory = float(np.median([m for m in memories if np.isfinite(m)] or [20.0 * interval]))
+        step = float(f"{interval * max(1, int(memory / 40.0 / interval)):.4g}")
+        samples = min(max(7, 2 * round(0.5 * memory / 5.0 / step) + 1), 41)
+        held = tuple(name for name in inputs if _rests(logs, name))
+        wind = all(set(WIND_INPUTS) <= set(log.channels) for log in logs)
+        return cls(
+            interval,
+            memory,
+            step,
+            float(f"{samples * step:.6g}"),
+            held,
+            "start" if len(held) == len(inputs) else "mean",
+            WIND_INPUTS if wind else (),
+        )
+
+    @property
+    def reason(self) -> str:
+        """What the numbers of time follow from."""
+        return (
+            f"logs have a sample each {self.interval:.3g} s, and a yaw rate that stays alike for"
+            f" {self.memory:.3g} s"
+        )
+
+    def content(self) -> dict[str, Any]:
+        """Return `prepare` as a config has it."""
+        grid: dict[str, Any] = {"step": f"{self.step:g} s"}
+        grid |= {"held": list(self.held)} if self.held else {}
+        window = f"{self.window:g} s"
+        derivative = {"kind": "savitzky_golay", "window": window, "order": 2}
+        return {"grid": grid, "derivative": derivative, "hold": self.hold}
+
+
+def _rests(logs: Sequence[Log], name: str) -> bool:
+    resting = [float(np.mean(np.diff(log[name]) == 0.0)) for log in logs if len(log) > 1]
+    return bool(resting) and float(np.median(resting)) > 0.9
+
+
+def judging(splits: Mapping[str, Sequence[Log]], length: float) -> dict[str, Any]:
+    """Return protocols, selection and scales of a config, for logs by split.
+
+    Args:
+        splits: `train`, `validation` and `test`.
+        length: of the free runs, s; see `window_length`.
+    """
+    laid = protocols(length)
+    both = [*splits["train"], *splits["validation"]]
+    return {"protocols": laid, "selection": next(iter(laid)), "scales": scales(both)}
+
+
+def _memory(log: Log) -> float:
+    """Return the time in s after which the yaw rate is correlated by 1/e only."""
+    values = log["r"] if "r" in log.channels else log["u"]
+    known = np.isfinite(values)
+    if known.sum() < 50:
+        return float("nan")
+    t, x = log.t[known], values[known] - values[known].mean()
+    step = float(np.median(np.diff(t)))
+    even = np.interp(np.arange(t[0], t[-1], step), t, x)[:20_000]
+    power = np.abs(np.fft.rfft(even, 2 * even.size)) ** 2
+    correlation = np.fft.irfft(power)[: even.size]
+    below = np.flatnonzero(correlation < correlation[0] / np.e)
+    return float(below[0] * step) if below.size else float("nan")
+
+
+def window_length(splits: Iterable[Sequence[Log]], memory: float) -> float:
+    """Return the length of free runs that most of the logs hold, and one of each split, s.
+
+    Args:
+        splits: logs of the validation and of the test; empty splits say nothing.
+        memory: how long the vessel remembers, s.
+    """
+    spans = [[float(log.t[-1] - log.t[0]) for log in logs] for logs in splits if logs]
+    lengths = sorted(length for split in spans for length in split)
+    usual = min((lengths[int(0.25 * (len(lengths) - 1))], *map(max, spans)) if spans else (1.0,))
+    room = [length for length in _WINDOWS if 1.15 * length <= usual] or [0.5 * usual]
+    return next((length for length in room if length <= 15.0 * memory), room[-1])
+
+
+def protocols(length: float) -> dict[str, Any]:
+    """Return two protocols: free runs of a length and of a third of it."""
+    short = max((w for w in _WINDOWS if w <= 0.4 * length), default=0.5 * length)
+    first = min(5.0, 0.1 * length)
+    return {
+        f"T{seconds:g}".replace(".", "_"): {
+            "kind": "windows",
+            "length": f"{seconds:g} s",
+            "first": f"{first:g} s",
+            "history": f"{first:g} s",
+        }
+        for seconds in (length, short)
+    }
+
+
+def scales(logs: Sequence[Log]) -> dict[str, Any]:
+    """Return the standard deviations of the velocities, in units that read well."""
+    spread = {
+        name: float(np.nanstd(np.concatenate([log[name] for log in logs]))) for name in VELOCITY
+    }
+    least = 1e-4
+    return {
+        "u": f"{max(spread['u'], least):.3g} m/s",
+        "v": f"{max(spread['v'], least):.3g} m/s",
+        "r": f"{np.degrees(max(spread['r'], least)):.3g} deg/s",
     }

@@ -26,8 +26,8 @@ from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import DisturbanceConfig
 from residnet.heads import ForceHead, HeadConfig
 from residnet.identification.recipe import PARTS, TIED, Facts, portfolio
-from residnet.judge.bands.config import BandsConfig
-from residnet.judge.config import EvaluationConfig
+from residnet.judge.band import BandsConfig
+from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.training.config import TrainingConfig
 from residnet.training.current import CurrentConfig

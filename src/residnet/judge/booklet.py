@@ -1,4 +1,4 @@
-"""The manoeuvring booklet: indices with intervals, limits of IMO, measured zigzags repeated."""
+"""The manoeuvring booklet and the table of indices, with intervals and limits of IMO."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from residnet.core.config import Config, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.data.simulated.flying import Flight
+from residnet.data.simulated.flying import Craft, Flight
 from residnet.dynamics.actuated import InputShare
 from residnet.manoeuvres import Manoeuvre, ManoeuvreConfig
 from residnet.manoeuvres.indices import IN_LENGTHS, UNITS
@@ -171,3 +171,64 @@ def _index(page: Page, name: str, length: float, scale: float, level: float) -> 
             "kept_share": float(np.mean(factor * others <= limit)) if others.size else None,
         }
     return out
+
+
+INDICES_SCHEMA = "residnet.indices/1"
+
+
+def index_rows(
+    craft: Craft, flights: Sequence[Flight], length: float | None
+) -> list[dict[str, Any]]:
+    """Return log, manoeuvre, craft, faults, indices and limits of each flight.
+
+    Indices in SI and rad; each limit with whether it is kept.
+
+    Args:
+        craft: what flew.
+        flights: of that craft.
+        length: of the hull in m; None where unknown, then there are neither lengths nor limits.
+    """
+    out = []
+    for flight in flights:
+        indices = (
+            {}
+            if flight.log.meta.get("diverged")
+            else flight.manoeuvre.indices(flight.motion, length)
+        )
+        speed = indices.get("approach_speed", 0.0)
+        limits = (
+            flight.manoeuvre.limits(craft.helm, length, speed)
+            if length is not None and speed > 0
+            else {}
+        )
+        out.append(
+            {
+                "log": flight.motion.name,
+                "manoeuvre": flight.manoeuvre.kind,
+                "craft": craft.name,
+                "fault": flight.fault,
+                "timed_out": bool(flight.log.meta.get("timed_out", False)),
+                "indices": indices,
+                "limits": {
+                    name: {"limit": limit, "kept": indices[name] <= limit}
+                    for name, limit in limits.items()
+                    if name in indices
+                },
+            }
+        )
+    return out
+
+
+def index_contents(
+    run: str, length: float | None, rows: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return the contents of indices.json."""
+    used = {name for row in rows for name in row["indices"]}
+    units = {name: UNITS.get(name, "-") for name in sorted(used)}
+    return {
+        "schema": INDICES_SCHEMA,
+        "run": run,
+        "length": length,
+        "units": units,
+        "rows": list(rows),
+    }

@@ -15,7 +15,7 @@ from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted
-from residnet.judge.bands.band import Band
+from residnet.judge.band import Band
 from residnet.judge.protocol import Window
 
 _LONGER = 4
@@ -80,6 +80,68 @@ class FreeRun:
     split: str
     windows: list[Window]
     predictions: dict[str, list[Prediction]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one model's free runs, the samples of all W windows one after the other.
+
+    u, v and the position are scored over usable samples; r and the heading, which no position
+    sensor disturbs, over all.
+
+    Attributes:
+        error: predicted minus measured x, y, psi, u, v, r [N, 6].
+        usable: which samples are [N].
+        counts: samples of each window [W].
+    """
+
+    error: np.ndarray
+    usable: np.ndarray
+    counts: np.ndarray
+
+    @classmethod
+    def of(
+        cls, windows: Sequence[Window], predictions: Sequence[Prediction], logs: Sequence[Prepared]
+    ) -> Errors:
+        """Return the errors of predictions over windows of logs."""
+        rows = [(logs[window.log], slice(window.start, window.stop)) for window in windows]
+        pairs = zip(predictions, rows, strict=True)
+        return cls(
+            np.concatenate([prediction.states - log.y[part] for prediction, (log, part) in pairs]),
+            np.concatenate([log.usable[part] for log, part in rows]),
+            np.array([window.stop - window.start for window in windows]),
+        )
+
+    @property
+    def begins(self) -> np.ndarray:
+        """First sample of each window [W]."""
+        return np.asarray(np.cumsum(self.counts) - self.counts)
+
+    @property
+    def place(self) -> np.ndarray:
+        """Number of each sample in its window [N]."""
+        return np.asarray(np.arange(len(self.error)) - np.repeat(self.begins, self.counts))
+
+    @property
+    def scored(self) -> np.ndarray:
+        """Whether u, v and r of each sample count [N, 3]."""
+        return np.stack((self.usable, self.usable, np.ones_like(self.usable)), axis=1)
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """Errors of u, v and r [N, 3], zero where they do not count."""
+        return np.asarray(np.where(self.scored, self.error[:, VELOCITIES], 0.0))
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Return the mean of values [N, 3] over each window's samples that count [W, 3]."""
+        with np.errstate(invalid="ignore"):
+            sums = np.add.reduceat(values, self.begins)
+            return np.asarray(sums / np.add.reduceat(self.scored.astype(float), self.begins))
+
+    @property
+    def rmse(self) -> np.ndarray:
+        """Root mean square errors of u, v and r of each window [W, 3]."""
+        return np.asarray(np.sqrt(self.mean(self.velocities**2)))
 
 
 def free_run(

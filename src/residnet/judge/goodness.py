@@ -1,7 +1,4 @@
-"""Goodness of fit of one-step predictions, by model and axis (document 000 appendix E).
-
-As corrected in corrections E1 to E9.
-"""
+"""Goodness of fit of one-step predictions by model and axis (document 000, appendix E)."""
 
 from __future__ import annotations
 
@@ -11,15 +8,174 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from residnet.core.names import ACCELERATION
-from residnet.judge.residual_series import (
-    autocovariance,
-    block_interval,
-    independent_interval,
-    ljung_box,
-    memory,
-)
+from residnet.judge.metrics import tail
+
+_LEVEL = 0.95
+_RESAMPLES = 2_000
+_MANY = 500
+"""From so many blocks on the mean of a resample is normal, and is not drawn."""
+_WIDEST = 1.5
+_SCREEN = 2.0
+"""Standard deviations of a correlation that is no more than noise (Politis and White 2004, section
+3.2: c = 2 for log base 10).
+"""
+
+Pieces = Sequence[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """The memory of a series: how far it remembers.
+
+    Attributes:
+        block: length of blocks for a bootstrap of its mean, in samples.
+        variance: its long-run variance, n times the variance of its mean.
+        effective: number of independent samples whose mean varies as much, at most n.
+    """
+
+    block: int
+    variance: float
+    effective: float
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean with a 95 % interval, the blocks' length in samples, and their number."""
+
+    mean: float
+    low: float
+    high: float
+    block: int
+    blocks: float
+
+
+def autocovariance(pieces: Pieces, lags: int) -> np.ndarray:
+    """Return autocovariances at lags 0 .. `lags`, [lags + 1], about the mean of all pieces.
+
+    Products are within pieces, over the number n of all samples.
+    """
+    joined = np.concatenate(list(pieces))
+    mean, out = joined.mean(), np.zeros(lags + 1)
+    for piece in pieces:
+        centred = piece - mean
+        spectrum = np.abs(np.fft.rfft(centred, 2 * len(centred))) ** 2
+        reach = min(lags + 1, len(centred))
+        out[:reach] += np.fft.irfft(spectrum, 2 * len(centred))[:reach]
+    return out / len(joined)
+
+
+def memory(pieces: Pieces) -> Memory:
+    """Return block length and long-run variance chosen from the data, for fixed blocks.
+
+    Politis and White 2004, Econometric Reviews 23, 53-70; corrected by Patton, Politis and White
+    2009, 28, 372-375.
+
+    The flat-top window of the autocovariances R(k) reaches to twice the lag m from which on
+    correlations are no more than noise; with g = sum R(k) and G = sum |k| R(k) under it, the block
+    is (3 G^2 / (2 g^2) n)^(1/3), at most min(3 sqrt(n), n / 3).
+    """
+    n = sum(len(piece) for piece in pieces)
+    run = max(5, math.ceil(math.sqrt(math.log10(n)))) if n > 1 else 5
+    most = math.ceil(math.sqrt(n)) + run
+    covariance = autocovariance(pieces, most + run)
+    if covariance[0] <= 1e-300:
+        return Memory(1, 0.0, float(n))
+    noise = np.abs(covariance[1:] / covariance[0]) < _SCREEN * math.sqrt(math.log10(n) / n)
+    quiet = np.flatnonzero(np.lib.stride_tricks.sliding_window_view(noise, run).all(axis=1))
+    loud = np.flatnonzero(~noise)
+    last = int(quiet[0]) if quiet.size else int(loud[-1]) + 1
+    reach = min(2 * max(last, 1), most)
+    lag = np.arange(1, reach + 1)
+    kept = np.minimum(1.0, 2.0 * (1.0 - lag / reach)) * covariance[1 : reach + 1]
+    # a window that is flat may sum to less than nothing
+    variance = max(float(covariance[0] + 2 * kept.sum()), 0.05 * float(covariance[0]))
+    spread = 2 * float((lag * kept).sum())
+    longest = max(min(3 * math.sqrt(n), n / 3), 1.0)
+    block = math.ceil(min(max((1.5 * spread**2 / variance**2 * n) ** (1 / 3), 1.0), longest))
+    return Memory(block, variance, min(n * float(covariance[0]) / variance, float(n)))
+
+
+def block_interval(pieces: Pieces, seed: int = 0) -> Interval:
+    """Return the mean of all samples with its 95 % interval by a moving-block bootstrap.
+
+    The block length is that of `memory`.
+
+    Percentiles about the mean, at levels widened for few blocks as Student's t is (see
+    `residnet.judge.metrics`), and by what blocks of finite length miss: the ratio of the standard
+    error from the long-run variance to that of the bootstrap, where it is above one (at most 1.5).
+    The interval speaks for more data of the same kind, not for other kinds of manoeuvre.
+    """
+    found = memory(pieces)
+    n = sum(len(piece) for piece in pieces)
+    mean = float(np.concatenate(list(pieces)).mean())
+    sums, sizes = _blocks(pieces, found.block)
+    held = n / float(sizes.mean())
+    if found.variance == 0 and n >= 2:
+        return Interval(mean, mean, mean, found.block, held)
+    if held < 2:
+        return Interval(mean, -math.inf, math.inf, found.block, held)
+    level, drawn = tail(max(math.floor(held), 2)), math.ceil(held)
+    if held > _MANY:
+        # of a ratio of sums, by its linear part
+        error = float(np.std(sums - sizes * (sums.sum() / sizes.sum())) / sizes.mean()) / math.sqrt(
+            held
+        )
+        low, high = error * float(stats.norm.ppf(level)), -error * float(stats.norm.ppf(level))
+    else:
+        draws = np.random.default_rng(seed).integers(0, len(sums), size=(_RESAMPLES, drawn))
+        means = sums[draws].sum(axis=1) / sizes[draws].sum(axis=1)
+        apart = means - means.mean()
+        error = float(apart.std())
+        low, high = np.quantile(apart, [level, 1 - level])
+    wide = min(max(math.sqrt(found.variance / n) / error, 1.0), _WIDEST) if error > 0 else 1.0
+    return Interval(mean, mean + wide * float(low), mean + wide * float(high), found.block, held)
+
+
+def _blocks(pieces: Pieces, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sums and lengths of all blocks of `length` samples; a shorter piece is a block."""
+    sums, sizes = [], []
+    for piece in pieces:
+        size = min(length, len(piece))
+        total = np.concatenate(([0.0], np.cumsum(piece)))
+        sums.append(total[size:] - total[:-size])
+        sizes.append(np.full(len(sums[-1]), float(size)))
+    return np.concatenate(sums), np.concatenate(sizes)
+
+
+def independent_interval(values: np.ndarray) -> tuple[float, float]:
+    """Return the 95 % interval of the mean as document 000 Listing 9.1 prints it.
+
+    Student's t times the standard error of independent samples.
+
+    The resampling of the listing moves only the centre, by noise (correction E8); here it is the
+    mean itself. Far too narrow for correlated values.
+    """
+    n = len(values)
+    half = (
+        float(stats.t.ppf(0.5 + _LEVEL / 2, n - 1) * values.std(ddof=1)) / math.sqrt(n)
+        if n > 1
+        else math.inf
+    )
+    return float(values.mean()) - half, float(values.mean()) + half
+
+
+def ljung_box(pieces: Pieces, lags: int) -> tuple[float, float]:
+    """Return the statistic of Ljung and Box (1978) and its chance in white noise.
+
+    The statistic is n (n + 2) sum rho_k^2 / (n - k) over lags 1 .. `lags`; the chance is that of a
+    larger one.
+    """
+    n = sum(len(piece) for piece in pieces)
+    covariance = autocovariance(pieces, lags)
+    if covariance[0] <= 1e-300:
+        return 0.0, 1.0
+    correlation = covariance[1:] / covariance[0]
+    statistic = float(n * (n + 2) * (correlation**2 / (n - np.arange(1, lags + 1))).sum())
+    return statistic, float(stats.chi2.sf(statistic, lags))
+
 
 SCHEMA = "residnet.goodness/1"
 LAGS = 20

@@ -10,8 +10,8 @@ import numpy as np
 from residnet.core.files import whole
 from residnet.core.names import STATE
 from residnet.data.prepare import Prepared
-from residnet.judge.bands.band import Bands
-from residnet.judge.bands.coverage import limits
+from residnet.judge.band import Bands
+from residnet.judge.bands import limits
 from residnet.judge.freerun import FreeRun, Prediction
 
 INPUT = "input_"

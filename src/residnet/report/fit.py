@@ -6,15 +6,13 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from residnet.judge.verdict.sanity_file import read_findings
+from residnet.judge.soundness import read_findings
 from residnet.report.blocks import Section
 from residnet.report.figure import Figure, figures_section, read_figures, write_figures
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import data, free_runs, manoeuvres, models, runs, verdict
 
-_DIVERGENCE = 3.0
-"""Times the training envelope beyond which a run has diverged, where the config gives none."""
 _INTERACTIVE = "free_runs|horizon|residuals"
 """Names of the figures that stand before the numbers."""
 
@@ -24,8 +22,7 @@ def _sections(run: RunFiles) -> list[Callable[[RunFiles], Section | None]]:
 
     A section is added here, and its figures below.
     """
-    divergence = float(run.evaluation.get("divergence") or _DIVERGENCE)
-    findings = read_findings(run.path, divergence=divergence)
+    findings = read_findings(run.path)
     return [
         partial(verdict.cautions, findings=findings),
         verdict.figures_of_lead,

@@ -11,7 +11,7 @@ from torch import nn
 from residnet.core.files import read_json
 from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
 from residnet.identification.models import FittedModel
-from residnet.judge.bands.file import read_bands
+from residnet.judge.band import read_bands
 from residnet.runs.checksums import require_sealed, seal
 from residnet.runs.folder import RunFolder
 

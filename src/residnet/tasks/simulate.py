@@ -86,7 +86,7 @@ class SimulateConfig(ComputingTask):
         Raises:
             UsageError: where something cannot fly the manoeuvres.
         """
-        from residnet.judge.index_table import contents, index_rows
+        from residnet.judge.booklet import index_contents, index_rows
         from residnet.report.sections.manoeuvres import flight_figures
 
         flown, places, length = (
@@ -98,7 +98,7 @@ class SimulateConfig(ComputingTask):
                 flight.log.save(folder.path / place / f"{flight.log.name}.parquet")
                 count += 1
         rows = [row for craft, flights in flown for row in index_rows(craft, flights, length)]
-        content = contents(self.name, length, rows)
+        content = index_contents(self.name, length, rows)
         folder.write_json(folder.path / "indices.json", content)
         figures = flight_figures({craft.name: flights for craft, flights in flown})
         write_figures(folder.figures, figures)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from residnet.judge.bands.band import Band, covered, worst
-from residnet.judge.bands.calibrate import calibrate
-from residnet.judge.bands.errors import RunErrors
-from residnet.judge.bands.quantiles import corrected, independent, quantile, run_weights
+from residnet.judge.band import Band, corrected, covered, independent, quantile, run_weights, worst
+from residnet.judge.bands import RunErrors, calibrate
 
 STEP = 0.5
 LENGTH = 60

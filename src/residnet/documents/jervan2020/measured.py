@@ -40,7 +40,7 @@ from residnet.documents.jervan2020.residual import (
     forward_equations,
     model_figures,
 )
-from residnet.judge.bootstrap import Blocks, blocks, intervals
+from residnet.judge.metrics import Blocks, blocks, intervals
 from residnet.physics.force_model import ForceModel
 from residnet.physics.fossen import Fossen3, FossenVessel, HullConfig
 from residnet.physics.vessel import load_vessel

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from residnet.judge.verdict.sentences import diverged_note
+from residnet.judge.verdict import diverged_note
 from residnet.report.blocks import (
     Block,
     Bullets,

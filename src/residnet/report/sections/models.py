@@ -13,7 +13,7 @@ import pandas as pd
 
 from residnet.core.errors import ConfigError
 from residnet.core.names import CHANNEL_UNITS
-from residnet.judge.verdict.sentences import diverged_note
+from residnet.judge.verdict import diverged_note
 from residnet.physics.terms import parse_term
 from residnet.report.blocks import (
     Block,

@@ -11,7 +11,7 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.names import VELOCITY
-from residnet.judge.bootstrap import blocks, intervals
+from residnet.judge.metrics import blocks, intervals
 from residnet.report.blocks import Cell, Column, Section, Table, Text, nested, table_of
 from residnet.report.figure import (
     BLUE,

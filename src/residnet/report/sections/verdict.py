@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from residnet.data.doctor import summary
-from residnet.judge.verdict.sanity import CHECKS, Finding
-from residnet.judge.verdict.sentences import UNSEEN, Evidence
-from residnet.judge.verdict.sentences import verdict as judged
+from residnet.judge.soundness import CHECKS, Finding
+from residnet.judge.verdict import UNSEEN, Evidence
+from residnet.judge.verdict import verdict as judged
 from residnet.report.blocks import Bullets, Cell, Facts, Section, table_of
 from residnet.report.format import DEG, minus, number, percent, title_of
 from residnet.report.run_reader import Content, RunFiles

@@ -11,7 +11,7 @@ import numpy as np
 
 from residnet.core.errors import UsageError
 from residnet.core.names import VELOCITY
-from residnet.judge.bootstrap import blocks, difference
+from residnet.judge.metrics import blocks, difference
 from residnet.runs.folder import RunFolder
 
 if TYPE_CHECKING:

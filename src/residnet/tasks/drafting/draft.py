@@ -21,6 +21,7 @@ from residnet.data.drafting.reading import INPUTS, log_files, read_drafted
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers.quantities import QUATERNION
+from residnet.identification.recipe import Preparation, judging, protocols, window_length
 from residnet.tasks.drafting import recipe
 from residnet.tasks.drafting.inputs import driving, lacks
 from residnet.tasks.drafting.yaml_text import commented
@@ -176,24 +177,22 @@ def _assembled(
     standard: bool,
 ) -> Draft:
     whole = list(read.whole.values())
-    time = recipe.timing(whole)
-    wind = recipe.exogenous(whole)
+    time = Preparation.of(whole, inputs)
+    wind = time.exogenous
     codes = _findings(list(read.logs.values()), inputs, marks)
-    preparation = _preparation(time, whole, inputs, codes)
+    preparation = time.content() | ({"masks": [{"kind": "frozen"}]} if "frozen" in codes else {})
     usable = _usable(read, (*inputs, *wind), preparation)
     split, splits = _split(read, usable, folder, marks)
     judged = [splits[name] for name in ("validation", "test")]
-    length = recipe.window_length(judged, time.memory)
+    length = window_length(judged, time.memory)
     split, splits = _long_enough(split, splits, length, marks)
     samples = int(sum(log.t[-1] - log.t[0] for log in splits["train"]) / time.step)
-    protocols = recipe.protocols(length)
     recipe.mark_timing(time, length, marks)
     thrown = [name for name, entry in read.reader.get("channels", {}).items() if "scale" in entry]
     plan = recipe.models(inputs, bool(wind), time, length, samples, thrown)
     if standard and inputs:
         plan = {"recipe": "standard"}
         marks.note(("recipe",), "eight models or so, whose terms and sizes follow from the logs")
-    scales = recipe.scales([*splits["train"], *splits["validation"]])
     marks.note(("evaluation", "scales"), "standard deviations over training and validation logs")
     config = {
         "task": "fit",
@@ -205,31 +204,12 @@ def _assembled(
         "integrator": "semi_implicit_euler",
         **plan,
         "export": {"models": []},
-        "evaluation": {
-            "protocols": protocols,
-            "selection": next(iter(protocols)),
-            "scales": scales,
-        },
+        "evaluation": judging(splits, length),
     }
     validate(config, FitConfig, "draft", folder)
     head = _head(read, marks)
     guesses = tuple((".".join(key), text) for key, text in marks.guesses)
     return Draft(config, guesses, commented(config, marks.comments, head))
-
-
-def _preparation(
-    time: recipe.Timing, logs: Sequence[Log], inputs: Sequence[str], codes: set[str]
-) -> dict[str, Any]:
-    held = recipe.held(logs, inputs)
-    grid: dict[str, Any] = {"step": f"{time.step:g} s"}
-    grid |= {"held": list(held)} if held else {}
-    masks = [{"kind": "frozen"}] if "frozen" in codes else []
-    return {
-        "grid": grid,
-        **({"masks": masks} if masks else {}),
-        "derivative": {"kind": "savitzky_golay", "window": f"{time.window:g} s", "order": 2},
-        "hold": "start" if len(held) == len(inputs) else "mean",
-    }
 
 
 def _findings(logs: Sequence[Log], inputs: Sequence[str], marks: Marks) -> set[str]:
@@ -319,9 +299,7 @@ def _relative(path: Path, folder: Path) -> str:
 def _long_enough(
     split: dict[str, Any], splits: dict[str, list[Log]], length: float, marks: Marks
 ) -> tuple[dict[str, Any], dict[str, list[Log]]]:
-    shortest = 1.2 * min(
-        float(entry["length"].split()[0]) for entry in recipe.protocols(length).values()
-    )
+    shortest = 1.2 * min(float(entry["length"].split()[0]) for entry in protocols(length).values())
     for name in ("validation", "test"):
         for entry, log in list(zip(split[name], splits[name], strict=True)):
             if log.t[-1] - log.t[0] >= shortest or len(split[name]) == 1:

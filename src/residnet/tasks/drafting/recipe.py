@@ -1,20 +1,14 @@
-"""The numbers of a fit that follow from logs: step, windows, scales, models, training."""
+"""The few models of a first draft, and what the numbers of time follow from."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from typing import Any
 
-import numpy as np
-
-from residnet.core.log import Log
-from residnet.core.names import VELOCITY
 from residnet.data.drafting.questions import Marks
-from residnet.physics.environment.wind import WIND_INPUTS
+from residnet.identification.recipe import Preparation
 from residnet.tasks.drafting.inputs import roles
 
-_WINDOWS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
 _HULL = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
 _SOUND = {"dissipative": True, "bounded": True}
 """A model of logs that nobody has looked at neither feeds itself energy nor runs away."""
@@ -22,108 +16,10 @@ _EFFORT = 12_000
 """Steps of rollouts that a network is trained through, in batches: about half a minute."""
 
 
-@dataclass(frozen=True)
-class Timing:
-    """How fast a vessel is, by its logs.
-
-    Attributes:
-        interval: usual step of the logs, s.
-        memory: time after which the yaw rate (or the speed) is another, s.
-        step: of the grid, s.
-        window: of the derivative, s.
-    """
-
-    interval: float
-    memory: float
-    step: float
-    window: float
-
-
-def timing(logs: Sequence[Log]) -> Timing:
-    """Return the time scales of logs that hold velocities."""
-    interval = float(np.median([np.median(np.diff(log.t)) for log in logs]))
-    memories = [_memory(log) for log in logs]
-    memory = float(np.median([m for m in memories if np.isfinite(m)] or [20.0 * interval]))
-    step = float(f"{interval * max(1, int(memory / 40.0 / interval)):.4g}")
-    samples = max(7, 2 * round(0.5 * memory / 5.0 / step) + 1)
-    return Timing(interval, memory, step, _readable(min(samples, 41) * step))
-
-
-def _memory(log: Log) -> float:
-    """Return the time in s after which the yaw rate is correlated by 1/e only."""
-    values = log["r"] if "r" in log.channels else log["u"]
-    known = np.isfinite(values)
-    if known.sum() < 50:
-        return float("nan")
-    t, x = log.t[known], values[known] - values[known].mean()
-    step = float(np.median(np.diff(t)))
-    even = np.interp(np.arange(t[0], t[-1], step), t, x)[:20_000]
-    power = np.abs(np.fft.rfft(even, 2 * even.size)) ** 2
-    correlation = np.fft.irfft(power)[: even.size]
-    below = np.flatnonzero(correlation < correlation[0] / np.e)
-    return float(below[0] * step) if below.size else float("nan")
-
-
-def _readable(value: float) -> float:
-    return float(f"{value:.6g}")
-
-
-def window_length(splits: Iterable[Sequence[Log]], memory: float) -> float:
-    """Return the length of free runs that most of the logs hold, and one of each split, s.
-
-    Args:
-        splits: logs of the validation and of the test; empty splits say nothing.
-        memory: how long the vessel remembers, s.
-    """
-    spans = [[float(log.t[-1] - log.t[0]) for log in logs] for logs in splits if logs]
-    lengths = sorted(length for split in spans for length in split)
-    usual = min((lengths[int(0.25 * (len(lengths) - 1))], *map(max, spans)) if spans else (1.0,))
-    room = [length for length in _WINDOWS if 1.15 * length <= usual] or [0.5 * usual]
-    return next((length for length in room if length <= 15.0 * memory), room[-1])
-
-
-def protocols(length: float) -> dict[str, Any]:
-    """Return two protocols: free runs of a length and of a third of it."""
-    short = max((w for w in _WINDOWS if w <= 0.4 * length), default=0.5 * length)
-    first = min(5.0, 0.1 * length)
-    return {
-        f"T{seconds:g}".replace(".", "_"): {
-            "kind": "windows",
-            "length": f"{seconds:g} s",
-            "first": f"{first:g} s",
-            "history": f"{first:g} s",
-        }
-        for seconds in (length, short)
-    }
-
-
-def scales(logs: Sequence[Log]) -> dict[str, Any]:
-    """Return the standard deviations of the velocities, in units that read well."""
-    spread = {
-        name: float(np.nanstd(np.concatenate([log[name] for log in logs]))) for name in VELOCITY
-    }
-    least = 1e-4
-    return {
-        "u": f"{max(spread['u'], least):.3g} m/s",
-        "v": f"{max(spread['v'], least):.3g} m/s",
-        "r": f"{np.degrees(max(spread['r'], least)):.3g} deg/s",
-    }
-
-
-def held(logs: Sequence[Log], inputs: Sequence[str]) -> tuple[str, ...]:
-    """Return the inputs that rest at one value most of the time, as commands do."""
-    out = []
-    for name in inputs:
-        resting = [float(np.mean(np.diff(log[name]) == 0.0)) for log in logs if len(log) > 1]
-        if resting and np.median(resting) > 0.9:
-            out.append(name)
-    return tuple(out)
-
-
 def models(
     inputs: Sequence[str],
     wind: bool,
-    time: Timing,
+    time: Preparation,
     length: float,
     samples: int,
     thrown: Collection[str] = (),
@@ -156,7 +52,7 @@ def models(
     else:
         physics["sets"] = ["linear", *(["wind"] if wind else [])]
         physics["terms"] = [*_HULL, *extra, *_driving(inputs, thrown)]
-    horizon = _readable(_seconds(0.2 * length))
+    horizon = _seconds(0.2 * length)
     plan: dict[str, Any] = {
         "baseline": linear,
         "baselines": {"physics": physics},
@@ -250,19 +146,9 @@ def _training(step: float, length: float) -> dict[str, Any]:
     }
 
 
-def exogenous(logs: Sequence[Log]) -> tuple[str, ...]:
-    """Return the channels of the true wind where every log holds them."""
-    there = all(set(WIND_INPUTS) <= set(log.channels) for log in logs)
-    return WIND_INPUTS if there else ()
-
-
-def mark_timing(time: Timing, length: float, marks: Marks) -> None:
+def mark_timing(chosen: Preparation, length: float, marks: Marks) -> None:
     """Write down what the numbers of time follow from."""
-    marks.note(
-        ("prepare", "grid"),
-        f"logs have a sample each {time.interval:.3g} s, and a yaw rate that stays alike for"
-        f" {time.memory:.3g} s",
-    )
+    marks.note(("prepare", "grid"), chosen.reason)
     marks.note(
         ("evaluation", "protocols"), f"free runs of {length:g} s fit into most logs for judging"
     )

@@ -9,9 +9,8 @@ import numpy as np
 
 from residnet.core.names import STATE, si_unit
 from residnet.data.prepare import Prepared
-from residnet.judge.limits import SCHEMA as LIMITS
+from residnet.judge.metrics import LIMITS_SCHEMA, metrics_content
 from residnet.judge.repeats import repeatability
-from residnet.judge.tables import metrics_content
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import errors_table
 from residnet.report.sections.verdict import verdict
@@ -53,7 +52,7 @@ def write_limits(
     }
     folder.write_json(
         folder.limits,
-        {"schema": LIMITS, "run": config.name, "splits": limiting, "repeatability": repeats},
+        {"schema": LIMITS_SCHEMA, "run": config.name, "splits": limiting, "repeatability": repeats},
     )
 
 

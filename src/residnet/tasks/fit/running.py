@@ -10,10 +10,10 @@ from residnet.core.progress import say
 from residnet.identification.fit import fit
 from residnet.identification.identified import Identified, goodness_rows, residual_table, term_table
 from residnet.identification.prepared import PreparedSplits, prepare_logs, through_currents
-from residnet.judge.bands.file import bands_content
+from residnet.judge.band import bands_content
 from residnet.judge.goodness import content
 from residnet.judge.rollout_files import write_rollouts
-from residnet.judge.verdict.sanity_file import content as sanity_content
+from residnet.judge.soundness import sanity_content
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import Outcome

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.layout import VELOCITIES, YAW_RATE
 from residnet.data.prepare import Prepared
-from residnet.judge.freerun import FreeRun
+from residnet.judge.freerun import Errors, FreeRun
 
 SCHEMA = "residnet.selection/2"
 FAMILIES = ("zero", "baseline", "refitted baseline", "closed-form head", "network", "ensemble")
@@ -302,19 +301,12 @@ def shares(
         labels: number of the block of each sample of each window.
         count: number of blocks.
     """
-    scale = np.array(list(scales.values()))
-    out = np.zeros(count)
-    for window, prediction, label in zip(run.windows, run.predictions[model], labels, strict=True):
-        log, rows = logs[window.log], slice(window.start, window.stop)
-        square = (prediction.states - log.y[rows])[:, VELOCITIES] ** 2
-        # as the metrics have it: u and v over usable samples, r over all
-        square[~log.usable[rows], : YAW_RATE - VELOCITIES.start] = 0.0
-        counted = np.array([log.usable[rows].sum()] * 2 + [len(square)])
-        rmse = np.sqrt(square.sum(0) / counted)
-        divisor = np.where(rmse > 0, rmse * counted * scale, 1.0)
-        sample = (square / divisor).sum(1) / (len(scale) * len(run.windows))
-        out += np.bincount(label, sample, count)
-    return out
+    found = Errors.of(run.windows, run.predictions[model], logs)
+    divisor = found.rmse * np.add.reduceat(found.scored, found.begins, dtype=float)
+    divisor = np.where(divisor > 0, divisor, 1.0) * np.array(list(scales.values()))
+    sample = (found.velocities**2 / np.repeat(divisor, found.counts, axis=0)).sum(1)
+    share = sample / (divisor.shape[1] * len(run.windows))
+    return np.bincount(np.concatenate(labels), share, count)
 
 
 def log_errors(shares: Mapping[str, np.ndarray], weights: np.ndarray) -> dict[str, np.ndarray]:
