@@ -30,9 +30,7 @@ LAYERS = [
     {"runs"},
     {"documents"},
     {"tasks"},
-    {"crash", "run_log"},
-    {"door", "terminal"},
-    {"commands"},
+    {"exits", "terminal"},
     {"cli", "__main__", "api", "testing"},
 ]
 ALLOWED = {("__main__", "cli")}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from residnet.door import enter
+from residnet.exits import enter
 
 
 def _command() -> None:

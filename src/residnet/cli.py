@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from residnet.commands import (
-    Quiet,
-    ardupilot,
-    compare,
-    evaluate,
-    export,
-    limit_threads,
-    list_names,
-    monitor,
-    plan_trial,
-    report,
-    runs,
-    show,
-)
-from residnet.door import enter
-from residnet.terminal import drawn_progress
+from residnet.exits import enter
+from residnet.terminal import RunLog, asked, drawn_progress
+
+if TYPE_CHECKING:
+    from residnet.runs.task import Finished
 
 app = typer.Typer(
     name="residnet",
@@ -65,6 +55,8 @@ class Recipe(StrEnum):
     standard = "standard"
 
 
+Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress, the result only.")]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
@@ -110,7 +102,6 @@ def run(
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
     from residnet.core.processes import spread
-    from residnet.run_log import RunLog
     from residnet.tasks.loading import config_file, load_task
 
     limit_threads()
@@ -167,7 +158,6 @@ def new(
     not tell is asked on a terminal; elsewhere the default is taken and marked as a guess.
     """
     from residnet.tasks.drafting.draft import new_config
-    from residnet.terminal import asked
 
     limit_threads()
     with drawn_progress(quiet=quiet):
@@ -256,10 +246,268 @@ def inspect(
         raise typer.Exit(1)
 
 
-for command in (evaluate, monitor, export, ardupilot, report, compare, runs):
-    app.command()(command)
-app.command(name="list")(list_names)
-app.command(name="plan-trial")(plan_trial)
+@app.command()
+def evaluate(
+    folder: RunPath,
+    logs: Annotated[
+        list[Path],
+        typer.Option(
+            "--logs", metavar="PATH", help="Logs to predict: files or folders; may be repeated."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="DIR", help="Where results go; RUN/external-<time> where not given."
+        ),
+    ] = None,
+    more: Annotated[
+        list[Path] | None, typer.Argument(metavar="[PATH]...", help="Further logs.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Evaluate the models of a finished run in free run on other logs."""
+    from residnet.tasks.verbs import evaluate_run
+
+    limit_threads()
+    with drawn_progress(quiet=quiet):
+        finished = evaluate_run(folder, [*logs, *(more or [])], out)
+    show(finished)
+
+
+@app.command()
+def monitor(
+    folder: RunPath,
+    logs: Annotated[
+        list[Path],
+        typer.Option(
+            "--logs", metavar="PATH", help="New logs in the order of time; may be repeated."
+        ),
+    ],
+    model: Annotated[str, typer.Option(help="Name of the model.")] = "selected",
+    window: Annotated[str, typer.Option(help="Length of the short free runs.")] = "10 s",
+    stretch: Annotated[str, typer.Option(help="Time that is looked back over.")] = "300 s",
+    false_alarm: Annotated[str, typer.Option(help="Mean time between false alarms.")] = "10 h",
+    refit: Annotated[
+        Path | None,
+        typer.Option(
+            "--refit",
+            metavar="DIR",
+            help="Put the changes that are named into a copy of the model, in a new run folder.",
+        ),
+    ] = None,
+    file: Annotated[
+        Path | None,
+        typer.Option("--json", metavar="FILE", help="Write what was found to a file as JSON, too."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Watch new logs with a model of a finished fit, and name what has changed.
+
+    The exit code is 1 where there is an alarm. A refit leaves the run as it is.
+    """
+    from residnet.core.files import require_file_place, whole
+    from residnet.tasks.verbs import monitor_run
+
+    limit_threads()
+    if file is not None:
+        require_file_place(file)
+    settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
+    with drawn_progress(quiet=quiet):
+        found, refitted = monitor_run(folder, logs, model, settings, refit)
+    for log in found:
+        print("\n".join(log.text()))
+    content: list[dict[str, Any]] = [log.content() for log in found]
+    if refitted is not None:
+        print("\n".join(refitted.text()))
+        content.append({"refit": refitted.content()})
+    if file is not None:
+        with whole(file) as part:
+            part.write_text(json.dumps(content, indent=1) + "\n")
+    if any(log.since is not None for log in found):
+        raise typer.Exit(1)
+
+
+@app.command(name="plan-trial")
+def plan_trial(
+    folder: RunPath,
+    model: Annotated[
+        str, typer.Option(help="Refitted baseline; the booklet's or the first if not given.")
+    ] = "",
+    time: Annotated[str, typer.Option(help="How long each trial lasts.")] = "120 s",
+    area: Annotated[
+        str | None, typer.Option(help="Largest distance from the start, such as '200 m'.")
+    ] = None,
+    speed: Annotated[str | None, typer.Option(help="Largest speed, such as '3 m/s'.")] = None,
+    rudder: Annotated[float, typer.Option(help="Largest share of full steer.")] = 1.0,
+    count: Annotated[int, typer.Option(help="Number of trials to choose.")] = 3,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for next_trials.yaml and tracks."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Say which manoeuvres to run next, and by how much they would narrow the predictions."""
+    from residnet.core.files import require_room
+    from residnet.tasks.verbs import plan_run
+
+    limit_threads()
+    if out is not None:
+        require_room(out)
+    limits = {"time": time, "area": area, "speed": speed, "rudder": rudder, "count": count}
+    with drawn_progress(quiet=quiet):
+        planned = plan_run(folder, model, limits)
+    print(planned.text())
+    for file in planned.write(out) if out is not None else []:
+        print(f"written: {file}")
+
+
+@app.command()
+def export(
+    folder: RunPath,
+    model: Annotated[
+        str,
+        typer.Option(
+            "--model",
+            metavar="NAME",
+            help="Name of the model; 'selected' for the one chosen on validation data.",
+        ),
+    ],
+    file_format: Annotated[
+        str,
+        typer.Option("--format", metavar="FORMAT", help="One of `residnet list formats`."),
+    ] = "torchscript",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE", help="File to write; RUN/exports/<model>.pt where not given."
+        ),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Export a model of a finished run for controllers, after a parity check."""
+    from residnet.tasks.verbs import export_run
+
+    limit_threads()
+    with drawn_progress(quiet=quiet):
+        written = export_run(folder, model, out, file_format)
+    print(written)
+
+
+@app.command()
+def ardupilot(
+    source: Annotated[
+        str, typer.Argument(metavar="VESSEL|RUN", help="A vessel, or the folder of a finished fit.")
+    ],
+    model: Annotated[
+        str, typer.Option("--model", metavar="NAME", help="Name of the model of a run.")
+    ] = "selected",
+    servo: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--servo",
+            metavar="COMMAND=OUTPUT:LOW:HIGH",
+            help="Servo output of a command and its values at 1000 and 2000 us, SI.",
+        ),
+    ] = None,
+    port: Annotated[int, typer.Option("--port", help="UDP port that ArduPilot sends to.")] = 9002,
+) -> None:
+    """Simulate a vessel or a learned model for ArduPilot (sim_vehicle.py --model JSON)."""
+    from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
+    from residnet.simulators.vehicle import vehicle
+
+    limit_threads()
+    boat = vehicle(source, model=model, dt=0.0025)
+    end = ArduPilotBackEnd(boat, servos(boat, servo or ()), port)
+    print(f"{boat.name} listens at UDP port {end.port}; Ctrl-C ends it", flush=True)
+    for name, at in zip(boat.inputs, end.servos, strict=False):
+        print(f"  {name}: servo output {at.channel}, {at.low:g} to {at.high:g}", flush=True)
+    end.serve()
+
+
+@app.command()
+def report(folder: RunPath, quiet: Quiet = False) -> None:
+    """Write the figures and the report of a finished run again."""
+    from residnet.tasks.verbs import report_run
+
+    limit_threads()
+    with drawn_progress(quiet=quiet):
+        page = report_run(folder)
+    print(page)
+
+
+@app.command()
+def compare(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="RUN RUN...", help="Folders of finished fits.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the page.")] = Path(
+        "comparison"
+    ),
+    quiet: Quiet = False,
+) -> None:
+    """Set finished fits side by side: errors on common logs, paired intervals, configs."""
+    from residnet.tasks.compare.comparing import compare_runs
+
+    limit_threads()
+    with drawn_progress(quiet=quiet):
+        text, page = compare_runs(folders, out)
+    print(text)
+    print(f"page: {page}")
+
+
+@app.command()
+def runs(
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder of runs.")] = Path("runs"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
+) -> None:
+    """List the runs below a folder with task, state, best figure and age."""
+    from residnet.tasks.run_list import runs_below, runs_text
+
+    entries = runs_below(folder)
+    print(json.dumps(entries, indent=1) if as_json else runs_text(folder, entries))
+
+
+@app.command(name="list")
+def list_names(
+    what: Annotated[
+        Literal[
+            "vessels",
+            "heads",
+            "manoeuvres",
+            "readers",
+            "tasks",
+            "baselines",
+            "formats",
+            "configs",
+        ],
+        typer.Argument(help="Kind of part to list."),
+    ],
+) -> None:
+    """List the parts that a config may name, with a line about each."""
+    from residnet.tasks.catalogue import catalogue
+
+    for name, about in catalogue(what):
+        print(f"{name:28s} {about}")
+
+
+def show(finished: Finished) -> None:
+    """Print the verdict and table of a run, its exported files and its report."""
+    for sentence in finished.outcome.verdict:
+        print(sentence)
+    if finished.outcome.table:
+        print(finished.outcome.table)
+    for file in finished.exports:
+        print(f"exported: {file}")
+    if finished.folder.report.is_file():
+        print(f"report: {finished.folder.report}")
+
+
+def limit_threads() -> None:
+    """Compute with one thread, unless the environment says otherwise."""
+    # small products are thirty times slower where several libraries fight for the cores
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 
 
 def main() -> None:

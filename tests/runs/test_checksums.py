@@ -10,8 +10,7 @@ import pytest
 from made_models import nomoto_model
 
 from residnet.core.errors import UsageError
-from residnet.runs.checksums import require_sealed, seal
-from residnet.runs.folder import RunFolder
+from residnet.runs.folder import RunFolder, require_sealed, seal
 from residnet.runs.model_store import FolderStore
 
 

@@ -12,7 +12,7 @@ from tiny import TINY, call
 
 from residnet.core.config import validate
 from residnet.data.simulated.trials import SimulatedTrials, simulate
-from residnet.runs.checksums import require_sealed
+from residnet.runs.folder import require_sealed
 
 DATA: dict[str, Any] = {
     **TINY["data"],

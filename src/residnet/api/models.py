@@ -21,7 +21,7 @@ from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_mo
 from residnet.export import ExportedVessel, exporter
 from residnet.identification.models import FittedModel
 from residnet.judge.band import Band, read_bands
-from residnet.runs.checksums import require_sealed, seal
+from residnet.runs.folder import require_sealed, seal
 
 if TYPE_CHECKING:
     import pandas as pd

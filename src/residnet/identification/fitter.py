@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -34,9 +34,12 @@ from residnet.judge.metrics import window_errors
 from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
 from residnet.regression.solutions import Solution
 from residnet.training.config import TrainingConfig
-from residnet.training.module import Score
 from residnet.training.refit import free_run_starts, refit
 from residnet.training.stage_windows import stage_windows
+
+if TYPE_CHECKING:
+    # its module imports Lightning, which checking a config must not wait for
+    from residnet.training.module import Score
 
 
 def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
@@ -91,6 +94,8 @@ class ValidationScore:
 
     def __call__(self, model: HybridDynamics) -> Score:
         """Return the divergences and the mean nrmse of the validation windows, run in float32."""
+        from residnet.training.module import Score
+
         candidate = Candidate("validated", "head", model)
         predictions = free_run(
             [candidate], self.windows, self.logs, self.step, self.limit, dtype=torch.float32

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.signal import correlate
+import scipy
 
 from residnet.core.layout import HEADING, POSE, POSITION, RANGE_VELOCITIES, VELOCITIES
 from residnet.core.names import VELOCITY
@@ -132,7 +132,10 @@ def mismatch(given: np.ndarray, series: np.ndarray) -> np.ndarray:
     for a, b in zip((given - middle).T, (series - middle).T, strict=True):
         energy = np.concatenate(([0.0], np.cumsum(b**2)))
         square = (
-            energy[length:] - energy[:-length] - 2 * correlate(b, a, mode="valid") + np.sum(a**2)
+            energy[length:]
+            - energy[:-length]
+            - 2 * scipy.signal.correlate(b, a, mode="valid")
+            + np.sum(a**2)
         )
         out.append(np.sqrt(np.maximum(square, 0.0) / length))
     return np.asarray(np.max(out, axis=0))

@@ -14,8 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.optimize import brentq
+import scipy
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
@@ -71,11 +70,16 @@ class Track:
             )
         self.t: np.ndarray = log.t[whole] - log.t[0]
         x, y, self.heading, self.u, self.v, self.r = motion[whole].T
-        self.psi = CubicSpline(self.t, self.heading)
-        self.x, self.y = CubicSpline(self.t, x), CubicSpline(self.t, y)
+        self.psi = scipy.interpolate.CubicSpline(self.t, self.heading)
+        self.x, self.y = (
+            scipy.interpolate.CubicSpline(self.t, x),
+            scipy.interpolate.CubicSpline(self.t, y),
+        )
         self.speed = np.hypot(self.u, self.v)
         steps = np.hypot(np.diff(x), np.diff(y))
-        self.travelled = CubicSpline(self.t, np.concatenate(([0.0], np.cumsum(steps))))
+        self.travelled = scipy.interpolate.CubicSpline(
+            self.t, np.concatenate(([0.0], np.cumsum(steps)))
+        )
 
     @property
     def end(self) -> float:
@@ -102,7 +106,7 @@ class Track:
         rate = self.psi.derivative()
         if best in (0, times.size - 1) or sign * rate(low) <= 0 or sign * rate(high) >= 0:
             return float(times[best]), float(sign * self.psi(times[best]))
-        time = float(brentq(lambda at: float(rate(at)), low, high, xtol=1e-12))
+        time = float(scipy.optimize.brentq(lambda at: float(rate(at)), low, high, xtol=1e-12))
         return time, float(sign * self.psi(time))
 
     def relative_position(self, time: float, origin: float) -> tuple[float, float]:
@@ -127,7 +131,7 @@ def first_crossing(function: Callable[[Any], Any], t: np.ndarray, after: float) 
         return None
     i = int(rising[0])
     return (
-        float(brentq(function, times[i], times[i + 1], xtol=1e-12))
+        float(scipy.optimize.brentq(function, times[i], times[i + 1], xtol=1e-12))
         if values[i + 1] > 0
         else float(times[i + 1])
     )
@@ -265,7 +269,7 @@ def stopping(log: Log, start: float, length: float | None) -> dict[str, Any]:
         length: of the hull in m.
     """
     track = Track(log)
-    surge = CubicSpline(track.t, track.u)
+    surge = scipy.interpolate.CubicSpline(track.t, track.u)
     indices: dict[str, Any] = {"approach_speed": track.approach(start)}
     stop = first_crossing(lambda t: -surge(t), track.t, start)
     if stop is None:

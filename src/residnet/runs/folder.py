@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from residnet.core.errors import UsageError
-from residnet.core.files import read_json, require_room, whole
-from residnet.runs.checksums import require_sealed
+from residnet.core.files import read_json, require_room, sha256, whole
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,6 +19,12 @@ SUMMARY = "residnet.summary/1"
 
 LOG = "log.txt"
 """File that holds the progress of a run, where that is kept."""
+EXPORTS = "exports.json"
+"""File that says what came of each export."""
+CHECKSUMS = "checksums.json"
+_RESULTS = {".json", ".yaml", ".parquet", ".safetensors"}
+_ELSEWHERE = {"figures", "exports", "tensorboard", "checkpoints"}
+"""Folders that have no checksums: nothing reads them back as a result."""
 _BEFORE_RESULTS = {
     "resolved.yaml",
     "provenance.json",
@@ -228,3 +233,50 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise UsageError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def seal(run: Path) -> None:
+    """Write checksums.json: the SHA-256 of every result that stands in the folder.
+
+    A run within the folder, such as an evaluation, has checksums of its own.
+    """
+    sums = {file.relative_to(run).as_posix(): sha256(file) for file in _results(run, run)}
+    with whole(run / CHECKSUMS) as file:
+        content = {"schema": "residnet.checksums/1", "files": sums}
+        file.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def require_sealed(run: Path) -> None:
+    """Check that the results of a finished run are those that it wrote.
+
+    A run of an earlier version has no checksums, and is taken as it is.
+
+    Raises:
+        UsageError: where a file is missing, cut off, edited or from elsewhere.
+    """
+    if not (run / CHECKSUMS).is_file():
+        return
+    sums = read_json(run / CHECKSUMS).get("files")
+    if not isinstance(sums, dict):
+        raise UsageError(f"{run / CHECKSUMS}: holds no checksums; restore the folder")
+    for name, expected in sums.items():
+        try:
+            found = sha256(run / name)
+        except (OSError, ValueError) as error:
+            raise UsageError(
+                f"{run / name}: cannot be read ({error}); restore the folder or run it again"
+            ) from error
+        if found != expected:
+            raise UsageError(
+                f"{run / name}: its SHA-256 is not the one in {CHECKSUMS}, so it is cut off, edited"
+                " or from elsewhere; restore the folder or run it again"
+            )
+
+
+def _results(folder: Path, run: Path) -> Iterator[Path]:
+    for path in sorted(folder.iterdir()):
+        if path.is_dir():
+            if path.name not in _ELSEWHERE and not (path / "summary.json").is_file():
+                yield from _results(path, run)
+        elif path.suffix in _RESULTS and path not in (run / CHECKSUMS, run / "summary.json"):
+            yield path

@@ -12,8 +12,7 @@ from residnet.core.files import read_json
 from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
 from residnet.identification.models import FittedModel
 from residnet.judge.band import read_bands
-from residnet.runs.checksums import require_sealed, seal
-from residnet.runs.folder import RunFolder
+from residnet.runs.folder import RunFolder, require_sealed, seal
 
 
 class FolderStore:

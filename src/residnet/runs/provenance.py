@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from residnet.core.errors import UsageError
-from residnet.core.files import read_json
+from residnet.core.files import read_json, sha256
 from residnet.core.version import __version__
 
 if TYPE_CHECKING:
@@ -85,12 +84,6 @@ class Provenance:
             "inputs": {str(path): sha256(path) for path in self.files},
         }
         folder.write_json(folder.provenance, content)
-
-
-def sha256(path: Path) -> str:
-    """Return the hexadecimal SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def git_revision() -> str | None:

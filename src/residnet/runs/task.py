@@ -9,26 +9,34 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, final
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
 
 from pydantic import Field
 
 from residnet.core.arrays.heap import keep_freed_memory
 from residnet.core.config import Config, dump_config, load_mapping
-from residnet.core.errors import DataError, ExportError, UsageError
-from residnet.report.blocks import Section
-from residnet.report.browser import Drawn
-from residnet.report.page import (
-    EXPORTS,
-    draw_sections,
-    exports_section,
-    title_and_description,
-    write_page,
-)
-from residnet.runs.checksums import seal
-from residnet.runs.exports import Exported, Exports, write_exports
-from residnet.runs.folder import RunFolder
+from residnet.core.errors import DataError, ExportError, ResidnetError, UsageError
+from residnet.runs.folder import EXPORTS, RunFolder, seal
 from residnet.runs.provenance import Provenance
+
+if TYPE_CHECKING:
+    from residnet.report.blocks import Section
+    from residnet.report.browser import Drawn
+
+Exports = Mapping[str, Callable[[], Path]]
+"""What writes each export and returns its file, by the name of the model."""
+
+
+class Exported(NamedTuple):
+    """What came of the exports of a run.
+
+    Attributes:
+        files: that were written.
+        faults: one line for each export that failed.
+    """
+
+    files: tuple[Path, ...] = ()
+    faults: tuple[str, ...] = ()
 
 
 class MainFigure(NamedTuple):
@@ -227,11 +235,13 @@ class Task(Config):
             made_from.write(folder)
             verdict, exported = list(outcome.verdict), Exported()
             if report:
+                from residnet.report.page import draw_sections
+
                 sections = self.report_sections(folder)
                 drawn = draw_sections(sections)
                 self._write_page(folder, sections, drawn)
                 if outcome.exports:
-                    exported = write_exports(folder, outcome.exports)
+                    exported = _write_exports(folder, outcome.exports)
                     verdict += [f"Not exported: {fault}." for fault in exported.faults]
                     folder.write_summary(self.task, verdict, figures, finished=False)
                     self._write_page(folder, sections, drawn)
@@ -252,6 +262,8 @@ class Task(Config):
     def _write_page(
         cls, run: RunFolder, sections: Sequence[Section], drawn: Drawn | None = None
     ) -> Path:
+        from residnet.report.page import exports_section, title_and_description, write_page
+
         title, description = title_and_description(run.path)
         exports = exports_section(run.path)
         return write_page(
@@ -299,3 +311,23 @@ class ComputingTask(Task):
             yield
         finally:
             torch.set_num_threads(before)
+
+
+def _write_exports(folder: RunFolder, exports: Exports) -> Exported:
+    """Write all exports, and exports.json, which says what came of each.
+
+    A model that cannot be exported does not keep the others, or the run, from coming to their end.
+    """
+    files, faults, rows = [], [], []
+    for name, write in exports.items():
+        try:
+            file = write()
+        except ResidnetError as error:
+            faults.append(str(error))
+            rows.append({"model": name, "file": None, "fault": str(error)})
+        else:
+            files.append(file)
+            place = file.relative_to(folder.path) if file.is_relative_to(folder.path) else file
+            rows.append({"model": name, "file": place.as_posix(), "fault": None})
+    folder.write_json(folder.path / EXPORTS, {"schema": "residnet.exports/1", "exports": rows})
+    return Exported(tuple(files), tuple(faults))

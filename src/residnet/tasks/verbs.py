@@ -11,8 +11,7 @@ from residnet.core.errors import UsageError
 from residnet.core.files import require_file_place, require_room
 from residnet.core.names import nearest
 from residnet.core.registry import kinds
-from residnet.runs.checksums import seal
-from residnet.runs.folder import RunFolder
+from residnet.runs.folder import RunFolder, seal
 from residnet.runs.task import Finished, Task
 from residnet.tasks.fit.config import FitTaskSettings
 from residnet.tasks.fit.planning import PlannedTrials, plan_trials

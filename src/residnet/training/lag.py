@@ -9,10 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.linalg import expm
-from scipy.optimize import least_squares
-from scipy.signal import lfilter
 from torch import Tensor
 
 from residnet.control.motion.anticipation import Lag
@@ -39,7 +37,7 @@ def followed(command: Tensor, lag: Lag, dt: float, runs: Sequence[int] = ()) -> 
     a[0, 1] = 1.0
     a[1] = [-w * w, -2 * z * w, w * w, 0.0]
     a[2, 3] = 1.0
-    e = expm(a * dt)
+    e = scipy.linalg.expm(a * dt)
     step, held, slope = e[:2, :2], e[:2, 2], e[:2, 3] / dt
     # x[k+1] = S x[k] + (h - g) u[k] + g u[k+1]; y = x[0] as a transfer function of order two
     trace, determinant = np.trace(step), np.linalg.det(step)
@@ -47,7 +45,7 @@ def followed(command: Tensor, lag: Lag, dt: float, runs: Sequence[int] = ()) -> 
     # y = C (zI - S)^-1 (b + g z) u with C = [1, 0]: (z - s22) (b0 + g0 z) + s12 (b1 + g1 z)
     s12, s22 = step[0, 1], step[1, 1]
     numerator = [g[0], b[0] - s22 * g[0] + s12 * g[1], -s22 * b[0] + s12 * b[1]]
-    return torch.from_numpy(lfilter(numerator, [1.0, -trace, determinant], u, axis=0))
+    return torch.from_numpy(scipy.signal.lfilter(numerator, [1.0, -trace, determinant], u, axis=0))
 
 
 def _delayed(u: np.ndarray, delay: float, dt: float) -> np.ndarray:
@@ -115,7 +113,7 @@ def fit_lag(
 
     starts = [np.array([w, 0.8, d]) for w in (1.0, 3.0, 8.0) for d in (0.05, 0.5)]
     first = min(starts, key=lambda p: float(np.square(miss(p)).sum()))
-    found = least_squares(
+    found = scipy.optimize.least_squares(
         miss,
         first,
         bounds=(_LEAST, _MOST),

@@ -16,8 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky_banded, solve_banded
-from scipy.signal import savgol_filter
+import scipy
 
 from residnet.core.log import Log
 from residnet.data.doctor.signals import noise_of
@@ -160,7 +159,7 @@ def _smoothed(values: np.ndarray) -> np.ndarray:
         return values
     at = np.arange(values.size)
     filled = np.interp(at, at[known], values[known])
-    smooth = savgol_filter(filled, 2 * _REACH + 1, 2)
+    smooth = scipy.signal.savgol_filter(filled, 2 * _REACH + 1, 2)
     smooth[_REACH:-_REACH] = np.convolve(filled, _around(), "valid")
     return np.where(known, smooth, np.nan)
 
@@ -249,11 +248,11 @@ class _Rows:
         diagonal, off = total + 2.0 * ends + floor**2, np.where(adjacent, -ends, 0.0)
         # noise of the pose alone is singular in the limit: a little of the diagonal keeps the
         # factor
-        self._factor = cholesky_banded(np.stack((1.0001 * diagonal, off)), lower=True)
+        self._factor = scipy.linalg.cholesky_banded(np.stack((1.0001 * diagonal, off)), lower=True)
 
     def _white(self, table: np.ndarray) -> np.ndarray:
         # rows of L: diagonal and the one below
-        return np.asarray(solve_banded((1, 0), self._factor, table))
+        return np.asarray(scipy.linalg.solve_banded((1, 0), self._factor, table))
 
     @staticmethod
     def _trimmed(y: np.ndarray, x: np.ndarray) -> np.ndarray:

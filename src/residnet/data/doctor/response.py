@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import savgol_filter
+import scipy
 
 from residnet.core.log import Log
 from residnet.data.doctor.findings import Finding
@@ -215,4 +215,4 @@ def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
 def _smoothed(values: np.ndarray) -> np.ndarray:
     """Return the values [T] smoothed by a parabola over 15 samples, NaN bridged."""
     at, known = np.arange(values.size), np.isfinite(values)
-    return np.asarray(savgol_filter(np.interp(at, at[known], values[known]), 15, 2))
+    return np.asarray(scipy.signal.savgol_filter(np.interp(at, at[known], values[known]), 15, 2))

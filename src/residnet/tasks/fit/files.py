@@ -14,9 +14,8 @@ from residnet.judge.repeats import repeatability
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import errors_table
 from residnet.report.sections.verdict import verdict
-from residnet.runs.exports import Exports
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure, Outcome
+from residnet.runs.task import Exports, MainFigure, Outcome
 from residnet.tasks.fit.config import FitTaskSettings
 
 

@@ -1,4 +1,4 @@
-"""The door of the command line: whatever ends a command ends it in one line and an exit code.
+"""How a command ends: in one line and an exit code, with a crash file where residnet is at fault.
 
 Nothing heavy is imported here, so that an interruption is heard from the first moment on.
 """
@@ -6,11 +6,15 @@ Nothing heavy is imported here, so that an interruption is heard from the first 
 from __future__ import annotations
 
 import errno
+import os
+import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 from residnet.core.errors import ResidnetError
@@ -110,8 +114,6 @@ def _told(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
         place = "" if error.filename is None else f"{error.filename}: "
         return f"{place}{error.strerror}; make room or give another place", 2
-    from residnet.crash import write_crash_file
-
     file = write_crash_file(error)
     first = next(iter(str(error).splitlines()), "")
     place = "it could not be described in a file" if file is None else f"attach {file} to an issue"
@@ -129,3 +131,87 @@ def _leave(line: str, code: int, cause: BaseException) -> None:
     # whatever the line quotes, it stays one line
     print(f"residnet: {ResidnetError(line)}", file=sys.stderr)
     raise SystemExit(code) from cause
+
+
+_LONGEST_CONFIG = 100_000
+_SECRET = re.compile(
+    r"(?i)((?:[\w.-]*(?:password|passwd|secret|token|api[_-]?key|credential)[\w.-]*)"
+    r"[\"']?\s*[:=]\s*)\S.*"
+)
+_ACCOUNT = re.compile(r"://[^/\s@]+@")
+
+
+def write_crash_file(error: BaseException) -> Path | None:
+    """Write versions, command, config and traceback to a file, and return the file.
+
+    It stands in the current folder, or where that cannot be written in the folder for temporary
+    files; None where neither can be. Passwords, tokens and the name of the user are left out, and
+    the environment is not looked at.
+    """
+    import tempfile
+
+    text = without_secrets(_content(error))
+    name = f"residnet-crash-{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}.txt"
+    for folder in (Path.cwd, lambda: Path(tempfile.gettempdir())):
+        try:
+            file = folder() / name
+            file.write_text(text, encoding="utf-8", errors="backslashreplace")
+        except OSError:
+            continue
+        return file
+    return None
+
+
+def without_secrets(text: str) -> str:
+    """Return text without passwords, tokens and the home folder's name."""
+    try:
+        home = str(Path.home())
+    except RuntimeError:
+        home = ""
+    if len(home) > 1:
+        text = text.replace(home, "~")
+    return _ACCOUNT.sub("://***@", _SECRET.sub(r"\1***", text))
+
+
+def _content(error: BaseException) -> str:
+    import platform
+    import traceback
+
+    from residnet.core.version import __version__
+
+    parts = [
+        f"residnet {__version__}, Python {platform.python_version()}, {platform.platform()}",
+        "packages: " + ", ".join(_versions()),
+        f"command: residnet {' '.join(sys.argv[1:])}",
+        "".join(traceback.format_exception(error)),
+    ]
+    return "\n\n".join([*parts, *_configs()]) + "\n"
+
+
+def _versions() -> list[str]:
+    """Versions of the packages that residnet needs, those of its extras where they are there."""
+    from importlib.metadata import PackageNotFoundError, requires, version
+
+    found = []
+    for requirement in requires("residnet") or ():
+        name = re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0]
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return sorted(set(found))
+
+
+def _configs() -> list[str]:
+    """Texts of the configs that the command names, by file or by run folder."""
+    out = []
+    for word in sys.argv[1:]:
+        try:
+            file = Path(word) / "resolved.yaml" if Path(word).is_dir() else Path(word)
+            if file.suffix in (".yaml", ".yml") and file.is_file():
+                text = file.read_text(encoding="utf-8", errors="backslashreplace")
+                out.append(f"{file}:\n{text[:_LONGEST_CONFIG]}")
+        except (OSError, ValueError):
+            # a word that is no path, or a file that cannot be read
+            continue
+    return out

@@ -1,4 +1,4 @@
-"""Whatever ends a command, the door tells it in one line with the exit code that belongs to it."""
+"""Whatever ends a command, it is told in one line with the exit code that belongs to it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from typing import NoReturn
 import pytest
 
 from residnet.core.errors import DataError, UsageError
-from residnet.crash import without_secrets
-from residnet.door import enter
+from residnet.exits import enter, without_secrets
 
 
 def ended(
