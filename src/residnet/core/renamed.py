@@ -27,10 +27,25 @@ RENAMED: dict[str, str] = {
 """For example `"free_run.lead": "warmup"`, `"baseline.kind=fossen": "hull"`."""
 
 
+GONE: dict[str, str] = {
+    "refit.*.folds": "the prior is fixed by the length of the logs",
+    "refit_baseline": "refit the baseline before its networks, by `refit`",
+    "begin_with": "a network begins from its baseline alone",
+    "swaps": "the search keeps a beam of sets and trims them",
+    "separate": "models of single phases are always fitted besides",
+    "standard.bounds": "parameters are free, as in the document",
+    "identify": "the first half identifies, as in the document",
+}
+"""Keys that nothing took the place of, and what holds instead."""
+
+
 def renamed(path: tuple[str | int, ...], value: str | None = None) -> str:
-    """Return `; it is 'new' now` for an old key, or an old value of it; empty where it is none."""
+    """Return `; it is 'new' now` for an old key or value, `; it is gone: ...`, or nothing."""
     written = ".".join(map(str, path)) + ("" if value is None else f"={value}")
     for old, new in RENAMED.items():
         if fnmatchcase(f".{written}", f"*.{old}"):
             return f"; it is '{new}' now"
+    for old, instead in GONE.items():
+        if fnmatchcase(f".{written}", f"*.{old}"):
+            return f"; it is gone: {instead}"
     return ""
