@@ -338,8 +338,8 @@ def test_inspect_drafts_a_channel_map_for_a_table_that_nobody_described(
     table.assign(mode="auto", spare=np.nan).to_csv(path, index=False)
     assert call(monkeypatch, "inspect", path) == 0
     text = capsys.readouterr().out
-    assert "1 columns hold nothing: spare" in text
-    assert "1 columns hold text: mode" in text
+    assert "# empty columns: spare" in text
+    assert "# columns of text: mode" in text
     assert "coherence 1.000" in text
     draft = yaml.safe_load(text[text.index("reader:") :])["reader"]
     assert draft["time"] == {"column": "time", "unit": "s"}

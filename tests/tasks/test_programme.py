@@ -106,7 +106,7 @@ def test_a_vessel_leaves_logs_indices_and_figures(ship: Path) -> None:
     )
     assert not any(row["timed_out"] for row in content["rows"])
     figures = {path.stem[3:] for path in (ship / "figures").glob("*.png")}
-    assert figures == {"tracks_1", *(f"history_{name}" for name in logs)}
+    assert figures == {f"manoeuvres_{number + 1}" for number in range(len(logs))}
     for path in (ship / "figures").glob("*.png"):
         with Image.open(path) as picture:
             assert min(picture.size) > 600
