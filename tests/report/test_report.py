@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from kinds import of_kind
 from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_json
 from read_page import Page, plain
 
-from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import DataError, UsageError
-from residnet.dynamics.store import ModelSpec, save_model
+from residnet.judge.soundness import CHECKS, Finding, sanity_content
 from residnet.report.fit import write_fit_page, write_fit_report
 from residnet.report.format import change, number
 from residnet.report.run_reader import RunFiles
@@ -338,30 +336,13 @@ def test_the_file_stands_alone_and_loads_nothing(run: Path) -> None:
     assert write_fit_page(RunFiles(run)).read_text() == text
 
 
-def test_physical_sanity_is_shown_where_models_can_be_loaded(run: Path) -> None:
-    spec = ModelSpec.model_validate(
-        {
-            "schema": "residnet.model/1",
-            "name": "plsr",
-            "role": "baseline",
-            "signals": {"inputs": ["n", "delta"]},
-            "baseline": {"kind": "regressors", "terms": ["u", "v", "r", "n", "delta"]},
-            "dt": 0.5,
-            "integrator": "euler",
-            "low": [0.0, -0.2, -0.1, 0.0, -0.6],
-            "high": [1.0, 0.2, 0.1, 10.0, 0.6],
-        }
-    )
-    model = spec.build()
-    # surge that feeds itself
-    of_kind(model.baseline, RegressorBaseline).theta.data[0, 0] = 0.3
-    save_model(run / "models" / "plsr", spec, model)
+def test_physical_sanity_is_shown_as_the_fit_found_it(run: Path) -> None:
+    assert "Physical sanity" not in html.unescape(shown(run))
+    found = [Finding("plsr", check, check != "damping", f"words on {check}") for check in CHECKS]
+    (run / "sanity.json").write_text(json.dumps(sanity_content({"plsr": found})))
     page = html.unescape(shown(run))
     assert "Physical sanity" in page
-    assert (
-        "plsr, damping: not damped (wrong sign or none): u at rest, v at rest, r at rest, u at"
-        " cruise" in page
-    )
+    assert "plsr, damping: words on damping" in page
 
 
 def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> None:
