@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,9 @@ def _told(work: Callable[..., object], files: Sequence[Path]) -> dict[str, Any]:
     """The map that a function of Python reports to whoever listens."""
     lines: list[str] = []
     work(files, lambda told: lines.append(told.message))
-    text = "\n".join(line.removeprefix("  ") for line in lines if line.startswith("  "))
+    begun = next(i for i, line in enumerate(lines) if "channel map as guessed" in line)
+    drafted = takewhile(lambda line: line.startswith("  "), lines[begun + 1 :])
+    text = "\n".join(line.removeprefix("  ") for line in drafted)
     return dict(yaml.safe_load(text)["data"]["reader"])
 
 

@@ -161,7 +161,7 @@ def prepare(
             )
         known = [name for name in taken if all(name in log.channels for log in every)]
         chosen = Preparation.of(every, known)
-        say(f"  {chosen.reason}")
+        say(f"recipe: {chosen.reason}")
         settings = {
             "inputs": list(taken) if not isinstance(taken, str) else taken,
             "exogenous": chosen.exogenous if exogenous is None else exogenous,
