@@ -210,6 +210,8 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(
         forces=config["signals"]["forces"],
         step=prepared["grid"]["step"],
         derivative=prepared["derivative"],
+        hold="start",
+        held=(),
         **{key: evaluation[key] for key in ("protocols", "selection", "scales")},
     )
     models = residnet.fit(
