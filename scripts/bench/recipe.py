@@ -1,18 +1,28 @@
-"""How far `recipe: standard` is from the best of its models in hindsight, on boats drawn at random.
+"""How far `recipe: standard` is from the best of its models in hindsight, and from a plain network.
 
-    python scripts/bench/recipe.py [--count N] [--minutes M] [--seed S] [--effort E]
-        [--records FILE]
+    python scripts/bench/recipe.py [--logs boats|shipped|measured] [--count N] [--seed S]
+        [--minutes M ...] [--vessels NAME ...] [--effort E] [--peer] [--records FILE]
 
-Each fit is of one small boat (one propeller and a rudder, or two propellers) that follows paths
-and does a few manoeuvres, with noise and gusts: M minutes for training and validation, as long for
-the test. For each fit a line; at the end the mean test error of the selected model, of the best
-model in hindsight, and how many selected models diverged. Test logs take no part in any choice.
+Nothing is said to `residnet.fit` but the logs: M minutes for training and validation (three to
+one), as long for the test, which takes part in no choice.
+
+    boats     small boats (one propeller and a rudder, or two propellers) that follow paths, with
+              noise and gusts
+    shipped   shipped vessels: zigzags, random steps and 3-2-1-1, with noise and random forces
+    measured  random stretches of the logs below RESIDNET_DATA: a model tanker (wind not given) and
+              a 7 m tanker model
+
+`--peer` adds what an hour of PyTorch gives: a GRU that reads two seconds of the past, and another
+that runs freely from what the first one leaves, the best of its validations kept; it is judged over
+the same windows. A line for each fit; at the end the means over the draws.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -20,149 +30,284 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
 
 from random_vessels import KINDS, small_boat_logs
 
+import residnet
 from residnet.core.config import validate
+from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
-from residnet.identification.fit import fit
-from residnet.identification.prepared import prepare_logs
-from residnet.identification.settings import FitSettings
-from residnet.judge.metrics import find
+from residnet.data.prepare import Prepared
+from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.judge.protocol import Window
 
-INPUTS = {"boat": ["n", "delta"], "twin": ["n_port", "n_stbd"]}
-_LENGTH = 20.0
-_FLIGHTS = 10
+CHANNELS = {
+    "esso_osaka": {
+        "x": ("x_position_mid [m]", "m"),
+        "y": ("y_position_mid [m]", "m"),
+        "psi": ("psi_hat [rad]", "rad"),
+        "u": ("u_velo [m/s]", "m/s"),
+        "v": ("vm_velo [m/s]", "m/s"),
+        "r": ("r_angvelo [rad/s]", "rad/s"),
+        "n": ("n_prop [rps]", "rps"),
+        "delta": ("delta_rudder [rad]", "rad"),
+    },
+    "kvlcc2": {
+        "x": ("x", "m"),
+        "y": ("y", "m"),
+        "psi": ("psi", "rad"),
+        "u": ("u", "m/s"),
+        "v": ("v", "m/s"),
+        "r": ("r", "rad/s"),
+        "n": ("rev", "1/s"),
+        "delta": {"column": "delta", "unit": "rad", "sign": -1},
+    },
+}
+TIME = {"esso_osaka": ("t [s]", "s"), "kvlcc2": "t"}
+SHIPPED: dict[str, dict[str, Any]] = {
+    "wam_v_cal": {"step": 0.1, "push": (20.0, 20.0, 20.0), "unit": 3.0},
+    "patrol_mss": {"step": 0.1, "push": None, "unit": 3.0},
+    "mariner": {"step": 1.0, "push": (2e4, 2e4, 1e6), "unit": 20.0},
+    "milliampere": {"step": 0.2, "push": (40.0, 40.0, 60.0), "unit": 5.0},
+}
+"""Step of the logs in s, largest standard deviations of random forces in N and N m (None where the
+vessel has no masses), and a time in s in which the vessel answers."""
+TRAINING, STRETCHES, PAST = 3, 4, 2.0
+"""Logs of training, logs of training and validation, and seconds that the peer reads."""
+Splits = dict[str, list[Log]]
 
 
-def settings_for(kind: str, splits: dict[str, list[Log]], effort: float = 1.0) -> FitSettings:
-    """The settings of a fit that says nothing but what the logs are."""
-    test = splits["test"]
-    step = float(np.median(np.diff(test[0].t)))
-    spread = {c: float(np.concatenate([log[c] for log in test]).std()) for c in ("u", "v", "r")}
-    windows = {"kind": "windows", "first": 2.0, "history": 2.0}
+def split(logs: list[Log]) -> Splits:
+    """Divide logs into training, validation and test."""
+    parts = (slice(None, TRAINING), slice(TRAINING, STRETCHES), slice(STRETCHES, None))
+    names = ("train", "validation", "test")
+    return {name: logs[part] for name, part in zip(names, parts, strict=True)}
+
+
+def of_boats(name: str, seconds: float, seed: int, _: np.random.Generator) -> list[Log]:
+    """Return logs of a small boat that follows paths."""
+    return small_boat_logs(name, seed, 2 * STRETCHES, seconds)
+
+
+def of_shipped(name: str, seconds: float, _: int, random: np.random.Generator) -> list[Log]:
+    """Return logs of a mixture of manoeuvres of a shipped vessel."""
+    known = SHIPPED[name]
+    noise = float(np.exp(random.uniform(np.log(0.005), np.log(0.05))))
+    unit = known["unit"]
+    family = {"start": min(unit, 0.1 * seconds), "drive": [0.4, 0.9]}
+    push = known["push"] and (random.uniform(0.1, 1.0) * np.array(known["push"])).tolist()
+    forces = zip(("force_x", "force_y", "force_n"), push, strict=True) if push else ()
     content = {
-        "recipe": "standard",
-        "effort": effort,
-        # bands choose nothing
-        "bands": None,
-        "prepare": {
-            "grid": {"step": step},
-            "derivative": {"kind": "savitzky_golay", "window": 11 * step, "order": 2},
-        },
-        "signals": {"inputs": INPUTS[kind]},
-        "integrator": "semi_implicit_euler",
-        "evaluation": {
-            "protocols": {
-                "T20": {**windows, "length": _LENGTH},
-                "T5": {**windows, "length": _LENGTH / 4},
-            },
-            "selection": "T20",
-            "scales": spread,
-        },
+        "vessel": name,
+        "duration": seconds,
+        "step": known["step"],
+        "substeps": 2,
+        "seed": int(random.integers(2**31)),
+        "noise": {"u": noise, "v": noise, "r": f"{random.uniform(0.05, 0.5)} deg/s"},
+        "disturbance": dict(forces),
+        "trials": [
+            {"kind": "zigzag", "count": 4, "heading": ["10 deg", "20 deg"], **family},
+            {"kind": "random_steps", "count": 2, "band": [0.05 / unit, 0.5 / unit], **family},
+            {"kind": "three_two_one_one", "count": 2, "unit": [0.7 * unit, 2.0 * unit], **family},
+        ],
+        "identification": {},
+        "validation": {},
     }
-    return validate(content, FitSettings, "bench")
+    config = validate(content, SimulatedTrials, "bench")
+    logs = simulate(config.draw(), config)
+    return [logs[i] for i in random.permutation(len(logs))]
 
 
-def splits_of(kind: str, seed: int, minutes: float) -> dict[str, list[Log]]:
-    """Logs for training, validation (three to one) and the test, as long as both together."""
-    seconds = 60.0 * minutes / _FLIGHTS * 2.0
-    logs = small_boat_logs(kind, seed, _FLIGHTS, seconds)
-    return {"train": logs[:4], "validation": logs[4:5], "test": logs[5:]}
+def of_measured(name: str, seconds: float, _: int, random: np.random.Generator) -> list[Log]:
+    """Return stretches of random measured logs; no log is in two of them."""
+    folder = Path(os.environ["RESIDNET_DATA"]) / name
+    files = sorted(path for path in folder.rglob("*.csv") if "cut" not in path.name)
+    chosen = random.permutation(np.array(files, dtype=object)).tolist()[: 2 * STRETCHES]
+    out = []
+    for log in residnet.read_logs(chosen, channels=CHANNELS[name], time=TIME[name]):
+        room = max(float(log.t[-1] - log.t[0]) - seconds, 0.0)
+        begin = log.t[0] + random.uniform(0.0, room)
+        rows = (log.t >= begin) & (log.t <= begin + seconds)
+        channels = {channel: values[rows] for channel, values in log.channels.items()}
+        out.append(log.replace(t=log.t[rows], channels=channels))
+    return out
 
 
-def one(kind: str, seed: int, minutes: float, effort: float = 1.0) -> dict[str, Any]:
-    """Fit the recipe to one boat and return what the comparison needs."""
-    started = time.process_time()
-    splits = splits_of(kind, seed, minutes)
-    settings = settings_for(kind, splits, effort)
-    return judged_fit(splits, settings) | {
-        "kind": kind,
-        "seed": seed,
-        "seconds": time.process_time() - started,
-    }
+SOURCES = {
+    "boats": (of_boats, list(KINDS)),
+    "shipped": (of_shipped, list(SHIPPED)),
+    "measured": (of_measured, list(CHANNELS)),
+}
 
 
-def judged_fit(splits: dict[str, list[Log]], settings: FitSettings) -> dict[str, Any]:
-    """Fit, select, and return test errors of all models by both protocols."""
-    logs = prepare_logs(splits, settings)
-    models = fit(logs, settings)
-    judged = {split: models.evaluate(logs[split]) for split in ("train", "validation", "test")}
-    chosen = models.select(judged)
-    rows = judged["test"].rows
-    errors = {}
-    for name in models:
-        parts = [find(rows, model=name, protocol=p) for p in settings.evaluation.protocols]
-        errors[name] = [part["nrmse"]["mean"] for part in parts]
-        errors[name].append(sum(part["diverged"] for part in parts))
+class Network(nn.Module):
+    """A GRU in free run, started by another one that reads the past."""
+
+    def __init__(self, inputs: int, size: int = 32) -> None:
+        super().__init__()
+        self.reader = nn.GRU(3 + inputs, size, batch_first=True)
+        self.cell = nn.GRUCell(3 + inputs, size)
+        self.out = nn.Linear(size, 3)
+
+    def forward(self, past: Tensor, start: Tensor, ahead: Tensor) -> Tensor:
+        """Velocities [B, T, 3] from past [B, P, 3 + m], velocities [B, 3] and inputs [B, T, m]."""
+        h = self.reader(past)[1][0]
+        nu, out = start, []
+        for k in range(ahead.shape[1]):
+            h = self.cell(torch.cat((nu, ahead[:, k]), 1), h)
+            nu = nu + 0.1 * self.out(h)
+            out.append(nu)
+        return torch.stack(out, 1)
+
+
+class Peer:
+    """The network with its scales, trained on one data set."""
+
+    def __init__(self, data: residnet.Data, steps: int = 600) -> None:
+        self.data = data
+        self.past = max(round(PAST / data.prepare.grid.step), 1)
+        joined = np.concatenate([self.rows(log) for log in data.logs("train")])
+        self.mean = np.nanmean(joined, 0)
+        # an input that hardly moves in training may move in the test
+        self.spread = np.maximum(np.nanstd(joined, 0), 0.05 * np.abs(self.mean)) + 1e-9
+        torch.manual_seed(0)
+        self.net = Network(joined.shape[1] - 3)
+        length = max(w.stop - w.start for w in self.windows("train"))
+        self.train(min(length, 200), steps)
+
+    @staticmethod
+    def rows(log: Prepared) -> np.ndarray:
+        """Velocities and inputs [T, 3 + m]."""
+        return np.concatenate((log.y[:, VELOCITIES], log.w), 1)
+
+    def scaled(self, log: Prepared) -> Tensor:
+        """The same in standard deviations."""
+        return torch.from_numpy(np.nan_to_num((self.rows(log) - self.mean) / self.spread)).float()
+
+    def windows(self, split: str) -> list[Window]:
+        """The windows of the protocol that chooses."""
+        protocol = self.data.evaluation.protocols[self.data.evaluation.selection]
+        step = self.data.prepare.grid.step
+        logs = enumerate(self.data.logs(split))
+        return [w for i, log in logs for w in protocol.windows(log, i, step)]
+
+    def train(self, length: int, steps: int) -> None:
+        """Free runs of some length from anywhere; the best of the validations is kept."""
+        logs = [self.scaled(log) for log in self.data.logs("train")]
+        starts = [
+            (i, k) for i, log in enumerate(logs) for k in range(self.past, len(log) - length - 1)
+        ]
+        optimiser = torch.optim.Adam(self.net.parameters(), 3e-3)
+        falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+        random, best = np.random.default_rng(0), (np.inf, copy.deepcopy(self.net.state_dict()))
+        for number in range(steps):
+            picked = [starts[i] for i in random.integers(len(starts), size=64)]
+            past = torch.stack([logs[i][k - self.past : k] for i, k in picked])
+            ahead = torch.stack([logs[i][k : k + length + 1] for i, k in picked])
+            nu = self.net(past, ahead[:, 0, :3], ahead[:, :-1, 3:])
+            loss = (nu - ahead[:, 1:, :3]).square().mean()
+            optimiser.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
+            optimiser.step()
+            falling.step()
+            if number % 25 == 24:
+                error = self.error("validation")
+                if error < best[0]:
+                    best = (error, copy.deepcopy(self.net.state_dict()))
+        self.net.load_state_dict(best[1])
+
+    @torch.no_grad()
+    def error(self, split: str) -> float:
+        """Mean NRMSE over the windows of a split, as the rows of metrics.json have it."""
+        logs, scales, out = self.data.logs(split), self.data.evaluation.scales.array(), []
+        for window in self.windows(split):
+            z = self.scaled(logs[window.log])
+            begin = max(window.start - self.past, 0)
+            past = z[begin : window.start] if window.start > begin else z[:1]
+            nu = self.net(
+                past[None], z[None, window.start, :3], z[None, window.start : window.stop - 1, 3:]
+            )[0].numpy()
+            truth = logs[window.log].y[window.start + 1 : window.stop, VELOCITIES]
+            apart = nu * self.spread[:3] + self.mean[:3] - truth
+            out.append(float((np.sqrt(np.mean(apart**2, 0)) / scales).mean()))
+        return float(np.mean(out))
+
+
+def judged(splits: Splits, effort: float, peer: bool) -> dict[str, Any]:
+    """Fit, and return the test errors by the protocol that chooses."""
+    began = time.process_time()
+    models = residnet.fit(splits, effort=effort, bands=None)
+    seconds = time.process_time() - began
+    rows = residnet.metrics(models, split="test")
+    rows = rows[rows.protocol == models.data.evaluation.selection].set_index("model")
+    single = rows[(rows.kind != "ensemble") & (rows.diverged == 0)]
     return {
-        "selected": chosen.selected,
-        "reason": chosen.reason,
-        "test": errors,
-        "validation": {entry.name: entry.error for entry in chosen.contenders},
-        "sound": [entry.name for entry in chosen.contenders if entry.sound],
-        "priors": {name: models[name].notes.get("prior") for name in ("baseline", "hull")},
-        "seconds_of": {name: models[name].notes.get("seconds") for name in models},
+        "selected": models.selected,
+        "seconds": seconds,
+        "test": {name: float(row.nrmse_mean) for name, row in rows.iterrows()},
+        "diverged": {name: int(row.diverged) for name, row in rows.iterrows()},
+        "best": float(single.nrmse_mean.min()),
+        "peer": Peer(models.data).error("test") if peer else None,
     }
 
 
 def line(record: dict[str, Any]) -> str:
     """One fit in a line: errors of all models, the selected one marked."""
     parts = [
-        f"{'*' if name == record['selected'] else ''}{name} {e[0]:.3f}/{e[1]:.3f}"
-        + (f" ({e[2]} diverged)" if e[2] else "")
-        for name, e in record["test"].items()
+        f"{'*' if name == record['selected'] else ''}{name} {error:.3f}"
+        + (f" ({record['diverged'][name]} diverged)" if record["diverged"][name] else "")
+        for name, error in record["test"].items()
     ]
-    return f"{record['kind']} {record['seed']} {record['seconds']:.0f} s: " + ", ".join(parts)
+    parts += [f"GRU {record['peer']:.3f}"] if record["peer"] is not None else []
+    return f"{record['seconds']:.0f} s: " + ", ".join(parts)
 
 
 def summary(records: list[dict[str, Any]]) -> str:
-    """The table of a bench."""
-    chosen = np.array([record["test"][record["selected"]] for record in records])
-    single = [{k: v for k, v in r["test"].items() if k != "tied"} for r in records]
-    best = np.array([min(e[0] for e in models.values() if not e[2]) for models in single])
-    least = np.array(
-        [
-            r["test"][min(s, key=lambda n: r["validation"][n])][0]
-            for r, s in zip(records, single, strict=True)
-        ]
-    )
-    tied = np.array([r["test"].get("tied", r["test"][r["selected"]])[0] for r in records])
-    count: dict[str, int] = {}
-    for record in records:
-        count[record["selected"]] = count.get(record["selected"], 0) + 1
+    """The means over the draws."""
+    own = np.array([record["test"][record["selected"]] for record in records])
+    best = np.array([record["best"] for record in records])
+    lost = sum(record["diverged"][record["selected"]] > 0 for record in records)
+    names = [record["selected"] for record in records]
     out = [
-        f"{len(records)} fits; selected: {', '.join(f'{k} {v}' for k, v in count.items())}",
-        f"selected models that diverged in a test window: {int((chosen[:, 2] > 0).sum())}",
-        f"mean test error of the selected model {chosen[:, 0].mean():.4f}",
-        f"of the best model in hindsight        {best.mean():.4f}:"
-        f" selected {100 * (chosen[:, 0].mean() / best.mean() - 1):+.1f} % (at most +10)",
-        f"of the least validation error         {least.mean():.4f}",
-        f"of the mean of the tied models        {tied.mean():.4f}",
+        f"{len(records)} fits; selected: "
+        + ", ".join(f"{name} {names.count(name)}" for name in dict.fromkeys(names)),
+        f"test error selected {own.mean():.4f}, best in hindsight {best.mean():.4f}"
+        f" ({100 * (own.mean() / best.mean() - 1):+.1f} %); on average of the draws"
+        f" {100 * (own / best - 1).mean():+.1f} %; selected models that diverged: {lost}",
     ]
-    for name in records[0]["test"]:
-        there = [r["test"][name][0] for r in records if name in r["test"]]
-        out.append(f"  {name:24s} {np.mean(there):.4f} in {len(there)} fits")
+    if records[0]["peer"] is not None:
+        peer = np.array([record["peer"] for record in records])
+        out.append(f"GRU {peer.mean():.4f}; selected no worse in {int((own <= peer).sum())}")
     return "\n".join(out)
 
 
 def main() -> None:
     """Run the bench and print its table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--count", type=int, default=20, help="number of fits")
-    parser.add_argument("--minutes", type=float, default=10.0, help="of training and validation")
-    parser.add_argument("--seed", type=int, default=0, help="of the first boat")
-    parser.add_argument("--effort", type=float, default=1.0, help="of the networks' trainings")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--logs", choices=list(SOURCES), default="boats")
+    parser.add_argument("--count", type=int, default=8, help="number of draws")
+    parser.add_argument("--seed", type=int, default=0, help="of all draws")
+    parser.add_argument("--minutes", type=float, nargs="+", default=[5.0])
+    parser.add_argument("--vessels", nargs="+", help="of the source; all of it otherwise")
+    parser.add_argument("--effort", type=float, default=1.0, help="of the recipe's networks")
+    parser.add_argument("--peer", action="store_true", help="train a plain GRU beside")
     parser.add_argument("--records", type=Path, help="file for one line of JSON for each fit")
     given = parser.parse_args()
     torch.set_num_threads(1)
+    source, names = SOURCES[given.logs]
+    names = given.vessels or names
     records = []
     for number in range(given.count):
-        seed = given.seed + number // 2
-        records.append(one(KINDS[number % 2], seed, given.minutes, given.effort))
-        print(line(records[-1]), flush=True)
+        name = names[number % len(names)]
+        minutes = given.minutes[number // len(names) % len(given.minutes)]
+        random = np.random.default_rng([given.seed, number])
+        logs = source(name, 60.0 * minutes / STRETCHES, given.seed + number // 2, random)
+        records.append(judged(split(logs), given.effort, given.peer))
+        print(f"{name}, {minutes:g} min, draw {number}, {line(records[-1])}", flush=True)
         if given.records is not None:
             with given.records.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(records[-1]) + "\n")
