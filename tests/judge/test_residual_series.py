@@ -60,9 +60,7 @@ def test_block_length_and_effective_size_come_near_those_of_the_process(phi: flo
 
 @pytest.mark.parametrize(("phi", "least"), [(0.0, 0.90), (0.8, 0.90), (0.95, 0.85)])
 def test_intervals_cover(phi: float, least: float) -> None:
-    """Fewer repetitions than scripts/bench/bootstrap.py, the same demands; the interval of
-    independent samples fails them.
-    """
+    """The interval of independent samples fails what moving blocks hold."""
     found = coverage(phi, 120, 1000, seed=11)
     assert found["mae"] >= least
     assert found["mean"] >= least
