@@ -1,15 +1,9 @@
 """Equations recovered from simulated logs: how often, how exactly, and how fast, on one thread.
 
-    python scripts/bench/symbolic.py [--parts exact,random,late,ships] [--designs 10] [--seed 0]
+    python scripts/bench/symbolic.py [--parts exact,random,late,ships,delay] [--designs N] [--seed 0]
 
     exact       all six equations of Odin (document 000, (6.6)-(6.8), (6.21)-(6.23)) from random
                 multi-sine designs with accelerations given; a coefficient counts within 1 %
-    steps       the three water-jet equations from the golden runs jetA*; needs RESIDNET_GOLDEN
-    spring      the mass-spring-damper (5.13), 50 s at 10 Hz, without and with noise
-    noise       the force model with noise of 0.3 standard deviations on the accelerations; "t" is
-                the smallest true term in standard errors (Cramer-Rao bound), "possible" how often
-                an efficient estimate of that term alone would pass plain BIC
-    velocities  the force model from velocities alone with 1 % noise, estimators side by side
     random      six random equations for each design, with products, magnitudes and ratios, and 0.1
                 standard deviations of noise: how often the structure is exactly the true one
     late        the same with inputs that act 0.3 s late
@@ -36,15 +30,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 
 import numpy as np
-import pandas as pd
 import torch
 from made_equations import CHANNELS, SPACE, Drawn, draw, draw_ship
-from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, msd_log, step_log
-from scipy.stats import norm
+from made_odin import FORCE_TRUTH, JET_TRUTH, force_logs, jet_logs, msd_log
 
 from residnet.core.names import ACCELERATION
-from residnet.core.samples import Samples
-from residnet.data.derivatives import SavitzkyGolay
 from residnet.heads import SymbolicConfig
 from residnet.physics.candidates import CandidatesConfig
 from residnet.physics.terms import TermLibrary
@@ -125,155 +115,6 @@ def exact(count: int, _: int) -> None:
         f"            all six together {np.median(times):.2f} s (median), {max(times):.2f} s"
         " (slowest)"
     )
-
-
-def steps(_: int, __: int) -> None:
-    for file in sorted(
-        Path(os.environ.get("RESIDNET_GOLDEN", "/nowhere")).glob("g2_odin/jetA*.csv.gz")
-    ):
-        frame = pd.read_csv(file)
-        log = {name: np.array(frame[name]) for name in frame}
-        found, equations, seconds = regress(
-            log, JETS, JET, np.stack([log["du"], log["dv"], log["dr"]], axis=1)
-        )
-        good = [right(f, truth, 0.01) for f, truth in zip(found, JET_TRUTH.values(), strict=True)]
-        shares = ", ".join(f"{e.share:.0e}" for e in equations)
-        print(
-            f"steps       {file.name}: {sum(good)} of 3 equations right, in {seconds:.2f} s;"
-            f" unexplained {shares}"
-        )
-
-
-def spring(_: int, __: int) -> None:
-    log = msd_log()
-    found, _, seconds = regress(log, SPRING, MSD, log["w_dot"][:, None])
-    print(
-        f"spring      noise-free {'right' if right(found[0], MSD_TRUTH, 0.01) else 'WRONG'} in"
-        f" {1e3 * seconds:.1f} ms",
-        end="; ",
-    )
-    noisy = [
-        log["w_dot"] + 0.1 * np.random.default_rng(seed).uniform(-1, 1, len(log["t"]))
-        for seed in range(20)
-    ]
-    runs = [regress(log, SPRING, MSD, y[:, None]) for y in noisy]
-    print(
-        f"amplitude 0.1: structure right in {sum(right(f[0], MSD_TRUTH) for f, _, _ in runs)} of"
-        f" 20, {1e3 * np.median([s for *_, s in runs]):.1f} ms"
-    )
-
-
-RECORDS: dict[str, tuple[float, float, tuple[float, float]]] = {
-    "300 s at 100 Hz, periods 5-70 s": (300.0, 0.01, (5.0, 70.0)),
-    "600 s at 20 Hz, periods 20-150 s": (600.0, 0.05, (20.0, 150.0)),
-    "300 s at 20 Hz, periods 20-150 s": (300.0, 0.05, (20.0, 150.0)),
-    "300 s at 10 Hz, periods 5-70 s": (300.0, 0.1, (5.0, 70.0)),
-}
-
-
-def noise(_: int, __: int) -> None:
-    for label, args in RECORDS.items():
-        good, each, named, times, worth = 0, np.zeros(3, dtype=int), 0, [], []
-        for number, log in enumerate(force_logs(15, *args)):
-            y = accelerations(log)
-            sigma = 0.3 * y.std(axis=0)
-            found, equations, seconds = regress(
-                log, FORCES, FORCE, y + sigma * np.random.default_rng(number).normal(size=y.shape)
-            )
-            hits = np.array(
-                [right(f, truth) for f, truth in zip(found, FORCE_TRUTH.values(), strict=True)]
-            )
-            good, each = good + int(hits.all()), each + hits
-            named += int("u" not in found[0] and "u" in equations[0].undecided)
-            own = np.stack(
-                [log["tau_x"], log["v"] * log["r"], log["u"], log["u"] * np.abs(log["u"])], axis=1
-            )
-            worth.append(0.0101 / (sigma[0] * np.sqrt(np.linalg.inv(own.T @ own)[2, 2])))
-            times.append(seconds)
-        print(
-            f"noise       {label}: all three right in {good} of 15 (surge {each[0]}, sway"
-            f" {each[1]}, yaw {each[2]}), {np.median(times):.2f} s;"
-        )
-        possible = float(norm.sf(np.sqrt(np.log(len(log["t"]))) - np.array(worth)).sum())
-        print(
-            f"            t of the weakest term {np.median(worth):.1f} (median), possible"
-            f" {possible:.1f} of 15; left out but named as undecided {named} times"
-        )
-
-
-ESTIMATORS: dict[str, tuple[float, dict[str, Any]]] = {
-    "central differences, least squares": (0.0, {"kind": "least_squares"}),
-    "Savitzky-Golay 0.5 s, least squares": (0.5, {"kind": "least_squares"}),
-    "Savitzky-Golay 1.5 s, least squares": (1.5, {"kind": "least_squares"}),
-    "weak form, 2 s": (0.0, {"kind": "weak", "window": "2 s"}),
-    "weak form, 4 s": (0.0, {"kind": "weak", "window": "4 s"}),
-    "instruments, 0.5 s behind": (0.0, {"kind": "instruments", "lag": "0.5 s"}),
-    "weak form 2 s, instruments 2 s behind": (
-        0.0,
-        {"kind": "instruments", "lag": "2 s", "window": "2 s"},
-    ),
-}
-
-
-def measured(log: Log, seed: int, window: float, *, masked: bool) -> Samples:
-    """Noisy velocities, differentiated in pieces that end at jumps of the inputs where these are
-    masked.
-    """
-    random, step = np.random.default_rng(seed), float(log["t"][1])
-    nu = np.stack(
-        [log[name] + 0.01 * log[name].std() * random.normal(size=len(log["t"])) for name in "uvr"],
-        axis=1,
-    )
-    forces = np.stack([log[name] for name in FORCES[3:]], axis=1)
-    jumps = np.flatnonzero((np.diff(forces, axis=0) != 0).any(axis=1))
-    bad = np.zeros(len(nu), dtype=bool)
-    if masked:
-        bad[jumps] = bad[jumps + 1] = True
-    pieces = np.where(bad, -1, np.cumsum(np.append(0, np.diff(bad.astype(int)) != 0)))
-    smooth, rate, good = SavitzkyGolay(window=max(window, 3 * step), order=2).derive(
-        nu, step, pieces
-    )
-    z = torch.from_numpy(np.concatenate((smooth, forces), axis=1)[good])
-    return Samples(
-        z,
-        torch.from_numpy(rate[good]),
-        torch.zeros(len(z), dtype=torch.long),
-        torch.from_numpy(log["t"][good]),
-        ("made",),
-        FORCES,
-    )
-
-
-def velocities(_: int, __: int) -> None:
-    logs = [step_log(number, 900.0, 0.02, 15.0) for number in range(3)]
-    print(
-        "velocities  1 % noise, forces in steps of 15 s, 900 s at 50 Hz, three records: equations"
-        " right of 9; largest coefficient error in %"
-    )
-    print(f"            {'':40s}{'jumps masked':>22s}{'not masked':>22s}{'seconds':>9s}")
-    for label, (window, estimator) in ESTIMATORS.items():
-        cells, taken = [], []
-        for masked in (True, False):
-            good, errors = 0, []
-            for number, log in enumerate(logs):
-                data = measured(log, number, window, masked=masked)
-                head = SymbolicConfig.model_validate(
-                    {"candidates": FORCE.model_dump(), "estimator": estimator}
-                ).build(FORCES)
-                head.calibrate(data)
-                started = time.perf_counter()
-                notes = head.solve(data)
-                taken.append(time.perf_counter() - started)
-                for axis, truth in FORCE_TRUTH.items():
-                    found = {
-                        c["term"]: c["value"] for c in notes["coefficients"] if c["axis"] == axis
-                    }
-                    good += right(found, truth)
-                    errors += [
-                        100 * abs(found.get(term, 0.0) / value - 1) for term, value in truth.items()
-                    ]
-            cells.append(f"{good} of 9, {max(errors):6.1f}")
-        print(f"            {label:40s}{cells[0]:>22s}{cells[1]:>22s}{np.median(taken):9.2f}")
 
 
 def delay(_: int, __: int) -> None:
@@ -375,10 +216,6 @@ PARTS: dict[str, Callable[[int, int], None]] = {
     "random": random_equations,
     "late": late,
     "ships": ships,
-    "steps": steps,
-    "spring": spring,
-    "noise": noise,
-    "velocities": velocities,
     "delay": delay,
 }
 
