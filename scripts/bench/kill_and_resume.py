@@ -17,25 +17,20 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
-import os
 import random
 import signal
-import subprocess
 import sys
 import tempfile
-import time
-import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
+from forks import Ending, attempt, command
 
 # imported before the forks, which then begin at once
 import residnet.report.still
 import residnet.tasks.fit.running
-from residnet.__main__ import main as main_of_residnet
 
 _SCHEDULE = {
     "steps": 3,
@@ -89,89 +84,9 @@ CODES = {
     signal.SIGINT: {130},
     signal.SIGTERM: {143},
 }
-LIMIT = 600
-"""Seconds after which an attempt hangs."""
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """A run that was started, and how it ended.
-
-    Attributes:
-        code: its exit code, negative for the signal that ended it.
-        seconds: that it took.
-        error: what it wrote to standard error.
-    """
-
-    code: int
-    seconds: float
-    error: str
-
-
-def _forked(words: list[str], error: Path) -> int:
-    """Start the command line in a fork of this process; returns the process's number."""
-    child = os.fork()
-    if child:
-        return child
-    code = 1
-    try:
-        with error.open("w") as stream, Path(os.devnull).open("w") as nowhere:
-            os.dup2(stream.fileno(), 2)
-            os.dup2(nowhere.fileno(), 1)
-        sys.argv = ["residnet", *words]
-        main_of_residnet()
-        code = 0
-    except SystemExit as end:
-        code = int(end.code or 0)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stderr.flush()
-        os._exit(code)
-
-
-def _started(words: list[str], error: Path) -> int:
-    """Start the command line as a process of its own; returns its number."""
-    with error.open("w") as stream:
-        return subprocess.Popen(
-            [sys.executable, "-m", "residnet", *words], stdout=subprocess.DEVNULL, stderr=stream
-        ).pid
-
-
-def _awaited(process: int, until: float) -> int | None:
-    """Wait for a process; returns its exit code, or None where it is still at work then."""
-    while True:
-        done, status = os.waitpid(process, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status)
-        if time.monotonic() > until:
-            return None
-        time.sleep(0.01)
-
-
-def attempt(
-    words: list[str],
-    file: Path,
-    after: float | None = None,
-    number: int = signal.SIGKILL,
-    *,
-    fresh: bool = False,
-) -> Attempt:
-    """Run the command line, and send it a signal after some seconds; None leaves it in peace."""
-    started = time.monotonic()
-    process = (_started if fresh else _forked)(words, file)
-    code = _awaited(process, started + (LIMIT if after is None else after))
-    if code is None:
-        os.kill(process, number)
-        code = _awaited(process, time.monotonic() + LIMIT)
-    if code is None:
-        os.kill(process, signal.SIGKILL)
-        code = _awaited(process, math.inf)
-    error = file.read_text(errors="backslashreplace")
-    return Attempt(int(code or 0), time.monotonic() - started, error)
-
-
-def faults(stopped: Attempt, number: int) -> list[str]:
+def faults(stopped: Ending, number: int) -> list[str]:
     """Return what is wrong with how a run ended that a signal was sent to."""
     if stopped.code == 0:
         return []  # it was done before the signal came
@@ -220,12 +135,11 @@ class Chains:
             fresh = draw.random() < self.fresh
             if fresh and draw.random() < 0.5:
                 after = draw.uniform(0.3, 4.0)  # while it imports
+            given = [*words, *(["--resume"] if place else [])]
             stopped = attempt(
-                [*words, *(["--resume"] if place else [])],
+                given if fresh else command(*given),
                 self.folder / f"{run.name}.{place}.txt",
-                after,
-                number,
-                fresh=fresh,
+                stop=(after, number),
             )
             told.append(f"{signal.Signals(number).name} at {after:.1f} s{' (fresh)' * fresh}")
             found += faults(stopped, number)
@@ -233,7 +147,7 @@ class Chains:
                 told[-1] = "done before that"
                 break
         # a resumed run that is done says so again
-        last = attempt([*words, "--resume"], self.folder / f"{run.name}.last.txt")
+        last = attempt(command(*words, "--resume"), self.folder / f"{run.name}.last.txt")
         if last.code != 0:
             found.append(f"exit code {last.code} of the last: {last.error[-2000:]}")
         elif rows(run) != self.truth:
@@ -265,7 +179,7 @@ def main() -> None:
     small = {**CONFIG, "export": {"models": []}}
     (folder / "no_export.yaml").write_text(yaml.safe_dump(small, sort_keys=False))
     words = _words(folder, folder / "whole", report=False)
-    whole = attempt(words, folder / "whole.txt")
+    whole = attempt(command(*words), folder / "whole.txt")
     if whole.code != 0:
         sys.exit(f"the undisturbed run ends with {whole.code}: {whole.error[-2000:]}")
     print(f"undisturbed: {whole.seconds:.0f} s, in {folder}", flush=True)

@@ -16,15 +16,13 @@ import argparse
 import contextlib
 import os
 import random
-import resource
 import shutil
 import signal
 import sys
 import tempfile
-import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +31,7 @@ import yaml
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
 
 from damaged_text import DAMAGES
+from forks import Ending, attempt, command
 from mutations import mutated_config, mutated_folder
 from tiny_tasks import TINY_TASKS, boat, measured, resolved
 
@@ -44,82 +43,27 @@ import residnet.report.still
 import residnet.tasks.fit.external
 import residnet.tasks.fit.running
 import residnet.tasks.inspection
-from residnet.__main__ import main as main_of_residnet
 from residnet.core.errors import ResidnetError
 
-LIMIT = 60.0
+LIMIT = 60
 """Seconds of processor time after which an attempt hangs."""
-MEMORY = 6 * 2**30
 
 
-@dataclass(frozen=True)
-class Ending:
-    """How an attempt ended.
-
-    Attributes:
-        code: exit code, negative for the signal that ended it.
-        seconds: of processor time.
-        error: what stands on standard error.
-    """
-
-    code: int
-    seconds: float
-    error: str
-
-    @property
-    def fault(self) -> str:
-        """What is wrong with it; empty where nothing is."""
-        last = (self.error.splitlines() or [""])[-1]
-        if self.code == -signal.SIGXCPU:
-            return f"longer than {LIMIT:.0f} s"
-        if "Traceback" in self.error or "Exception ignored" in self.error:
-            return "traceback: " + last
-        if "this is a defect" in self.error:
-            return last
-        if self.code not in (0, 1, 2):
-            return f"exit code {self.code}: {last}"
-        lines = [line for line in self.error.splitlines() if line.startswith("residnet: ")]
-        if self.code and (len(lines) != 1 or lines[0] != last or len(last) > 2000):
-            return f"not one line: {self.error[-500:]}"
-        return ""
-
-
-def attempt(work: Callable[[], object], file: Path) -> Ending:
-    """Do some work in a fork of this process."""
-    child = os.fork()
-    if child == 0:
-        code = 1
-        try:
-            with file.open("w") as stream, Path(os.devnull).open("w") as nowhere:
-                os.dup2(stream.fileno(), 2)
-                os.dup2(nowhere.fileno(), 1)
-            resource.setrlimit(resource.RLIMIT_CPU, (round(LIMIT), round(LIMIT) + 5))
-            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-            work()
-            code = 0
-        except SystemExit as end:
-            code = int(end.code or 0)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stderr.flush()
-            os._exit(code)
-    _, status, used = os.wait4(child, 0)
-    return Ending(
-        os.waitstatus_to_exitcode(status),
-        used.ru_utime + used.ru_stime,
-        file.read_text(errors="backslashreplace"),
-    )
-
-
-def command(*words: object) -> Callable[[], None]:
-    """Return what gives the command line some words."""
-
-    def work() -> None:
-        sys.argv = ["residnet", *map(str, words)]
-        main_of_residnet()
-
-    return work
+def fault(ending: Ending) -> str:
+    """Return what is wrong with an ending; empty where nothing is."""
+    last = (ending.error.splitlines() or [""])[-1]
+    if ending.code == -signal.SIGXCPU:
+        return f"longer than {LIMIT} s"
+    if "Traceback" in ending.error or "Exception ignored" in ending.error:
+        return "traceback: " + last
+    if "this is a defect" in ending.error:
+        return last
+    if ending.code not in (0, 1, 2):
+        return f"exit code {ending.code}: {last}"
+    lines = [line for line in ending.error.splitlines() if line.startswith("residnet: ")]
+    if ending.code and (len(lines) != 1 or lines[0] != last or len(last) > 2000):
+        return f"not one line: {ending.error[-500:]}"
+    return ""
 
 
 def in_python(work: Callable[[], object]) -> Callable[[], None]:
@@ -150,8 +94,8 @@ class Tally:
     def add(self, told: str, ending: Ending) -> None:
         """Count an ending, and tell at once of a bad one."""
         self.endings.append((told, ending))
-        if ending.fault:
-            print(f"{self.title} {len(self.endings)}: {told}: {ending.fault}", flush=True)
+        if fault(ending):
+            print(f"{self.title} {len(self.endings)}: {told}: {fault(ending)}", flush=True)
         if len(self.endings) % 100 == 0:
             print(f"{self.title}: {len(self.endings)} done", file=sys.stderr, flush=True)
 
@@ -160,12 +104,12 @@ class Tally:
         if not self.endings:
             return 0
         codes = Counter(ending.code for _, ending in self.endings)
-        bad = sum(bool(ending.fault) for _, ending in self.endings)
-        told, slowest = max(self.endings, key=lambda entry: entry[1].seconds)
+        bad = sum(bool(fault(ending)) for _, ending in self.endings)
+        told, slowest = max(self.endings, key=lambda entry: entry[1].processor)
         print(
             f"{self.title}: {len(self.endings)}, {bad} bad; exit codes"
             f" {', '.join(f'{code}: {count}' for code, count in sorted(codes.items()))}; slowest"
-            f" {slowest.seconds:.1f} s ({told})",
+            f" {slowest.processor:.1f} s ({told})",
             flush=True,
         )
         return bad
@@ -190,10 +134,10 @@ def tables(count: int, folder: Path, draw: random.Random) -> Tally:
             if number % 10 == 0
             else ("inspect", file, "--config", fit)
         )
-        ending = attempt(command(*words), folder / "error.txt")
+        ending = attempt(command(*words), folder / "error.txt", LIMIT)
         if words[0] == "inspect" and ending.code == 1 and "residnet: " not in ending.error:
             # the doctor's own exit code: the fit would be misled
-            ending = Ending(0, ending.seconds, ending.error)
+            ending = replace(ending, code=0)
         tally.add(f"{'+'.join(told)} in {words[0]}", ending)
     file.write_bytes(before)
     return tally
@@ -213,9 +157,9 @@ def configs(count: int, folder: Path, draw: random.Random, names: Sequence[str])
         data, told = mutated_config(draw.choice(trees[name]), draw)
         file.write_bytes(data)
         shutil.rmtree(run, ignore_errors=True)
-        ending = attempt(command("run", file, "--out", run), folder / "error.txt")
+        ending = attempt(command("run", file, "--out", run), folder / "error.txt", LIMIT)
         tally.add(f"{name}: {told}", ending)
-        if ending.fault:
+        if fault(ending):
             shutil.copy(file, folder / f"bad_config_{len(tally.endings)}.yaml")
     return tally
 
@@ -251,7 +195,7 @@ def folders(count: int, folder: Path, draw: random.Random) -> Tally:
         config.write_text(yaml.safe_dump(TINY_TASKS[name](folder), sort_keys=False))
         made[name] = (config, folder / f"whole_{name}")
         words = ("run", config, "--out", made[name][1], "--overwrite")
-        ending = attempt(command(*words), folder / "error.txt")
+        ending = attempt(command(*words), folder / "error.txt", LIMIT)
         if ending.code:
             sys.exit(f"the undamaged run fails: {ending.error}")
     config, whole = made["measured"]
@@ -267,7 +211,7 @@ def folders(count: int, folder: Path, draw: random.Random) -> Tally:
             for name in ("summary.json", "metrics.json"):
                 if draw.random() < 0.5 and (run / name).is_file():
                     (run / name).unlink()
-        ending = attempt(verbs[verb], folder / "error.txt")
+        ending = attempt(verbs[verb], folder / "error.txt", LIMIT)
         tally.add(f"{verb}, {told}", ending)
     return tally
 

@@ -1,6 +1,6 @@
 """Equations recovered from simulated logs: how often, how exactly, and how fast, on one thread.
 
-    python scripts/bench/symbolic.py [--parts exact,random,late,ships,delay] [--designs N] [--seed 0]
+    python scripts/bench/symbolic.py [--parts exact,random,late,ships,delay] [--designs N]
 
     exact       all six equations of Odin (document 000, (6.6)-(6.8), (6.21)-(6.23)) from random
                 multi-sine designs with accelerations given; a coefficient counts within 1 %
