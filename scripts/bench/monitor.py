@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from selection import scattered
+from scattered import scattered
 
 from residnet.core.config import validate
 from residnet.core.files import config_folder

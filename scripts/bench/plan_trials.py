@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from selection import scattered
+from scattered import scattered
 from torch import Tensor
 
 from residnet.core.config import validate

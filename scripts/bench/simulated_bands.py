@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
+from scattered import scattered
 
 from residnet.core.config import validate
 from residnet.core.log import Log
@@ -42,27 +42,6 @@ KINDS = ("zigzag", "three_two_one_one", "acceleration_deceleration", "random_ste
 _ASKED = 0.02
 """Largest distance of the mean coverage from 0.9 that is asked for."""
 CHANNELS = ("u", "v", "r", "heading", "position", "mean", "whole")
-
-
-def scattered(name: str, random: np.random.Generator, folder: Path) -> Path:
-    """Write a vessel's file with parameters of some sections scattered by about a fifth."""
-    vessels = Path(__file__).resolve().parents[2] / "configs" / "vessels"
-    content = yaml.safe_load((vessels / f"{name}.yaml").read_text(encoding="utf-8"))
-
-    def moved(part: Any) -> Any:
-        if isinstance(part, dict):
-            return {key: value if key in _WORDS else moved(value) for key, value in part.items()}
-        return float(part * np.exp(0.2 * random.standard_normal()))
-
-    for section in ("added_mass", "damping"):
-        content[section] = moved(content[section])
-    content["name"] = "scattered"
-    path = folder / "scattered.yaml"
-    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    return path
-
-
-_WORDS = ("unit", "source")
 
 
 def drawn(vessel: str, random: np.random.Generator, logs: int, test: int) -> dict[str, list[Log]]:
