@@ -23,7 +23,7 @@ from pydantic.fields import FieldInfo
 from residnet.core.config import Quantity
 from residnet.core.registry import Kinds, kinds
 from residnet.physics.vessel import VesselConfig
-from residnet.tasks.union import TaskConfig
+from residnet.tasks.registry import TaskConfig
 
 ROOTS = (TaskConfig, VesselConfig)
 DISCRIMINATORS = ("task", "kind")

@@ -29,7 +29,7 @@ from residnet.judge.band import CHANNELS, Band, covered, interval_score, read_ba
 from residnet.judge.bands import RunErrors, calibrate, run_errors
 from residnet.tasks.fit.config import FitTaskSettings
 from residnet.tasks.fit.inputs import take_logs
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 Judged = tuple[RunErrors, Band]
 

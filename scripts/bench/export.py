@@ -28,12 +28,13 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "support"))
 import exported_models  # noqa: E402
 
-from residnet.export import ExportedVessel, exporter, vessel  # noqa: E402
+from residnet.export import exporter, vessel  # noqa: E402
 from residnet.export.aoti import AotiModel  # noqa: E402
 from residnet.export.c_code import compiler  # noqa: E402
 from residnet.export.casadi_function import CasadiModel  # noqa: E402
 from residnet.export.guard import GuardedDynamics  # noqa: E402
 from residnet.export.onnx_file import OnnxModel  # noqa: E402
+from residnet.export.vessel import ExportedVessel  # noqa: E402
 
 SIZES = {"mlp": {"hidden": (64, 64)}, "lstm": {"hidden_size": 64}}
 C_LOOP = """#include "boat.h"

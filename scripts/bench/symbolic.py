@@ -35,7 +35,7 @@ from made_equations import CHANNELS, SPACE, Drawn, draw, draw_ship
 from made_odin import FORCE_TRUTH, JET_TRUTH, force_logs, jet_logs, msd_log
 
 from residnet.core.names import ACCELERATION
-from residnet.heads import SymbolicConfig
+from residnet.heads.symbolic import SymbolicConfig
 from residnet.physics.candidates import CandidatesConfig
 from residnet.physics.terms import TermLibrary
 from residnet.regression.equation_rows import delay_profile

@@ -32,7 +32,8 @@ from residnet.core.arrays.heap import keep_freed_memory
 from residnet.data.windows import WindowBatches
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted
-from residnet.heads import LstmConfig, ResidualHead
+from residnet.heads.base import ResidualHead
+from residnet.heads.lstm import LstmConfig
 from residnet.physics.signals import SignalsConfig
 
 _NAMES = ("u", "v", "r", "tau_x", "tau_n")

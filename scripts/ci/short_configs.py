@@ -460,7 +460,7 @@ def main() -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     import lightning  # noqa: F401  (every run that trains loads it; forks have it already)
 
-    import residnet.tasks.union  # noqa: F401
+    import residnet.tasks.registry  # noqa: F401
 
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as temporary:

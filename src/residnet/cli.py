@@ -102,7 +102,7 @@ def run(
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
     from residnet.core.processes import spread
-    from residnet.tasks.loading import config_file, load_task
+    from residnet.tasks.registry import config_file, load_task
 
     limit_threads()
     task = load_task(config, overrides or [])
@@ -196,7 +196,7 @@ def check(
     quiet: Quiet = False,
 ) -> None:
     """Validate a config and everything that it names, without running it."""
-    from residnet.tasks.loading import load_task
+    from residnet.tasks.registry import load_task
 
     limit_threads()
     with drawn_progress(quiet=quiet):
@@ -267,11 +267,14 @@ def evaluate(
     quiet: Quiet = False,
 ) -> None:
     """Evaluate the models of a finished run in free run on other logs."""
-    from residnet.tasks.verbs import evaluate_run
+    from residnet.core.files import require_room
+    from residnet.tasks.registry import finished_task
 
     limit_threads()
     with drawn_progress(quiet=quiet):
-        finished = evaluate_run(folder, [*logs, *(more or [])], out)
+        run, task = finished_task(folder, "evaluate")
+        require_room(out or folder)
+        finished = task.evaluate_on(run, [*logs, *(more or [])], out)
     show(finished)
 
 
@@ -307,14 +310,15 @@ def monitor(
     The exit code is 1 where there is an alarm. A refit leaves the run as it is.
     """
     from residnet.core.files import require_file_place, whole
-    from residnet.tasks.verbs import monitor_run
+    from residnet.tasks.registry import finished_task
 
     limit_threads()
     if file is not None:
         require_file_place(file)
     settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
     with drawn_progress(quiet=quiet):
-        found, refitted = monitor_run(folder, logs, model, settings, refit)
+        run, task = finished_task(folder, "monitor")
+        found, refitted = task.monitor(run, logs, model, settings, refit)
     for log in found:
         print("\n".join(log.text()))
     content: list[dict[str, Any]] = [log.content() for log in found]
@@ -349,14 +353,15 @@ def plan_trial(
 ) -> None:
     """Say which manoeuvres to run next, and by how much they would narrow the predictions."""
     from residnet.core.files import require_room
-    from residnet.tasks.verbs import plan_run
+    from residnet.tasks.registry import finished_task
 
     limit_threads()
     if out is not None:
         require_room(out)
     limits = {"time": time, "area": area, "speed": speed, "rudder": rudder, "count": count}
     with drawn_progress(quiet=quiet):
-        planned = plan_run(folder, model, limits)
+        run, task = finished_task(folder, "plan-trial")
+        planned = task.plan_trial(run, model, limits)
     print(planned.text())
     for file in planned.write(out) if out is not None else []:
         print(f"written: {file}")
@@ -386,11 +391,14 @@ def export(
     quiet: Quiet = False,
 ) -> None:
     """Export a model of a finished run for controllers, after a parity check."""
-    from residnet.tasks.verbs import export_run
+    from residnet.core.files import require_file_place
+    from residnet.tasks.registry import finished_task
 
     limit_threads()
     with drawn_progress(quiet=quiet):
-        written = export_run(folder, model, out, file_format)
+        run, task = finished_task(folder, "export")
+        require_file_place(out or run.exports / model)
+        written = task.export_model(run, model, out, file_format)
     print(written)
 
 
@@ -428,7 +436,7 @@ def ardupilot(
 @app.command()
 def report(folder: RunPath, quiet: Quiet = False) -> None:
     """Write the figures and the report of a finished run again."""
-    from residnet.tasks.verbs import report_run
+    from residnet.tasks.registry import report_run
 
     limit_threads()
     with drawn_progress(quiet=quiet):
@@ -462,7 +470,7 @@ def runs(
     as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
     """List the runs below a folder with task, state, best figure and age."""
-    from residnet.tasks.run_list import runs_below, runs_text
+    from residnet.tasks.registry import runs_below, runs_text
 
     entries = runs_below(folder)
     print(json.dumps(entries, indent=1) if as_json else runs_text(folder, entries))
@@ -485,7 +493,7 @@ def list_names(
     ],
 ) -> None:
     """List the parts that a config may name, with a line about each."""
-    from residnet.tasks.catalogue import catalogue
+    from residnet.tasks.registry import catalogue
 
     for name, about in catalogue(what):
         print(f"{name:28s} {about}")

@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from residnet.baselines import BelievedConfig
+from residnet.baselines.believed import BelievedConfig
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.export import ExportedVessel, exporter
+from residnet.export import exporter
+from residnet.export.vessel import ExportedVessel
 from residnet.physics.plant import HullPlant
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel, vessel_files

@@ -6,7 +6,7 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from residnet.baselines import MMGBaseline, MMGConfig
+from residnet.baselines.mmg import MMGBaseline, MMGConfig
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
 from residnet.physics.mmg import PARAMETERS, usual_priors

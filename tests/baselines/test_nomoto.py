@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.baselines import NomotoConfig, NomotoSideslipConfig, RegressorBaseline
+from residnet.baselines.nomoto import NomotoConfig, NomotoSideslipConfig
+from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads import ZeroHead
+from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 NAMES = ("u", "v", "r", "n", "delta")

@@ -17,7 +17,7 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.registry import kinds
 from residnet.data.readers import ReaderConfig
-from residnet.export import exporter, exporters, vessel
+from residnet.export import FORMATS, exporter, vessel
 from residnet.heads import HeadConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.signals import SignalsConfig
@@ -157,7 +157,7 @@ def test_export_format(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.exporters
-@pytest.mark.parametrize("name", exporters())
+@pytest.mark.parametrize("name", FORMATS.names())
 def test_export_format_that_needs_compilers(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
     check_exporter(exporter(name))

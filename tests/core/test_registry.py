@@ -13,11 +13,12 @@ from residnet.core import registry
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
 from residnet.data.readers import ReaderConfig
-from residnet.export import exporter, exporters
-from residnet.heads import HeadConfig, PlsrConfig
+from residnet.export import FORMATS, exporter
+from residnet.heads import HeadConfig
+from residnet.heads.plsr import PlsrConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.catalogue import catalogue
+from residnet.tasks.registry import catalogue
 
 
 @pytest.fixture
@@ -74,8 +75,8 @@ def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> N
 @pytest.mark.parametrize(
     ("target", "fault"),
     [
-        ("residnet.heads:PlsrConfig", "no subclass of residnet.heads.base.HeadKind"),
-        ("residnet.heads:HeadKind", "HeadKind lacks build"),
+        ("residnet.heads.plsr:PlsrConfig", "no subclass of residnet.heads.base.HeadKind"),
+        ("residnet.heads.base:HeadKind", "HeadKind lacks build"),
         ("residnet_sample.slow_water:SlowWaterConfig", "has no field `kind: Literal['odd']`"),
         ("residnet_sample.slow_water:Nothing", "AttributeError"),
         ("os", "no subclass"),
@@ -94,7 +95,7 @@ def test_no_package_takes_a_name_away(installed: Path) -> None:
 
 def test_faults_of_formats_and_vessels(installed: Path) -> None:
     declare(installed / "site", "residnet.exporters", odd="residnet_sample.knots:KnotsReader")
-    assert isinstance(exporters()["odd"], registry.ThirdParty)
+    assert isinstance(FORMATS.find("odd"), registry.ThirdParty)
     with pytest.raises(ConfigError, match=r"format 'odd' of the package made 1\.0 cannot be"):
         exporter("odd")
     with pytest.raises(ConfigError, match=r"no export format 'gguf'; valid: .*torchscript"):

@@ -15,16 +15,13 @@ import written_recorders
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.data.readers import (
-    ArduPilotConfig,
-    Hdf5Config,
-    MatConfig,
-    NmeaConfig,
-    RosbagConfig,
-    TopicFolderConfig,
-    UlogConfig,
-)
 from residnet.data.readers.compose import RecordingConfig
+from residnet.data.readers.formats.ardupilot import ArduPilotConfig
+from residnet.data.readers.formats.nmea import NmeaConfig
+from residnet.data.readers.formats.rosbag import RosbagConfig
+from residnet.data.readers.formats.topic_folder import TopicFolderConfig
+from residnet.data.readers.formats.trees import Hdf5Config, MatConfig
+from residnet.data.readers.formats.ulog import UlogConfig
 
 CASES: list[tuple[Callable[[Log, Path], Path], RecordingConfig]] = [
     (written_logs.mat5, MatConfig()),

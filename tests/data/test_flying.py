@@ -15,7 +15,10 @@ from residnet.data.simulated.flying import Craft, Sea, fly, log_names
 from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.manoeuvres import ConstantInput, Helm, Manoeuvre, TurningCircle, Zigzag
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.constant import ConstantInput
+from residnet.manoeuvres.turning_circle import TurningCircle
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.physics.environment.waves import Box, JonswapSpectrum, WavesConfig
 from residnet.physics.vessel import load_vessel
 

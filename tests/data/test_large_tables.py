@@ -11,7 +11,8 @@ import pytest
 from residnet.core.config import validate
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.readers import LogReader, ReaderConfig, texts
+from residnet.data.readers import ReaderConfig, texts
+from residnet.data.readers.base import LogReader
 
 
 def reader(kind: str = "csv") -> LogReader:

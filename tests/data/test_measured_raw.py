@@ -14,7 +14,7 @@ import pytest
 from residnet.core.files import config_folder
 from residnet.core.log import Log
 from residnet.tasks.import_logs import ImportConfig
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 FERRY = Path(os.environ.get("RESIDNET_DATA", "")) / "milliampere"
 pytestmark = pytest.mark.skipif(not (FERRY / "raw_nlp1").is_dir(), reason=f"no raw_nlp1 in {FERRY}")

@@ -13,7 +13,8 @@ import pytest
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
-from residnet.data.readers import LogReader, ReaderConfig
+from residnet.data.readers import ReaderConfig
+from residnet.data.readers.base import LogReader
 
 
 def build(

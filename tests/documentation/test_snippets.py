@@ -24,8 +24,7 @@ import residnet
 from residnet.cli import app
 from residnet.core.config import load_config, load_mapping, validate
 from residnet.physics.vessel import VesselConfig
-from residnet.tasks.loading import load_task
-from residnet.tasks.union import TaskConfig
+from residnet.tasks.registry import TaskConfig, load_task
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -36,7 +36,7 @@ from residnet.documents.halvorsen2019.standard_model import (
     truth,
 )
 from residnet.physics.odin import AccelerationHull
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 CONFIG = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019" / "standard_model.yaml"
 MASS = 4935.14

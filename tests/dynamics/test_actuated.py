@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.baselines import StillConfig
+from residnet.baselines.still import StillConfig
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
 from residnet.data.align import GridConfig
@@ -25,8 +25,11 @@ from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputSh
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.heads import ResidualHead, RidgeConfig, ZeroHead
-from residnet.manoeuvres import Helm, Manoeuvre, Zigzag
+from residnet.heads.base import ResidualHead
+from residnet.heads.ridge import RidgeConfig
+from residnet.heads.zero import ZeroHead
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 

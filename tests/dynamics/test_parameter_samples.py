@@ -3,10 +3,10 @@ import copy
 import torch
 from kinds import of_kind
 
-from residnet.baselines import RegressorBaseline
+from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.ensemble import SampledDynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import ZeroHead
+from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 TERMS = ["1", "u", "v", "r", "u v", "tau_x", "tau_n"]

@@ -13,7 +13,7 @@ from tiny_tasks import TINY_TASKS
 
 from residnet.core.errors import ConfigError
 from residnet.dynamics.simulated import MOST_STEPS, check_steps
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 
 def test_two_days_at_ten_steps_a_second_are_simulated_and_years_are_not() -> None:

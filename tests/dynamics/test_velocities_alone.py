@@ -12,7 +12,7 @@ from residnet.core.layout import HEADING_AND_VELOCITIES, POSITION
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads import LstmConfig
+from residnet.heads.lstm import LstmConfig
 from residnet.physics.signals import SignalsConfig
 
 DT = 0.05

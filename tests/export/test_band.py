@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from residnet.dynamics.store import BandTable
-from residnet.export import ExportedVessel, exporter, vessel
+from residnet.export import exporter, vessel
 from residnet.export.c_code import compile_shared
-from residnet.export.vessel import ExportedModel
+from residnet.export.vessel import ExportedModel, ExportedVessel
 from residnet.testing.examples import example_model, example_spec
 
 TABLE = BandTable(

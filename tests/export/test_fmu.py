@@ -15,7 +15,8 @@ from exported_models import built
 from fmpy.validation import validate_fmu
 
 from residnet.dynamics.rollout import Rollout
-from residnet.export import ExportedVessel, exporter, vessel
+from residnet.export import exporter, vessel
+from residnet.export.vessel import ExportedVessel
 
 pytestmark = pytest.mark.exporters
 INPUTS = {"n_port": 20.0, "n_stbd": 25.0, "wind_speed": 3.0, "wind_dir": 1.0}

@@ -23,7 +23,7 @@ from exported_models import HIGH, LOW, VARIANTS, AsTensors, built, spec_of
 
 from residnet.core.errors import ExportError
 from residnet.dynamics.ensemble import mean_of
-from residnet.export import ExportedVessel, base, exporter, torchscript, vessel
+from residnet.export import base, exporter, torchscript, vessel
 from residnet.export.aoti import AotiModel
 from residnet.export.base import Loaded, RoundingError
 from residnet.export.c import CompiledModel
@@ -32,6 +32,7 @@ from residnet.export.casadi_function import CasadiModel
 from residnet.export.lowering import lowered
 from residnet.export.onnx_file import OnnxModel
 from residnet.export.torchscript import ScriptedModel
+from residnet.export.vessel import ExportedVessel
 from residnet.testing import check_bad_inputs
 
 STEPS = 60

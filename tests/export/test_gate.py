@@ -15,7 +15,8 @@ from residnet.core.samples import Samples
 from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.export import ExportedVessel, exporter, vessel
+from residnet.export import exporter, vessel
+from residnet.export.vessel import ExportedVessel
 from residnet.physics.signals import SignalsConfig
 from residnet.testing import example_samples
 

@@ -16,7 +16,8 @@ from exported_models import built
 from residnet.core.errors import UsageError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export import ExportedVessel, exporter
+from residnet.export import exporter
+from residnet.export.vessel import ExportedVessel
 
 FORCES = ("tau_x", "tau_y", "tau_n")
 

@@ -13,9 +13,11 @@ from tiny import TINY, call
 from residnet.core.errors import ResidnetError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, save_model
-from residnet.export import ExportedVessel, exporter, exporters, vessel
+from residnet.export import FORMATS as REGISTERED
+from residnet.export import exporter, vessel
+from residnet.export.vessel import ExportedVessel
 
-FORMATS = list(exporters())
+FORMATS = REGISTERED.names()
 
 
 @pytest.fixture

@@ -34,8 +34,8 @@ from residnet.documents.gouletas2020.law import DocumentAutopilot, SimulatedPred
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import NomotoDynamics, TracedPlantDynamics
-from residnet.manoeuvres import Helm, Zigzag
-from residnet.manoeuvres.base import ScheduleSource
+from residnet.manoeuvres.base import Helm, ScheduleSource
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.physics.nomoto import NomotoConfig, SteeringVessel
 from residnet.physics.patrol import PatrolConfig
 from residnet.physics.plant import Plant

@@ -18,8 +18,8 @@ from kinds import of_kind
 
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
-from residnet.manoeuvres import Helm, StackedSource, Zigzag
-from residnet.manoeuvres.base import ScheduleSource
+from residnet.manoeuvres.base import Helm, ScheduleSource, StackedSource
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.physics.actuators.stern_rudders import SternRudders
 from residnet.physics.patrol import PatrolVessel
 from residnet.physics.vessel import load_vessel

@@ -22,16 +22,12 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.heads import ZeroHead
-from residnet.manoeuvres import (
-    AccelerationDeceleration,
-    ConstantInput,
-    Helm,
-    Manoeuvre,
-    StackedSource,
-    ThreeTwoOneOne,
-    Zigzag,
-)
+from residnet.heads.zero import ZeroHead
+from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration
+from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
+from residnet.manoeuvres.constant import ConstantInput
+from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.physics.actuators import DifferentialThrust
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.signals import SignalsConfig

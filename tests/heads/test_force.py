@@ -10,8 +10,8 @@ import pytest
 import torch
 from made_samples import NAMES as SURGE_YAW
 
-from residnet.baselines import RegressorsConfig
 from residnet.baselines.believed import BelievedConfig
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import mean_of
@@ -19,7 +19,11 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.export.feed_forward import BelievedForce, RequiredForce, ResidualForce
-from residnet.heads import ForceHead, MlpConfig, PlsrConfig, RidgeConfig, SymbolicConfig
+from residnet.heads.force import ForceHead
+from residnet.heads.mlp import MlpConfig
+from residnet.heads.plsr import PlsrConfig
+from residnet.heads.ridge import RidgeConfig
+from residnet.heads.symbolic import SymbolicConfig
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel

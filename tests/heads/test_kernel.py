@@ -16,8 +16,7 @@ from sklearn.metrics.pairwise import rbf_kernel
 
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
-from residnet.heads import KernelConfig
-from residnet.heads.kernel import KernelHead
+from residnet.heads.kernel import KernelConfig, KernelHead
 from residnet.regression.kernel import Polynomial, Rbf, spread_out
 
 SAMPLES = made(300)

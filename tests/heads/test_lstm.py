@@ -12,8 +12,7 @@ from torch import nn
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.heads import LstmConfig
-from residnet.heads.lstm import LstmCore, LstmHead
+from residnet.heads.lstm import LstmConfig, LstmCore, LstmHead
 
 
 def built(**config: object) -> LstmHead:

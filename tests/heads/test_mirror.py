@@ -11,8 +11,9 @@ from torch import Tensor
 
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
-from residnet.heads import LstmConfig, MlpConfig, ResidualHead
-from residnet.heads.mlp import MlpHead
+from residnet.heads.base import ResidualHead
+from residnet.heads.lstm import LstmConfig
+from residnet.heads.mlp import MlpConfig, MlpHead
 
 CHANNELS = {
     "rudder": (("u", "v", "r", "n", "delta"), [0, 1, 2, 3, 4], [1, -1, -1, 1, -1]),

@@ -11,9 +11,11 @@ from made_samples import NAMES, made
 from sklearn.cross_decomposition import PLSRegression
 
 from residnet.core.errors import FitError
-from residnet.heads import ClosedFormHead, KernelConfig, PlsrConfig, RidgeConfig
+from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisHead
-from residnet.heads.plsr import PlsrHead
+from residnet.heads.kernel import KernelConfig
+from residnet.heads.plsr import PlsrConfig, PlsrHead
+from residnet.heads.ridge import RidgeConfig
 from residnet.regression.shrinkage import pls_path
 
 

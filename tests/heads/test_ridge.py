@@ -10,8 +10,7 @@ import torch
 from made_samples import NAMES, made
 from sklearn.linear_model import Ridge
 
-from residnet.heads import RidgeConfig
-from residnet.heads.ridge import RidgeHead
+from residnet.heads.ridge import RidgeConfig, RidgeHead
 
 
 def fitted(penalties: tuple[float, ...], folds: int = 5) -> tuple[RidgeHead, dict[str, Any]]:

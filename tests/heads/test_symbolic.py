@@ -18,8 +18,7 @@ from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, m
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.data.derivatives import SavitzkyGolay
-from residnet.heads import SymbolicConfig
-from residnet.heads.symbolic import SymbolicHead
+from residnet.heads.symbolic import SymbolicConfig, SymbolicHead
 from residnet.physics.symmetry import term_parity
 
 FORCES, JETS = ("u", "v", "r", "tau_x", "tau_y", "tau_n"), ("u", "v", "r", "rpm", "nozzle")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from residnet.baselines import RegressorsConfig
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import ZeroHead
+from residnet.heads.zero import ZeroHead
 from residnet.identification.fitter import choose_solution
 from residnet.physics.signals import SignalsConfig
 from residnet.regression.solutions import Solution

@@ -10,14 +10,15 @@ import pytest
 import torch
 from random_vessels import small_boat_logs
 
-from residnet.baselines import RegressorsConfig
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
 from residnet.core.log import Log
 from residnet.data.prepare import samples
 from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
-from residnet.heads import LstmConfig, ZeroHead
+from residnet.heads.lstm import LstmConfig
+from residnet.heads.zero import ZeroHead
 from residnet.identification.fit import Identified, fit
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.recipe import PARTS, Facts, portfolio

@@ -10,14 +10,16 @@ import torch
 from made_logs import made, prepared, random_states
 from torch import Tensor
 
-from residnet.baselines import StillConfig
 from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.still import StillConfig
 from residnet.core.log import Log
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.heads import LstmConfig, ResidualHead, ZeroHead
+from residnet.heads.base import ResidualHead
+from residnet.heads.lstm import LstmConfig
+from residnet.heads.zero import ZeroHead
 from residnet.judge import freerun
 from residnet.judge.freerun import Candidate, free_run, integrate
 from residnet.judge.protocol import Window

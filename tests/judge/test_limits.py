@@ -11,7 +11,7 @@ from made_logs import made
 from residnet.baselines.still import StillBaseline
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import ZeroHead
+from residnet.heads.zero import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
 from residnet.judge.metrics import kinematics, limits, nrmse_of_windows, window_errors
 from residnet.judge.protocol import Window

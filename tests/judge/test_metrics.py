@@ -10,7 +10,7 @@ from made_logs import made, random_states
 
 from residnet.baselines.still import StillBaseline
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import ZeroHead
+from residnet.heads.zero import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
 from residnet.judge.metrics import find, rows, window_errors
 from residnet.judge.protocol import Window

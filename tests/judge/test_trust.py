@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from residnet.baselines import StillConfig
+from residnet.baselines.still import StillConfig
 from residnet.core.log import Log
 from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import ZeroHead
+from residnet.heads.zero import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
 from residnet.judge.metrics import compared, nrmse_of_windows, outside, trust, window_errors
 from residnet.judge.protocol import Windows

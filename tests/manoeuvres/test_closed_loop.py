@@ -17,19 +17,13 @@ from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.manoeuvres import (
-    FourCorner,
-    Helm,
-    MultiSine,
-    RandomSteps,
-    Spiral,
-    StackedSource,
-    TurningCircle,
-    Watched,
-    Zigzag,
-)
-from residnet.manoeuvres.four_corner import SEGMENTS
+from residnet.manoeuvres.base import Helm, StackedSource, Watched
+from residnet.manoeuvres.excitation import MultiSine, RandomSteps
+from residnet.manoeuvres.four_corner import SEGMENTS, FourCorner
+from residnet.manoeuvres.spiral import Spiral
 from residnet.manoeuvres.steady import Steady, SteadyConfig
+from residnet.manoeuvres.turning_circle import TurningCircle
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180

@@ -14,8 +14,13 @@ from scipy.optimize import brentq
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.manoeuvres import Helm, Spiral, Stopping, TurningCircle, Zigzag, imo
+from residnet.manoeuvres import imo
+from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.indices import IN_LENGTHS, UNITS, Track, first_crossing, turning, zigzag
+from residnet.manoeuvres.spiral import Spiral
+from residnet.manoeuvres.stopping import Stopping
+from residnet.manoeuvres.turning_circle import TurningCircle
+from residnet.manoeuvres.zigzag import Zigzag
 
 DEG = math.pi / 180
 

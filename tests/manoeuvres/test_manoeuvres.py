@@ -28,18 +28,14 @@ from residnet.core.log import Log
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.manoeuvres import (
-    AccelerationDeceleration,
-    ConstantInput,
-    Helm,
-    ManoeuvreConfig,
-    StackedSource,
-    ThreeTwoOneOne,
-    Zigzag,
-)
-from residnet.manoeuvres.base import ScheduleSource
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration
+from residnet.manoeuvres.base import Helm, ScheduleSource, StackedSource
+from residnet.manoeuvres.constant import ConstantInput
 from residnet.manoeuvres.excitation import MultiSine
 from residnet.manoeuvres.indices import UNITS
+from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.physics.actuators import DifferentialThrust
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel

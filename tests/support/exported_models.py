@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.baselines import RegressorsConfig
-from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
+from residnet.core.registry import kinds
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Loaded
 from residnet.export.vessel import ExportedVessel
-from residnet.heads import ClosedFormHead, HeadConfig
+from residnet.heads import HeadConfig
+from residnet.heads.base import ClosedFormHead
 from residnet.physics.signals import SignalsConfig
 
 SIGNALS = SignalsConfig(
@@ -24,9 +25,7 @@ SIGNALS = SignalsConfig(
 NAMES = SIGNALS.build().names
 FEATURES = ("u", "v", "r", "tau_x", "tau_n", "wind_u", "wind_v", "wind_mag")
 LOW, HIGH = (-0.5, -0.6, -0.4, -10.0, -12.0, 0.0, -3.0), (3.0, 0.6, 0.4, 30.0, 32.0, 9.0, 3.0)
-KINDS: dict[str, type[Any]] = {
-    config.model_fields["kind"].default: config for config in get_args(get_args(HeadConfig)[0])
-}
+KINDS: dict[str, type[Any]] = kinds(HeadConfig)
 # smaller than the defaults, for the sake of time
 SIZES: dict[str, dict[str, Any]] = {"mlp": {"hidden": (8,)}, "lstm": {"hidden_size": 6}}
 VARIANTS: dict[str, dict[str, Any]] = {

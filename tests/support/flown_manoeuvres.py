@@ -5,22 +5,20 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from residnet.core.log import Log
+from residnet.core.registry import kinds
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre, ManoeuvreConfig, Replay
+from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.replay import Replay
 from residnet.physics.plant import Plant
-
-
-def kinds(union: Any) -> dict[str, Any]:
-    return {config.model_fields["kind"].default: config for config in get_args(get_args(union)[0])}
-
 
 FAMILIES, MANOEUVRES = kinds(FamilyConfig), kinds(ManoeuvreConfig)
 # what a family cannot do without; a new family whose fields have defaults beyond these needs no

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from kinds import of_kind
 
-from residnet.baselines import RegressorBaseline, RegressorsConfig
+from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.physics.signals import SignalsConfig

@@ -16,7 +16,8 @@ from residnet.core.names import STATE
 from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads import ResidualHead, ZeroHead
+from residnet.heads.base import ResidualHead
+from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 STEP = 0.1

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from residnet.core.config import dump_config
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 CHANNELS = {
     "x": "m",

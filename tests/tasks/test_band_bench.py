@@ -9,7 +9,7 @@ import pytest
 
 from residnet.core.files import shipped_configs
 from residnet.tasks.fit.config import FitTaskSettings
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 BENCH = Path(__file__).parents[2] / "scripts" / "bench" / "bands.py"
 

@@ -32,7 +32,7 @@ def one_line(capsys: pytest.CaptureFixture[str]) -> str:
     ids=lambda p: p.name,
 )
 def test_every_config_is_valid(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from residnet.tasks.loading import load_task
+    from residnet.tasks.registry import load_task
 
     monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
     task = load_task(path, [])
@@ -124,7 +124,7 @@ def test_help_does_not_import_torch() -> None:
 
 
 def test_check_does_not_import_lightning(tiny_config: Path) -> None:
-    load = f"import residnet.tasks.loading as l; l.load_task(Path({str(tiny_config)!r}), [])"
+    load = f"import residnet.tasks.registry as l; l.load_task(Path({str(tiny_config)!r}), [])"
     code = f"import sys; from pathlib import Path; {load}; sys.exit('lightning' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
@@ -186,7 +186,7 @@ def csv_logs(tmp_path: Path, trial_logs: list[Log]) -> Path:
 @pytest.fixture(scope="session")
 def trial_logs() -> list[Log]:
     from residnet.data.simulated.trials import SimulatedTrials, simulate
-    from residnet.manoeuvres import ThreeTwoOneOne
+    from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne
 
     flown = [
         ThreeTwoOneOne(drive=d, steer=s, unit=u, start=2)

@@ -19,7 +19,7 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import Outcome
 from residnet.tasks.compare.comparing import compare_runs
 from residnet.tasks.compare.errors import judged_runs, paired
-from residnet.tasks.run_list import runs_below, runs_text
+from residnet.tasks.registry import runs_below, runs_text
 from residnet.tasks.simulate import SimulateConfig
 
 

@@ -16,7 +16,7 @@ from tiny import call
 from tiny_tasks import imported
 
 from residnet.core.log import Log
-from residnet.data.readers import CanonicalConfig
+from residnet.data.readers.canonical import CanonicalConfig
 
 
 def config(folder: Path, **keys: object) -> Path:

@@ -17,7 +17,7 @@ from tiny_tasks import TINY_TASKS
 
 from residnet.core.errors import ResidnetError
 from residnet.runs.folder import RunFolder
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 
 def complaint(work: Callable[[Path], object], path: Path) -> str:

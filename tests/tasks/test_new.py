@@ -22,7 +22,7 @@ from residnet.data.drafting.questions import Question
 from residnet.data.readers import ReaderConfig
 from residnet.identification.recipe import window_length
 from residnet.tasks.drafting.draft import new_config
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from read_page import plain
 from tiny import call
 
 from residnet.core.log import Log
-from residnet.data.readers import CanonicalConfig
+from residnet.data.readers.canonical import CanonicalConfig
 
 STEP = 0.1
 VESSEL: dict[str, Any] = {

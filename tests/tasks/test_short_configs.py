@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 
 from residnet.core.files import config_folder
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 FILE = Path(__file__).parents[2] / "scripts" / "ci" / "short_configs.py"
 

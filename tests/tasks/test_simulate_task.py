@@ -13,9 +13,9 @@ import yaml
 from tiny import TINY, call
 
 from residnet.core.log import Log
-from residnet.data.readers import CanonicalConfig
+from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.simulated.trials import SimulatedTrials, simulate
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 DATA: dict[str, Any] = copy.deepcopy(TINY["data"])
 CONFIG = {"task": "simulate", "name": "trials", "data": DATA}

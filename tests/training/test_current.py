@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.baselines import RegressorsConfig
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate
 from residnet.core.errors import FitError
 from residnet.data.prepare import PrepareConfig, Prepared, prepare, samples

@@ -8,7 +8,8 @@ import pytest
 import torch
 from made_system import LINEAR, SCALES, model_of, trials
 
-from residnet.baselines import ParametricBaseline, RegressorsConfig
+from residnet.baselines.base import ParametricBaseline
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
 from residnet.training.free_runs.left_out import without_logs

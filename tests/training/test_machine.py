@@ -10,12 +10,13 @@ import torch
 from kinds import of_kind
 from made_system import LINEAR, SCALES, model_of, trials
 
-from residnet.baselines import RegressorsConfig
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import UsageError
 from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
-from residnet.heads import LstmConfig, MlpConfig
+from residnet.heads.lstm import LstmConfig
+from residnet.heads.mlp import MlpConfig
 from residnet.training.config import TrainingConfig
 from residnet.training.machine import MachineConfig
 from residnet.training.module import HeadTraining, Score

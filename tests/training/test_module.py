@@ -18,14 +18,14 @@ from kinds import of_kind
 from made_system import LINEAR, SCALES, STEP, free_run_error, model_of, trials
 from torch import Tensor
 
-from residnet.baselines import RegressorsConfig
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import DataError, FitError
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import LstmConfig, MlpConfig
-from residnet.heads.mlp import MlpHead
+from residnet.heads.lstm import LstmConfig
+from residnet.heads.mlp import MlpConfig, MlpHead
 from residnet.training.config import TrainingConfig
 from residnet.training.module import HeadTraining, Score, Validate
 from residnet.training.trainer import train

@@ -25,8 +25,8 @@ from made_system import (
 )
 from torch import Tensor
 
-from residnet.baselines import RegressorsConfig, StillConfig
-from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
+from residnet.baselines.still import StillConfig
 from residnet.core.errors import DataError, FitError, ResidnetError
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, samples
@@ -34,7 +34,7 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads import ZeroHead
+from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training import refit as module
 from residnet.training.offsets import Offsets, OffsetsConfig

@@ -12,12 +12,11 @@ import torch
 from made_system import QUADRATIC, SCALES, SIGNALS, STEP, THETA, trials
 from torch import Tensor
 
-from residnet.baselines import RegressorsConfig
-from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import ZeroHead
+from residnet.heads.zero import ZeroHead
 from residnet.training.refit import Refitted, refit
 from residnet.training.refit_config import RefitConfig
 

@@ -14,7 +14,8 @@ from residnet.core.log import Log
 from residnet.core.progress import ProgressCallback, report, say
 from residnet.data.drafting.reading import log_files, read_each
 from residnet.data.parts import log_names
-from residnet.data.readers import LogReader, ReaderConfig
+from residnet.data.readers import ReaderConfig
+from residnet.data.readers.base import LogReader
 from residnet.tasks.drafting.yaml_text import commented
 
 if TYPE_CHECKING:

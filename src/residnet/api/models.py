@@ -18,7 +18,8 @@ from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model
-from residnet.export import ExportedVessel, exporter
+from residnet.export import exporter
+from residnet.export.vessel import ExportedVessel
 from residnet.identification.models import FittedModel
 from residnet.judge.band import Band, read_bands
 from residnet.runs.folder import require_sealed, seal

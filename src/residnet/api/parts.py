@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal
 
 from residnet.api.values import PartGiven, part
-from residnet.baselines import BaselineConfig, IdentifiedConfig
+from residnet.baselines import BaselineConfig
+from residnet.baselines.base import IdentifiedConfig
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.heads import HeadConfig
 from residnet.heads.base import FeatureConfig
-from residnet.tasks.catalogue import catalogue
+from residnet.tasks.registry import catalogue
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,7 +12,8 @@ from residnet.core.log import Log
 from residnet.core.progress import ProgressCallback
 from residnet.data.simulated.flying import Flight
 from residnet.judge.booklet import index_rows
-from residnet.manoeuvres import Manoeuvre, ManoeuvreConfig
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.manoeuvres.base import Manoeuvre
 from residnet.physics.vessel import load_vessel
 from residnet.physics.vessel_file import VesselFile
 from residnet.tasks.programme import Programme

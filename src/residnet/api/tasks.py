@@ -19,7 +19,7 @@ from residnet.core.progress import ProgressCallback
 from residnet.judge.metrics import metrics_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
-from residnet.tasks.union import TaskConfig
+from residnet.tasks.registry import TaskConfig
 
 if TYPE_CHECKING:
     import pandas as pd

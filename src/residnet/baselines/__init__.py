@@ -1,47 +1,31 @@
-"""The known part, identified from data: one config class per kind, listed in `BaselineConfig`."""
+"""The known part, identified from data: one config class per kind."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline
-from residnet.baselines.believed import BelievedConfig
-from residnet.baselines.equations import EquationsConfig
-from residnet.baselines.linear_steady import LinearSteadyConfig
-from residnet.baselines.mmg import MMGBaseline, MMGConfig
-from residnet.baselines.nomoto import NomotoConfig, NomotoSideslipConfig
-from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
-from residnet.baselines.still import StillConfig
 from residnet.core.registry import Kinds
-from residnet.regression.solutions import Coefficient
 
-BaselineConfig = Annotated[
-    BelievedConfig
-    | EquationsConfig
-    | LinearSteadyConfig
-    | MMGConfig
-    | NomotoConfig
-    | NomotoSideslipConfig
-    | RegressorsConfig
-    | StillConfig,
-    Kinds("residnet.baselines", IdentifiedConfig),
-]
+if TYPE_CHECKING:
+    from residnet.baselines.base import IdentifiedConfig
+
+    BaselineConfig = IdentifiedConfig
+else:
+    BaselineConfig = Annotated[
+        Any,
+        Kinds(
+            "residnet.baselines",
+            "residnet.baselines.base:IdentifiedConfig",
+            {
+                "believed": "residnet.baselines.believed:BelievedConfig",
+                "equations": "residnet.baselines.equations:EquationsConfig",
+                "linear_steady": "residnet.baselines.linear_steady:LinearSteadyConfig",
+                "mmg": "residnet.baselines.mmg:MMGConfig",
+                "nomoto": "residnet.baselines.nomoto:NomotoConfig",
+                "nomoto_sideslip": "residnet.baselines.nomoto:NomotoSideslipConfig",
+                "regressors": "residnet.baselines.regressors:RegressorsConfig",
+                "still": "residnet.baselines.still:StillConfig",
+            },
+        ),
+    ]
 """Config of any baseline, those of other packages included; its `kind` says which."""
-
-__all__ = [
-    "Baseline",
-    "BaselineConfig",
-    "BelievedConfig",
-    "Coefficient",
-    "EquationsConfig",
-    "IdentifiedConfig",
-    "LinearSteadyConfig",
-    "MMGBaseline",
-    "MMGConfig",
-    "NomotoConfig",
-    "NomotoSideslipConfig",
-    "ParametricBaseline",
-    "RegressorBaseline",
-    "RegressorsConfig",
-    "StillConfig",
-]

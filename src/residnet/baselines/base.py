@@ -122,6 +122,8 @@ class ParametricBaseline(Baseline, ABC):
 class IdentifiedConfig(Config, ABC):
     """A kind of baseline and how it is identified."""
 
+    kind: str
+
     def resolved(self) -> Self:
         """Return the config without references to files, as it is kept with a model."""
         return self

@@ -607,7 +607,7 @@ def _plain(annotation: Any) -> Any:
             inside, *metadata = get_args(annotation)
             kinds = next((part for part in metadata if isinstance(part, Kinds)), None)
             if kinds is not None:
-                return kinds.of(inside)
+                return kinds
             annotation = inside
         elif _is_union(annotation) and len(_options(annotation)) == 1:
             annotation = _options(annotation)[0]

@@ -6,8 +6,10 @@ A package declares its part in its own pyproject.toml, for example
     tide = "my_package.heads:TideConfig"
 
 and `kind: tide` works in YAML, in Python and in `residnet list heads`. A part that cannot be loaded
-is kept with its fault: it says so where it is used, and disturbs nothing else. A kind is imported
-when a config names it.
+is kept with its fault: it says so where it is used, and disturbs nothing else.
+
+residnet's own kinds stand in a table by name and `module:Class`. A kind is imported when a config
+names it, and `residnet list` reads its first line from the source: neither waits for PyTorch.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import importlib
 import importlib.metadata
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -26,8 +28,8 @@ from pydantic import BaseModel, GetCoreSchemaHandler, ValidationInfo
 from pydantic_core import CoreSchema, core_schema, to_json
 
 import residnet
-from residnet.core.errors import ConfigError, UsageError
-from residnet.core.names import nearest
+from residnet.core.errors import UsageError
+from residnet.core.files import config_folder
 
 GROUPS = (
     "residnet.heads",
@@ -115,28 +117,21 @@ def forget() -> None:
 class Kinds:
     """Marks a config field that takes one of several kinds, those of other packages included.
 
-    `TaskConfig = Annotated[Task, Kinds("residnet.tasks", Task, {"fit": "residnet.tasks.fit:Fit"},
-    key="task")]`. A kind's module is imported when a config names the kind.
+    Parts that are no configs, such as formats of exports, are kinds told apart by an attribute.
+    `HeadConfig = Annotated[Any, Kinds("residnet.heads", "residnet.heads.base:HeadKind",
+    {"lstm": "residnet.heads.lstm:LstmConfig"})]`.
 
     Attributes:
-        group: of the entry points.
-        base: class that the configs of other packages must extend.
-        builtin: residnet's own kinds, each as `module:Class`; where there are none, the annotation
-            is a union of their classes.
+        group: of the entry points; one that nobody names is closed to other packages.
+        base: `module:Class` that the configs of other packages must extend.
+        builtin: residnet's own kinds, each as `module:Class`.
         key: field that tells the kinds apart.
     """
 
     group: str
-    base: type[BaseModel]
-    builtin: Mapping[str, Any] = field(default_factory=dict)
+    base: str
+    builtin: Mapping[str, str]
     key: str = "kind"
-
-    def of(self, annotation: Any) -> Kinds:
-        """Return the same kinds with the built-in ones of the annotation that is marked."""
-        if self.builtin:
-            return self
-        members = (annotation,) if inspect.isclass(annotation) else get_args(annotation)
-        return replace(self, builtin={str(kind_of(member, self.key)): member for member in members})
 
     def others(self) -> list[ThirdParty]:
         """Return the kinds of other packages, each checked against what a kind has to be."""
@@ -150,19 +145,22 @@ class Kinds:
     def _fault(self, found: ThirdParty, taken_by: str | None) -> str:
         if taken_by is not None:
             return f"{taken_by} has a {self.key} of that name already"
-        fault = _no_subclass(found.part, self.base)
-        if not fault and kind_of(found.part, self.key) != found.name:
-            return f"{found.part.__name__} has no field `{self.key}: Literal['{found.name}']`"
-        return fault
+        fault = _no_subclass(found.part, imported(self.base))
+        if fault or kind_of(found.part, self.key) == found.name:
+            return fault
+        name = found.part.__name__
+        if issubclass(found.part, BaseModel):
+            return f"{name} has no field `{self.key}: Literal['{found.name}']`"
+        return f"{name} has no attribute `{self.key} = '{found.name}'`"
 
     def names(self) -> list[str]:
         """Return the names of all kinds, broken ones included."""
         return list(dict.fromkeys([*self.builtin, *(part.name for part in self.others())]))
 
     def find(self, name: str) -> type[Any] | ThirdParty:
-        """Return the config class of one kind; a broken one of another package as it is kept."""
+        """Return the class of one kind; a broken one of another package as it is kept."""
         if name in self.builtin:
-            found: type[Any] = _imported(self.builtin[name])
+            found: type[Any] = imported(self.builtin[name])
             return found
         # a second part of the same name could never be told from the first
         other = next(part for part in self.others() if part.name == name)
@@ -172,13 +170,12 @@ class Kinds:
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         """Return the schema of a union that is told apart by `key` and imports what is named."""
-        kinds = self.of(source)
         return core_schema.tagged_union_schema(
             {
                 name: core_schema.with_info_plain_validator_function(
-                    functools.partial(kinds._validated, name)
+                    functools.partial(self._validated, name)
                 )
-                for name in kinds.names()
+                for name in self.names()
             },
             discriminator=self.key,
             from_attributes=True,
@@ -196,15 +193,32 @@ class Kinds:
         return found.model_validate(value, context=info.context)
 
 
-def _imported(place: Any) -> Any:
-    if not isinstance(place, str):
-        return place
+def imported(place: str) -> Any:
+    """Return what stands at `module:name`."""
     module, _, name = place.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
-def kind_of(config: type[BaseModel], key: str = "kind") -> str | None:
-    """Return the value of the field that tells a config class from others; None without one."""
+def deferred(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return the `__getattr__` of a package whose names are loaded when they are first used.
+
+    Args:
+        package: its `__name__`.
+        homes: module within the package, by the name that it offers.
+    """
+
+    def load(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+        return imported(f"{package}.{homes[name]}:{name}")
+
+    return load
+
+
+def kind_of(config: type[Any], key: str = "kind") -> str | None:
+    """Return the value of the field that tells a class from others; None without one."""
+    if not issubclass(config, BaseModel):
+        return config.__dict__.get(key)
     found = config.model_fields.get(key)
     if found is None or get_origin(found.annotation) is not Literal:
         return None
@@ -220,7 +234,7 @@ def marker(union: Any) -> Kinds:
     found = next((part for part in get_args(union)[1:] if isinstance(part, Kinds)), None)
     if found is None:
         raise UsageError(f"{union} is no union of kinds that other packages may add to")
-    return found.of(get_args(union)[0])
+    return found
 
 
 def kinds(union: Any) -> dict[str, Any]:
@@ -235,8 +249,12 @@ def kinds(union: Any) -> dict[str, Any]:
 
 
 def listed(union: Any) -> list[tuple[str, str]]:
-    """Return name and first line of every kind; residnet's own ones are read, not imported."""
-    mark = marker(union)
+    """Return name and first line of every part; residnet's own ones are read, not imported.
+
+    Args:
+        union: for example `residnet.heads.HeadConfig`.
+    """
+    mark = union if isinstance(union, Kinds) else marker(union)
     out = [(name, _first_line(place)) for name, place in mark.builtin.items()]
     return out + [
         (part.name, broken_line(part) if part.fault else _first_line(part.part))
@@ -250,41 +268,20 @@ def broken_line(part: ThirdParty) -> str:
 
 
 def _first_line(place: Any) -> str:
+    """Return `about` of a class where it has one, else the first line of its docstring."""
     if not isinstance(place, str):
-        return (place.__doc__ or "").strip().splitlines()[0]
+        about: str = getattr(place, "about", "") or (place.__doc__ or "").strip().splitlines()[0]
+        return about
     module, _, name = place.partition(":")
     at = Path(residnet.__file__).parent.joinpath(*module.split(".")[1:])
     file = at / "__init__.py" if at.is_dir() else at.with_suffix(".py")
     for node in ast.parse(file.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ClassDef) and node.name == name:
+            for line in node.body:
+                if isinstance(line, ast.AnnAssign) and ast.unparse(line.target) == "about":
+                    return str(ast.literal_eval(line.value)) if line.value else ""
             return (ast.get_docstring(node) or "").partition("\n")[0]
-    return _first_line(_imported(place))
-
-
-def objects(group: str, builtin: Mapping[str, Any], base: type[Any]) -> dict[str, Any]:
-    """Return parts that are no configs, built-in and third-party ones, by name.
-
-    Args:
-        group: of the entry points; each leads to a subclass of `base` that takes no arguments.
-        builtin: the parts of residnet.
-        base: class of the parts; its attribute `name` must be that of the entry point.
-
-    Returns:
-        The parts; for a broken one its `ThirdParty`, which says what is wrong with it.
-    """
-    out: dict[str, Any] = dict(builtin)
-    for found in third_party(group):
-        if found.name not in out:
-            checked = found.checked(functools.partial(_object_fault, found, base))
-            out[found.name] = checked if checked.fault else found.part()
-    return out
-
-
-def _object_fault(found: ThirdParty, base: type[Any]) -> str:
-    fault = _no_subclass(found.part, base)
-    if not fault and found.part.__dict__.get("name") != found.name:
-        return f"{found.part.__name__} has no attribute `name = '{found.name}'`"
-    return fault
+    return _first_line(imported(place))
 
 
 def _no_subclass(part: Any, base: type[Any]) -> str:
@@ -294,19 +291,6 @@ def _no_subclass(part: Any, base: type[Any]) -> str:
     if abstract:
         return f"{part.__name__} lacks {', '.join(sorted(abstract))}"
     return ""
-
-
-def usable(parts: Mapping[str, Any], name: str, what: str) -> Any:
-    """Return the part of that name.
-
-    Raises:
-        ConfigError: where there is none, or it is broken.
-    """
-    if name not in parts:
-        raise ConfigError(f"no {what} '{name}'{nearest(name, parts)}")
-    if isinstance(parts[name], ThirdParty):
-        raise ConfigError(f"{what} {parts[name].complaint}")
-    return parts[name]
 
 
 def folders(group: str) -> dict[str, Path | ThirdParty]:
@@ -325,4 +309,28 @@ def folders(group: str) -> dict[str, Path | ThirdParty]:
             out[found.name] = replace(found, part=None, fault=fault)
         else:
             out[found.name] = Path(file).parent
+    return out
+
+
+def vessel_files() -> dict[str, Path]:
+    """Return names and files of the vessels of residnet, then those of other packages."""
+    found = {path.stem: path for path in sorted((config_folder() / "vessels").glob("*.yaml"))}
+    for folder in folders("residnet.vessels").values():
+        if isinstance(folder, Path):
+            for path in sorted(folder.glob("*.yaml")):
+                found.setdefault(path.stem, path)
+    return found
+
+
+def broken_vessels() -> list[ThirdParty]:
+    """Return entry points of vessels that lead to no folder, and vessels whose name is taken."""
+    files, out = vessel_files(), []
+    for name, folder in folders("residnet.vessels").items():
+        if isinstance(folder, ThirdParty):
+            out.append(folder)
+            continue
+        for path in sorted(folder.glob("*.yaml")):
+            if files[path.stem] != path:
+                taken = f"{files[path.stem]} is the vessel of that name"
+                out.append(ThirdParty(path.stem, f"of the entry point {name}", fault=taken))
     return out

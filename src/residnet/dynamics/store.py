@@ -26,7 +26,8 @@ from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
-from residnet.heads import HeadConfig, ZeroHead
+from residnet.heads import HeadConfig
+from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 

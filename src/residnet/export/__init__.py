@@ -1,38 +1,33 @@
-"""Export for controllers: one file per format, found by name in `exporters`."""
+"""Export for controllers: one file per format, found by name in `FORMATS`."""
 
 from __future__ import annotations
 
-from residnet.core.registry import ThirdParty, objects, usable
-from residnet.export.aoti import AotiExporter
-from residnet.export.base import Exported, Exporter
-from residnet.export.c import CExporter
-from residnet.export.casadi_function import CasadiExporter
-from residnet.export.feed_forward import FeedForwardExporter
-from residnet.export.fmu import Fmu2Exporter, Fmu3Exporter
-from residnet.export.onnx_file import OnnxExporter
-from residnet.export.parameters import ParametersExporter
-from residnet.export.torchscript import TorchScriptExporter
-from residnet.export.vessel import ExportedVessel
+from typing import TYPE_CHECKING
 
-__all__ = ["Exported", "ExportedVessel", "Exporter", "exporter", "exporters"]
+from residnet.core.errors import ConfigError
+from residnet.core.names import nearest
+from residnet.core.registry import Kinds, ThirdParty
 
-_BUILTIN: tuple[Exporter, ...] = (
-    TorchScriptExporter(),
-    CExporter(),
-    OnnxExporter(),
-    CasadiExporter(),
-    Fmu3Exporter(),
-    Fmu2Exporter(),
-    AotiExporter(),
-    ParametersExporter(),
-    FeedForwardExporter(),
+if TYPE_CHECKING:
+    from residnet.export.base import Exporter
+
+FORMATS = Kinds(
+    "residnet.exporters",
+    "residnet.export.base:Exporter",
+    {
+        "torchscript": "residnet.export.torchscript:TorchScriptExporter",
+        "c": "residnet.export.c:CExporter",
+        "onnx": "residnet.export.onnx_file:OnnxExporter",
+        "casadi": "residnet.export.casadi_function:CasadiExporter",
+        "fmu": "residnet.export.fmu:Fmu3Exporter",
+        "fmu2": "residnet.export.fmu:Fmu2Exporter",
+        "aoti": "residnet.export.aoti:AotiExporter",
+        "parameters": "residnet.export.parameters:ParametersExporter",
+        "feed_forward": "residnet.export.feed_forward:FeedForwardExporter",
+    },
+    key="name",
 )
-
-
-def exporters() -> dict[str, Exporter | ThirdParty]:
-    """Return all formats by name, those of other packages included; a broken one is kept."""
-    builtin = {format.name: format for format in _BUILTIN}
-    return objects("residnet.exporters", builtin, Exporter)
+"""All formats, those of other packages included."""
 
 
 def exporter(name: str) -> Exporter:
@@ -41,5 +36,10 @@ def exporter(name: str) -> Exporter:
     Raises:
         ConfigError: where there is none, or the package that offers it is broken.
     """
-    found: Exporter = usable(exporters(), name, "export format")
-    return found
+    if name not in (known := FORMATS.names()):
+        raise ConfigError(f"no export format '{name}'{nearest(name, known)}")
+    found = FORMATS.find(name)
+    if isinstance(found, ThirdParty):
+        raise ConfigError(f"export format {found.complaint}")
+    format: Exporter = found()
+    return format

@@ -72,7 +72,6 @@ class Loaded(ABC):
         """
         return None
 
-
     def rollout(self, *given: Numbers) -> Numbers | None:
         """Return the states of a free run of one row; None where the format has only steps."""
         return None

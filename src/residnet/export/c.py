@@ -221,8 +221,7 @@ class CompiledModel(Loaded):
         returned = self._call("step", *rows, *out.values())
         found = out | {name: np.array([returned]) for name in flags[:1]}
         return tuple(
-            bool(found[name][0]) if name in flags else found[name]
-            for name in self.exported.results
+            bool(found[name][0]) if name in flags else found[name] for name in self.exported.results
         )
 
     def memory(self, *past: Numbers) -> Numbers | None:

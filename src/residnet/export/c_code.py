@@ -250,9 +250,7 @@ class Body:
             return [[i + j for i in _range(info["outer"]) for j in _range(info["inner"])]]
         offsets = info["offset"]
         height = matrix.dep(0).shape[0] if op == ca.OP_HORZSPLIT else 1
-        return [
-            list(range(a * height, b * height)) for a, b in pairwise(offsets)
-        ]
+        return [list(range(a * height, b * height)) for a, b in pairwise(offsets)]
 
     def real(self, cell: str, flag: bool) -> str:
         return f"(REAL){cell}" if flag else cell

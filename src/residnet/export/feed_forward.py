@@ -21,7 +21,7 @@ from residnet.export.base import Exported, Exporter, Loaded
 from residnet.export.guard import replaced, widening
 from residnet.export.torchscript import TorchScriptExporter, require_shape, size
 from residnet.export.vessel import ExportedVessel
-from residnet.heads import ForceHead
+from residnet.heads.force import ForceHead
 from residnet.physics.force_model import MOTION
 from residnet.physics.signals import FORCE_CHANNELS
 

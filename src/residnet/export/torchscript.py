@@ -90,7 +90,6 @@ class ScriptedModel(Loaded):
             found: Numbers = begin(*self._given(past))[0].numpy()
         return found
 
-
     def rollout(self, *given: Numbers) -> Numbers | None:
         """Return the states of a free run."""
         with torch.no_grad():

@@ -1,46 +1,30 @@
-"""What is learned on top of the baseline: one config class per kind, listed in `HeadConfig`."""
+"""What is learned on top of the baseline: one config class per kind."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from residnet.core.registry import Kinds
-from residnet.heads.base import ClosedFormHead, EquationHead, HeadKind, ResidualHead
-from residnet.heads.force import ForceHead
-from residnet.heads.genetic import GeneticConfig
-from residnet.heads.kernel import KernelConfig
-from residnet.heads.lstm import LstmConfig
-from residnet.heads.mlp import MlpConfig
-from residnet.heads.plsr import PlsrConfig
-from residnet.heads.ridge import RidgeConfig
-from residnet.heads.symbolic import SymbolicConfig
-from residnet.heads.zero import ZeroHead
 
-HeadConfig = Annotated[
-    PlsrConfig
-    | RidgeConfig
-    | KernelConfig
-    | SymbolicConfig
-    | GeneticConfig
-    | MlpConfig
-    | LstmConfig,
-    Kinds("residnet.heads", HeadKind),
-]
+if TYPE_CHECKING:
+    from residnet.heads.base import HeadKind
+
+    HeadConfig = HeadKind
+else:
+    HeadConfig = Annotated[
+        Any,
+        Kinds(
+            "residnet.heads",
+            "residnet.heads.base:HeadKind",
+            {
+                "plsr": "residnet.heads.plsr:PlsrConfig",
+                "ridge": "residnet.heads.ridge:RidgeConfig",
+                "kernel": "residnet.heads.kernel:KernelConfig",
+                "symbolic": "residnet.heads.symbolic:SymbolicConfig",
+                "genetic": "residnet.heads.genetic:GeneticConfig",
+                "mlp": "residnet.heads.mlp:MlpConfig",
+                "lstm": "residnet.heads.lstm:LstmConfig",
+            },
+        ),
+    ]
 """Config of any head, those of other packages included; its `kind` says which."""
-
-__all__ = [
-    "ClosedFormHead",
-    "EquationHead",
-    "ForceHead",
-    "GeneticConfig",
-    "HeadConfig",
-    "HeadKind",
-    "KernelConfig",
-    "LstmConfig",
-    "MlpConfig",
-    "PlsrConfig",
-    "ResidualHead",
-    "RidgeConfig",
-    "SymbolicConfig",
-    "ZeroHead",
-]

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from residnet.baselines import ParametricBaseline
+from residnet.baselines.base import ParametricBaseline
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.progress import say
@@ -20,8 +20,7 @@ from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import ClosedFormHead
-from residnet.heads.base import EquationHead
+from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.fitter import residual_samples
 from residnet.identification.identified import Identified
 from residnet.identification.models import FittedModel, references

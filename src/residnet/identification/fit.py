@@ -20,7 +20,7 @@ from residnet.core.progress import Progress, listen, listener, report, say
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, restored
-from residnet.heads import ClosedFormHead
+from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
 from residnet.identification.bands import calibrate_bands
 from residnet.identification.fitter import Fitter

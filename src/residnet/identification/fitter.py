@@ -13,7 +13,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from residnet.baselines import BaselineConfig, Coefficient, ParametricBaseline, StillConfig
+from residnet.baselines import BaselineConfig
+from residnet.baselines.base import ParametricBaseline
+from residnet.baselines.still import StillConfig
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
@@ -23,8 +25,8 @@ from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
-from residnet.heads import ClosedFormHead, ZeroHead
-from residnet.heads.base import ResidualHead
+from residnet.heads.base import ClosedFormHead, ResidualHead
+from residnet.heads.zero import ZeroHead
 from residnet.identification.models import FitStore, FittedModel, NoStore
 from residnet.identification.prepared import PreparedSplits, velocity_limit
 from residnet.identification.recipe import Facts
@@ -32,7 +34,7 @@ from residnet.identification.settings import FitSettings, ForceConfig, GateConfi
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.metrics import window_errors
 from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
-from residnet.regression.solutions import Solution
+from residnet.regression.solutions import Coefficient, Solution
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import free_run_starts, refit
 from residnet.training.stage_windows import stage_windows

@@ -20,8 +20,7 @@ from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.heads import ClosedFormHead
-from residnet.heads.base import EquationHead
+from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.models import FittedModel, references
 from residnet.identification.settings import FitSettings
 from residnet.judge.band import Bands

@@ -12,7 +12,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.baselines import ParametricBaseline
+from residnet.baselines.base import ParametricBaseline
 from residnet.core.config import Config, Metres, MetresPerSecond, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import POSITION, SURGE, SWAY
@@ -24,15 +24,12 @@ from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputSh
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.models import FittedModel
-from residnet.manoeuvres import (
-    AccelerationDeceleration,
-    Helm,
-    Manoeuvre,
-    MultiSine,
-    ThreeTwoOneOne,
-    TurningCircle,
-    Zigzag,
-)
+from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.excitation import MultiSine
+from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne
+from residnet.manoeuvres.turning_circle import TurningCircle
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.training.free_runs.covariance import LeftOpen
 from residnet.training.refit_config import RefitConfig
 from residnet.training.sensitivities import step_sensitivities

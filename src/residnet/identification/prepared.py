@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from residnet.baselines import RegressorBaseline
+from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.arrays import paged
 from residnet.core.errors import DataError
 from residnet.core.layout import RANGE_VELOCITIES

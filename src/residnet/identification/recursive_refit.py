@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.baselines import ParametricBaseline
+from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import UsageError
 from residnet.core.layout import VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics

@@ -12,19 +12,18 @@ from pydantic import (
     model_validator,
 )
 
-from residnet.baselines import (
-    BaselineConfig,
-    ParametricBaseline,
-    RegressorBaseline,
-    StillConfig,
-)
+from residnet.baselines import BaselineConfig
+from residnet.baselines.base import ParametricBaseline
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.still import StillConfig
 from residnet.core.config import Config, Seconds, validate
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import DisturbanceConfig
-from residnet.heads import ForceHead, HeadConfig
+from residnet.heads import HeadConfig
+from residnet.heads.force import ForceHead
 from residnet.identification.recipe import PARTS, TIED, Facts, portfolio
 from residnet.judge.band import BandsConfig
 from residnet.judge.protocol import EvaluationConfig
@@ -201,7 +200,8 @@ class FitSettings(Parts):
     def _parts_fit_together(self) -> None:
         """Build every part once, so that what does not fit together is refused before any work."""
         names = self.signals.build().names
-        for key, part in {**self.all_baselines, **self.heads}.items():
+        parts: dict[str, Any] = {**self.all_baselines, **self.heads}
+        for key, part in parts.items():
             try:
                 part.build(names)
             except ConfigError as error:

@@ -108,7 +108,8 @@ def wind_flights(
 ) -> Flights:
     """Run steps of the reference with the nominal vessel in wind from eight directions."""
     weather: dict[str, float | Tensor] = {
-        "wind_speed": speed, "wind_dir": torch.arange(8) * (torch.pi / 4.0),
+        "wind_speed": speed,
+        "wind_dir": torch.arange(8) * (torch.pi / 4.0),
     }
     vessel, headings = SteeredPlant(plant, calm=False), torch.full((8,), heading)
     return fly(vessel, policy, headings, _nominal(8), dt=dt, duration=duration, weather=weather)

@@ -15,7 +15,8 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.simulated.flying import Craft, Flight
 from residnet.dynamics.actuated import InputShare
-from residnet.manoeuvres import Manoeuvre, ManoeuvreConfig
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.manoeuvres.base import Manoeuvre
 from residnet.manoeuvres.indices import IN_LENGTHS, UNITS
 
 SCHEMA = "residnet.booklet/1"

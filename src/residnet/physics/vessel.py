@@ -10,18 +10,17 @@ from pydantic import AfterValidator, Field
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
+from residnet.core.registry import vessel_files
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.fossen import FossenConfig, MassMatrixConfig
 from residnet.physics.nomoto import NomotoConfig, SecondOrderNomotoConfig, SideslipNomotoConfig
 from residnet.physics.odin import OdinConfig
 from residnet.physics.patrol import PatrolConfig
-from residnet.physics.vessel_file import broken_vessels, vessel_files
 
 __all__ = [
     "AnyVessel",
     "VesselConfig",
     "VesselName",
-    "broken_vessels",
     "load_vessel",
     "vessel_files",
 ]

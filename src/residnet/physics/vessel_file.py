@@ -10,9 +10,8 @@ from pydantic import ValidationInfo, field_validator, model_validator
 
 from residnet.core.config import Config, load_mapping
 from residnet.core.errors import ConfigError
-from residnet.core.files import config_folder
 from residnet.core.names import nearest
-from residnet.core.registry import ThirdParty, folders
+from residnet.core.registry import vessel_files
 from residnet.physics.parameters import Length, above_zero
 from residnet.physics.plant import Plant
 
@@ -46,30 +45,6 @@ class VesselFile(Config, ABC):
         Raises:
             ConfigError: where the parameters make no plant, for example a singular mass matrix.
         """
-
-
-def vessel_files() -> dict[str, Path]:
-    """Return names and files of the vessels of residnet, then those of other packages."""
-    found = {path.stem: path for path in sorted((config_folder() / "vessels").glob("*.yaml"))}
-    for folder in folders("residnet.vessels").values():
-        if isinstance(folder, Path):
-            for path in sorted(folder.glob("*.yaml")):
-                found.setdefault(path.stem, path)
-    return found
-
-
-def broken_vessels() -> list[ThirdParty]:
-    """Return entry points of vessels that lead to no folder, and vessels whose name is taken."""
-    files, out = vessel_files(), []
-    for name, folder in folders("residnet.vessels").items():
-        if isinstance(folder, ThirdParty):
-            out.append(folder)
-            continue
-        for path in sorted(folder.glob("*.yaml")):
-            if files[path.stem] != path:
-                taken = f"{files[path.stem]} is the vessel of that name"
-                out.append(ThirdParty(path.stem, f"of the entry point {name}", fault=taken))
-    return out
 
 
 def with_base(data: Any, folder: Path | None) -> Any:

@@ -297,6 +297,7 @@ def _sum(x: Regressors, of: Callable[[slice, Tensor], Tensor]) -> Tensor:
         total = total + of(rows, part)
     return total
 
+
 @dataclass(frozen=True)
 class Descent(Generic[Point]):
     """Where a descent ended, and how many steps it took."""

@@ -1,1 +1,1 @@
-"""The kinds of run; `residnet.tasks.loading.load_task` reads the one that a config describes."""
+"""The kinds of run; `residnet.tasks.registry.load_task` reads the one that a config describes."""

@@ -34,7 +34,7 @@ from residnet.data.sources import MeasuredLogs
 from residnet.tasks.drafting.yaml_text import commented
 from residnet.tasks.fit.task import FitConfig
 from residnet.tasks.import_logs import ImportConfig
-from residnet.tasks.loading import load_task
+from residnet.tasks.registry import load_task
 
 _ILL_CONDITIONED = 1e6
 """Condition number from which regressors leave their coefficients to the noise."""
@@ -187,7 +187,7 @@ def _read(
 
 def _regressors(logs: Sequence[Log], task: Any) -> list[Finding]:
     """Return how well the prepared logs condition the regressors of each baseline."""
-    from residnet.baselines import RegressorBaseline
+    from residnet.baselines.regressors import RegressorBaseline
     from residnet.data.prepare import prepare, samples
 
     try:

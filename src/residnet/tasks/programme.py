@@ -20,7 +20,9 @@ from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
 from residnet.dynamics.simulated import TracedPlantDynamics, check_steps
 from residnet.dynamics.store import chosen_model, load_model
-from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre, ManoeuvreConfig, Replay
+from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.replay import Replay
 from residnet.physics.vessel import load_vessel
 
 STEP = 0.05

@@ -11,7 +11,7 @@ from pydantic import model_validator
 from residnet.core.progress import say
 from residnet.data.simulated.flying import Craft, Flight
 from residnet.data.simulated.trials import SimulatedTrials, fly_trials, stand_ins, trials_craft
-from residnet.manoeuvres import Replay
+from residnet.manoeuvres.replay import Replay
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Section
 from residnet.report.figure import write_figures

@@ -17,24 +17,27 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from residnet.baselines import BaselineConfig, IdentifiedConfig
+from residnet.baselines import BaselineConfig
+from residnet.baselines.base import IdentifiedConfig
 from residnet.core.config import Config, validate
 from residnet.core.errors import ResidnetError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import si_unit
 from residnet.core.registry import kind_of
 from residnet.core.samples import Samples
-from residnet.data.readers import LogReader
+from residnet.data.readers.base import LogReader
 from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import Craft, Flight, Sea, fly, source_of
 from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.dynamics.store import load_model, save_model
-from residnet.export import ExportedVessel, Exporter
+from residnet.export.base import Exporter
+from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
 from residnet.heads.base import FeatureConfig
-from residnet.manoeuvres import Helm, Manoeuvre, ManoeuvreConfig
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 from residnet.testing.examples import example_model, example_models, example_samples, example_spec

@@ -6,15 +6,16 @@ import functools
 
 import torch
 
-from residnet.baselines import RegressorsConfig
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.layout import RANGE_INPUTS, RANGE_VELOCITIES
 from residnet.core.samples import Samples
 from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.simulated.trials import SimulatedTrials, fly_trials
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.heads import ClosedFormHead, LstmConfig, RidgeConfig
-from residnet.heads.base import FeatureConfig
+from residnet.heads.base import ClosedFormHead, FeatureConfig
+from residnet.heads.lstm import LstmConfig
+from residnet.heads.ridge import RidgeConfig
 from residnet.physics.signals import SignalsConfig
 
 SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolved()

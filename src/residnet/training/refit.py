@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from residnet.baselines import ParametricBaseline
+from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import FitError
 from residnet.core.layout import VELOCITIES, zero_acceleration
 from residnet.core.samples import Samples

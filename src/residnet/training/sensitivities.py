@@ -8,7 +8,7 @@ from typing import final
 import torch
 from torch import Tensor
 
-from residnet.baselines import Baseline, ParametricBaseline
+from residnet.baselines.base import Baseline, ParametricBaseline
 from residnet.core.layout import HEADING, PLANAR, YAW_RATE, zero_acceleration
 from residnet.dynamics.hybrid import HybridDynamics
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from made_system import LINEAR, SCALES, STEP, model_of, trials
 
-from residnet.baselines import RegressorsConfig
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import DataError, UsageError
 from residnet.data.prepare import envelope, samples
 from residnet.data.windows import WindowStore
@@ -24,7 +24,7 @@ from residnet.identification.planning import (
     spread,
     volume_gain,
 )
-from residnet.manoeuvres import ConstantInput
+from residnet.manoeuvres.constant import ConstantInput
 from residnet.physics.signals import SignalsConfig
 from residnet.training.free_runs.covariance import LeftOpen, left_open
 from residnet.training.refit import refit

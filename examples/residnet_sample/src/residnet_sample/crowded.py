@@ -8,8 +8,7 @@ from typing import Literal, final
 from torch import Tensor, nn
 
 from residnet.core.samples import Samples
-from residnet.heads import HeadKind, ResidualHead
-from residnet.heads.base import Features, ResidualScale
+from residnet.heads.base import Features, HeadKind, ResidualHead, ResidualScale
 
 
 class CrowdedConfig(HeadKind):

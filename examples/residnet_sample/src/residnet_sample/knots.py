@@ -10,8 +10,9 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.readers import LogReader, ReaderKind
 from residnet.data.readers.base import (
+    LogReader,
+    ReaderKind,
     provenance,
     require_file,
     require_increasing,

@@ -9,7 +9,8 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from residnet.core.errors import ExportError, UsageError
-from residnet.export import Exported, ExportedVessel, Exporter
+from residnet.export.base import Exported, Exporter
+from residnet.export.vessel import ExportedVessel
 
 
 @final

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.config import Seconds
-from residnet.manoeuvres import Scheduled
+from residnet.manoeuvres.base import Scheduled
 
 
 @final

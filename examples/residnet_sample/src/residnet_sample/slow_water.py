@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from residnet.core.config import Seconds
 from residnet.core.samples import Samples
-from residnet.heads import HeadKind, ResidualHead
-from residnet.heads.base import Features, ResidualScale
+from residnet.heads.base import Features, HeadKind, ResidualHead, ResidualScale
 
 
 class SlowWaterConfig(HeadKind):

@@ -168,7 +168,8 @@ def clock_of(sheet: Sheet) -> Clock:
     rising = [
         name
         for name, values in sheet.numbers.items()
-        if values.size > 1 and bool((np.diff(values[np.isfinite(values)]) > 0.0).all())
+        if values.size > 1
+        and bool((np.diff(values[np.isfinite(values)]) > 0.0).all())
         # pandas writes the number of each row under no name
         and not name.startswith("Unnamed: ")
     ]

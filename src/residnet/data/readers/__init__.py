@@ -1,66 +1,37 @@
-"""Readers of logs: one file per format, listed once in `ReaderConfig`."""
+"""Readers of logs: one row per format."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from residnet.core.registry import Kinds
-from residnet.data.readers.base import LogReader, ReaderKind
-from residnet.data.readers.canonical import CanonicalConfig, CanonicalReader
-from residnet.data.readers.detect import AutoConfig
-from residnet.data.readers.formats.ardupilot import ArduPilotConfig
-from residnet.data.readers.formats.nmea import NmeaConfig
-from residnet.data.readers.formats.rosbag import RosbagConfig
-from residnet.data.readers.formats.topic_folder import TopicFolderConfig
-from residnet.data.readers.formats.trees import Hdf5Config, MatConfig
-from residnet.data.readers.formats.ulog import UlogConfig
-from residnet.data.readers.quantities import ChannelMap
-from residnet.data.readers.tables import (
-    CsvConfig,
-    ExcelConfig,
-    JsonLinesConfig,
-    ParquetConfig,
-    TableReader,
-    TimeColumn,
-)
 
-ReaderConfig = Annotated[
-    CsvConfig
-    | ParquetConfig
-    | ExcelConfig
-    | JsonLinesConfig
-    | CanonicalConfig
-    | TopicFolderConfig
-    | RosbagConfig
-    | MatConfig
-    | Hdf5Config
-    | NmeaConfig
-    | UlogConfig
-    | ArduPilotConfig
-    | AutoConfig,
-    Kinds("residnet.readers", ReaderKind),
-]
+if TYPE_CHECKING:
+    from residnet.data.readers.base import ReaderKind
+    from residnet.data.readers.canonical import CanonicalConfig
+
+    ReaderConfig: TypeAlias = ReaderKind | CanonicalConfig
+else:
+    ReaderConfig = Annotated[
+        Any,
+        Kinds(
+            "residnet.readers",
+            "residnet.data.readers.base:ReaderKind",
+            {
+                "csv": "residnet.data.readers.tables:CsvConfig",
+                "parquet": "residnet.data.readers.tables:ParquetConfig",
+                "excel": "residnet.data.readers.tables:ExcelConfig",
+                "json_lines": "residnet.data.readers.tables:JsonLinesConfig",
+                "canonical": "residnet.data.readers.canonical:CanonicalConfig",
+                "csv_topics": "residnet.data.readers.formats.topic_folder:TopicFolderConfig",
+                "rosbag": "residnet.data.readers.formats.rosbag:RosbagConfig",
+                "mat": "residnet.data.readers.formats.trees:MatConfig",
+                "hdf5": "residnet.data.readers.formats.trees:Hdf5Config",
+                "nmea": "residnet.data.readers.formats.nmea:NmeaConfig",
+                "ulog": "residnet.data.readers.formats.ulog:UlogConfig",
+                "ardupilot": "residnet.data.readers.formats.ardupilot:ArduPilotConfig",
+                "auto": "residnet.data.readers.detect:AutoConfig",
+            },
+        ),
+    ]
 """Config of any reader, those of other packages included; its `kind` says which."""
-
-__all__ = [
-    "ArduPilotConfig",
-    "AutoConfig",
-    "CanonicalConfig",
-    "CanonicalReader",
-    "ChannelMap",
-    "CsvConfig",
-    "ExcelConfig",
-    "Hdf5Config",
-    "JsonLinesConfig",
-    "LogReader",
-    "MatConfig",
-    "NmeaConfig",
-    "ParquetConfig",
-    "ReaderConfig",
-    "ReaderKind",
-    "RosbagConfig",
-    "TableReader",
-    "TimeColumn",
-    "TopicFolderConfig",
-    "UlogConfig",
-]

@@ -26,7 +26,8 @@ from residnet.data.simulated.flying import (
 )
 from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics, check_steps
-from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre
+from residnet.manoeuvres import FamilyConfig
+from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.physics.vessel import VesselName, load_vessel
 
 

@@ -43,7 +43,9 @@ from residnet.heads.genetic import GeneticConfig
 from residnet.heads.symbolic import SymbolicConfig
 from residnet.judge.goodness import OneStep
 from residnet.judge.goodness import table as goodness_table
-from residnet.manoeuvres import AccelerationDeceleration, Helm, Manoeuvre, Zigzag
+from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.physics.froude import PHASES, froude_number, phase_of
 from residnet.physics.odin import AccelerationHull, OdinConfig
 from residnet.physics.vessel import load_vessel

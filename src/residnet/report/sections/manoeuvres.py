@@ -11,7 +11,10 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.data.simulated.flying import Flight
-from residnet.manoeuvres import Replay, Spiral, Waypoints, Zigzag
+from residnet.manoeuvres.replay import Replay
+from residnet.manoeuvres.spiral import Spiral
+from residnet.manoeuvres.waypoints import Waypoints
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.report.blocks import Block, Bullets, Cell, Column, Section, Table, Text, table_of
 from residnet.report.figure import (
     DASHED,

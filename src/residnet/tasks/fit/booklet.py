@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from residnet.baselines import ParametricBaseline
+from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY, nearest
@@ -21,8 +21,9 @@ from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputSh
 from residnet.dynamics.ensemble import SampledDynamics
 from residnet.identification.models import FittedModel
 from residnet.judge.booklet import BookletConfig, Page, contents
-from residnet.manoeuvres import Helm, Manoeuvre, Zigzag
+from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.recognise import steered_zigzag
+from residnet.manoeuvres.zigzag import Zigzag
 from residnet.runs.folder import RunFolder
 
 _PARAMETER = "model.baseline.theta"

@@ -7,7 +7,8 @@ from pathlib import Path
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.dynamics.store import load_model, model_names
-from residnet.export import ExportedVessel, exporter
+from residnet.export import exporter
+from residnet.export.vessel import ExportedVessel
 from residnet.runs.folder import RunFolder
 
 

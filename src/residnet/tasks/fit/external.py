@@ -14,7 +14,7 @@ from residnet.core.progress import say
 from residnet.data.drafting.reading import log_files
 from residnet.data.parts import data_files, log_names
 from residnet.data.prepare import prepare
-from residnet.data.readers import CanonicalConfig
+from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.identification.identified import candidates, evaluate

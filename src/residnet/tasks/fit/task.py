@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, Literal, final
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 from residnet.report.blocks import Section
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Finished, Outcome
 from residnet.tasks.fit.config import FitTaskSettings
+
+if TYPE_CHECKING:
+    from residnet.tasks.fit.planning import PlannedTrials
+    from residnet.tasks.fit.refitting import RefitRun
+    from residnet.tasks.fit.watching import WatchedLog
 
 
 @final
@@ -68,6 +73,47 @@ class FitConfig(FitTaskSettings):
         external = ExternalLogs(self, run, logs)
         folder = external.create_folder(out)
         return self.conduct(folder, external.provenance, external.judge)
+
+    def monitor(
+        self,
+        run: RunFolder,
+        logs: Sequence[Path],
+        model: str,
+        settings: Mapping[str, Any],
+        refit: Path | None,
+    ) -> tuple[list[WatchedLog], RefitRun | None]:
+        """Watch new logs with a model of a finished fit, and refit it to them where that is asked.
+
+        Args:
+            run: the fit.
+            logs: new logs, in the order of time.
+            model: name of the model; `selected` for the one chosen on validation data.
+            settings: of `MonitorConfig`.
+            refit: folder of a run for the refitted model; None for no refit.
+
+        Raises:
+            UsageError: where there is no such model, or the folder may not be used.
+            DataError: where a log cannot be used, or clean logs are too few.
+        """
+        from residnet.tasks.fit.refitting import refit_run, require_refit
+        from residnet.tasks.fit.watching import in_service, watch_logs
+
+        if refit is not None:
+            require_refit(run, refit, self)
+        service = in_service(self, run, logs, model, settings)
+        watched = watch_logs(service)
+        return watched, None if refit is None else refit_run(self, run, service, refit)
+
+    def plan_trial(self, run: RunFolder, model: str, limits: Mapping[str, Any]) -> PlannedTrials:
+        """Plan the next trials for a refitted baseline of a finished fit.
+
+        Raises:
+            UsageError: where the run has no such baseline.
+            DataError: where no candidate stays within the limits.
+        """
+        from residnet.tasks.fit.planning import plan_trials
+
+        return plan_trials(self, run, model, limits)
 
     def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
         """Export one model, `selected` for the one chosen on validation data; returns the file.

@@ -12,12 +12,12 @@ from residnet.report.run_reader import RunFiles
 from residnet.report.sections.sweep import draw, sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Outcome
+from residnet.tasks.registry import SweepableConfig
 from residnet.tasks.sweep.config import GridSearch, SweepConfig
 from residnet.tasks.sweep.journal import require_optuna
 from residnet.tasks.sweep.results import write_results
 from residnet.tasks.sweep.running import run_trials
 from residnet.tasks.sweep.trial import trial_task
-from residnet.tasks.union import SweepableConfig
 
 
 @final

@@ -11,9 +11,9 @@ from residnet.core.files import read_json
 from residnet.core.progress import Progress, listen
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
+from residnet.tasks.registry import SweepableConfig
 from residnet.tasks.sweep.config import SweepConfig
 from residnet.tasks.sweep.journal import open_study
-from residnet.tasks.union import SweepableConfig
 
 
 class Ended(NamedTuple):

@@ -1,0 +1,221 @@
+"""Kinds of run, their configs read, finished runs opened, and what `residnet list` and `runs` show.
+
+Nothing here waits for PyTorch: a task is imported when a config names it.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from residnet.baselines import BaselineConfig
+from residnet.core.config import load_config, load_mapping
+from residnet.core.errors import ConfigError, ResidnetError, UsageError
+from residnet.core.files import config_folder, require_room, shipped_configs
+from residnet.core.names import nearest
+from residnet.core.registry import (
+    Kinds,
+    ThirdParty,
+    broken_line,
+    broken_vessels,
+    listed,
+    marker,
+    vessel_files,
+)
+from residnet.data.readers import ReaderConfig
+from residnet.export import FORMATS
+from residnet.heads import HeadConfig
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.report.blocks import Cell, Table
+from residnet.runs.folder import RunFolder, seal
+from residnet.runs.task import Task
+
+_BASE, _DOCUMENTS = "residnet.runs.task:Task", "residnet.documents"
+SINGLE = {
+    "fit": "residnet.tasks.fit.task:FitConfig",
+    "import": "residnet.tasks.import_logs:ImportConfig",
+    "simulate": "residnet.tasks.simulate:SimulateConfig",
+    "study": "residnet.tasks.study:StudyConfig",
+    "actuators": "residnet.tasks.actuators:ActuatorsTaskConfig",
+    "autopilot": "residnet.tasks.autopilot.task:AutopilotConfig",
+    "course": "residnet.tasks.course.task:CourseTaskConfig",
+    "ferry_study": f"{_DOCUMENTS}.jervan2020.ferry:FerryStudyConfig",
+    "force_residual": f"{_DOCUMENTS}.jervan2020.measured:ForceResidualConfig",
+    "breeding": f"{_DOCUMENTS}.halvorsen2019.breeding:BreedingTaskConfig",
+    "sea_trial": f"{_DOCUMENTS}.halvorsen2019.sea_trial:SeaTrialTaskConfig",
+}
+"""All but the sweep, which varies any of these."""
+_ALL = {**SINGLE, "sweep": "residnet.tasks.sweep.task:SweepTaskConfig"}
+TaskConfig = Annotated[Task, Kinds("residnet.tasks", _BASE, _ALL, key="task")]
+SweepableConfig = Annotated[Task, Kinds("residnet.tasks", _BASE, SINGLE, key="task")]
+
+_LISTS: dict[str, Any] = {
+    "heads": HeadConfig,
+    "manoeuvres": ManoeuvreConfig,
+    "readers": ReaderConfig,
+    "tasks": TaskConfig,
+    "baselines": BaselineConfig,
+    "formats": FORMATS,
+}
+_UNITS = (("d", 86_400.0), ("h", 3_600.0), ("min", 60.0), ("s", 1.0))
+
+
+def load_task(path: Path, overrides: Sequence[str] = ()) -> Task:
+    """Return the task of a config file with overrides.
+
+    Args:
+        path: YAML file, or the name of a config that comes with residnet, such as `quickstart`.
+        overrides: `dotted.key=value`, in order; `~dotted.key` takes a key away.
+
+    Raises:
+        ConfigError: one line with file or override, key, fault and the nearest valid name.
+    """
+    task: Task = load_config(config_file(path), overrides, TaskConfig)
+    return task
+
+
+def config_file(path: Path) -> Path:
+    """Return the file of a config: the path itself, or that of a shipped config of this name.
+
+    Raises:
+        ConfigError: where there is neither; the message names the nearest shipped config.
+    """
+    try:
+        if path.is_file() or path.suffix or path.is_absolute():
+            return path
+    except OSError as error:
+        raise ConfigError(f"{path}: is no path ({error.strerror})") from error
+    shipped = shipped_configs()
+    if (name := path.as_posix()) in shipped:
+        return shipped[name]
+    raise ConfigError(
+        f"{path}: no such file, and no config of this name comes with residnet"
+        f"{nearest(name, shipped)}; residnet list configs shows them"
+    )
+
+
+def task_class(run: RunFolder) -> type[Task]:
+    """Return the class of a run's task, by the name in its resolved.yaml.
+
+    The class alone can write the report, so that a run can be reported whose inputs have gone.
+
+    Raises:
+        UsageError: where there is no such task, or it cannot be used.
+    """
+    mark, name = marker(TaskConfig), str(load_mapping(run.resolved).get("task"))
+    if name not in (known := mark.names()):
+        raise UsageError(f"{run.resolved}: no task '{name}'{nearest(name, known)}")
+    found: type[Task] | ThirdParty = mark.find(name)
+    if isinstance(found, ThirdParty):
+        raise UsageError(f"{run.resolved}: task {found.complaint}")
+    return found
+
+
+def finished_task(path: Path, verb: str) -> tuple[RunFolder, Any]:
+    """Return the folder and the config of a finished run whose task answers to a verb.
+
+    Raises:
+        UsageError: where there is no finished run, or its task lacks the verb.
+    """
+    run = RunFolder.open(path)
+    found = task_class(run)
+    if verb not in found.verbs:
+        # said before the config is read: its inputs may have gone
+        raise found.lacks_verb(run)
+    return run, load_config(run.resolved, [], found)
+
+
+def report_run(path: Path) -> Path:
+    """Write figures and report of a finished run from its folder alone; returns the page's path.
+
+    Raises:
+        UsageError: where there is no finished run, or its task is not known.
+    """
+    run = RunFolder.open(path)
+    require_room(path)
+    page = task_class(run).write_report(run)
+    # a study writes its comparison anew with the report
+    seal(path)
+    return page
+
+
+def catalogue(what: str) -> list[tuple[str, str]]:
+    """Return names and one-line descriptions of what there is, third-party parts included.
+
+    Args:
+        what: `vessels`, `heads`, `manoeuvres`, `readers`, `tasks`, `baselines`, `formats` or
+            `configs`.
+    """
+    if what == "vessels":
+        known = [(name, _description(name, file)) for name, file in vessel_files().items()]
+        return known + [(part.name, broken_line(part)) for part in broken_vessels()]
+    if what == "configs":
+        files = {file: name for name, file in reversed(shipped_configs().items())}
+        return [
+            (name, str(load_mapping(file).get("description") or ""))
+            for file, name in sorted(files.items())
+        ]
+    return listed(_LISTS[what])
+
+
+def _description(name: str, file: Path) -> str:
+    if file.is_relative_to(config_folder()):
+        return str(load_mapping(file).get("description") or "")
+    from residnet.physics.vessel import load_vessel
+
+    try:
+        return load_vessel(name).description
+    except ResidnetError as error:
+        # one wrong file of another package must not hide all others
+        return f"(cannot be used: {error})"
+
+
+def runs_below(folder: Path) -> list[dict[str, Any]]:
+    """Return what lies below a folder of runs, the newest first.
+
+    Each entry has run, task, state (`finished`, `unfinished` or `damaged`), best (name, value and
+    unit of its first main figure, or None) and age in s.
+
+    Raises:
+        UsageError: where the folder does not exist.
+    """
+    if not folder.is_dir():
+        raise UsageError(f"{folder}: no such folder; runs lie in runs/ unless --out says otherwise")
+    found = [_entry(file.parent) for file in folder.rglob("resolved.yaml")]
+    return sorted(found, key=lambda entry: float(entry["age"]))
+
+
+def runs_text(folder: Path, entries: Sequence[Mapping[str, Any]]) -> str:
+    """Return the runs as a table for the terminal."""
+    if not entries:
+        return f"{folder}: no runs"
+    table = Table(["run", "task", "state", "best", "age"])
+    for entry in entries:
+        figure, best, age = "", entry["best"], entry["age"]
+        if best is not None:
+            unit = "" if best["unit"] == "-" else f" {best['unit']}"
+            value = "not finite" if best["value"] is None else f"{best['value']:.4g}{unit}"
+            figure = f"{best['name']} {value}"
+        unit, size = next((pair for pair in _UNITS if age >= pair[1]), _UNITS[-1])
+        cells = (entry["task"], entry["state"], figure, f"{age / size:.0f} {unit}")
+        table.add(str(entry["run"]), [Cell(str(text), mark="text") for text in cells])
+    return table.text()
+
+
+def _entry(folder: Path) -> dict[str, Any]:
+    entry: dict[str, Any] = {"run": str(folder), "task": "unknown", "state": "unfinished"}
+    entry |= {"best": None, "age": time.time() - (folder / "resolved.yaml").stat().st_mtime}
+    try:
+        entry["task"] = str(load_mapping(folder / "resolved.yaml").get("task", "unknown"))
+        if not (folder / "summary.json").is_file():
+            return entry
+        content = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        entry["state"] = "finished" if content.get("finished") else "unfinished"
+        for name, figure in list((content.get("figures") or {}).items())[:1]:
+            entry["best"] = {"name": name, "value": figure["value"], "unit": figure["unit"]}
+    except (ConfigError, ValueError, AttributeError, KeyError, TypeError, OSError):
+        return {**entry, "state": "damaged"}
+    return entry
