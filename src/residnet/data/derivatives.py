@@ -98,13 +98,20 @@ class SavitzkyGolay(Derivative):
         return self.samples(step)
 
     def _piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        from scipy.signal import savgol_filter
-
-        size = self.samples(step)
-        smooth = savgol_filter(values, size, self.order, axis=0, mode="interp")
-        return smooth, savgol_filter(
-            values, size, self.order, deriv=1, delta=step, axis=0, mode="interp"
-        )
+        size, half = self.samples(step), self.samples(step) // 2
+        # as scipy.signal.savgol_filter, whose import takes longer than most checks
+        powers = np.vander(np.linspace(-1.0, 1.0, size), self.order + 1, increasing=True)
+        fit = np.linalg.pinv(powers)
+        slopes = np.zeros_like(powers)
+        slopes[:, 1:] = powers[:, :-1] * np.arange(1, self.order + 1)
+        first, last = fit @ values[:size], fit @ values[-size:]
+        out = []
+        span = half * step
+        for rows, middle in ((powers, fit[0]), (slopes / span, fit[1] / span)):
+            inner = [np.correlate(column, middle, "valid") for column in values.T]
+            ends = rows[:half] @ first, rows[half + 1 :] @ last
+            out.append(np.concatenate((ends[0], np.stack(inner, axis=1), ends[1])))
+        return out[0], out[1]
 
 
 @final

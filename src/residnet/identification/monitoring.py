@@ -18,9 +18,9 @@ from itertools import pairwise
 from typing import final
 
 import numpy as np
+import scipy
 import torch
 from pydantic import Field
-from scipy.stats import t as student
 from torch import Tensor
 
 from residnet.core.config import Config, Seconds
@@ -820,7 +820,7 @@ class Watch:
         self.always = known
         self.scatter = scattered(apart)
         looks = config.false_alarm / config.stretch * _OVERLAP * len(self.causes)
-        self.threshold = float(student.isf(0.5 / looks, len(apart) - 1))
+        self.threshold = float(scipy.stats.t.isf(0.5 / looks, len(apart) - 1))
 
     def _wrong(self, found: Sequence[Sequence[_Innovations]]) -> list[np.ndarray]:
         """Return what the model has always got wrong, by innovations of groups of clean windows."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from residnet.core.names import ACCELERATION
 from residnet.judge.metrics import tail
@@ -123,7 +123,8 @@ def block_interval(pieces: Pieces, seed: int = 0) -> Interval:
         error = float(np.std(sums - sizes * (sums.sum() / sizes.sum())) / sizes.mean()) / math.sqrt(
             held
         )
-        low, high = error * float(stats.norm.ppf(level)), -error * float(stats.norm.ppf(level))
+        low = error * float(scipy.stats.norm.ppf(level))
+        high = -low
     else:
         draws = np.random.default_rng(seed).integers(0, len(sums), size=(_RESAMPLES, drawn))
         means = sums[draws].sum(axis=1) / sizes[draws].sum(axis=1)
@@ -155,7 +156,7 @@ def independent_interval(values: np.ndarray) -> tuple[float, float]:
     """
     n = len(values)
     half = (
-        float(stats.t.ppf(0.5 + _LEVEL / 2, n - 1) * values.std(ddof=1)) / math.sqrt(n)
+        float(scipy.stats.t.ppf(0.5 + _LEVEL / 2, n - 1) * values.std(ddof=1)) / math.sqrt(n)
         if n > 1
         else math.inf
     )
@@ -174,7 +175,7 @@ def ljung_box(pieces: Pieces, lags: int) -> tuple[float, float]:
         return 0.0, 1.0
     correlation = covariance[1:] / covariance[0]
     statistic = float(n * (n + 2) * (correlation**2 / (n - np.arange(1, lags + 1))).sum())
-    return statistic, float(stats.chi2.sf(statistic, lags))
+    return statistic, float(scipy.stats.chi2.sf(statistic, lags))
 
 
 SCHEMA = "residnet.goodness/1"

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from residnet.core.layout import HEADING, POSE, VELOCITIES
 from residnet.core.names import VELOCITY
@@ -107,8 +107,8 @@ def tail(count: int) -> float:
 
     It is 0.025 for many blocks and less for few.
     """
-    wide = math.sqrt(count / (count - 1)) * stats.t.ppf(0.5 + _LEVEL / 2, count - 1)
-    return float(stats.norm.cdf(-wide))
+    wide = math.sqrt(count / (count - 1)) * scipy.stats.t.ppf(0.5 + _LEVEL / 2, count - 1)
+    return float(scipy.stats.norm.cdf(-wide))
 
 
 @lru_cache(maxsize=16)

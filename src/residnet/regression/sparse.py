@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, final
 
 import numpy as np
+import scipy
 import torch
 from pydantic import Field
-from scipy.special import gammaln
 from torch import Tensor
 
 from residnet.core.config import Config
@@ -247,6 +247,7 @@ class Criterion(NamedTuple):
         """Return the criterion of models with `terms` terms and residual sums of squares `rss`."""
         share = np.maximum(np.asarray(rss), 0.0) / self.energy + self.precision**2
         room = max(self.candidates, terms)
+        gammaln = scipy.special.gammaln
         ways = gammaln(room + 1) - gammaln(terms + 1) - gammaln(room - terms + 1)
         return np.asarray(
             self.samples * np.log(share) + terms * np.log(self.samples) + 2.0 * self.gamma * ways
