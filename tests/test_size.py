@@ -33,7 +33,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2840, 320),
     "runs": (337, 47),
     "simulators": (362, 45),
-    "tasks": (3494, 319),
+    "tasks": (3169, 278),
     "testing": (485, 33),
     "training": (1344, 150),
     "": (433, 50),

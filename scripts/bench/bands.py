@@ -27,8 +27,7 @@ from residnet.identification.fit import fit
 from residnet.identification.prepared import prepare_logs
 from residnet.judge.band import CHANNELS, Band, covered, interval_score, read_bands, worst
 from residnet.judge.bands import RunErrors, calibrate, run_errors
-from residnet.tasks.fit.config import FitTaskSettings
-from residnet.tasks.fit.inputs import take_logs
+from residnet.tasks.fit import FitConfig
 from residnet.tasks.registry import load_task
 
 Judged = tuple[RunErrors, Band]
@@ -54,7 +53,7 @@ def stored(run: Path, split: str, model: str, bands: dict[str, Band]) -> dict[st
     return out
 
 
-def alone(config: FitTaskSettings, model: str) -> list[str]:
+def alone(config: FitConfig, model: str) -> list[str]:
     """Return overrides that leave out all models of a config that one does not stand on.
 
     Args:
@@ -75,9 +74,9 @@ def alone(config: FitTaskSettings, model: str) -> list[str]:
     return out
 
 
-def crossed(config: FitTaskSettings, model: str, folds: int, seed: int) -> dict[str, list[Judged]]:
+def crossed(config: FitConfig, model: str, folds: int, seed: int) -> dict[str, list[Judged]]:
     """Return free runs over all logs of a config with bands of fits that have not seen them."""
-    prepared = prepare_logs(take_logs(config), config)
+    prepared = prepare_logs(config.logs(), config)
     logs = [log for members in prepared.values() for log in members]
     kinds = [log.log.manoeuvre for log in logs]
     number = fold_numbers(kinds, folds, seed)
@@ -158,11 +157,11 @@ def main() -> None:
     torch.set_num_threads(1)
     if given.cross is not None:
         config = load_task(given.cross, given.overrides)
-        assert isinstance(config, FitTaskSettings)
+        assert isinstance(config, FitConfig)
         if given.alone:
             left_out = alone(config, given.model or "baseline")
             config = load_task(given.cross, [*given.overrides, *left_out])
-            assert isinstance(config, FitTaskSettings)
+            assert isinstance(config, FitConfig)
         found = crossed(config, given.model or "baseline", given.folds, given.seed)
     else:
         metrics = json.loads((given.run / "metrics.json").read_text())

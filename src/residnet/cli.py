@@ -455,7 +455,7 @@ def compare(
     quiet: Quiet = False,
 ) -> None:
     """Set finished fits side by side: errors on common logs, paired intervals, configs."""
-    from residnet.tasks.compare.comparing import compare_runs
+    from residnet.tasks.compare import compare_runs
 
     limit_threads()
     with drawn_progress(quiet=quiet):

@@ -16,7 +16,7 @@ from residnet.documents import study_sections
 from residnet.documents.moreno2019 import curves, errors_of_grid
 from residnet.report.blocks import Cell, Table, Text
 from residnet.report.figure import Figure
-from residnet.tasks.fit.task import FitConfig
+from residnet.tasks.fit import FitConfig
 
 MODELS = (
     "zero",

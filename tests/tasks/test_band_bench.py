@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from residnet.core.files import shipped_configs
-from residnet.tasks.fit.config import FitTaskSettings
+from residnet.tasks.fit import FitConfig
 from residnet.tasks.registry import load_task
 
 BENCH = Path(__file__).parents[2] / "scripts" / "bench" / "bands.py"
@@ -27,9 +27,9 @@ def test_what_a_model_does_not_stand_on_is_left_out(model: str, left: list[str])
         "heads.mlp.kind=mlp",
     ]
     config = load_task(file, changes)
-    assert isinstance(config, FitTaskSettings)
+    assert isinstance(config, FitConfig)
     found = load_task(file, [*changes, *alone(config, model)])
-    assert isinstance(found, FitTaskSettings)
+    assert isinstance(found, FitConfig)
     assert list(found.model_names) == left
     with pytest.raises(ValueError, match="is no baseline or head"):
         alone(config, "nobody")

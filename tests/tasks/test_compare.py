@@ -17,8 +17,7 @@ from residnet.core.progress import say
 from residnet.core.version import __version__
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Outcome
-from residnet.tasks.compare.comparing import compare_runs
-from residnet.tasks.compare.errors import judged_runs, paired
+from residnet.tasks.compare import compare_runs, judged_runs, paired
 from residnet.tasks.registry import runs_below, runs_text
 from residnet.tasks.simulate import SimulateConfig
 
@@ -60,7 +59,8 @@ def made_run(folder: Path, size: float, *, task: str = "fit") -> Path:
         t = np.concatenate([start + 0.1 * np.arange(21) for start in (0.0, 2.0)])
         table = pd.DataFrame({"t": t, "window": np.repeat([0, 1], 21)})
         table["protocol"], table["model"], table["usable"] = "T2", "linear", True
-        for name in ("u", "v", "r"):
+        table["diverged"] = False
+        for name in ("u", "v", "r", "psi", "x", "y"):
             table[name] = random.standard_normal(t.size)
             table[f"{name}_hat"] = table[name] + (size if name == "u" else 0.0)
         table.to_parquet(folder / "rollouts" / "test" / f"log{log}.parquet")

@@ -40,7 +40,7 @@ def _values(out: Path) -> list[tuple[Any, Any]]:
 def test_a_grid_is_searched_whole_and_resumed(
     sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from residnet.tasks.sweep import running
+    from residnet.tasks import sweep as running
 
     out = tmp_path / "out"
     real, begun = running.carry_out_trial, []
@@ -85,23 +85,32 @@ def test_a_grid_is_searched_whole_and_resumed(
     assert "heads.ridge.degree" in (out / "report.html").read_text()
 
 
-def test_values_of_a_random_search_hang_on_its_seed_alone(sweep: Path) -> None:
+def test_values_of_a_random_search_hang_on_its_seed_alone(sweep: Path, tmp_path: Path) -> None:
     from residnet.core.config import load_config
-    from residnet.tasks.sweep.journal import drawn
-    from residnet.tasks.sweep.task import SweepTaskConfig
+    from residnet.tasks.sweep import SweepConfig, Trials, open_study
 
     space = "space={heads.ridge.penalty: {low: 1e-6, high: 1.0, log: true}}"
-    found = {}
-    for seed in (3, 4):
+    found = []
+    for number, seed in enumerate((3, 3, 4)):
         search = f"search={{kind: random, trials: 30, seed: {seed}}}"
-        config = load_config(sweep, [space, search], SweepTaskConfig)
-        found[seed] = [one["heads.ridge.penalty"] for one in drawn(config, 30)]
-        # what a resumed sweep draws begins as the undisturbed one did
-        assert [one["heads.ridge.penalty"] for one in drawn(config, 7)] == found[seed][:7]
-        assert all(1e-6 <= value <= 1.0 for value in found[seed])
+        config = load_config(sweep, [space, search], SweepConfig)
+        (folder := tmp_path / str(number)).mkdir()
+        drawn = []
+        # what a resumed sweep draws goes on as the undisturbed one does
+        for _ in range(3):
+            trials = Trials(config, open_study(config, folder))
+            while len(drawn) < 30 and (trial := trials.next()):
+                drawn.append(trial.params["heads.ridge.penalty"])
+                trials.study.tell(trial.number, 1.0)
+                if len(drawn) in (7, 20):
+                    break
+        assert trials.next() is None
+        assert len(drawn) == 30
+        assert all(1e-6 <= value <= 1.0 for value in drawn)
         # evenly in the logarithm
-        assert 8 <= sum(value < 1e-3 for value in found[seed]) <= 22
-    assert found[3] != found[4]
+        assert 8 <= sum(value < 1e-3 for value in drawn) <= 22
+        found.append(drawn)
+    assert found[0] == found[1] != found[2]
 
 
 def test_a_poor_trial_is_ended_early(sweep: Path, tmp_path: Path) -> None:
@@ -109,28 +118,26 @@ def test_a_poor_trial_is_ended_early(sweep: Path, tmp_path: Path) -> None:
 
     from residnet.core.config import load_config
     from residnet.core.progress import Progress
-    from residnet.tasks.sweep.journal import Trials, open_study
-    from residnet.tasks.sweep.task import SweepTaskConfig
-    from residnet.tasks.sweep.trial import _watch
+    from residnet.tasks.sweep import SweepConfig, Trials, open_study, watch
 
     words = ["pruning={startup: 3}", "search={kind: random, trials: 5}"]
-    config = load_config(sweep, words, SweepTaskConfig)
+    config = load_config(sweep, words, SweepConfig)
     study = open_study(config, tmp_path)
     trials = Trials(config, study)
     for level in (1.0, 2.0, 3.0):
         trial = trials.next()
         assert trial is not None
-        heard = _watch(config, tmp_path, trial._trial_id)
+        heard = watch(config, tmp_path, trial._trial_id)
         for epoch in (1, 2):
             heard(Progress("training ridge", epoch, 2, score=level / epoch))
         study.tell(trial.number, level)
     good, poor = trials.next(), trials.next()
     assert good is not None
     assert poor is not None
-    heard = _watch(config, tmp_path, good._trial_id)
+    heard = watch(config, tmp_path, good._trial_id)
     heard(Progress("training ridge", 1, 2, score=1.5))
     heard(Progress("training other", 1, 2, score=9.0))
-    heard = _watch(config, tmp_path, poor._trial_id)
+    heard = watch(config, tmp_path, poor._trial_id)
     with pytest.raises(optuna.TrialPruned):
         heard(Progress("training ridge", 1, 2, score=2.5))
 

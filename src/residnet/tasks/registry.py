@@ -35,7 +35,7 @@ from residnet.runs.task import Task
 
 _BASE, _DOCUMENTS = "residnet.runs.task:Task", "residnet.documents"
 SINGLE = {
-    "fit": "residnet.tasks.fit.task:FitConfig",
+    "fit": "residnet.tasks.fit:FitConfig",
     "import": "residnet.tasks.import_logs:ImportConfig",
     "simulate": "residnet.tasks.simulate:SimulateConfig",
     "study": "residnet.tasks.study:StudyConfig",
@@ -48,7 +48,7 @@ SINGLE = {
     "sea_trial": f"{_DOCUMENTS}.halvorsen2019.sea_trial:SeaTrialTaskConfig",
 }
 """All but the sweep, which varies any of these."""
-_ALL = {**SINGLE, "sweep": "residnet.tasks.sweep.task:SweepTaskConfig"}
+_ALL = {**SINGLE, "sweep": "residnet.tasks.sweep:SweepConfig"}
 TaskConfig = Annotated[Task, Kinds("residnet.tasks", _BASE, _ALL, key="task")]
 SweepableConfig = Annotated[Task, Kinds("residnet.tasks", _BASE, SINGLE, key="task")]
 

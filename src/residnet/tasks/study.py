@@ -90,7 +90,7 @@ class StudyConfig(Task):
         for variant in self.variants:
             fit = load_config(self.base, self.overrides(variant, self.seeds[0]), FitConfig)
             fit.check()
-            models = ("selected", "baseline", *fit.baselines, *fit.heads, *fit.ensembles)
+            models = ("selected", *fit.model_names)
             if self.model not in models:
                 raise UsageError(
                     f"variant {variant}: no model is named"
@@ -109,65 +109,55 @@ class StudyConfig(Task):
         """Fit all variants and write the comparison; runs that are there already are kept.
 
         Raises:
-            ResidnetError: where a variant cannot be run.
+            ResidnetError: where a variant cannot be run, or the system ends a process.
         """
-        jobs = [
-            (self, variant, seed, folder.path / "variants" / f"{variant}.{seed}")
-            for variant in self.variants
-            for seed in self.seeds
-        ]
-        if self.workers == 1:
-            seconds = []
-            for number, job in enumerate(jobs):
-                report("fits of the study", number, len(jobs))
-                seconds.append(_fit(*job))
-            report("fits of the study", len(jobs), len(jobs))
-        else:
-            seconds = _side_by_side(self.workers, jobs)
-        names = [(variant, seed) for _, variant, seed, _ in jobs]
-        return self._write(folder, dict(zip(names, seconds, strict=True)))
-
-    def _write(self, folder: RunFolder, seconds: dict[tuple[str, int], float]) -> Outcome:
-        found = {
-            (variant, seed): window_nrmse(
-                folder.path / "variants" / f"{variant}.{seed}", self.model, self.split
-            )
+        places = {
+            (variant, seed): folder.path / "variants" / f"{variant}.{seed}"
             for variant in self.variants
             for seed in self.seeds
         }
-        first = next(iter(found.values()))
-        keys = {protocol: errors.keys for protocol, errors in first.items()}
-        variants = [
-            Variant(
-                variant,
-                self.variants[variant],
-                {
-                    protocol: np.stack(
-                        [found[variant, seed][protocol].values for seed in self.seeds]
-                    )
-                    for protocol in keys
-                },
-                tuple(seconds[variant, seed] for seed in self.seeds),
-                {
-                    protocol: sum(
-                        int(found[variant, seed][protocol].diverged.sum()) for seed in self.seeds
-                    )
-                    for protocol in keys
-                },
+        seconds = dict[tuple[str, int], float]()
+        if self.workers == 1:
+            for number, (job, out) in enumerate(places.items()):
+                report("fits of the study", number, len(places))
+                seconds[job] = _fit(self, *job, out)
+            report("fits of the study", len(places), len(places))
+        else:
+            with processes(self.workers) as pool:
+                work = [(self, *job, out) for job, out in places.items()]
+                found = pool.map(_fit, *zip(*work, strict=True))
+                seconds = dict(zip(places, found, strict=True))
+        errors = {job: window_nrmse(out, self.model, self.split) for job, out in places.items()}
+        protocols = next(iter(errors.values()))
+        variants = []
+        for variant, overrides in self.variants.items():
+            own = [errors[variant, seed] for seed in self.seeds]
+            variants.append(
+                Variant(
+                    variant,
+                    overrides,
+                    {name: np.stack([one[name].values for one in own]) for name in protocols},
+                    tuple(seconds[variant, seed] for seed in self.seeds),
+                    {name: sum(int(one[name].diverged.sum()) for one in own) for name in protocols},
+                )
             )
-            for variant in self.variants
-        ]
+        keys = {name: one.keys for name, one in protocols.items()}
         rows = table(variants, keys, self.reference)
-        head = {
+        content = {
             "schema": "residnet.study/1",
             "run": self.name,
             "model": self.model,
             "split": self.split,
             "reference": self.reference,
+            "rows": rows,
         }
-        folder.write_json(folder.path / "study.json", head | {"rows": rows})
+        folder.write_json(folder.path / "study.json", content)
+        figures = {
+            f"nrmse_{row['variant']}_{row['protocol']}": MainFigure(row["nrmse_mean"])
+            for row in rows
+        }
         text = variants_table(rows, self.reference).text()
-        return Outcome(_verdict(rows, self.reference), _main_figures(rows), text)
+        return Outcome(_verdict(rows, self.reference), figures, text)
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
@@ -207,22 +197,6 @@ def _verdict(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:
             named = ", ".join(f"'{row['variant']}' in {row['diverged']} windows" for row in lost)
             sentences.append(f"{protocol}: free runs DIVERGED: {named}.")
     return sentences
-
-
-def _main_figures(rows: Sequence[dict[str, Any]]) -> dict[str, MainFigure]:
-    return {
-        f"nrmse_{row['variant']}_{row['protocol']}": MainFigure(row["nrmse_mean"]) for row in rows
-    }
-
-
-def _side_by_side(workers: int, jobs: Sequence[tuple[StudyConfig, str, int, Path]]) -> list[float]:
-    """Fit in processes side by side.
-
-    Raises:
-        FitError: where the system ends a process.
-    """
-    with processes(workers) as pool:
-        return list(pool.map(_fit, *zip(*jobs, strict=True)))
 
 
 def _fit(study: StudyConfig, variant: str, seed: int, out: Path) -> float:

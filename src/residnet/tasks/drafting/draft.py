@@ -25,7 +25,7 @@ from residnet.identification.recipe import Preparation, judging, protocols, wind
 from residnet.tasks.drafting import recipe
 from residnet.tasks.drafting.inputs import driving, lacks
 from residnet.tasks.drafting.yaml_text import commented
-from residnet.tasks.fit.task import FitConfig
+from residnet.tasks.fit import FitConfig
 
 _UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
 _INSPECTED = 12

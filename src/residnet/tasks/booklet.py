@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ import torch
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
-from residnet.core.names import VELOCITY, nearest
+from residnet.core.names import STATE, VELOCITY, nearest
 from residnet.data.prepare import Prepared
 from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import Craft, Flight, Sea, fly, source_of
@@ -50,44 +49,43 @@ def write_booklet(
     """
     import pandas as pd
 
-    craft = _craft(config, fitted, config.inputs)
+    craft, rudder = _craft(config, fitted, config.inputs), config.rudder()
     pages = [
-        _page(craft, config, flights, limit, None)
+        _page(craft, config, flights, limit)
         for flights in _flown(craft, config, fitted, config.manoeuvres)
     ]
-    repeated = _measured(config, logs)
+    repeated = [
+        (prepared.log, split)
+        for split in config.repeat
+        for prepared in logs.get(split, ())
+        if prepared.log.manoeuvre == "zigzag"
+        and np.isfinite(prepared.log.stack(("psi", rudder))).all()
+    ]
     if repeated:
         shares = _shares(config, [log for log, _ in repeated])
         craft = _craft(config, fitted, shares)
         craft = replace(craft, start=torch.cat([_began(craft, log) for log, _ in repeated]))
-        zigzags = [_like(config, shares, log) for log, _ in repeated]
-        flown = _flown(
-            craft,
-            config,
-            fitted,
-            [
-                _acted(config, zigzag, log, craft.dynamics.dt)
-                for zigzag, (log, _) in zip(zigzags, repeated, strict=True)
-            ],
-        )
-        for measured, zigzag, flights in zip(repeated, zigzags, flown, strict=True):
-            pages.append(
-                _page(
-                    craft,
-                    config,
-                    [replace(flight, manoeuvre=zigzag) for flight in flights],
-                    limit,
-                    measured,
-                )
-            )
+        zigzags = [_zigzags(log, rudder, shares, craft.dynamics.dt) for log, _ in repeated]
+        flown = _flown(craft, config, fitted, [acted for _, acted in zigzags])
+        for measured, (zigzag, _), flights in zip(repeated, zigzags, flown, strict=True):
+            named = [replace(flight, manoeuvre=zigzag) for flight in flights]
+            pages.append(_page(craft, config, named, limit, *measured))
     folder.write_json(
         folder.booklet,
         contents(config.model, config.length, config.scale, config.draws, config.level, pages),
     )
-    folder.write_table(
-        folder.booklet.with_suffix(".parquet"),
-        pd.concat([_frame(page, config.rudder()) for page in pages]),
-    )
+    parts = []
+    for page in pages:
+        motions = [(-1, page.measured)] if page.measured is not None else []
+        motions += [(i, f.motion) for i, f in enumerate(page.flights) if page.indices[i]]
+        for draw, log in motions:
+            # of drawn flights every half second or so
+            every = max(round(0.5 / float(log.t[1] - log.t[0])), 1) if draw > 0 else 1
+            columns = {name: log[name][::every] for name in STATE}
+            angle = log[rudder] if rudder in log.channels else log[f"cmd_{rudder}"]
+            about = {"page": page.name, "draw": draw, "t": log.t[::every] - log.t[0]}
+            parts.append(pd.DataFrame({**about, **columns, "rudder": angle[::every]}))
+    folder.write_table(folder.booklet.with_suffix(".parquet"), pd.concat(parts))
     return (
         f"booklet: {len(config.manoeuvres)} manoeuvres, {len(repeated)} measured zigzags repeated,"
         f" {config.draws} draws each"
@@ -120,9 +118,8 @@ def _craft(config: BookletConfig, fitted: FittedModel, inputs: Mapping[str, Inpu
                 f" '{name}'{nearest(name, actuated.state)}"
             )
         start[:, actuated.state.index(name)] = float(value)
-    return Craft(
-        config.model, actuated, Helm(gear.demand, actuated.state, gear.inputs), gear.commands, start
-    )
+    helm = Helm(gear.demand, actuated.state, gear.inputs)
+    return Craft(config.model, actuated, helm, gear.commands, start)
 
 
 def _flown(
@@ -133,13 +130,8 @@ def _flown(
     rows = [manoeuvre for manoeuvre in manoeuvres for _ in range(len(theta))]
     start = craft.start.repeat_interleave(len(theta), 0) if len(craft.start) > 1 else craft.start
     many = replace(craft, dynamics=SampledDynamics(craft.dynamics, _PARAMETER, theta), start=start)
-    flights = fly(
-        many,
-        rows,
-        Sea(None, Disturbance(), SensorNoise(), config.seed),
-        config.duration,
-        craft.dynamics.dt,
-    )
+    sea = Sea(None, Disturbance(), SensorNoise(), config.seed)
+    flights = fly(many, rows, sea, config.duration, craft.dynamics.dt)
     for place in range(0, len(flights), len(theta)):
         yield flights[place : place + len(theta)]
 
@@ -164,53 +156,40 @@ def drawn(fitted: FittedModel, draws: int, seed: int) -> torch.Tensor:
     random = torch.from_numpy(
         np.random.default_rng([seed, 7]).standard_normal((draws, len(values)))
     )
-    moves = random * values.clamp(min=0.0).sqrt() @ vectors.T
     theta = baseline.theta.detach().double().flatten().repeat(1 + draws, 1)
-    theta[1:, baseline.free_indices()] += moves
+    theta[1:, baseline.free_indices()] += random * values.clamp(min=0.0).sqrt() @ vectors.T
     return theta.reshape(1 + draws, *baseline.theta.shape)
-
-
-def _measured(
-    config: BookletConfig, logs: Mapping[str, Sequence[Prepared]]
-) -> list[tuple[Log, str]]:
-    """Logs of the splits to repeat whose manoeuvre is a zigzag."""
-    chosen = [
-        (p.log, split)
-        for split in config.repeat
-        for p in logs.get(split, ())
-        if p.log.manoeuvre == "zigzag"
-    ]
-    return [
-        (log, split)
-        for log, split in chosen
-        if np.isfinite(log.stack(("psi", config.rudder()))).all()
-    ]
 
 
 def _shares(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
     """Return the shares of the inputs; full drive and steer are the most that the logs have."""
     rudder = config.rudder()
     steer = max(steered_zigzag(log, rudder).angle for log in logs)
-    out = {}
-    for name, share in config.inputs.items():
-        if name == rudder:
-            out[name] = share.model_copy(update={"steer": steer, "limit": steer})
-        else:
-            out[name] = share.model_copy(
-                update={"drive": max(float(log[name].mean()) for log in logs), "limit": None}
-            )
-    return out
+    return {
+        name: share.model_copy(
+            update={"steer": steer, "limit": steer}
+            if name == rudder
+            else {"drive": max(float(log[name].mean()) for log in logs), "limit": None}
+        )
+        for name, share in config.inputs.items()
+    }
 
 
-def _like(config: BookletConfig, shares: Mapping[str, InputShare], log: Log) -> Zigzag:
-    """Return the zigzag of a log as a manoeuvre."""
-    steered, rudder = steered_zigzag(log, config.rudder()), config.rudder()
+def _zigzags(
+    log: Log, rudder: str, shares: Mapping[str, InputShare], step: float
+) -> tuple[Zigzag, Zigzag]:
+    """Return the zigzag of a log, and the same with reversals where its rudder left its side.
+
+    The gear of a model moves at once, the trial's did after its order took effect. A bound on the
+    heading is seen at the next step, on average half a step of `step` seconds late.
+    """
+    steered = steered_zigzag(log, rudder)
     drives = [
         float(log[name].mean()) / float(share.drive)
         for name, share in shares.items()
         if name != rudder
     ]
-    return Zigzag(
+    zigzag = Zigzag(
         name=log.name,
         drive=min(drives[0], 1.0) if drives else 0.0,
         steer=steered.angle / float(shares[rudder].steer),
@@ -219,16 +198,8 @@ def _like(config: BookletConfig, shares: Mapping[str, InputShare], log: Log) -> 
         start=steered.start,
         duration=float(log.t[-1] - log.t[0]),
     )
-
-
-def _acted(config: BookletConfig, zigzag: Zigzag, log: Log, step: float) -> Zigzag:
-    """The zigzag with reversals where the rudder of the log left its side: the gear moves at once,
-    the trial's did after its order took effect.
-
-    A bound on the heading is seen at the next step, on average half a step of `step` seconds late.
-    """
-    steered = steered_zigzag(log, config.rudder())
-    return zigzag.model_copy(update={"heading": steered.leaves - 0.5 * step * steered.turning})
+    heading = steered.leaves - 0.5 * step * steered.turning
+    return zigzag, zigzag.model_copy(update={"heading": heading})
 
 
 def sound(flight: Flight, limit: np.ndarray) -> bool:
@@ -243,51 +214,24 @@ def _page(
     config: BookletConfig,
     flights: Sequence[Flight],
     limit: np.ndarray,
-    measured: tuple[Log, str] | None,
+    log: Log | None = None,
+    split: str = "",
 ) -> Page:
-    """One manoeuvre with its indices by flight.
+    """One manoeuvre with its indices by flight, beside those of the log that it repeats.
 
     Raises:
         DataError: where the fitted model itself does not end the manoeuvre.
     """
-    manoeuvre = flights[0].manoeuvre
+    manoeuvre, name = flights[0].manoeuvre, flights[0].motion.name
     if flights[0].fault:
         raise DataError(
-            f"booklet: {config.model}, {flights[0].motion.name}: {flights[0].fault}; give more"
+            f"booklet: {config.model}, {name}: {flights[0].fault}; give more"
             " duration, or another model"
         )
     indices = [
         manoeuvre.indices(flight.motion, None) if sound(flight, limit) else {} for flight in flights
     ]
-    ship = config.scale**0.5
-    limits = manoeuvre.limits(
-        craft.helm, config.length * config.scale, indices[0].get("approach_speed", 0.0) * ship
-    )
-    log, split = measured or (None, "")
+    speed = indices[0].get("approach_speed", 0.0) * config.scale**0.5
+    limits = manoeuvre.limits(craft.helm, config.length * config.scale, speed)
     found = {} if log is None else manoeuvre.indices(log.replace(t=log.t - log.t[0]), None)
-    return Page(flights[0].motion.name, manoeuvre, flights, indices, limits, log, split, found)
-
-
-def _frame(page: Page, rudder: str) -> Any:
-    """Motion of each flight (draw 0 as fitted) and of the measurement (draw -1), every half second
-    or so.
-    """
-    import pandas as pd
-
-    parts = []
-    logs = [(-1, page.measured)] if page.measured is not None else []
-    for draw, log in [
-        *logs,
-        *((i, flight.motion) for i, flight in enumerate(page.flights) if page.indices[i]),
-    ]:
-        every = max(round(0.5 / float(log.t[1] - log.t[0])), 1) if draw > 0 else 1
-        columns = {name: log[name][::every] for name in ("x", "y", "psi", "u", "v", "r")}
-        columns["rudder"] = (log[rudder] if rudder in log.channels else log[f"cmd_{rudder}"])[
-            ::every
-        ]
-        parts.append(
-            pd.DataFrame(
-                {"page": page.name, "draw": draw, "t": log.t[::every] - log.t[0], **columns}
-            )
-        )
-    return pd.concat(parts)
+    return Page(name, manoeuvre, flights, indices, limits, log, split, found)

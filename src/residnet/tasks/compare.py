@@ -1,0 +1,258 @@
+"""`residnet compare`: finished fits side by side over common windows, and what they differ in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from residnet.core.errors import UsageError
+from residnet.core.names import VELOCITY
+from residnet.judge.metrics import blocks, difference
+from residnet.report.blocks import Block, Cell, Section, Table
+from residnet.report.figure import Case, Figure, Panel, family, write_figure
+from residnet.report.page import write_page
+from residnet.report.run_reader import RunFiles
+from residnet.runs.folder import RunFolder
+
+_MOST = 60
+_ABSENT = object()
+Window = tuple[str, str, float]
+"""Log, protocol and first time of a window."""
+
+
+class JudgedRun(RunFiles):
+    """A finished fit, as far as runs are compared.
+
+    Attributes:
+        name: that tells it from the others.
+    """
+
+    def __init__(self, name: str, path: Path) -> None:
+        super().__init__(RunFolder.open(path).path)
+        self.name = name
+        if not (path / "metrics.json").is_file():
+            raise UsageError(f"{path}: has no metrics.json; runs of fits can be compared")
+        found = (split for split in ("test", "external") if split in self.splits)
+        self.split = next(found, self.splits[-1])
+        self.model = str(self.metrics["selected"])
+        self.scales = np.array([float(self.metrics["scales"][name]) for name in VELOCITY])
+
+    @cached_property
+    def series(self) -> dict[Window, tuple[np.ndarray, np.ndarray]]:
+        """Of each window the times from its start [T] and the errors of the selected model in
+        u, v, r [T, 3], NaN where a sample is not usable.
+        """
+        out = {}
+        for one in self.windows(self.split):
+            apart = (one.predicted[self.model] - one.measured)[:, : len(VELOCITY)]
+            errors = np.where(one.usable[:, None], apart, np.nan)
+            out[one.log, one.protocol, round(float(one.t[0]), 3)] = (one.t - one.t[0], errors)
+        return out
+
+
+def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
+    """Compare finished fits; returns the table for the terminal and the page.
+
+    Args:
+        paths: folders of the runs; the first is what the others are compared with.
+        out: folder of the page.
+
+    Raises:
+        UsageError: where a folder holds no finished fit, or the page cannot be written.
+    """
+    runs = judged_runs(paths)
+    pairs = paired(runs)
+    tables = [_metrics_table(runs), *([_paired_table(runs, pairs)] if pairs else [])]
+    tables.append(_config_table(runs))
+    verdict = _sentence(runs, pairs)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        sections = [Section("On common logs", [tables[1], _curves(runs, out)])] if pairs else []
+        sections += [
+            Section("Every model of every run", [tables[0]]),
+            Section("Where the runs differ", [tables[-1]]),
+        ]
+        names = " against ".join(run.name for run in runs)
+        page = write_page(out, "Runs compared", names, [verdict], sections)
+    except OSError as error:
+        raise UsageError(f"{out}: cannot be written ({error.strerror})") from error
+    return "\n\n".join([*(table.text() for table in tables), verdict]), page
+
+
+def judged_runs(paths: Sequence[Path]) -> list[JudgedRun]:
+    """Return the runs in folders.
+
+    Raises:
+        UsageError: where there is no finished fit in one of them, or fewer than two are named.
+    """
+    if len(paths) < 2:
+        raise UsageError("compare: name at least two runs")
+    short = [path.name or path.resolve().name for path in paths]
+    names = short if len(set(short)) == len(short) else [str(path) for path in paths]
+    if len(set(names)) < len(names):
+        raise UsageError("compare: a run is named twice")
+    return [JudgedRun(name, path) for name, path in zip(names, paths, strict=True)]
+
+
+def _common(runs: Sequence[JudgedRun]) -> list[Window]:
+    """Return the windows that all runs were judged on, of one and the same length."""
+    shared = set.intersection(*(set(run.series) for run in runs))
+    return sorted(w for w in shared if len({len(run.series[w][0]) for run in runs}) == 1)
+
+
+def paired(runs: Sequence[JudgedRun]) -> dict[str, dict[str, Any]]:
+    """Return protocol -> run -> difference to the first run over common windows.
+
+    Errors are normalised root mean squares, the mean over u, v, r, by the first run's scales.
+    """
+    out: dict[str, dict[str, Any]] = {}
+    shared = _common(runs)
+    for protocol in dict.fromkeys(window[1] for window in shared):
+        windows = [window for window in shared if window[1] == protocol]
+        squares = [[np.nanmean(run.series[w][1] ** 2, axis=0) for w in windows] for run in runs]
+        errors = (np.sqrt(np.array(squares)) / runs[0].scales).mean(axis=-1)
+        known = np.isfinite(errors).all(axis=0)
+        if not known.any():
+            continue
+        logs = list(dict.fromkeys(window[0] for window in windows))
+        numbers = np.array([logs.index(window[0]) for window in windows])
+        resampled = blocks(numbers[known])
+        out[protocol] = {
+            run.name: {
+                "windows": int(known.sum()),
+                "mean": float(own[known].mean()),
+                **difference(own[known], errors[0][known], runs[0].name, resampled),
+            }
+            for run, own in zip(runs, errors, strict=True)
+        }
+    return out
+
+
+def _metrics_table(runs: Sequence[JudgedRun]) -> Table:
+    table = Table(
+        ["run", "model", "protocol", "u [m/s]", "v [m/s]", "r [deg/s]", "NRMSE [-]", "diverged"],
+        caption="Errors in free run on the test split of each run, by that run's own scales.",
+    )
+    for run in runs:
+        rows = [r for r in run.rows if (r["split"], r["manoeuvre"]) == (run.split, "all")]
+        for number, row in enumerate(rows):
+            selected, rmse = row["model"] == run.model, row["rmse"]
+            texts = [f"{row['model']}{' (selected)' if selected else ''}", str(row["protocol"])]
+            numbers = [rmse["u"], rmse["v"], np.degrees(rmse["r"]), row["nrmse"]["mean"]]
+            cells = [Cell(text, mark="text") for text in texts]
+            cells += [Cell(f"{value:.3g}") for value in numbers]
+            cells.append(Cell(f"{row['diverged']}/{row['windows']}"))
+            table.add(run.name, cells, rule=number == 0, selected=selected)
+    return table
+
+
+def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> Table:
+    table = Table(
+        ["run", "model", "protocol", "windows", "NRMSE [-]", "difference", "95 % interval"],
+        caption=(
+            "Selected models over the windows that all runs were judged on, by the scales of"
+            f" {runs[0].name}; differences to {runs[0].name}, negative where the run is better."
+        ),
+    )
+    for protocol, entries in pairs.items():
+        for run in runs:
+            entry, told = entries[run.name], ("", "")
+            if run is not runs[0]:
+                ends = entry["ci95"]
+                interval = f"{ends[0]:+.3f} to {ends[1]:+.3f}" if ends else "too few logs"
+                told = (f"{entry['nrmse_mean']:+.3f}", interval)
+            cells = [Cell(run.model, mark="text"), Cell(protocol, mark="text")]
+            texts = (str(entry["windows"]), f"{entry['mean']:.3g}", *told)
+            table.add(run.name, [*cells, *map(Cell, texts)], rule=run is runs[0])
+    return table
+
+
+def _config_table(runs: Sequence[JudgedRun]) -> Table:
+    """Return the settings in which the runs differ; a part that only some have is one line."""
+    found = _differing([run.resolved for run in runs], "")
+    found = [pair for pair in found if pair[0] not in ("name", "description")]
+    more = f" The first {_MOST} of {len(found)} stand here." if len(found) > _MOST else ""
+    told = f"What the runs were asked to do differently; what is alike is left out.{more}"
+    table = Table(
+        ["setting", *(run.name for run in runs)],
+        caption=told if found else "The runs were asked to do the same.",
+    )
+    for key, texts in found[:_MOST]:
+        table.add(key, [Cell(text, mark="text") for text in texts])
+    return table
+
+
+def _differing(values: Sequence[Any], path: str) -> list[tuple[str, list[str]]]:
+    """Return the paths below which values differ, with what each says there."""
+    if all(value == values[0] for value in values):
+        return []
+    if not all(isinstance(value, Mapping) for value in values):
+        return [(path, [_short(value) for value in values])]
+    out = []
+    for key in dict.fromkeys(key for value in values for key in value):
+        below = [value.get(key, _ABSENT) for value in values]
+        out += _differing(below, f"{path}.{key}" if path else str(key))
+    return out
+
+
+def _short(value: Any) -> str:
+    """Return a value in a few words; of a part with many settings its kind or its first ones."""
+    match value:
+        case None | [] | ():
+            return "none"
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:.4g}"
+        case {"kind": kind}:
+            return f"there (kind {kind})"
+        case Mapping():
+            parts = [f"{key} {_short(part)}" for key, part in value.items()]
+            more = " ..." if len(parts) > 2 else ""
+            return f"there ({', '.join(parts[:2])}{more})" if parts else "there"
+        case list() | tuple():
+            text = ", ".join(map(_short, value))
+        case _:
+            text = "not there" if value is _ABSENT else f"{value}"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _sentence(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> str:
+    if not pairs:
+        return "The runs have no window of a log in common: their errors stand beside each other."
+    protocol, entries = next(iter(pairs.items()))
+    best = min(runs, key=lambda run: float(entries[run.name]["mean"]))
+    if best is runs[0]:
+        return f"Over the common windows of {protocol}, no run is better than {best.name}."
+    entry = entries[best.name]
+    sure = ", beyond chance." if entry["excludes_zero"] else ", which may be chance."
+    return (
+        f"Over {entry['windows']} common windows of {protocol}, {best.name} ({best.model}) has"
+        f" the least error: {entry['nrmse_mean']:+.3f} against {runs[0].name}{sure}"
+    )
+
+
+def _curves(runs: Sequence[JudgedRun], out: Path) -> Block:
+    """Draw how the errors of the selected models grow over the common windows."""
+    windows = _common(runs)
+    protocol = windows[0][1]
+    chosen = [window for window in windows if window[1] == protocol]
+    shortest = min(len(runs[0].series[window][0]) for window in chosen)
+    curves = {}
+    for run in runs:
+        size = np.stack([run.series[window][1][:shortest] ** 2 for window in chosen])
+        growth = np.sqrt(np.nanmean(size, axis=0)) / runs[0].scales
+        curves[run.name] = (run.series[chosen[0]][0][:shortest], growth.mean(axis=1))
+    figure = Figure(
+        "horizon",
+        "Error against horizon",
+        f"Selected models over {len(chosen)} common windows of {protocol}, mean over u, v, r.",
+        family(curves),
+        [Panel("error [-]", "time from the start of a free run [s]", height=300)],
+        [Case("", [curves])],
+    )
+    return write_figure(out / "figures", figure)

@@ -1,0 +1,325 @@
+"""Carrying out a fit into a run folder, judging its models on other logs, and exporting them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from residnet.core.config import dump_config
+from residnet.core.errors import DataError, UsageError
+from residnet.core.log import Log
+from residnet.core.names import STATE, nearest, si_unit
+from residnet.core.progress import say
+from residnet.data.doctor import inspect, inspect_together, inspection, summary
+from residnet.data.drafting.reading import log_files
+from residnet.data.masks import Spike
+from residnet.data.parts import data_files, log_names
+from residnet.data.prepare import Prepared, prepare
+from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.readers.compose import RecordingConfig
+from residnet.data.simulated.trials import SimulatedTrials
+from residnet.dynamics.store import ModelSpec, load_model, model_names
+from residnet.export import exporter
+from residnet.export.vessel import ExportedVessel
+from residnet.identification.fit import fit
+from residnet.identification.identified import (
+    Evaluation,
+    candidates,
+    evaluate,
+    goodness_rows,
+    residual_table,
+    term_table,
+)
+from residnet.identification.prepared import (
+    prepare_logs,
+    require_window,
+    through_currents,
+    velocity_limit,
+)
+from residnet.judge.band import bands_content
+from residnet.judge.goodness import content
+from residnet.judge.metrics import LIMITS_SCHEMA, metrics_content
+from residnet.judge.repeats import repeatability
+from residnet.judge.rollout_files import write_rollouts
+from residnet.judge.soundness import sanity_content
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.free_runs import errors_table
+from residnet.report.sections.verdict import verdict
+from residnet.runs.folder import RunFolder
+from residnet.runs.model_store import FolderStore
+from residnet.runs.provenance import Provenance
+from residnet.runs.task import Exports, Finished, MainFigure, Outcome
+from residnet.tasks.booklet import write_booklet
+from residnet.tasks.fit import FitConfig
+
+SPLIT = "external"
+"""Name of the split of logs that no fit has seen."""
+
+
+def run_fit(config: FitConfig, folder: RunFolder) -> Outcome:
+    """Fit all models, judge them in free run, and write what was found.
+
+    Logs that ran in currents are taken through the water.
+
+    Raises:
+        ResidnetError: where the logs cannot be used, or do not determine a model.
+    """
+    say(f"{config.name}: reading logs")
+    read = config.logs()
+    _write_inspection(folder, read, config)
+    logs = prepare_logs(read, config)
+    say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
+    logs, currents = through_currents(logs, config)
+    if config.current is not None:
+        folder.write_json(folder.path / "currents.json", currents)
+    identified = fit(logs, config, store=FolderStore(folder))
+    say("  free runs")
+    fitted, step = list(identified.values()), config.prepare.grid.step
+    if config.bands is not None:
+        bands = {entry.name: entry.bands for entry in fitted}
+        folder.write_json(folder.bands, bands_content(config.name, bands))
+    held = {str(split): logs[split] for split in config.evaluation.splits}
+    judged = identified.evaluate_splits(held, config.data)
+    chosen = identified.select(judged)
+    say(f"  selected: {chosen.selected}")
+    folder.write_json(folder.selection, chosen.content())
+    folder.write_json(folder.sanity, sanity_content(identified.findings))
+    write_judged(folder, config, judged, chosen.selected, chosen.selected_ensemble, logs)
+    for place, found in {
+        folder.residuals: residual_table(fitted, logs["test"]),
+        folder.path / "terms.parquet": term_table(fitted, logs["test"]),
+    }.items():
+        if len(found):
+            folder.write_table(place, found)
+    splits = goodness_rows(fitted, logs, step)
+    folder.write_json(folder.goodness, content(config.name, splits, step))
+    failure = ""
+    if config.booklet is not None:
+        refitted = identified[config.booklet.model]
+        try:
+            say("  " + write_booklet(folder, config.booklet, refitted, logs, identified.limit))
+        except DataError as error:
+            # the fit itself is done, and its report is worth having
+            failure = str(error)
+    exports = {
+        name: partial(export_model, folder, name, None, "torchscript")
+        for name in config.export.models
+    }
+    return fit_outcome(folder, "test", exports, failure)
+
+
+def _write_inspection(
+    folder: RunFolder, splits: Mapping[str, Sequence[Log]], config: FitConfig
+) -> None:
+    """Write doctor.json: what the doctor finds in all logs as the run's masks leave them."""
+    inputs, masks = config.signals.columns, (*config.prepare.masks, Spike())
+    logs = [log for members in splits.values() for log in members]
+    split_of = {log.name: split for split, members in splits.items() for log in members}
+    reports = [inspect(log, inputs, masks) for log in logs]
+    together = inspect_together(logs, inputs, split_of)
+    for report in reports:
+        for finding in report.find("fill_values"):
+            say(f"  {report.name}: {finding.text}")
+    found = inspection(reports, together)
+    folder.write_json(folder.path / "doctor.json", found)
+    # the tally stands in the verdict; what may be corrected is told before the fit takes its time
+    if first := summary(found).first:
+        say(f"  {first}")
+
+
+def write_judged(
+    folder: RunFolder,
+    config: FitConfig,
+    judged: Mapping[str, Evaluation],
+    selected: str,
+    selected_ensemble: str | None,
+    logs: Mapping[str, Sequence[Prepared]],
+) -> None:
+    """Write what free runs show: rollouts, metrics.json, limits.json and data_quality.json.
+
+    Args:
+        folder: of the run, or of an evaluation.
+        config: of the fit.
+        judged: free runs by split.
+        selected: name of the selected model.
+        selected_ensemble: name of the selected mean of models.
+        logs: by split, those that were not judged too.
+    """
+    for split, part in judged.items():
+        write_rollouts(
+            folder.rollouts / split, part.runs, part.logs, config.signals.columns, part.bands
+        )
+    scales = config.evaluation.scales.named()
+    units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in STATE}
+    rows = [row for part in judged.values() for row in part.rows]
+    folder.write_json(
+        folder.metrics,
+        metrics_content(config.name, units, scales, selected, selected_ensemble, rows),
+    )
+    commands, step = len(config.signals.inputs), config.prepare.grid.step
+    seen = [log for part in judged.values() for log in part.logs]
+    limits = {
+        "schema": LIMITS_SCHEMA,
+        "run": config.name,
+        "splits": {split: part.limits for split, part in judged.items()},
+        "repeatability": {
+            name: repeatability(protocol, seen, commands, scales, step)
+            for name, protocol in config.evaluation.protocols.items()
+        },
+    }
+    folder.write_json(folder.limits, limits)
+    quality = [
+        {
+            "log": log.log.name,
+            "split": split,
+            "manoeuvre": log.log.manoeuvre,
+            "seconds": float(log.log.t[-1] - log.log.t[0]),
+            "samples": len(log),
+            "usable": float(log.usable.mean()),
+            "learned_from": float(log.good.mean()),
+            "masked": {
+                reason: float(np.mean(mask)) for reason, mask in log.log.masks.items() if mask.any()
+            },
+            "largest": {
+                name: float(np.abs(log.y[log.usable, STATE.index(name)]).max())
+                for name in ("u", "v", "r")
+            },
+        }
+        for split, members in logs.items()
+        for log in members
+    ]
+    folder.write_json(folder.data_quality, quality)
+
+
+def fit_outcome(
+    folder: RunFolder, split: str, exports: Exports | None = None, failure: str = ""
+) -> Outcome:
+    """Return the verdict of a fit or an evaluation, and the errors of its selected model.
+
+    Args:
+        folder: where the results stand.
+        split: that is shown.
+        exports: what writes each export when the run ends; None for none.
+        failure: a line where a result fails a check.
+    """
+    files = RunFiles(folder.path)
+    row = files.row(files.selected, split, files.protocols[0])
+    figures: dict[str, MainFigure] = {}
+    if row is not None:
+        figures = {
+            "nrmse": MainFigure(row["nrmse"]["mean"]),
+            "rmse_u": MainFigure(row["rmse"]["u"], "m/s"),
+            "rmse_v": MainFigure(row["rmse"]["v"], "m/s"),
+            "rmse_r": MainFigure(row["rmse"]["r"], "rad/s"),
+            "position_error_end": MainFigure(row["position_error_end"], "m"),
+            "heading_error_end": MainFigure(row["heading_error_end"], "rad"),
+        }
+    sentences = [sentence for sentence in verdict(files) if sentence]
+    return Outcome(sentences, figures, errors_table(files, split).text(), failure, exports or {})
+
+
+def export_model(run: RunFolder, name: str, out: Path | None, file_format: str) -> Path:
+    """Export one model of a fit in the format of that name, and return the file.
+
+    Args:
+        run: of the fit.
+        name: of the model; `selected` for the one chosen on validation data.
+        out: file to write; exports/<model> with the format's suffix where not given.
+        file_format: one of `residnet list formats`.
+
+    Raises:
+        ConfigError: where there is no such format.
+        UsageError: where there is no such model.
+        ExportError: where the exported model does not agree with the one that it came from.
+    """
+    chosen_format, metrics = exporter(file_format), run.read_metrics()
+    chosen = str(metrics["selected"]) if name == "selected" else name
+    known = model_names(run.models)
+    if chosen not in known:
+        raise UsageError(f"{run.path}: no model '{name}'{nearest(name, ['selected', *known])}")
+    spec, model = load_model(run.models / chosen)
+    rows = [row for row in metrics["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"]
+    file = out or run.exports / f"{chosen}{chosen_format.suffix}"
+    chosen_format.export(ExportedVessel(spec, model, rows), file)
+    return file
+
+
+def evaluate_on(
+    config: FitConfig, run: RunFolder, paths: Sequence[Path], out: Path | None
+) -> Finished:
+    """Free-run every model of a fit on logs that it has never seen.
+
+    Its reader, masks, protocols and scales are used; `zero` comes first, then the config's order.
+
+    Args:
+        config: of the finished fit.
+        run: its folder.
+        paths: files and folders.
+        out: folder of the results; RUN/external-<time> where none is given.
+
+    Raises:
+        DataError: where a log cannot be used or is too short.
+        UsageError: where a path or a channel is missing, or the folder may not be used.
+    """
+    files, read, logs = external_logs(config, paths)
+    for log in logs:
+        require_window(log, config)
+    made_from = Provenance(run.resolved, (), config.seed, files, time.time())
+    place = out or run.path / time.strftime("external-%Y%m%dT%H%M%S")
+    folder = RunFolder.create(place, dump_config(config))
+
+    def judge(folder: RunFolder) -> Outcome:
+        store, order = FolderStore(run), ["zero", *config.model_names]
+        fitted = [store.load(name) for name in store.names()]
+        fitted.sort(key=lambda model: (*order, model.name).index(model.name))
+        say(f"{config.name}: {len(logs)} logs, {len(fitted)} models")
+        _write_inspection(folder, {SPLIT: read}, config)
+        simulated = isinstance(config.data, SimulatedTrials) and all(
+            "vessel" in log.meta for log in read
+        )
+        models = [c for c in candidates(fitted, config.data) if c.kind != "truth" or simulated]
+        limit = limit_of(fitted[0].spec, config)
+        judged = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit)
+        # bands, and why the model was selected, are the fit's own; the report shows them
+        for own, copy in ((run.bands, folder.bands), (run.selection, folder.selection)):
+            if own.is_file():
+                folder.write(copy, own.read_text(encoding="utf-8"))
+        chosen = run.read_metrics()
+        ensemble = chosen.get("selected_ensemble")
+        write_judged(
+            folder, config, {SPLIT: judged}, str(chosen["selected"]), ensemble, {SPLIT: logs}
+        )
+        return fit_outcome(folder, SPLIT)
+
+    return config.conduct(folder, made_from, judge)
+
+
+def external_logs(
+    config: FitConfig, paths: Sequence[Path]
+) -> tuple[list[Path], list[Log], list[Prepared]]:
+    """Return the files of other logs, the logs, and the logs prepared as those of the fit.
+
+    They are read as the fit read its own; canonical files are recognised by their own mark.
+
+    Raises:
+        ResidnetError: where a file cannot be read.
+    """
+    data = config.data
+    own = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
+    # a folder may be one log, as a ROS 2 bag is
+    files = log_files(paths, isinstance(own, RecordingConfig))
+    read = [
+        (CanonicalConfig() if Log.recognises(path) else own).build().read(path).replace(name=name)
+        for path, name in log_names(files).items()
+    ]
+    logs = [prepare(log, SPLIT, config.signals.columns, config.prepare) for log in read]
+    return list(data_files(files)), read, logs
+
+
+def limit_of(spec: ModelSpec, config: FitConfig) -> np.ndarray:
+    """Return the |u, v, r| [3] beyond which a free run of a model has diverged."""
+    return velocity_limit(np.array(spec.low), np.array(spec.high), config.evaluation.divergence)
