@@ -15,7 +15,8 @@ from random_vessels import random_logs, ship_of
 
 from residnet.core.log import Log
 from residnet.data.doctor import inspect, inspect_together
-from residnet.data.doctor.actuators.propeller import propeller_findings
+from residnet.data.doctor.findings import run
+from residnet.data.doctor.statistics import Record
 from residnet.data.outliers import spike_cells, without_spikes
 from residnet.data.plausible import beyond_belief, fills
 
@@ -86,5 +87,5 @@ def twin(port: float, stbd: float, yaw: float, speed: float) -> Log:
     ],
 )
 def test_two_propellers_steer_by_their_difference(log: Log, said: list[str]) -> None:
-    found = propeller_findings(log, ["n_port", "n_stbd"])
+    found = [*run("actuators", Record(log, ["n_port", "n_stbd"]))]
     assert [finding.code for finding in found] == said

@@ -10,7 +10,7 @@ import pytest
 from known_logs import wavy
 
 from residnet.core.log import Log
-from residnet.data.doctor.dates import date_findings
+from residnet.data.doctor import date_findings
 
 
 def written(path: Path, log: Log, rate: float, *, epoch: bool) -> Path:

@@ -10,6 +10,7 @@ from residnet.core.log import Log
 from residnet.data.doctor import inspect
 from residnet.data.doctor.findings import with_channels
 from residnet.data.doctor.kinematics import position_causes
+from residnet.data.doctor.statistics import Record
 
 
 @pytest.mark.filterwarnings("error")
@@ -56,6 +57,6 @@ def turn_on_the_spot(seed: int) -> Log:
 def test_noise_of_velocities_is_no_scale_of_theirs() -> None:
     # a lever arm can stand for the steady part, and then noise decides on the scale
     for seed in range(20):
-        causes = position_causes(turn_on_the_spot(seed))
+        causes = position_causes(Record(turn_on_the_spot(seed)))
         gains = [causes[name].values for name in causes if name.startswith("gain")]
         assert np.abs(np.concatenate([[0.0], *gains])).max() < 0.3, seed

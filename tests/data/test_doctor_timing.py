@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from residnet.core.log import Log
-from residnet.data.doctor.actuators.timing import delay_of, timing_findings
+from residnet.data.doctor import inspect
+from residnet.data.doctor.actuators import delay_of
+from residnet.data.doctor.statistics import Record
 
 _STEP = 0.1
 
@@ -34,16 +36,16 @@ def test_a_manoeuvre_that_repeats_itself_is_not_answered_half_a_period_early(
     period: float, late: float
 ) -> None:
     log = steered_log(zigzag(period), late)
-    delay = delay_of(log, ("delta",), "r")
+    delay = delay_of(Record(log), ("delta",), "r")
     assert delay is not None
     assert delay.seconds == pytest.approx(late, abs=0.25)
-    assert not list(timing_findings(log, ["delta"]))
+    assert not inspect(log).find("acausal")
 
 
 @pytest.mark.parametrize("early", [0.8, 1.6])
 def test_an_answer_before_the_input_is_found(early: float) -> None:
     rng = np.random.default_rng(3)
     delta = np.repeat(rng.uniform(-0.4, 0.4, 40), 20)
-    (finding,) = timing_findings(steered_log(delta, -early), ["delta"])
+    (finding,) = inspect(steered_log(delta, -early)).find("acausal")
     assert finding.level == "will mislead"
     assert finding.figures["lag"] == pytest.approx(-early, abs=0.25)

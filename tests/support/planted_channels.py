@@ -9,8 +9,9 @@ import numpy as np
 from planted import Fault, Plant, Ship, _late, _one, _stretch, _with
 
 from residnet.core.log import Log
-from residnet.data.doctor.actuators.rudder import neutral_angle
-from residnet.data.doctor.effects.one_step import OneStep
+from residnet.data.doctor.actuators import neutral_angle
+from residnet.data.doctor.effects import OneStep
+from residnet.data.doctor.statistics import Record
 
 HARMLESS = (
     *("time gap", "NaN stretch", "standing still"),
@@ -64,7 +65,7 @@ def _scaled(log: Log, names: list[str], factor: float) -> Log:
 
 
 def _rudder_bias(ship: Ship, log: Log, random: np.random.Generator) -> Log:
-    neutral = neutral_angle(log, "delta")
+    neutral = neutral_angle(Record(log))
     if neutral is None or neutral.error > np.radians(0.5):
         raise Undecidable
     bias = np.radians(random.uniform(3.0, 5.0)) * random.choice([-1.0, 1.0])
@@ -175,7 +176,7 @@ def _inputs_late(names: Callable[[Log], list[str]]) -> Plant:
     def damage(ship: Ship, log: Log, random: np.random.Generator) -> Log:
         late = _late(log, ship.lag[0], *names(log))
         inputs = [name for name in log.channels if name not in _MOTION]
-        before, after = (_left(OneStep(one, inputs)) for one in (log, late))
+        before, after = (_left(OneStep(Record(one, inputs))) for one in (log, late))
         if float((after / before).max()) < 1.1:
             raise Undecidable
         return late
@@ -184,7 +185,7 @@ def _inputs_late(names: Callable[[Log], list[str]]) -> Plant:
 
 
 def _left(rows: OneStep) -> np.ndarray:
-    return rows.residual(rows.fit(np.ones(len(rows), dtype=bool)))
+    return rows.left(rows.fit())
 
 
 _TIMING = ("acausal", "input_late", "input_early", "lag_n", "timing")

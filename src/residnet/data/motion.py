@@ -13,8 +13,8 @@ from residnet.core.config import Config, Metres, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, POSE, STATE
-from residnet.data.doctor.signals import noise_of, spikes
 from residnet.data.held import without_held
+from residnet.data.outliers import noise_of, spikes
 from residnet.data.readers.base import unwrap
 from residnet.data.readers.recording import remark
 from residnet.data.sparse_smoother import Track, smooth_track

@@ -25,6 +25,23 @@ _FEWEST = 20
 _MOVED = ("x", "y", "psi", "phi", "u", "v", "r", "p")
 
 
+def noise_of(values: np.ndarray) -> float:
+    """Return the standard deviation of a channel's white noise, from third differences.
+
+    These hardly see the motion. The differences are taken over the known samples only; 0 where
+    there are fewer than 8, or where most third differences vanish.
+    """
+    known = values[np.isfinite(values)]
+    if known.size < 8:
+        return 0.0
+    return float(SIGMA_OF_MAD * np.median(np.abs(np.diff(known, 3))) / np.sqrt(20.0))
+
+
+def spikes(values: np.ndarray) -> np.ndarray:
+    """Return [T] bool: samples that the mask `hampel` with its defaults leaves out."""
+    return far_from_median(values, 6.0, 11)
+
+
 def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarray:
     """Return [T] bool: known values [T] that stand out of their neighbours by `Hampel`'s rule.
 

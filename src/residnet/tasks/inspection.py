@@ -18,13 +18,13 @@ from residnet.data.doctor import (
     Finding,
     Level,
     Report,
+    conditioning,
+    date_findings,
     inspect,
     inspect_together,
     inspection,
     summary,
 )
-from residnet.data.doctor.dates import date_findings
-from residnet.data.doctor.excitation import conditioning
 from residnet.data.drafting.reading import DraftedLogs, log_files, read_each
 from residnet.data.masks import Mask
 from residnet.data.parts import log_names

@@ -1,4 +1,8 @@
-"""The data doctor: what logs hold, what is wrong with them, and whether a fit would be misled."""
+"""The data doctor: what logs hold, what is wrong with them, and whether a fit would be misled.
+
+A check is a function with `@check` above it, in the module of its subject; it reads a `Record` and
+yields findings. `STAGES` says when it looks, and at what state of the log.
+"""
 
 from __future__ import annotations
 
@@ -10,38 +14,61 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.align import GridConfig, align
-from residnet.data.doctor.actuators.between import between_findings
-from residnet.data.doctor.actuators.propeller import propeller_findings
-from residnet.data.doctor.actuators.rudder import rudder_findings
-from residnet.data.doctor.actuators.timing import timing_findings
-from residnet.data.doctor.clock import clock_findings, order_findings
-from residnet.data.doctor.compare import comparison_findings
+from residnet.data.doctor import actuators, excitation, frames, inputs, values
+from residnet.data.doctor.between import Together
+from residnet.data.doctor.clock import date_findings
 from residnet.data.doctor.effects import Effects
-from residnet.data.doctor.excitation import excitation_findings, set_findings
-from residnet.data.doctor.findings import Finding, Level, Report, imported, inspection
-from residnet.data.doctor.frames import frame_findings
-from residnet.data.doctor.inputs import input_findings
-from residnet.data.doctor.sensors.fixes import fix_findings
-from residnet.data.doctor.signals import MEASURED, without
-from residnet.data.doctor.summary import Summary, summary
-from residnet.data.doctor.values import channel_findings, value_findings
-from residnet.data.doctor.wraps import unwrapped, wrap_findings
+from residnet.data.doctor.excitation import conditioning
+from residnet.data.doctor.findings import (
+    CHECKS,
+    Check,
+    Finding,
+    Level,
+    Report,
+    Summary,
+    check,
+    imported,
+    inspection,
+    run,
+    summary,
+)
+from residnet.data.doctor.statistics import MEASURED, Record
 from residnet.data.masks import Mask, apply_masks
 
 __all__ = [
+    "CHECKS",
+    "STAGES",
+    "Check",
     "Finding",
     "Level",
     "Report",
     "Summary",
+    "actuators",
+    "check",
+    "conditioning",
+    "date_findings",
+    "excitation",
+    "frames",
+    "inputs",
     "inspect",
     "inspect_together",
     "inspection",
     "summary",
+    "values",
 ]
 
-
-# findings about single samples of pose and velocities
-_DOUBTED = ("frozen", "outliers", "spikes", "clipping", "interpolated")
+STAGES = {
+    "header": "as recorded",
+    "order": "as recorded; a finding here ends the examination",
+    "clock": "as recorded, with an increasing clock",
+    "values": "with its headings continuous",
+    "grid": "on a uniform grid, without what a finding about values says is wrong",
+    "inputs": "with its headings continuous",
+    "actuators": "without what a finding about values says is wrong",
+    "excitation": "with its headings continuous",
+    "between": "several logs (`Together`)",
+}
+"""Stage -> the state of the log that its checks see, in the order of the stages."""
 
 
 def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask] = ()) -> Report:
@@ -60,97 +87,46 @@ def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask]
     """
     if len(log) < 2:
         raise DataError(f"log {log.name}: {len(log)} samples, at least 2 are needed; leave it out")
-    for name, values in log.channels.items():
-        if not np.isfinite(values).any():
+    for name, channel in log.channels.items():
+        if not np.isfinite(channel).any():
             raise DataError(
                 f"log {log.name}: channel {name} holds no number; take it out of the channel map"
             )
-    driving = (
-        tuple(name for name in log.channels if name not in MEASURED)
-        if inputs is None
-        else tuple(inputs)
-    )
+    driving = [name for name in log.channels if name not in MEASURED]
+    driving = driving if inputs is None else list(inputs)
     log.stack(driving)
-    findings = [*imported(log.meta.get("findings", ())), *channel_findings(log)]
-    broken = order_findings(log)
-    if not broken:
-        findings += [*clock_findings(log), *_contents(log, driving)]
-    left_out = (
-        ~apply_masks(log, masks).usable if masks and not broken else np.zeros(len(log), dtype=bool)
-    )
-    excused = [finding.excused(left_out) for finding in (*findings, *broken)]
-    if not broken and any(finding.level == "will mislead" for finding in excused):
-        effects = Effects(_without_masked(unwrapped(log), left_out), driving)
-        excused = [effects.measured(finding) for finding in excused]
-    return Report(log.name, tuple(excused), str(log.meta.get("source", "")))
+    raw = Record(log, driving)
+    found = [*imported(log.meta.get("findings", ())), *run("header", raw)]
+    source = str(log.meta.get("source", ""))
+    broken = [*run("order", raw)]
+    if broken:
+        return Report(log.name, (*found, *broken), source)
+    record = Record(values.unwrapped(log), driving)
+    about_values = [*run("values", record)]
+    found += [*run("clock", raw), *about_values]
+    wrong = [one.at for one in about_values if one.spoils and one.at is not None]
+    bad = np.logical_or.reduce([np.zeros(len(log), dtype=bool), *wrong])
+    trusted = record if bad.mean() > 0.5 else record.without(bad)
+    found += _on_grid(trusted)
+    found += [*run("inputs", record), *run("actuators", trusted), *run("excitation", record)]
+    left_out = ~apply_masks(log, masks).usable if masks else np.zeros(len(log), dtype=bool)
+    found = [one.excused(left_out) for one in found]
+    if any(one.level == "will mislead" for one in found):
+        effects = Effects(record.without(left_out))
+        found = [effects.measured(one) for one in found]
+    return Report(log.name, tuple(found), source)
 
 
-def _without_masked(log: Log, left_out: np.ndarray) -> Log:
-    """Return the log with NaN in the measured channels where the masks leave samples out."""
-    if not left_out.any():
-        return log
-    channels = {
-        name: without(values, left_out) if name in MEASURED else values
-        for name, values in log.channels.items()
-    }
-    return log.replace(channels=channels)
-
-
-def _contents(log: Log, driving: Sequence[str]) -> list[Finding]:
-    """Return the findings about what the channels of a log with an increasing clock hold."""
-    findings = wrap_findings(log)
-    log = unwrapped(log)
-    values = value_findings(log, driving)
-    return [
-        *findings,
-        *values,
-        *_frames(_trusted(log, values)),
-        *fix_findings(log),
-        *input_findings(log, driving),
-        *_actuators(_trusted(log, values), driving),
-        *excitation_findings(log, driving),
-    ]
-
-
-def _trusted(log: Log, findings: Sequence[Finding]) -> Log:
-    """Return the log with NaN where a finding about values says that pose or velocity is wrong."""
-    doubted = [
-        finding.at for finding in findings if finding.at is not None and finding.code in _DOUBTED
-    ]
-    bad = np.logical_or.reduce(doubted) if doubted else np.zeros(len(log), dtype=bool)
-    if bad.mean() > 0.5:
-        return log
-    return log.replace(
-        channels={
-            name: without(values, bad) if name in MEASURED else values
-            for name, values in log.channels.items()
-        }
-    )
-
-
-def _at_samples(finding: Finding, grid: np.ndarray, t: np.ndarray) -> Finding:
-    """Return a finding about points of a grid [G] as one about the samples at t [T]."""
-    if finding.at is None:
-        return finding
-    near = np.searchsorted(grid - grid[0], t - t[0] - 1e-9)
-    return dataclasses.replace(finding, at=finding.at[np.minimum(near, grid.size - 1)])
-
-
-def _frames(log: Log) -> list[Finding]:
+def _on_grid(log: Record) -> list[Finding]:
+    """Return the findings of the checks that need a uniform grid, told at the log's own samples."""
     try:
-        grid = align(log, GridConfig(step=float(np.median(np.diff(log.t)))))
-        return [_at_samples(finding, grid.t, log.t) for finding in frame_findings(grid)]
+        grid = align(log.log, GridConfig(step=log.step))
     except DataError as error:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
-
-
-def _actuators(log: Log, driving: Sequence[str]) -> list[Finding]:
-    """Return what the motion says against propellers and rudders."""
-    return [
-        *propeller_findings(log, driving),
-        *rudder_findings(log, driving),
-        *timing_findings(log, driving),
-    ]
+    found = [*run("grid", Record(grid, log.inputs))]
+    near = np.searchsorted(grid.t - grid.t[0], log.t - log.t[0] - 1e-9)
+    near = np.minimum(near, len(grid) - 1)
+    return [one if one.at is None else dataclasses.replace(one, at=one.at[near]) for one in found]
 
 
 def inspect_together(
@@ -168,7 +144,6 @@ def inspect_together(
             measures.
         splits: log's name -> train, validation or test, where a config says.
     """
-    sound = [log for log in logs if not order_findings(log)]
-    found = [*comparison_findings(sound, splits), *set_findings(sound, inputs)] if sound else []
-    found += between_findings(sound, inputs)
+    sound = [log for log in logs if not [*run("order", Record(log))]]
+    found = run("between", Together(sound, inputs, splits or {})) if sound else ()
     return Report("together", tuple(found))

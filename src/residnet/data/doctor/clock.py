@@ -1,119 +1,191 @@
-"""What the data doctor sees in the clock: rate, jitter, gaps, order, start."""
+"""What is wrong with a log's clock: order, rate, jitter, gaps, start, dates beside it."""
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.doctor.findings import Finding, Level, share_of
+from residnet.data.doctor.findings import Check, Finding, Level, check, share_of
+from residnet.data.doctor.statistics import Record
+from residnet.data.readers.encoding import as_utf8
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # stamps scatter by this share of a step before interpolation between them suffers
 _MOST_JITTER = 0.05
-# longest time step, in usual ones, that the grid interpolates across
-_BRIDGED = 3.0
+# longest time step, in usual ones, that the grid interpolates across, and rounding
+_BRIDGED = 3.0 * (1.0 + 1e-6)
 # stamps beyond this count from 1970
-_EPOCH = 1e8
+EPOCH = 1e8
 
 
-def order_findings(log: Log) -> list[Finding]:
-    """Return why nothing else can be examined: times that are NaN, repeat or run backwards."""
-    if not np.isfinite(log.t).all():
-        count = int((~np.isfinite(log.t)).sum())
-        text = f"{count} of {len(log)} samples have no time"
-        return [
-            Finding(
-                "fatal", "time_missing", text, {"count": count}, "delete them or restore their time"
-            )
-        ]
-    backwards, repeats = np.flatnonzero(np.diff(log.t) < 0.0), np.flatnonzero(np.diff(log.t) == 0.0)
-    out = []
-    if backwards.size:
-        text = (
-            f"time runs backwards {backwards.size} times, first after t ="
-            f" {log.t[backwards[0]]:.6g} s"
+@check("order", "time_missing", "fatal", "delete them or restore their time")
+def times_missing(log: Record, found: Check) -> Iterator[Finding]:
+    """Report samples without a time."""
+    count = int((~np.isfinite(log.t)).sum())
+    if count:
+        yield found(f"{count} of {len(log)} samples have no time", {"count": count})
+
+
+@check(
+    "order", "time_backwards", "fatal", "sort the rows, or split the log where its clock restarts"
+)
+def backwards(log: Record, found: Check) -> Iterator[Finding]:
+    """Report a time that runs backwards."""
+    at = np.flatnonzero(np.diff(log.t) < 0.0)
+    if at.size and np.isfinite(log.t).all():
+        text = f"time runs backwards {at.size} times, first after t = {log.t[at[0]]:.6g} s"
+        yield found(text, {"count": at.size})
+
+
+@check("order", "duplicate_rows", "fatal", "delete the repeated rows")
+def repeated_stamps(log: Record, found: Check) -> Iterator[Finding]:
+    """Report times that repeat."""
+    at = np.flatnonzero(np.diff(log.t) == 0.0)
+    if at.size and np.isfinite(log.t).all():
+        yield found(
+            f"{at.size} time stamps repeat, first t = {log.t[at[0]]:.6g} s", {"count": at.size}
         )
-        out.append(
-            Finding(
-                "fatal",
-                "time_backwards",
-                text,
-                {"count": backwards.size},
-                "sort the rows, or split the log where its clock restarts",
-            )
-        )
-    if repeats.size:
-        text = f"{repeats.size} time stamps repeat, first t = {log.t[repeats[0]]:.6g} s"
-        out.append(
-            Finding(
-                "fatal", "duplicate_rows", text, {"count": repeats.size}, "delete the repeated rows"
-            )
-        )
-    return out
 
 
-def clock_findings(log: Log) -> Iterator[Finding]:
-    """Return the findings about an increasing clock."""
-    dt = np.diff(log.t)
-    step, span = float(np.median(dt)), float(log.t[-1] - log.t[0])
-    near = dt[dt <= 1.5 * step]
-    jitter = float(near.std() / step)
-    level: Level = "will mislead" if jitter > _MOST_JITTER else "note"
+@check("clock", "clock")
+def rate(log: Record, found: Check) -> Iterator[Finding]:
+    """Report the rate of the samples, and how much their times scatter."""
+    dt, step, span = np.diff(log.t), log.step, float(log.t[-1] - log.t[0])
+    jitter = float(dt[dt <= 1.5 * step].std() / step)
     text = (
         f"{1.0 / step:.4g} Hz over {span:.1f} s from t = {log.t[0]:.1f} s, steps vary by"
         f" {share_of(jitter)} (standard deviation)"
     )
-    action = (
+    fix = (
         "use the sender's stamps, or a coarser grid (prepare.grid.step), so that averaging replaces"
         " interpolation"
-        if level != "note"
-        else ""
     )
-    yield Finding(
-        level, "clock", text, {"rate": 1.0 / step, "jitter": jitter, "span": span}, action
-    )
-    yield from _gaps(log, dt, step, span)
-    if abs(log.t[0]) > step:
-        kind = "Unix time" if log.t[0] > _EPOCH else "not at 0"
-        action = "times count from the log's own clock, nothing to do"
-        yield Finding(
-            "note",
-            "clock_start",
-            f"time starts at {log.t[0]:.10g} s ({kind})",
-            {"start": float(log.t[0])},
-            action,
-        )
+    level: Level = "will mislead" if jitter > _MOST_JITTER else "note"
+    fix = fix if level != "note" else ""
+    yield found(text, {"rate": 1.0 / step, "jitter": jitter, "span": span}, level=level, fix=fix)
 
 
-def _gaps(log: Log, dt: np.ndarray, step: float, span: float) -> Iterator[Finding]:
-    short = (dt > 1.5 * step) & (dt <= _BRIDGED * step * (1.0 + 1e-6))
-    if short.any():
-        text = (
-            f"{int(short.sum())} single samples or pairs are missing (steps up to"
-            f" {dt[short].max():.3g} s)"
-        )
-        yield Finding(
-            "note",
-            "dropped_samples",
-            text,
-            {"count": short.sum(), "longest": dt[short].max()},
-            "the grid interpolates across them",
-        )
-    gaps = np.flatnonzero(dt > _BRIDGED * step * (1.0 + 1e-6))
-    if gaps.size:
-        longest, lost = gaps[np.argmax(dt[gaps])], float((dt[gaps] - step).sum())
-        text = (
-            f"{gaps.size} gaps, {lost:.2f} s in all, the longest {dt[longest]:.2f} s after t ="
-            f" {log.t[longest]:.2f} s"
-        )
-        at = np.zeros(len(log), dtype=bool)
-        at[gaps + 1] = True
-        level: Level = "fatal" if lost > 0.5 * span else "will mislead"
-        figures = {
-            "count": gaps.size,
-            "lost": lost,
-            "longest": float(dt[longest]),
-            "t": float(log.t[longest]),
-        }
-        yield Finding(level, "gaps", text, figures, "split the log there (mask kind: gap)", at)
+@check("clock", "dropped_samples", "note", "the grid interpolates across them")
+def dropped(log: Record, found: Check) -> Iterator[Finding]:
+    """Report single samples that are missing."""
+    dt = np.diff(log.t)
+    short = dt[(dt > 1.5 * log.step) & (dt <= _BRIDGED * log.step)]
+    if short.size:
+        text = f"{short.size} single samples or pairs are missing (steps up to {short.max():.3g} s)"
+        yield found(text, {"count": short.size, "longest": short.max()})
+
+
+@check("clock", "gaps", fix="split the log there (mask kind: gap)")
+def gaps(log: Record, found: Check) -> Iterator[Finding]:
+    """Report time steps that are too long to be bridged."""
+    dt = np.diff(log.t)
+    at = np.append(False, dt > _BRIDGED * log.step)
+    if not at.any():
+        return
+    lost = float((dt[at[1:]] - log.step).sum())
+    longest = int(np.argmax(dt))
+    text = (
+        f"{int(at.sum())} gaps, {lost:.2f} s in all, the longest {dt[longest]:.2f} s after t ="
+        f" {log.t[longest]:.2f} s"
+    )
+    level: Level = "fatal" if lost > 0.5 * (log.t[-1] - log.t[0]) else "will mislead"
+    figures = {"count": at.sum(), "lost": lost, "longest": dt[longest], "t": log.t[longest]}
+    yield found(text, figures, level=level, at=at)
+
+
+@check("clock", "clock_start", "note", "times count from the log's own clock, nothing to do")
+def start(log: Record, found: Check) -> Iterator[Finding]:
+    """Report a clock that does not start at 0."""
+    if abs(log.t[0]) > log.step:
+        kind = "Unix time" if log.t[0] > EPOCH else "not at 0"
+        yield found(f"time starts at {log.t[0]:.10g} s ({kind})", {"start": float(log.t[0])})
+
+
+_NAMED = re.compile(r"date|time|stamp|utc|gps|clock|epoch", re.IGNORECASE)
+# seconds, milliseconds, microseconds and nanoseconds since 1970 of the years 2001 to 2065
+_EPOCHS = {1.0: (1e9, 3e9), 1e-3: (1e12, 3e12), 1e-6: (1e15, 3e15), 1e-9: (1e18, 3e18)}
+_ROWS = 50_000
+# a clock that is off by more than this share misleads
+_LEAST_RATE = 0.005
+_FEWEST_DATES = 20
+
+
+def date_findings(log: Log, path: Path) -> list[Finding]:
+    """Return the columns of dates that go faster or slower than the log's time.
+
+    Args:
+        log: as read from the table, row by row.
+        path: the table; anything that is no csv or Parquet file has no such columns.
+    """
+    table, out = _dated_columns(path), []
+    if table is None:
+        return []
+    for name in table.columns:
+        dates = _seconds(table[name])[: len(log)]
+        known = np.isfinite(dates)
+        short = dates.size < min(len(log), _ROWS) or known.sum() < _FEWEST_DATES
+        if short or float(np.ptp(dates[known])) <= 0.0:
+            continue
+        t, dates = log.t[: dates.size][known] - log.t[0], dates[known] - dates[known][0]
+        rate = float(np.polyfit(t, dates, 1)[0])
+        follows = float(np.corrcoef(t, dates)[0, 1])
+        if follows > 0.99 and abs(rate - 1.0) > _LEAST_RATE and 0.05 < rate < 20.0:
+            text = (
+                f"'{name}' goes on by {rate:.4g} s for every second of the log's time: the time"
+                " column is nominal, or its unit is wrong"
+            )
+            action = f"take the time from '{name}'"
+            out.append(Finding("will mislead", "clock_rate", text, {"rate": rate}, action))
+    return out
+
+
+def _dated_columns(path: Path) -> pd.DataFrame | None:
+    """Return the columns that may hold dates; None where the file is no table that can be read."""
+    import pandas as pd
+
+    try:
+        if path.suffix.lower() == ".parquet":
+            import pyarrow.parquet as pq
+
+            names = [name for name in pq.read_schema(path).names if _NAMED.search(name)]
+            return pd.read_parquet(path, columns=names).head(_ROWS) if names else None
+        if path.suffix.lower() not in (".csv", ".txt", ".tsv"):
+            return None
+        with as_utf8(path) as file:
+            return pd.read_csv(
+                file,
+                sep=None,
+                engine="python",
+                nrows=_ROWS,
+                usecols=lambda name: bool(_NAMED.search(str(name))),
+                encoding="utf-8-sig",
+            )
+    except (DataError, OSError, ValueError, LookupError):
+        # a file that cannot be read again has no date to tell
+        return None
+
+
+def _seconds(column: pd.Series) -> np.ndarray:
+    """Return a column of dates as seconds [T]; empty where it holds none."""
+    import pandas as pd
+
+    if pd.api.types.is_numeric_dtype(column):
+        values = column.to_numpy(dtype=float)
+        middle = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
+        units = [unit for unit, (low, high) in _EPOCHS.items() if low < middle < high]
+        return (values - values[np.isfinite(values)][0]) * units[0] if units else np.zeros(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        dates = pd.to_datetime(column.astype("string"), errors="coerce", utc=True)
+    if dates.notna().mean() < 0.9:
+        return np.zeros(0)
+    return np.asarray((dates - dates.dropna().iloc[0]).dt.total_seconds(), dtype=float)

@@ -1,20 +1,21 @@
-"""The outcome of the data doctor: findings, and the report that holds them."""
+"""Findings of the data doctor, the checks that make them, and the reports that hold them."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.data.doctor.summary import LEVELS, summary
 
 Level = Literal["note", "will mislead", "fatal"]
+LEVELS = ("note", "will mislead", "fatal")
 SCHEMA = "residnet.inspection/1"
+_MOST_KINDS = 4
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class Finding:
         channels: that the samples concerned belong to, where it concerns single samples.
         repair: returns a log with the fault corrected, where the finding says how; what it changes
             is measured.
+        certain: a fault of the record itself, to be corrected whatever a fit makes of it.
+        spoils: the samples concerned are wrong, and no later check may rely on them.
     """
 
     level: Level
@@ -45,6 +48,8 @@ class Finding:
     effect: float | None = None
     channels: tuple[str, ...] = ()
     repair: Callable[[Log], Log] | None = field(default=None, repr=False, compare=False)
+    certain: bool = field(default=False, repr=False, compare=False)
+    spoils: bool = field(default=False, repr=False, compare=False)
 
     @property
     def line(self) -> str:
@@ -53,12 +58,8 @@ class Finding:
 
     def excused(self, masked: np.ndarray) -> Finding:
         """Return the finding as a note where masks [T] leave out every sample that it concerns."""
-        if (
-            self.at is None
-            or self.level == "note"
-            or not self.at.any()
-            or not masked[self.at].all()
-        ):
+        concerned = self.at is not None and self.at.any() and bool(masked[self.at].all())
+        if not concerned or self.level == "note":
             return self
         return dataclasses.replace(self, level="note", action="the config masks these samples")
 
@@ -68,14 +69,93 @@ class Finding:
             name: float(value) if math.isfinite(value) else None
             for name, value in self.figures.items()
         }
-        return {
-            "level": self.level,
-            "code": self.code,
-            "text": self.text,
-            "action": self.action,
-            "effect": self.effect,
-            "figures": figures,
-        }
+        plain = {name: getattr(self, name) for name in ("level", "code", "text", "action")}
+        return {**plain, "effect": self.effect, "figures": figures}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that the doctor looks for.
+
+    Called with a text it makes the finding of this check; what is not given is that of the check.
+
+    Attributes:
+        stage: when it looks, and at which state of a log (`residnet.data.doctor.STAGES`).
+        code: of its findings.
+        level: of its findings.
+        fix: what to do about them.
+        needs: channels without which it has nothing to say.
+        certain: see `Finding`.
+        spoils: see `Finding`.
+        body: the function; given a log under examination (or several) and the check.
+    """
+
+    stage: str
+    code: str
+    level: Level
+    fix: str
+    needs: tuple[str, ...]
+    certain: bool
+    spoils: bool
+    body: Callable[[Any, Check], Iterable[Finding]]
+
+    def __call__(
+        self,
+        text: str,
+        figures: Mapping[str, Any] | None = None,
+        *,
+        code: str = "",
+        level: Level | None = None,
+        fix: str | None = None,
+        at: np.ndarray | None = None,
+        channels: tuple[str, ...] = (),
+        repair: Callable[[Log], Log] | None = None,
+    ) -> Finding:
+        """Return a finding; `figures` are its numbers, SI."""
+        return Finding(
+            self.level if level is None else level,
+            code or self.code,
+            text,
+            {name: float(value) for name, value in (figures or {}).items()},
+            self.fix if fix is None else fix,
+            at,
+            channels=channels,
+            repair=repair,
+            certain=self.certain,
+            spoils=self.spoils,
+        )
+
+
+CHECKS: list[Check] = []
+"""All checks, in the order in which they look."""
+
+_Body = Callable[[Any, Check], Iterable[Finding]]
+
+
+def check(
+    stage: str,
+    code: str,
+    level: Level = "will mislead",
+    fix: str = "",
+    *,
+    needs: tuple[str, ...] = (),
+    certain: bool = False,
+    spoils: bool = False,
+) -> Callable[[_Body], _Body]:
+    """Register a function as a check; the arguments are the attributes of `Check`."""
+
+    def register(body: _Body) -> _Body:
+        CHECKS.append(Check(stage, code, level, fix, needs, certain, spoils, body))
+        return body
+
+    return register
+
+
+def run(stage: str, subject: Any) -> Iterator[Finding]:
+    """Return what the checks of a stage find in a log, or between several."""
+    for one in CHECKS:
+        if one.stage == stage and all(name in subject for name in one.needs):
+            yield from one.body(subject, one)
 
 
 @dataclass(frozen=True)
@@ -107,28 +187,26 @@ class Report:
 
     def lines(self) -> list[str]:
         """Return the report as text, one line per finding, the worst first."""
-        order = sorted(
-            self.findings,
-            key=lambda finding: (-LEVELS.index(finding.level), -(finding.effect or 0.0)),
-        )
+        order = sorted(self.findings, key=lambda one: _weight(one.content()), reverse=True)
         return [f"{self.name}: {finding.line}" for finding in order]
 
     def content(self) -> dict[str, Any]:
         """Return the report as plain values for JSON."""
-        return {
-            "name": self.name,
-            "source": self.source,
-            "misled": self.misled,
-            "findings": [finding.content() for finding in self.findings],
-        }
+        findings = [finding.content() for finding in self.findings]
+        about = {"name": self.name, "source": self.source, "misled": self.misled}
+        return {**about, "findings": findings}
+
+
+def imported(remarks: Iterable[Mapping[str, Any]]) -> list[Finding]:
+    """Return what a reader noted on the way in (`Log.meta["findings"]`)."""
+    return [Finding(**{"action": "", "figures": {}, **entry}) for entry in remarks]
 
 
 def inspection(reports: Sequence[Report], together: Report) -> dict[str, Any]:
     """Return all reports for JSON, schema residnet.inspection/1, with their tally."""
-    misled = any(report.misled for report in (*reports, together))
     content = {
         "schema": SCHEMA,
-        "misled": misled,
+        "misled": any(report.misled for report in (*reports, together)),
         "logs": [report.content() for report in reports],
         "together": together.content()["findings"],
     }
@@ -136,18 +214,72 @@ def inspection(reports: Sequence[Report], together: Report) -> dict[str, Any]:
     return {**content, "tally": counted.tally, "first": counted.first}
 
 
-def imported(remarks: Iterable[dict[str, Any]]) -> list[Finding]:
-    """Return what a reader noted on the way in (`Log.meta["findings"]`)."""
-    return [
-        Finding(
-            entry["level"],
-            entry["code"],
-            entry["text"],
-            dict(entry.get("figures", {})),
-            entry.get("action", ""),
-        )
-        for entry in remarks
-    ]
+@dataclass(frozen=True)
+class Summary:
+    """The findings above a note, counted.
+
+    Attributes:
+        logs: number of logs that were looked at.
+        misled: number of logs with a finding above a note.
+        kinds: code of a finding above a note -> number of logs that have it, the worst first;
+            findings between logs count as one.
+        tally: one sentence with these numbers.
+        first: one sentence that begins with "First fix this:"; empty where there is nothing.
+    """
+
+    logs: int
+    misled: int
+    kinds: Mapping[str, int] = field(default_factory=dict)
+    tally: str = ""
+    first: str = ""
+
+    @property
+    def lines(self) -> list[str]:
+        """The sentences that there are."""
+        return [line for line in (self.tally, self.first) if line]
+
+
+def _weight(finding: Mapping[str, Any]) -> tuple[int, float]:
+    return LEVELS.index(finding["level"]), float(finding.get("effect") or 0.0)
+
+
+def summary(inspection: Mapping[str, Any]) -> Summary:
+    """Return the tally of an inspection, and the finding to look at first.
+
+    Findings are ranked by level, then by the largest measured effect on a fit, then by the number
+    of logs that have them.
+
+    Args:
+        inspection: content of doctor.json, or of `residnet inspect --json`.
+    """
+    logs: Sequence[Mapping[str, Any]] = inspection.get("logs") or []
+    together = {"name": "together", "findings": inspection.get("together") or []}
+    members: dict[str, list[tuple[str, Mapping[str, Any]]]] = {}
+    for entry in (*logs, together):
+        for finding in entry["findings"]:
+            if finding["level"] != "note":
+                members.setdefault(str(finding["code"]), []).append((str(entry["name"]), finding))
+    count = len(logs)
+    if not members:
+        what = "the log" if count == 1 else f"the {count} logs"
+        return Summary(count, 0, tally=f"Data doctor: nothing in {what} would mislead a fit.")
+    where = {code: {name for name, _ in part} for code, part in members.items()}
+    worst = {code: max(_weight(finding) for _, finding in part) for code, part in members.items()}
+    order = sorted(members, key=lambda code: (*worst[code], len(where[code])), reverse=True)
+    misled = len(set.union(*where.values()) - {"together"})
+    shown = [f"{code.replace('_', ' ')} ({len(where[code])})" for code in order[:_MOST_KINDS]]
+    rest = len(order) - len(shown)
+    more = f" and {rest} other kinds" if rest > 1 else " and one other kind" if rest else ""
+    of = f"{misled} of {count} logs hold" if misled else "the logs together hold"
+    of = "the log holds" if count == 1 and misled else of
+    tally = f"Data doctor: {of} something that would mislead a fit: {', '.join(shown)}{more}."
+    name, first = max(members[order[0]], key=lambda pair: _weight(pair[1]))
+    place = "" if name == "together" else f"{name}: "
+    action = f"; {first['action']}" if first["action"] else ""
+    effect = first.get("effect")
+    size = f" It changes a fit by {100.0 * effect:.0f} %." if effect else ""
+    text = f"First fix this: {place}{first['text']}{action}.{size}"
+    return Summary(count, misled, {code: len(where[code]) for code in order}, tally, text)
 
 
 def show(value: float, unit: str) -> str:
@@ -179,12 +311,15 @@ _SLIPS = {
 }
 
 
-def unit_slip(factor: float) -> str:
-    """Return what mistake of units makes values too large by `factor`; empty where none is near."""
+def slip_in_words(factor: float) -> str:
+    """Return the mistake of units that makes values too large by a factor, in brackets.
+
+    Empty where none is within 8 %.
+    """
     if factor <= 0.0:
         return ""
     best = min(_SLIPS, key=lambda known: abs(math.log(known / factor)))
-    return _SLIPS[best] if abs(math.log(best / factor)) < 0.08 else ""
+    return f" ({_SLIPS[best]})" if abs(math.log(best / factor)) < 0.08 else ""
 
 
 def with_channels(log: Log, **channels: np.ndarray) -> Log:
@@ -192,30 +327,13 @@ def with_channels(log: Log, **channels: np.ndarray) -> Log:
     return log.replace(channels={**log.channels, **channels})
 
 
-def shifted(names: Sequence[str], lag: float) -> Callable[[Log], Log]:
-    """Return the correction of channels that trail by `lag` in s."""
+def correction(
+    names: Sequence[str], factor: float = 1.0, offset: float = 0.0, lag: float = 0.0
+) -> Callable[[Log], Log]:
+    """Return the repair of channels too large by `factor`, too small by `offset`, `lag` s late."""
 
-    def repair(log: Log) -> Log:
-        return with_channels(
-            log, **{name: np.interp(log.t + lag, log.t, log[name]) for name in names}
-        )
+    def right(log: Log, name: str) -> np.ndarray:
+        values = np.interp(log.t + lag, log.t, log[name]) if lag else log[name]
+        return np.asarray(values / factor + offset)
 
-    return repair
-
-
-def scaled(names: Sequence[str], factor: float) -> Callable[[Log], Log]:
-    """Return the correction of channels that are too large by `factor`."""
-
-    def repair(log: Log) -> Log:
-        return with_channels(log, **{name: log[name] / factor for name in names})
-
-    return repair
-
-
-def raised(name: str, offset: float) -> Callable[[Log], Log]:
-    """Return the correction of a channel that is too small by `offset`, SI."""
-
-    def repair(log: Log) -> Log:
-        return with_channels(log, **{name: log[name] + offset})
-
-    return repair
+    return lambda log: with_channels(log, **{name: right(log, name) for name in names})

@@ -1,33 +1,40 @@
 """Whether position, heading and velocities of a log describe one motion.
 
-Frames, signs and units come first, then what is finer.
+Frames, signs and units come first, then what is finer (`kinematics`). All look at a log on a
+uniform grid, with NaN where a channel is not to be trusted.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.core.names import VELOCITY
-from residnet.data.doctor.causes import POSITION_LIMITS, YAW_LIMITS, cause_findings
-from residnet.data.doctor.findings import Finding, Level, raised
-from residnet.data.doctor.following import FEWEST_SAMPLES, follow_findings, slip_in_words
-from residnet.data.doctor.kinematics import Cause, position_causes, yaw_causes
-from residnet.data.doctor.rates import Rates, average_rates
-from residnet.data.doctor.sensors.course import course_findings
-from residnet.data.doctor.signals import noise_of
+from residnet.core.names import POSE, VELOCITY
+from residnet.data.doctor.findings import (
+    Check,
+    Finding,
+    Level,
+    check,
+    correction,
+    slip_in_words,
+    with_channels,
+)
+from residnet.data.doctor.kinematics import (
+    LEAST_LAG,
+    POSITION_LIMITS,
+    YAW_LIMITS,
+    cause_findings,
+    position_causes,
+    yaw_causes,
+)
+from residnet.data.doctor.statistics import FEWEST, Record, agreement, bridged
+from residnet.data.outliers import SIGMA_OF_MAD
 
-# a reference must vary by this share of the speed (or this yaw rate, rad/s) before a correlation
-# says anything
-_SHARE_OF_SPEED = 0.05
-_LEAST_YAW = math.radians(0.1)
-# from here on a gyro's bias, or the heading lost to it over the log, misleads
-_LEAST_BIAS = math.radians(0.03)
-_SHARE_OF_YAW = 0.05
-_MOST_DRIFT = math.radians(15.0)
 # (change of sign, constant angle in deg) -> how a user would say it; psi, y and v reversed cover
 # all, because any two equal the third
 _CONVENTIONS = {
@@ -39,239 +46,382 @@ _CONVENTIONS = {
     ("v reversed", 0): "v positive to port (frame: body_fpu)",
     ("v reversed", 180): "u positive astern (sign: -1)",
 }
+_ALL = (*POSE, "u", "v")
 
 
-def frame_findings(log: Log) -> list[Finding]:
-    """Return whether position, heading and velocities of a log describe one motion.
+@dataclass(frozen=True)
+class Rates:
+    """The rates of a log on a uniform grid, all averaged over the same few seconds.
 
-    The log is on a uniform grid, with NaN where a channel is not to be trusted.
+    Pose and velocities are thus filtered alike.
+
+    Attributes:
+        ground: rate of the position, north + i east, [T] in m/s.
+        through_water: the same from psi, u, v [T], for each convention.
+        yaw: rate of psi [T] in rad/s.
+        measured: u, v, r as far as the log has them, [T].
+        noise: the larger of those in `yaw` and in the averaged r, rad/s.
     """
-    absent = [name for name in ("x", "y", "psi") if name not in log.channels]
-    moving = [name for name in VELOCITY if name in log.channels]
-    if absent or not moving:
-        return [
-            Finding(
-                "note",
-                "frames_unchecked",
-                f"frames not checked: the log has no {', '.join(absent or VELOCITY)}",
-            )
-        ]
-    motion = average_rates(log, moving)
-    findings: list[Finding] = []
-    if "u" in moving and "v" in moving:
-        convention = _velocity(motion)
-        findings += [*convention, *_position_jumps(log, motion.step)]
-        findings += course_findings(log, motion)
-        # an offset or a current is found by the comparison of increments, wrong axes are not
-        if any(
-            finding.figures.get("coherence", 0.0) > 0.8
-            and 0.8 < finding.figures["speed_ratio"] < 1.25
-            for finding in convention
-        ):
-            causes = position_causes(log)
-            findings += [
-                *_follows_ground(log, motion, causes),
-                *cause_findings(causes, POSITION_LIMITS, log, ("u", "v")),
-            ]
-    if "r" in moving:
-        findings += _yaw(log, motion)
-    return findings
+
+    ground: np.ndarray
+    through_water: dict[str, np.ndarray]
+    yaw: np.ndarray
+    measured: dict[str, np.ndarray]
+    noise: float
 
 
-def _velocity(motion: Rates) -> list[Finding]:
-    good = (
-        np.isfinite(motion.ground)
-        & np.isfinite(motion.through_water["as declared"])
-        & np.isfinite(motion.through_water["psi reversed"])
+def rates(log: Record) -> Rates:
+    """Return the rates over windows in which the pose moves by several times its noise."""
+    known = [name for name in log.moving if np.isfinite(log[name]).any()]
+    turning = float(np.nanstd(log["r"])) if "r" in known else 0.0
+
+    def half(noise: float, rate: float) -> int:
+        longest = float(log.t[-1] - log.t[0]) / 15.0
+        return max(
+            round(0.5 * min(max(1.5, 10.0 * noise / max(rate, 1e-9)), longest) / log.step), 3
+        )
+
+    def rate(values: np.ndarray, half: int) -> np.ndarray:
+        """Return central differences [T] over 2 half steps, NaN at the ends."""
+        out = np.full(values.shape, np.nan, dtype=values.dtype)
+        if values.size > 2 * half:
+            out[half:-half] = (values[2 * half :] - values[: -2 * half]) / (2 * half * log.step)
+        return out
+
+    def mean(values: np.ndarray, half: int) -> np.ndarray:
+        """Return trapezoidal means [T] over 2 half steps, NaN at the ends and around a gap."""
+        out = np.full(values.shape, np.nan, dtype=values.dtype)
+        if values.size > 2 * half:
+            weights, there = np.ones(2 * half + 1), np.isfinite(values)
+            lost = np.convolve(~there, weights, mode="valid") > 0.5
+            weights[[0, -1]] = 0.5
+            whole = np.convolve(np.where(there, values, 0.0), weights / (2 * half), mode="valid")
+            out[half:-half] = np.where(lost, np.nan, whole)
+        return out
+
+    place = half(max(log.noise("x"), log.noise("y")), log.speed)
+    turn = half(log.noise("psi"), turning)
+    u, v = (log[name] if name in known else np.full(len(log), np.nan) for name in ("u", "v"))
+    noise = np.sqrt(0.5) * log.noise("psi") / (turn * log.step)
+    return Rates(
+        rate(log["x"] + 1j * log["y"], place),
+        {
+            "as declared": mean(np.exp(1j * log["psi"]) * (u + 1j * v), place),
+            "psi reversed": mean(np.exp(-1j * log["psi"]) * (u + 1j * v), place),
+            "v reversed": mean(np.exp(1j * log["psi"]) * (u - 1j * v), place),
+        },
+        rate(log["psi"], turn),
+        {name: mean(log[name], turn if name == "r" else place) for name in known},
+        max(noise, log.noise("r") / np.sqrt(2.0 * turn) if "r" in known else 0.0),
     )
-    ground, through_water = (
-        motion.ground[good],
-        {name: values[good] for name, values in motion.through_water.items()},
-    )
-    if good.sum() < FEWEST_SAMPLES or not ground.any() or not through_water["as declared"].any():
-        return [
-            Finding(
-                "note",
-                "frames_unchecked",
-                f"u, v not checked against position: fewer than {FEWEST_SAMPLES} samples with"
-                " motion",
-            )
-        ]
-    return [_convention(ground, through_water)]
 
 
-def _convention(ground: np.ndarray, through_water: dict[str, np.ndarray]) -> Finding:
-    """Return how the velocity over ground [N] agrees with R(psi) [u, v] under each convention.
+@check("grid", "frames_unchecked", "note")
+def unchecked(log: Record, found: Check) -> Iterator[Finding]:
+    """Report a log without what is needed."""
+    lost = [name for name in POSE if name not in log]
+    if lost or not log.moving:
+        yield found(f"frames not checked: the log has no {', '.join(lost or VELOCITY)}")
 
-    Vectors are complex numbers.
 
-    The coherence is 1 where both agree, and the angle of the complex overlap is what would have to
-    be added to psi.
+@dataclass(frozen=True)
+class Convention:
+    """How the velocity over ground agrees with R(psi) [u, v] under each convention.
+
+    Attributes:
+        overlap: complex for each convention; its size, the coherence, is 1 where both agree, and
+            its angle is what would have to be added to psi.
+        ratio: size of the declared velocity over that of the velocity over ground.
     """
-    candidates = {name: (ground, values) for name, values in through_water.items()} | {
-        "y reversed": (ground.conj(), through_water["as declared"])
-    }
+
+    overlap: dict[str, complex]
+    ratio: float
+
+    @property
+    def fits(self) -> bool:
+        """Whether frames and units are right, so that finer causes can be looked for."""
+        return self.overlap["as declared"].real > 0.8 and 0.8 < self.ratio < 1.25
+
+
+def convention(log: Record) -> Convention | None:
+    """Return how position and velocities agree; None where fewer than 50 samples tell."""
+    motion = log.of(rates)
+    good = np.isfinite(motion.ground)
+    for values in motion.through_water.values():
+        good &= np.isfinite(values)
+    ground = motion.ground[good]
+    declared = motion.through_water["as declared"][good]
+    if good.sum() < FEWEST or not ground.any() or not declared.any():
+        return None
+    sides = {name: (ground, values[good]) for name, values in motion.through_water.items()}
+    sides["y reversed"] = ground.conj(), declared
     overlap = {
         name: complex(np.vdot(b, g)) / float(np.linalg.norm(g) * np.linalg.norm(b))
-        for name, (g, b) in candidates.items()
+        for name, (g, b) in sides.items()
     }
+    return Convention(overlap, float(np.linalg.norm(declared) / np.linalg.norm(ground)))
+
+
+@check("grid", "frames", fix="correct it in the channel map", needs=_ALL)
+def frames(log: Record, found: Check) -> Iterator[Finding]:
+    """Report frames, signs and units of position and velocities."""
+    known = log.of(convention)
+    if known is None:
+        text = f"u, v not checked against position: fewer than {FEWEST} samples with motion"
+        yield found(text, code="frames_unchecked", level="note", fix="")
+        return
+    overlap, ratio = known.overlap, known.ratio
     declared, offset = overlap["as declared"].real, math.degrees(np.angle(overlap["as declared"]))
-    ratio = float(np.linalg.norm(through_water["as declared"]) / np.linalg.norm(ground))
     # on a straight course all conventions do equally well: the declared one wins
-    best = max(
-        overlap, key=lambda name: abs(overlap[name]) + (1e-3 if name == "as declared" else 0.0)
-    )
+    best = max(overlap, key=lambda name: abs(overlap[name]) + 1e-3 * (name == "as declared"))
     reached, angle = abs(overlap[best]), math.degrees(np.angle(overlap[best]))
     text = (
         f"x, y rates against R(psi) [u, v]: coherence {declared:.3f}, heading off by {offset:+.1f}"
         f" deg, speed ratio {ratio:.3f}"
     )
     level: Level = "will mislead"
-    action = "correct it in the channel map"
+    fix = None
     better = best != "as declared" and reached > 0.8 and 1.0 - reached < 0.5 * (1.0 - declared)
     if (declared < 0.8 and reached > declared + 0.1) or (better and reached > declared + 0.02):
-        near = [
-            key
-            for key in _CONVENTIONS
-            if key[0] == best and abs((angle - key[1] + 180.0) % 360.0 - 180.0) < 15.0
-        ]
-        named = _CONVENTIONS[near[0]] if near else f"{best}, {angle:+.1f} deg added to psi"
+        named = f"{best}, {angle:+.1f} deg added to psi"
+        for (name, about), words in _CONVENTIONS.items():
+            if name == best and abs((angle - about + 180.0) % 360.0 - 180.0) < 15.0:
+                named = words
         text += f"; the frames do not fit: coherence {reached:.3f} with {named}"
     elif declared < 0.8:
-        level, action = "fatal", "are the columns of one run, one clock and one vessel?"
+        level, fix = "fatal", "are the columns of one run, one clock and one vessel?"
         text += "; no change of sign or angle makes them fit"
     elif not 0.8 < ratio < 1.25:
         text += f"; check the units of u, v and x, y{slip_in_words(ratio)}"
     elif abs(offset) > 5.0:
-        text, action = (
-            text + "; a compass offset, or velocities through the water in a current",
-            "correct psi, or give the current as an input",
-        )
+        text += "; a compass offset, or velocities through the water in a current"
+        fix = "correct psi, or give the current as an input"
     else:
-        level, action = "note", ""
-    figures = {"coherence": declared, "offset": math.radians(offset), "speed_ratio": ratio}
-    return Finding(
-        level,
-        "frames",
+        level, fix = "note", ""
+    yield found(
         text,
-        {**figures, "best_coherence": reached, "best_offset": math.radians(angle)},
-        action,
+        {
+            "coherence": declared,
+            "offset": math.radians(offset),
+            "speed_ratio": ratio,
+            "best_coherence": reached,
+            "best_offset": math.radians(angle),
+        },
+        level=level,
+        fix=fix,
     )
 
 
-def _follows_ground(log: Log, motion: Rates, causes: dict[str, Cause]) -> Iterator[Finding]:
-    in_body_axes = motion.ground * np.exp(-1j * log["psi"])
-    known = np.isfinite(in_body_axes)
-    if not known.any():
-        return
-    speed = float(np.sqrt(np.mean(np.abs(in_body_axes[known]) ** 2)))
-    for name, reference in (("u", in_body_axes.real), ("v", in_body_axes.imag)):
-        certain = any(cause.sure for cause in causes.values())
-        yield from follow_findings(
-            name,
-            reference,
-            motion,
-            _SHARE_OF_SPEED * speed,
-            f"the position's rate along {'xy'[name == 'v']}",
-            certain,
-        )
-
-
-def _position_jumps(log: Log, step: float) -> Iterator[Finding]:
-    """Return the steps of the position that the velocities do not explain."""
+@check(
+    "grid",
+    "position_jump",
+    fix="mask them (kind: frozen or jump), or split the log there",
+    needs=_ALL,
+)
+def position_jumps(log: Record, found: Check) -> Iterator[Finding]:
+    """Report steps of the position that the velocities do not explain."""
     velocity = (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])
-    explained = 0.5 * step * (velocity[1:] + velocity[:-1])
+    explained = 0.5 * log.step * (velocity[1:] + velocity[:-1])
     excess = np.abs(np.nan_to_num(np.diff(log["x"] + 1j * log["y"]) - explained))
     known = np.abs(explained[np.isfinite(explained)])
-    limit = max(
-        15.0 * float(np.median(excess)),
-        0.5 * float(np.quantile(known, 0.95)) if known.size else 0.0,
+    fast = 0.5 * float(np.quantile(known, 0.95)) if known.size else 0.0
+    limit = max(15.0 * float(np.median(excess)), fast)
+    what = (
+        f"position jumps {{}} times by more than {limit:.2g} m beyond u, v, at most by {{:.2g}} m"
     )
-    over = np.flatnonzero(excess > limit)
-    if over.size:
-        worst = int(over[np.argmax(excess[over])])
-        text = (
-            f"position jumps {over.size} times by more than {limit:.2g} m beyond u, v, at most by"
-            f" {excess[worst]:.2g} m "
-        )
-        text += f"at t = {log.t[worst + 1]:.2f} s"
-        figures = {
-            "count": over.size,
-            "largest": float(excess[worst]),
-            "t": float(log.t[worst + 1]),
-        }
-        at = np.zeros(len(log), dtype=bool)
-        at[over] = at[over + 1] = True
-        yield Finding(
-            "will mislead",
-            "position_jump",
-            text,
-            figures,
-            "mask them (kind: frozen or jump), or split the log there",
-            at,
-            channels=("x", "y"),
-        )
+    yield from _jumps(log, found, excess, limit, what, ("x", "y"))
 
 
-def _yaw(log: Log, motion: Rates) -> Iterator[Finding]:
-    causes = yaw_causes(log)
-    certain = any(cause.sure for cause in causes.values())
-    follows = list(follow_findings("r", motion.yaw, motion, _LEAST_YAW, "the rate of psi", certain))
-    yield from follows
-    psi, r = log["psi"], log["r"]
-    change = np.diff(psi) - 0.5 * motion.step * (r[1:] + r[:-1])
-    noise = max(
-        noise_of(psi) * math.sqrt(2.0),
-        1.4826 * float(np.nanmedian(np.abs(change))) if np.isfinite(change).any() else 0.0,
-    )
-    over = np.abs(np.nan_to_num(change)) > max(10.0 * noise, math.radians(2.0))
+def _jumps(
+    log: Record,
+    found: Check,
+    excess: np.ndarray,
+    limit: float,
+    what: str,
+    channels: tuple[str, ...],
+    factor: float = 1.0,
+) -> Iterator[Finding]:
+    """Return the steps of a pose whose excess [T - 1] is beyond a limit, if any."""
+    over = np.abs(excess) > limit
     if over.any():
-        worst = int(np.argmax(np.where(over, np.abs(change), 0.0)))
-        text = (
-            f"psi jumps {int(over.sum())} times beyond what r explains, at most by"
-            f" {math.degrees(change[worst]):+.1f} deg "
+        worst = int(np.argmax(np.abs(excess)))
+        largest, t = float(abs(excess[worst])), float(log.t[worst + 1])
+        yield found(
+            what.format(int(over.sum()), factor * excess[worst]) + f" at t = {t:.2f} s",
+            {"count": over.sum(), "largest": largest, "t": t},
+            at=np.append(over, False) | np.append(False, over),
+            channels=channels,
         )
-        text += f"at t = {log.t[worst + 1]:.2f} s"
-        figures = {
-            "count": over.sum(),
-            "largest": float(abs(change[worst])),
-            "t": float(log.t[worst + 1]),
-        }
-        yield Finding(
-            "will mislead",
-            "heading_jump",
-            text,
-            figures,
-            "mask it (kind: jump, channel: psi), or split the log there",
-            np.append(over, False) | np.append(False, over),
-            channels=("psi",),
-        )
-    if all(finding.level == "note" or "lag" in finding.action for finding in follows):
-        yield from _drift(log, causes)
 
 
-def _drift(log: Log, causes: dict[str, Cause]) -> Iterator[Finding]:
-    """Return the bias, lag and gain of r against psi."""
-    if min(int(np.isfinite(log[name]).sum()) for name in ("psi", "r")) < 2:
+@check("grid", "course_as_heading", fix="take psi from the compass", needs=_ALL)
+def course_as_heading(log: Record, found: Check) -> Iterator[Finding]:
+    """Report a heading that follows the course over ground where velocities tell of drift."""
+    motion = log.of(rates)
+    if not {"u", "v"} <= motion.measured.keys():
         return
-    psi, r = (
-        np.interp(log.t, log.t[np.isfinite(values)], values[np.isfinite(values)])
-        for values in (log["psi"], log["r"])
+    drift = np.angle(motion.measured["u"] + 1j * motion.measured["v"])
+    course = np.angle(motion.ground * np.exp(-1j * log["psi"]))
+    good = np.isfinite(course) & np.isfinite(drift)
+    speed = np.abs(motion.ground)
+    if good.any():
+        good &= (speed > 0.3 * np.quantile(speed[good], 0.9)) & (np.abs(drift) < 1.2)
+    spread = float(np.std(drift[good])) if good.sum() >= 100 else 0.0
+    # the drift angle must vary by so much before it tells heading from course
+    if spread < math.radians(1.0):
+        return
+    as_heading, as_course = (
+        float(np.sqrt(np.mean(np.angle(np.exp(1j * angle)) ** 2)))
+        for angle in (course[good] - drift[good], course[good])
     )
+    if as_course < 0.6 * min(as_heading, spread):
+        text = (
+            "psi is the course over ground: it follows the positions to"
+            f" {math.degrees(as_course):.1f} deg without the drift of v over u, and to"
+            f" {math.degrees(as_heading):.1f} deg with it"
+        )
+        yield found(text, {"as_course": as_course, "as_heading": as_heading}, repair=_without_drift)
+
+
+def _without_drift(log: Log) -> Log:
+    drift = np.where(np.abs(log["u"]) > 0.0, np.arctan2(log["v"], log["u"]), 0.0)
+    return with_channels(log, psi=log["psi"] - drift)
+
+
+@check("grid", "follows", needs=_ALL)
+def follows_ground(log: Record, found: Check) -> Iterator[Finding]:
+    """Report sign, gain and lag of u and v against the rate of the position."""
+    known = log.of(convention)
+    ground = log.of(rates).ground * np.exp(-1j * log["psi"])
+    if known is None or not known.fits or not np.isfinite(ground).any():
+        return
+    # an offset or a current is found by the comparison of increments, wrong axes are not
+    sure = any(cause.sure for cause in log.of(position_causes).values())
+    least = 0.05 * float(np.sqrt(np.nanmean(np.abs(ground) ** 2)))
+    for name, axis, reference in (("u", "x", ground.real), ("v", "y", ground.imag)):
+        what = f"the position's rate along {axis}"
+        told = _follow(log, name, reference, least, what, sure)
+        if told:
+            yield found(**told)
+
+
+def _follow(
+    log: Record, name: str, reference: np.ndarray, least: float, what: str, certain: bool
+) -> dict[str, Any]:
+    """Return what a finding says of a channel against a reference [T] of `least` variation.
+
+    Its sign, gain and lag; nothing where these cannot be told.
+
+    A lag alone misleads where the finer look is `certain` that pose and velocities differ at all:
+    slow channels correlate at any lag.
+    """
+    motion = log.of(rates)
+    match = agreement(reference, motion.measured[name], log.step)
+    if match is None or match.spread < least:
+        return {}
+    correlation, gain, lag, spread = match
+    text = (
+        f"{name} against {what}: correlation {correlation:.3f}, gain {gain:.3f}, lag {lag:+.2f} s"
+    )
+    level: Level = "will mislead"
+    fix = ""
+    clear = name != "r" or spread > 5.0 * motion.noise
+    if correlation < -0.8 or (correlation < -0.5 and clear):
+        text, fix = f"{text}; it has the opposite sign", "turn it in the channel map (sign: -1)"
+    elif correlation < 0.5 and name == "r" and clear:
+        level, fix = "fatal", "are both columns of this vessel and this clock?"
+        text += "; they do not describe one motion"
+    elif correlation > 0.9 and not 0.6 < gain < 1.6:
+        text += f"; check its unit{slip_in_words(gain)}"
+        fix = "correct the unit in the channel map"
+    else:
+        # how far a lag misleads is measured with the causes, which tell the channels apart
+        level = "note"
+        if correlation > 0.9 and abs(lag) > max(LEAST_LAG, log.step) and clear and certain:
+            text += f"; it {'trails' if lag > 0.0 else 'leads'}, a filter or another clock"
+    figures = {"correlation": correlation, "gain": gain, "lag": lag}
+    return {"text": text, "figures": figures, "code": f"follows_{name}", "level": level, "fix": fix}
+
+
+@check("grid", "position_causes", needs=_ALL)
+def causes_of_position(log: Record, found: Check) -> Iterator[Finding]:
+    """Report what makes position and velocities differ, where the frames are right."""
+    known = log.of(convention)
+    if known is not None and known.fits:
+        yield from cause_findings(log.of(position_causes), POSITION_LIMITS, log, found)
+
+
+def yaw_follows(log: Record) -> dict[str, Any]:
+    """Return what a finding says of r against the rate of psi."""
+    if "r" not in log.of(rates).measured:
+        return {}
+    sure = any(cause.sure for cause in log.of(yaw_causes).values())
+    reference = log.of(rates).yaw
+    return _follow(log, "r", reference, math.radians(0.1), "the rate of psi", sure)
+
+
+def _yaw_is_one(log: Record) -> bool:
+    """Return whether psi and r describe one motion, but for what is finer."""
+    known = min(int(np.isfinite(log[name]).sum()) for name in ("psi", "r")) > 1
+    return known and log.of(yaw_follows).get("level", "note") == "note"
+
+
+_YAW = (*POSE, "r")
+
+
+@check("grid", "follows", needs=_YAW)
+def follows_heading(log: Record, found: Check) -> Iterator[Finding]:
+    """Report sign, gain and lag of r against the rate of psi."""
+    told = log.of(yaw_follows)
+    if told:
+        yield found(**told)
+
+
+@check(
+    "grid",
+    "heading_jump",
+    fix="mask it (kind: jump, channel: psi), or split the log there",
+    needs=_YAW,
+)
+def heading_jumps(log: Record, found: Check) -> Iterator[Finding]:
+    """Report steps of the heading that the yaw rate does not explain."""
+    psi, r = log["psi"], log["r"]
+    change = np.diff(psi) - 0.5 * log.step * (r[1:] + r[:-1])
+    scatter = float(np.nanmedian(np.abs(change))) if np.isfinite(change).any() else 0.0
+    noise = max(log.noise("psi") * math.sqrt(2.0), SIGMA_OF_MAD * scatter)
+    limit = max(10.0 * noise, math.radians(2.0))
+    what = "psi jumps {} times beyond what r explains, at most by {:+.1f} deg"
+    excess = np.nan_to_num(change)
+    yield from _jumps(log, found, excess, limit, what, ("psi",), math.degrees(1.0))
+
+
+@check("grid", "yaw_drift", needs=_YAW, certain=True)
+def yaw_drift(log: Record, found: Check) -> Iterator[Finding]:
+    """Report the bias of r against psi."""
+    if not _yaw_is_one(log):
+        return
+    psi, r = bridged(log.t, log["psi"]), bridged(log.t, log["r"])
     drift = psi - psi[0] - np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (r[1:] + r[:-1])))
     end, most, span = float(drift[-1]), float(np.abs(drift).max()), float(log.t[-1] - log.t[0])
-    spread = max(float(np.nanstd(log["r"])), 1e-12)
+    spread, bias = max(float(np.nanstd(log["r"])), 1e-12), end / span
+    causes = log.of(yaw_causes)
     known = causes.get("bias") or causes.get("ramp")
-    bias = end / span
-    sure = known is not None and known.sure
-    strong = sure and (abs(bias) > max(_LEAST_BIAS, _SHARE_OF_YAW * spread) or most > _MOST_DRIFT)
+    # a bias misleads from 1.8 deg a minute and 5 % of the yaw rate on, or by what it adds up to
+    large = abs(bias) > max(math.radians(0.03), 0.05 * spread) or most > math.radians(15.0)
+    strong = known is not None and known.sure and large
     text = (
         f"heading minus the integral of r: {math.degrees(end):+.1f} deg at the end, at most"
         f" {math.degrees(most):.1f} deg, a bias of {math.degrees(bias):+.4f} deg/s"
         f" ({100.0 * abs(bias) / spread:.2g} % of the standard deviation of r)"
     )
     level: Level = "will mislead" if strong else "note"
-    action = "take the bias off r, or use the rate of psi in its place" if strong else ""
-    figures = {"end": end, "most": most, "bias": bias}
-    yield Finding(level, "yaw_drift", text, figures, action, repair=raised("r", bias))
-    yield from cause_findings(causes, YAW_LIMITS, log, ("r",))
+    fix = "take the bias off r, or use the rate of psi in its place" if strong else ""
+    repair = correction(("r",), offset=bias)
+    yield found(text, {"end": end, "most": most, "bias": bias}, level=level, fix=fix, repair=repair)
+
+
+@check("grid", "yaw_causes", needs=_YAW)
+def causes_of_yaw(log: Record, found: Check) -> Iterator[Finding]:
+    """Report gain and lag of r against psi."""
+    if _yaw_is_one(log):
+        yield from cause_findings(log.of(yaw_causes), YAW_LIMITS, log, found)

@@ -1,22 +1,195 @@
-"""Findings about the channels that drive the vessel.
+"""Findings about the channels that drive the vessel, and about what stands beside the motion.
 
-These are jumps, limits, offset, astern, stuck actuators and wind that contains the motion.
+Jumps, limits, offset, astern, unit, stuck actuators; wind that contains the motion; positions
+against latitude and longitude.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
-from residnet.core.log import Log
 from residnet.core.stretches import stretches
-from residnet.data.doctor.findings import Finding, share_of, show
-from residnet.data.doctor.relative_wind import relative_wind_findings
-from residnet.data.doctor.response import response_findings
-from residnet.data.doctor.signals import noise_of
+from residnet.data.doctor.findings import (
+    Check,
+    Finding,
+    Level,
+    check,
+    share_of,
+    show,
+    slip_in_words,
+)
+from residnet.data.doctor.statistics import FEWEST, STEERING, Record, bridged, fit, high
+from residnet.data.outliers import noise_of
+
+_LATITUDE = ("latitude", "lat", "gps_lat", "gnss_lat", "latitude_deg", "lat_deg")
+_LONGITUDE = ("longitude", "lon", "lng", "long", "gps_lon", "gnss_lon", "longitude_deg", "lon_deg")
+# mean radii of curvature are within .4 % of this
+_RADIUS = 6_371_000.0
+
+
+@check(
+    "inputs",
+    "positions_scaled",
+    fix="compute x, y from latitude and longitude, or correct their unit",
+    needs=("x", "y"),
+)
+def positions_scaled(log: Record, found: Check) -> Iterator[Finding]:
+    """Report a scale or turn of x, y against latitude and longitude."""
+    by_name = {name.lower(): name for name in log}
+    latitude = next((by_name[name] for name in _LATITUDE if name in by_name), "")
+    longitude = next((by_name[name] for name in _LONGITUDE if name in by_name), "")
+    if not latitude or not longitude:
+        return
+    north, east = (
+        log[name] if log.units[name] == "rad" else np.radians(log[name])
+        for name in (latitude, longitude)
+    )
+    fixes = _RADIUS * (north - np.nanmean(north) + 1j * np.cos(north) * (east - np.nanmean(east)))
+    place = log["x"] + 1j * log["y"]
+    good = np.isfinite(fixes) & np.isfinite(place)
+    if good.sum() < FEWEST:
+        return
+    fixes, place = fixes[good] - fixes[good].mean(), place[good] - place[good].mean()
+    if float(np.abs(fixes).max()) < 1.0:
+        return
+    overlap = complex(np.vdot(fixes, place)) / float(np.vdot(fixes, fixes).real)
+    rest = float(np.linalg.norm(place - overlap * fixes))
+    rest /= max(float(np.linalg.norm(place)), 1e-12)
+    scale, turn = abs(overlap), float(np.angle(overlap))
+    if rest >= 0.2:
+        text = f"x, y do not follow {latitude}, {longitude}: {100.0 * rest:.0f} % is left"
+    elif abs(scale - 1.0) >= 0.02 or abs(turn) >= math.radians(3.0):
+        text = (
+            f"x, y are {scale:.3f} times as far as {latitude}, {longitude} say, turned by"
+            f" {math.degrees(turn):+.1f} deg{slip_in_words(scale)}"
+        )
+    else:
+        return
+    yield found(text, {"scale": scale, "turn": turn, "rest": rest})
+
+
+def _driving(log: Record) -> list[str]:
+    return [name for name in log.inputs if np.isfinite(log[name]).sum() > 1]
+
+
+@check(
+    "inputs",
+    "input_jump",
+    "note",
+    "derivatives are biased around it, mask them (kind: input_jump)",
+)
+def input_jumps(log: Record, found: Check) -> Iterator[Finding]:
+    """Report inputs that change by a quarter of their range within one sample."""
+    for name in _driving(log):
+        change = np.abs(np.nan_to_num(np.diff(log[name])))
+        span = float(np.nanmax(log[name]) - np.nanmin(log[name]))
+        at = int(np.argmax(change))
+        largest, t = float(change[at]), float(log.t[at + 1])
+        # a direction may wrap
+        if 0.0 < 0.25 * span < largest and (log.units[name] != "rad" or name in STEERING):
+            text = (
+                f"{name} changes by {show(largest, log.units[name])} within one sample"
+                f" ({share_of(largest / span)} of its range) at t = {t:.2f} s"
+            )
+            yield found(text, {"largest": largest, "t": t, "share_of_range": largest / span})
+
+
+@check("inputs", "at_limits", "note", "what lies beyond is not learned")
+def limits(log: Record, found: Check) -> Iterator[Finding]:
+    """Report rests at the largest and smallest value, and where their middle lies."""
+    for name in _driving(log):
+        known, unit = log[name][np.isfinite(log[name])], log.units[name]
+        low, most = float(known.min()), float(known.max())
+        margin = 1e-3 * (most - low)
+        shares = float((known <= low + margin).mean()), float((known >= most - margin).mean())
+        if np.unique(known).size <= 2 or max(shares) <= 0.01:
+            continue
+        text = (
+            f"{name} rests at its limits {show(low, unit)} ({share_of(shares[0])}) and"
+            f" {show(most, unit)} ({share_of(shares[1])})"
+        )
+        yield found(text, {"low": low, "high": most, "share": sum(shares)})
+        middle = 0.5 * (low + most)
+        # only limits that are nearly the same on both sides are two ends of one actuator
+        alike = low < 0.0 < most and 1e-3 * most < abs(middle) < 0.02 * (most - low)
+        if alike and name in STEERING and unit == "rad":
+            text = (
+                f"{name} goes from {show(low, unit)} to {show(most, unit)}, not the same to both"
+                f" sides: an offset of {show(middle, unit)}"
+            )
+            fix = "take it off, or keep a constant among the regressors"
+            yield found(
+                text, {"offset": middle, "low": low, "high": most}, code="input_offset", fix=fix
+            )
+
+
+@check(
+    "inputs",
+    "reversed",
+    "note",
+    "a propeller astern obeys another law: give it terms of its own, or leave these parts out",
+)
+def astern(log: Record, found: Check) -> Iterator[Finding]:
+    """Report propellers that run astern."""
+    for name in _driving(log):
+        share = float((log[name] < 0.0).mean())
+        turns = log.units[name] == "1/s" or name.split("_")[0] in ("n", "rpm", "rev")
+        if turns and 0.0 < share < 1.0:
+            most = show(float(np.nanmin(log[name])), log.units[name])
+            text = (
+                f"{name} is negative (astern) in {share_of(share)} of the samples, down to {most}"
+            )
+            yield found(text, {"share": share})
+
+
+@check("inputs", "unit", fix="correct the unit in the channel map", certain=True)
+def rudder_unit(log: Record, found: Check) -> Iterator[Finding]:
+    """Report a rudder angle that no rudder has."""
+    for name in _driving(log):
+        largest = high(log[name], 0.99)
+        if name in ("delta", "cmd_delta") and largest > math.radians(100.0):
+            shown = show(largest, "rad")
+            text = f"{name} reaches {shown}, more than any rudder: deg taken as rad?"
+            yield found(text, {"largest": largest})
+
+
+@check("inputs", "outliers")
+def excursions(log: Record, found: Check) -> Iterator[Finding]:
+    """Report values far outside the rest of an input that return within a second."""
+    half = max(round(1.5 / log.step), 3)
+    for name in _driving(log):
+        # a direction may go anywhere at once, as that of a light wind does
+        direction = log.units[name] == "rad" and name not in STEERING
+        if direction or np.isfinite(log[name]).sum() < 10 * half:
+            continue
+        known = bridged(log.t, log[name])
+        padded = np.pad(known, half, mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
+        distance = np.abs(known - np.median(windows, axis=1))
+        low, top = (float(value) for value in np.quantile(known, (0.01, 0.99)))
+        beyond = np.maximum(low - known, known - top)
+        least = 0.25 * max(top - low, 1e-12)
+        far = (np.minimum(distance, beyond) > least) & (distance > 8.0 * noise_of(known))
+        change = np.abs(np.diff(known, prepend=known[0], append=known[-1]))
+        for start, stop in zip(*stretches(far), strict=True):
+            # an actuator takes its time, an outlier goes and comes within a step or two
+            edges = change[max(start - 1, 0) : start + 1].max(), change[stop : stop + 2].max()
+            far[start:stop] = min(edges) > 0.5 * distance[start:stop].max()
+        starts, _ = stretches(far)
+        if starts.size:
+            furthest = show(float(known[far][np.argmax(distance[far])]), log.units[name])
+            text = (
+                f"{name} leaves its range for a moment {starts.size} times ({int(far.sum())}"
+                f" samples), to {furthest}"
+            )
+            fix = f"mask them (kind: hampel, channels: [{name}])"
+            figures = {"count": starts.size, "samples": far.sum(), "t": log.t[starts[0]]}
+            yield found(text, figures, fix=fix, at=far, channels=(name,))
+
 
 # words that tell a demand from what the actuator does
 _DEMAND = re.compile(
@@ -25,280 +198,123 @@ _DEMAND = re.compile(
 # an actuator that rests so long, s, so far from its demand (share of the demand's range) is stuck
 _STUCK = 5.0
 _FAR_APART = 0.2
-# a heading that goes so far one way and the other was steered
-_SWING = math.radians(10.0)
-_STEERING = ("delta", "cmd_delta", "nozzle", "cmd_nozzle")
 
 
-def input_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Return the findings about the inputs."""
-    driving = [name for name in inputs if np.isfinite(log[name]).sum() > 1]
-    for name in driving:
-        yield from _jumps(log, name)
-        yield from _limits(log, name)
-        yield from _astern(log, name)
-        yield from _size(log, name)
-        yield from _excursions(log, name)
-    yield from _stuck(log, inputs)
-    yield from relative_wind_findings(log, inputs)
-    yield from response_findings(log, inputs)
-
-
-def _jumps(log: Log, name: str) -> Iterator[Finding]:
-    change, span = (
-        np.abs(np.nan_to_num(np.diff(log[name]))),
-        float(np.nanmax(log[name]) - np.nanmin(log[name])),
-    )
-    at = int(np.argmax(change))
-    # a direction may wrap
-    if 0.0 < 0.25 * span < change[at] and (log.units[name] != "rad" or name in _STEERING):
-        text = (
-            f"{name} changes by {show(change[at], log.units[name])} within one sample"
-            f" ({share_of(change[at] / span)} of its range) "
-        )
-        text += f"at t = {log.t[at + 1]:.2f} s"
-        figures = {
-            "largest": float(change[at]),
-            "t": float(log.t[at + 1]),
-            "share_of_range": float(change[at] / span),
-        }
-        yield Finding(
-            "note",
-            "input_jump",
-            text,
-            figures,
-            "derivatives are biased around it, mask them (kind: input_jump)",
-        )
-
-
-def _limits(log: Log, name: str) -> Iterator[Finding]:
-    """Rests at the largest and smallest value, and where their middle lies."""
-    known = log[name][np.isfinite(log[name])]
-    low, high = float(known.min()), float(known.max())
-    tolerance = 1e-3 * (high - low)
-    at = (known <= low + tolerance, known >= high - tolerance)
-    shares = [float(end.mean()) for end in at]
-    if np.unique(known).size <= 2 or max(shares) <= 0.01:
-        return
-    unit = log.units[name]
-    text = (
-        f"{name} rests at its limits {show(low, unit)} ({share_of(shares[0])}) and"
-        f" {show(high, unit)} ({share_of(shares[1])})"
-    )
-    yield Finding(
-        "note",
-        "at_limits",
-        text,
-        {"low": low, "high": high, "share": sum(shares)},
-        "what lies beyond is not learned",
-    )
-    middle = 0.5 * (low + high)
-    # only limits that are nearly the same on both sides are two ends of one actuator
-    if name in _STEERING and low < 0.0 < high and 1e-3 * high < abs(middle) < 0.02 * (high - low):
-        text = (
-            f"{name} goes from {show(low, unit)} to {show(high, unit)}, not the same to both sides:"
-            f" an offset of {show(middle, unit)}"
-        )
-        yield Finding(
-            "note",
-            "input_offset",
-            text,
-            {"offset": middle, "low": low, "high": high},
-            "take it off, or keep a constant among the regressors",
-        )
-
-
-def _astern(log: Log, name: str) -> Iterator[Finding]:
-    if log.units[name] != "1/s" and name.split("_")[0] not in ("n", "rpm", "rev"):
-        return
-    share = float((log[name] < 0.0).mean())
-    if 0.0 < share < 1.0:
-        text = (
-            f"{name} is negative (astern) in {share_of(share)} of the samples, down to"
-            f" {show(float(np.nanmin(log[name])), log.units[name])}"
-        )
-        yield Finding(
-            "note",
-            "reversed",
-            text,
-            {"share": share},
-            "a propeller astern obeys another law: give it terms of its own, or leave these"
-            " parts out",
-        )
-
-
-def _size(log: Log, name: str) -> Iterator[Finding]:
-    """Return a rudder angle that no rudder has."""
-    if name not in ("delta", "cmd_delta"):
-        return
-    largest = float(np.nanquantile(np.abs(log[name]), 0.99))
-    if largest > math.radians(100.0):
-        text = f"{name} reaches {show(largest, 'rad')}, more than any rudder: deg taken as rad?"
-        yield Finding(
-            "will mislead",
-            "unit",
-            text,
-            {"largest": largest},
-            "correct the unit in the channel map",
-        )
-
-
-def _excursions(log: Log, name: str) -> Iterator[Finding]:
-    """Return the values far outside the rest of the channel that return within a second."""
-    if log.units[name] == "rad" and name not in _STEERING:
-        # a direction may go anywhere at once, as that of a light wind does
-        return
-    values = log[name]
-    step = float(np.median(np.diff(log.t)))
-    half = max(round(1.5 / step), 3)
-    if np.isfinite(values).sum() < 10 * half:
-        return
-    known = np.interp(log.t, log.t[np.isfinite(values)], values[np.isfinite(values)])
-    windows = np.lib.stride_tricks.sliding_window_view(
-        np.pad(known, half, mode="edge"), 2 * half + 1
-    )
-    distance = np.abs(known - np.median(windows, axis=1))
-    low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
-    beyond = np.maximum(low - known, known - high)
-    far = (
-        (distance > 0.25 * max(high - low, 1e-12))
-        & (beyond > 0.25 * max(high - low, 1e-12))
-        & (distance > 8.0 * noise_of(known))
-    )
-    far = _abrupt(known, distance, far)
-    starts, _ = stretches(far)
-    if starts.size:
-        furthest = show(float(known[far][np.argmax(distance[far])]), log.units[name])
-        text = (
-            f"{name} leaves its range for a moment {starts.size} times ({int(far.sum())} samples),"
-            f" to {furthest}"
-        )
-        figures = {"count": starts.size, "samples": far.sum(), "t": float(log.t[starts[0]])}
-        yield Finding(
-            "will mislead",
-            "outliers",
-            text,
-            figures,
-            f"mask them (kind: hampel, channels: [{name}])",
-            far,
-            channels=(name,),
-        )
-
-
-def _abrupt(values: np.ndarray, distance: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Return the excursions among far [T] that go and come within a step or two.
-
-    An actuator takes its time.
-    """
-    change = np.abs(np.diff(values, prepend=values[0], append=values[-1]))
-    out = far.copy()
-    for start, stop in zip(*stretches(far), strict=True):
-        edges = change[max(start - 1, 0) : start + 1].max(), change[stop : stop + 2].max()
-        out[start:stop] = min(edges) > 0.5 * distance[start:stop].max()
-    return out
-
-
-def _stuck(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Return the actuators that rest although their demand goes elsewhere."""
-    for demand in log.channels:
-        actual = _actual_of(demand, log)
-        if actual is None or log.units[actual] != log.units[demand]:
+@check("inputs", "stuck", fix="leave this part out", certain=True)
+def stuck(log: Record, found: Check) -> Iterator[Finding]:
+    """Report actuators that rest although their demand goes elsewhere."""
+    for demand in log:
+        bare = _DEMAND.sub("", demand)
+        names = [bare, f"n_{bare}", f"actual_{bare}", f"{bare}_actual", f"acting_{bare}"]
+        names = names if bare != demand else [f"acting_{demand}"]
+        actual = next((name for name in names if name in log), "")
+        span = float(np.nanmax(log[demand]) - np.nanmin(log[demand]))
+        if not actual or log.units[actual] != log.units[demand] or span <= 0.0:
             continue
         demanded, measured = log[demand], log[actual]
-        span = float(np.nanmax(demanded) - np.nanmin(demanded))
-        if span <= 0.0:
-            continue
-        still = np.abs(np.nan_to_num(np.diff(measured))) <= max(
-            6.0 * noise_of(measured), 1e-4 * span
-        )
-        starts, stops = stretches(still)
-        worst: tuple[float, int, int] = (0.0, 0, 0)
-        for start, stop in zip(starts, stops, strict=True):
-            run = slice(start, stop + 1)
-            seconds = float(log.t[stop] - log.t[start])
-            far_apart = np.abs(demanded[run] - measured[run]) > _FAR_APART * span
-            if (
-                seconds >= _STUCK
-                and float(np.ptp(demanded[run])) > _FAR_APART * span
-                and float(far_apart.mean()) > 0.1
-                and seconds > worst[0]
-            ):
-                worst = (seconds, int(start), int(stop))
-        if worst[0] > 0.0:
-            at = np.zeros(len(log), dtype=bool)
-            at[worst[1] : worst[2] + 1] = True
+        still = max(6.0 * log.noise(actual), 1e-4 * span)
+        runs = stretches(np.abs(np.nan_to_num(np.diff(measured))) <= still)
+        longest = slice(0, 0)
+        seconds = 0.0
+        for start, stop in zip(*runs, strict=True):
+            run, lasted = slice(start, stop + 1), float(log.t[stop] - log.t[start])
+            apart = np.abs(demanded[run] - measured[run]) > _FAR_APART * span
+            moved = float(np.ptp(demanded[run])) > _FAR_APART * span
+            if lasted >= max(_STUCK, seconds) and moved and float(apart.mean()) > 0.1:
+                longest, seconds = run, lasted
+        if seconds:
+            at, first = np.zeros(len(log), dtype=bool), float(log.t[longest.start])
+            at[longest] = True
             text = (
-                f"{actual} rests for {worst[0]:.1f} s from t = {log.t[worst[1]]:.2f} s while"
-                f" {demand} moves on: stuck, or not recorded"
+                f"{actual} rests for {seconds:.1f} s from t = {first:.2f} s while {demand} moves"
+                " on: stuck, or not recorded"
             )
-            yield Finding(
-                "will mislead",
-                "stuck",
-                text,
-                {"seconds": worst[0], "t": float(log.t[worst[1]])},
-                "leave this part out",
-                at,
-            )
-    yield from _idle(log, inputs)
+            yield found(text, {"seconds": seconds, "t": first}, at=at)
 
 
-def _actual_of(demand: str, log: Log) -> str | None:
-    """Return the channel that says what an actuator does, for that which says what it should.
-
-    None where there is none.
-    """
-    bare = _DEMAND.sub("", demand)
-    if bare == demand:
-        candidates = [f"acting_{demand}"]
-    else:
-        candidates = [bare, f"n_{bare}", f"actual_{bare}", f"{bare}_actual", f"acting_{bare}"]
-    return next((name for name in candidates if name in log.channels), None)
+# a heading that goes so far one way and the other was steered
+_SWING = math.radians(10.0)
 
 
-def _idle(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Return a vessel that weaves although nothing that drives it moves."""
-    driving = [name for name in inputs if not name.startswith(("wind", "current"))]
-    if not driving or "psi" not in log.channels or np.isfinite(log["psi"]).sum() < 50:
+@check(
+    "inputs",
+    "stuck",
+    fix="the recorded input is stuck, or another one is missing from the log",
+    needs=("psi",),
+    certain=True,
+)
+def idle(log: Record, found: Check) -> Iterator[Finding]:
+    """Report a vessel that weaves although nothing that drives it moves."""
+    driving = [name for name in log.inputs if not name.startswith(("wind", "current"))]
+    if not driving or np.isfinite(log["psi"]).sum() < FEWEST:
         return
-    known = np.isfinite(log["psi"])
-    psi = np.interp(log.t, log.t[known], log["psi"][known])
-    still = np.logical_and.reduce(
-        [
-            np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * np.nanmax(np.abs(log[name]))
-            for name in driving
-        ]
-    )
+    psi, still = bridged(log.t, log["psi"]), np.ones(len(log) - 1, dtype=bool)
+    for name in driving:
+        still &= np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * high(log[name], 1.0)
     for start, stop in zip(*stretches(still), strict=True):
-        turns = _swings(psi[start : stop + 1])
+        turns, low, top, way = 0, psi[start], psi[start], 0
+        for angle in psi[start : stop + 1].tolist():
+            low, top = min(low, angle), max(top, angle)
+            if way <= 0 and angle - low > _SWING:
+                turns, way, top = turns + (way < 0), 1, angle
+            elif way >= 0 and top - angle > _SWING:
+                turns, way, low = turns + (way > 0), -1, angle
         if turns >= 2:
-            text = (
-                f"no input moves for {log.t[stop] - log.t[start]:.1f} s from t = {log.t[start]:.2f}"
-                f" s, yet the heading turns round {turns} times"
-            )
             at = np.zeros(len(log), dtype=bool)
             at[start : stop + 1] = True
-            figures = {
-                "seconds": float(log.t[stop] - log.t[start]),
-                "turns": float(turns),
-                "t": float(log.t[start]),
-            }
-            yield Finding(
-                "will mislead",
-                "stuck",
-                text,
-                figures,
-                "the recorded input is stuck, or another one is missing from the log",
-                at,
+            seconds, first = float(log.t[stop] - log.t[start]), float(log.t[start])
+            text = (
+                f"no input moves for {seconds:.1f} s from t = {first:.2f} s, yet the heading turns"
+                f" round {turns} times"
             )
+            yield found(text, {"seconds": seconds, "turns": turns, "t": first}, at=at)
 
 
-def _swings(angle: np.ndarray) -> int:
-    """Return how often an angle [T] turns round after going more than `_SWING` one way."""
-    count, low, high, direction = 0, float(angle[0]), float(angle[0]), 0
-    for value in angle.tolist():
-        low, high = min(low, value), max(high, value)
-        if direction <= 0 and value - low > _SWING:
-            count, direction, high = count + (direction < 0), 1, value
-        elif direction >= 0 and high - value > _SWING:
-            count, direction, low = count + (direction > 0), -1, value
-    return count
+@check("inputs", "relative_wind", needs=("psi",))
+def relative_wind(log: Record, found: Check) -> Iterator[Finding]:
+    """Report wind directions that turn against the heading: relative wind, not true wind."""
+    directions = [name for name in log if "wind" in name and log.units[name] == "rad"]
+    for name in directions:
+        slope, error = _slope_against_heading(log, name)
+        others = (one for one in directions if one != name and _same_direction(log, name, one))
+        partner = next(others, None)
+        turns = error > 0.0 and slope < -5.0 * error and abs(slope + 1.0) < max(3.0 * error, 0.2)
+        if not (turns or partner or "relative" in name or name.startswith("rel_")):
+            continue
+        text = f"{name} turns by {slope:+.2f} +- {2.0 * error:.2f} of every change of heading"
+        text += f", and plus psi it is {partner}" if partner else ""
+        given = name in log.inputs
+        level: Level = "will mislead" if given else "note"
+        fix = "a free run must not be given it" if given else "do not make it an input"
+        text += ": a relative wind contains psi, u and v"
+        yield found(
+            text, {"slope": slope, "error": error}, level=level, fix=f"{fix}: use the true wind"
+        )
+
+
+def _same_direction(log: Record, relative: str, true: str) -> bool:
+    """Return whether one direction plus the heading is the other, where the heading tells."""
+    turned, plain = (
+        abs(np.nanmean(np.exp(1j * (log[relative] + turn - log[true]))))
+        for turn in (log["psi"], 0.0)
+    )
+    return bool(turned > 0.9 and plain < turned - 0.02)
+
+
+def _slope_against_heading(log: Record, name: str) -> tuple[float, float]:
+    """Return the change of a direction over ten seconds per rad of heading, and its error.
+
+    The error is a standard error; both are 0 where nothing can be said.
+    """
+    hop = max(round(10.0 / log.step), 1)
+    if len(log) < 5 * hop:
+        return 0.0, 0.0
+    change = np.angle(np.exp(1j * (log[name][hop:] - log[name][:-hop])))
+    turn = log["psi"][hop:] - log["psi"][:-hop]
+    # beyond half a circle a change of direction is ambiguous
+    good = np.isfinite(change) & np.isfinite(turn) & (np.abs(turn) < 1.5)
+    if good.sum() < 100 or float(np.std(turn[good])) < math.radians(1.0):
+        return 0.0, 0.0
+    x, y = turn[good] - turn[good].mean(), change[good] - change[good].mean()
+    found = fit(x[:, None], y)
+    return float(found.values[0]), float(found.errors[0])

@@ -12,24 +12,26 @@ filters leave errors that are not white.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from residnet.core.log import Log
-from residnet.data.doctor.signals import noise_of
+from residnet.data.doctor.findings import Check, Finding, Level, correction, with_channels
+from residnet.data.doctor.statistics import FEWEST, SECTIONS, WINDOW, Record, bridged, fit
+from residnet.data.outliers import SIGMA_OF_MAD
 
-_FEWEST = 50
-_SECTIONS = 20
+LEAST_LAG = 0.2
+"""A lag below this matters to no rollout of a vessel, s."""
 _MOST_CAUSES = 4
 # a cause must lower the sum of squares by this many variances of the noise, and be this many
 # standard errors from nothing
 _WORTH = 60.0
 _SURE = 3.5
-_REACH = 7
-"""Samples on either side that smooth a velocity."""
+_REACH = WINDOW // 2
 
 
 @dataclass(frozen=True)
@@ -37,12 +39,10 @@ class Cause:
     """What explains a difference between two measurements.
 
     Attributes:
-        name: of the cause.
         values: its size, one number for each column.
         errors: their standard errors.
     """
 
-    name: str
     values: np.ndarray
     errors: np.ndarray
 
@@ -52,7 +52,7 @@ class Cause:
         return bool((np.abs(self.values) > _SURE * self.errors).any())
 
 
-def yaw_causes(log: Log) -> dict[str, Cause]:
+def yaw_causes(log: Record) -> dict[str, Cause]:
     """Return what makes the increments of psi differ from the integral of r.
 
     Causes: `gain` (r is too large by 1 + value), `lag` (r trails psi, s), `bias` (of r, rad/s, the
@@ -61,21 +61,16 @@ def yaw_causes(log: Log) -> dict[str, Cause]:
     """
     psi, r, t = log["psi"], log["r"], log.t
     dt = np.diff(t)
-    turned = 0.5 * dt * (r[1:] + r[:-1])
-    smooth = _smoothed(r)
+    smooth = _around(r)
     time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
-    columns = {
-        "gain": -0.5 * (dt * (smooth[1:] + smooth[:-1]))[:, None],
-        "lag": np.diff(smooth)[:, None],
-        "bias": -dt[:, None],
-        "ramp": np.stack((-dt, -dt * time), axis=-1),
-    }
-    if not _stands_out(r):
-        columns = {name: part for name, part in columns.items() if name in ("bias", "ramp")}
-    return _Rows(psi, turned, dt, noise_of(psi), np.full(dt.size, noise_of(r))).explained(columns)
+    columns = {"bias": [-dt], "ramp": [-dt, -dt * time]}
+    if _stands_out(log, "r"):
+        columns = {"gain": [-_area(dt, smooth)], "lag": [np.diff(smooth)], **columns}
+    rate = np.full(dt.size, log.noise("r"))
+    return _explained(psi, _area(dt, r), dt, log.noise("psi"), rate, columns)
 
 
-def position_causes(log: Log) -> dict[str, Cause]:
+def position_causes(log: Record) -> dict[str, Cause]:
     """Return what makes the increments of x, y differ from the integral of R(psi) [u, v].
 
     Causes: `gain_u`, `gain_v`, `gain` (u, v, or both too large by 1 + value), `heading` (to be
@@ -84,22 +79,14 @@ def position_causes(log: Log) -> dict[str, Cause]:
     starboard, m), `current` (u, v are through water that moves north, east, m/s), `bias` (of u, v,
     m/s).
     """
-    t = log.t
-    dt = np.diff(t)
-    turn = np.exp(1j * log["psi"])
-    mid = np.exp(0.5j * (log["psi"][1:] + log["psi"][:-1]))
-    u, v = (_smoothed(log[name]) for name in ("u", "v"))
-    ground = turn * (u + 1j * v)
-
-    def area(rate: np.ndarray) -> np.ndarray:
-        increments: np.ndarray = 0.5 * dt * (rate[1:] + rate[:-1])
-        return increments
-
-    measured = area(turn * (log["u"] + 1j * log["v"]))
-    along, across = area(turn * u), area(1j * turn * v)
+    dt, psi = np.diff(log.t), log["psi"]
+    turn, mid = np.exp(1j * psi), np.exp(0.5j * (psi[1:] + psi[:-1]))
+    u, v = _around(log["u"]), _around(log["v"])
+    along, across = _area(dt, turn * u), _area(dt, 1j * turn * v)
     lag_u, lag_v = mid * np.diff(u), 1j * mid * np.diff(v)
-    lag_psi = 0.5j * np.diff(_smoothed(log["psi"])) * (ground[1:] + ground[:-1])
-    complex_columns: dict[str, list[np.ndarray]] = {
+    ground = turn * (u + 1j * v)
+    lag_psi = 0.5j * np.diff(_around(psi)) * (ground[1:] + ground[:-1])
+    columns = {
         "gain_u": [-along],
         "gain_v": [-across],
         "gain": [-(along + across)],
@@ -111,26 +98,21 @@ def position_causes(log: Log) -> dict[str, Cause]:
         "lag_xy": [-(lag_u + lag_v + lag_psi)],
         "lever_arm": [np.diff(turn), 1j * np.diff(turn)],
         "current": [dt + 0j, 1j * dt],
-        "bias": [-area(turn), -1j * area(turn)],
+        "bias": [-_area(dt, turn), -1j * _area(dt, turn)],
+    }
+    quiet = {name for name in ("u", "v") if not _stands_out(log, name)}
+    quiet |= {"psi"} if "r" in log and not _stands_out(log, "r") else set()
+    columns = {
+        name: parts
+        for name, parts in columns.items()
+        if not any(name in _NEEDS[channel] for channel in quiet)
     }
     speed = np.hypot(np.nan_to_num(log["u"]), np.nan_to_num(log["v"]))
-    noise = np.sqrt(
-        max(noise_of(log["u"]), noise_of(log["v"])) ** 2
-        + (noise_of(log["psi"]) * 0.5 * (speed[1:] + speed[:-1])) ** 2
-    )
-    rows = _Rows(
-        log["x"] + 1j * log["y"], measured, dt, max(noise_of(log["x"]), noise_of(log["y"])), noise
-    )
-    noisy = {name for name in ("u", "v") if not _stands_out(log[name])}
-    noisy |= {"psi"} if "r" in log.channels and not _stands_out(log["r"]) else set()
-    without = {cause for name in noisy for cause in _NEEDS[name]}
-    return rows.explained(
-        {
-            name: np.stack(parts, axis=-1)
-            for name, parts in complex_columns.items()
-            if name not in without
-        }
-    )
+    turned = log.noise("psi") * 0.5 * (speed[1:] + speed[:-1])
+    rate = np.hypot(max(log.noise("u"), log.noise("v")), turned)
+    measured = _area(dt, turn * (log["u"] + 1j * log["v"]))
+    place = log["x"] + 1j * log["y"]
+    return _explained(place, measured, dt, max(log.noise("x"), log.noise("y")), rate, columns)
 
 
 # channel -> causes that cannot be found where it holds noise only: the noise would explain itself
@@ -141,13 +123,17 @@ _NEEDS = {
 }
 
 
-def _stands_out(values: np.ndarray) -> bool:
+def _area(dt: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Return the integrals [T - 1] of a rate [T] over each step."""
+    return np.asarray(0.5 * dt * (rate[1:] + rate[:-1]))
+
+
+def _stands_out(log: Record, name: str) -> bool:
     """Return whether a channel does more than its noise."""
-    smooth = _smoothed(values)
-    return float(np.sqrt(np.nanmean(smooth**2))) > 1.2 * noise_of(values)
+    return float(np.sqrt(np.nanmean(_around(log[name]) ** 2))) > 1.2 * log.noise(name)
 
 
-def _smoothed(values: np.ndarray) -> np.ndarray:
+def _around(values: np.ndarray) -> np.ndarray:
     """Return the values [T] smoothed by a parabola over 15 samples; NaN stay where they are.
 
     The parabola is that of the samples around each one, without it and its neighbours: columns then
@@ -155,26 +141,26 @@ def _smoothed(values: np.ndarray) -> np.ndarray:
     a log they do.
     """
     known = np.isfinite(values)
-    if known.sum() < 2 * _REACH + 1:
+    if known.sum() < WINDOW:
         return values
-    at = np.arange(values.size)
-    filled = np.interp(at, at[known], values[known])
-    smooth = scipy.signal.savgol_filter(filled, 2 * _REACH + 1, 2)
-    smooth[_REACH:-_REACH] = np.convolve(filled, _around(), "valid")
+    filled = bridged(np.arange(values.size), values)
+    offsets = np.arange(-_REACH, _REACH + 1)
+    weights, others = np.zeros(WINDOW), np.abs(offsets) > 1
+    weights[others] = np.linalg.pinv(np.vander(offsets[others], 3))[-1]
+    smooth = scipy.signal.savgol_filter(filled, WINDOW, 2)
+    smooth[_REACH:-_REACH] = np.convolve(filled, weights, "valid")
     return np.where(known, smooth, np.nan)
 
 
-def _around() -> np.ndarray:
-    """Return the weights [15] of a parabola through the samples around one, at that one."""
-    offsets = np.arange(-_REACH, _REACH + 1)
-    weights = np.zeros(offsets.size)
-    others = np.abs(offsets) > 1
-    weights[others] = np.linalg.pinv(np.vander(offsets[others], 3))[-1]
-    return weights
-
-
-class _Rows:
-    """Whitened increments of a pose between its own samples.
+def _explained(
+    pose: np.ndarray,
+    known: np.ndarray,
+    dt: np.ndarray,
+    noise: float,
+    rate: np.ndarray,
+    columns: Mapping[str, list[np.ndarray]],
+) -> dict[str, Cause]:
+    """Return the causes that it takes to explain a pose, in the order of their weight.
 
     Args:
         pose: [T] real or complex, NaN where it was not measured.
@@ -182,151 +168,208 @@ class _Rows:
         dt: time steps [T - 1], s.
         noise: of the pose at each sample.
         rate: noise [T - 1] of the velocity.
+        columns: what each cause adds to the increments, [T - 1] each.
     """
+    at = np.flatnonzero(np.isfinite(pose))
 
-    def __init__(
-        self, pose: np.ndarray, known: np.ndarray, dt: np.ndarray, noise: float, rate: np.ndarray
-    ) -> None:
-        self._at = np.flatnonzero(np.isfinite(pose))
-        self._excess = np.diff(pose[self._at]) - self._between(known)
-        self._seconds = self._between(dt)
-        self._dt, self._rate, self._noise = dt, rate, noise
-
-    def _between(self, steps: np.ndarray) -> np.ndarray:
-        """Return the sums [K, ...] of steps [T - 1, ...] between neighbouring pose samples.
-
-        They are NaN where one of the steps is.
-        """
-        unknown = ~np.isfinite(steps)
-        start = np.zeros((1, *steps.shape[1:]))
-        total = np.concatenate((start, np.cumsum(np.where(unknown, 0.0, steps), axis=0)))[self._at]
-        count = np.concatenate((start, np.cumsum(unknown, axis=0)))[self._at]
+    def between(steps: np.ndarray) -> np.ndarray:
+        """Return the sums [K, ...] of steps [T - 1, ...] from one pose to the next, NaN as well."""
+        unknown, start = ~np.isfinite(steps), np.zeros((1, *steps.shape[1:]))
+        total = np.concatenate((start, np.cumsum(np.where(unknown, 0.0, steps), axis=0)))[at]
+        count = np.concatenate((start, np.cumsum(unknown, axis=0)))[at]
         return np.where(np.diff(count, axis=0) > 0, np.nan, np.diff(total, axis=0))
 
-    def explained(self, columns: Mapping[str, np.ndarray]) -> dict[str, Cause]:
-        """Return the causes that it takes, in the order of their weight.
-
-        Columns [T - 1, m] real or complex.
-        """
-        if self._at.size < _FEWEST:
-            return {}
-        names = np.array([name for name, part in columns.items() for _ in range(part.shape[1])])
-        table = self._between(np.concatenate(list(columns.values()), axis=1))
-        longest = 3.0 * float(np.median(self._seconds))
-        usable = (
-            np.isfinite(self._excess)
-            & np.isfinite(table).all(axis=1)
-            & np.isfinite(self._between(self._rate))
-            & (self._seconds <= longest)
-        )
-        keep = np.flatnonzero(usable)
-        if keep.size < _FEWEST:
-            return {}
-        self._factorise(keep)
-        y, x = self._white(self._excess[keep][:, None])[:, 0], self._white(table[keep])
-        section = np.arange(keep.size) * _SECTIONS // keep.size
-        if np.iscomplexobj(y):
-            y, x, section = (
-                np.concatenate((y.real, y.imag)),
-                np.concatenate((x.real, x.imag)),
-                np.concatenate((section, section)),
-            )
-        weight = self._trimmed(y, x)
-        return _pursuit(y * weight, x * weight[:, None], names, section)
-
-    def _factorise(self, keep: np.ndarray) -> None:
-        variance = (self._dt * self._rate) ** 2
-        total = self._between(variance)[keep]
-        shared = variance[np.minimum(self._at[keep], variance.size - 1)]
-        shared = np.where(np.isfinite(shared), np.minimum(shared, total), total)
-        floor = 1e-3 * float(np.median(np.abs(self._excess[keep]))) + 1e-12
-        # the trapezoid shares half a sample with its neighbour, which noise of the pose hides at
-        # least in part: increments are never taken as more alike than independent ones, or the
-        # whitening would look at the highest frequencies alone
-        ends = np.maximum(self._noise**2 - 0.25 * shared, 0.0)
-        adjacent = np.append(keep[1:] == keep[:-1] + 1, False)
-        diagonal, off = total + 2.0 * ends + floor**2, np.where(adjacent, -ends, 0.0)
-        # noise of the pose alone is singular in the limit: a little of the diagonal keeps the
-        # factor
-        self._factor = scipy.linalg.cholesky_banded(np.stack((1.0001 * diagonal, off)), lower=True)
-
-    def _white(self, table: np.ndarray) -> np.ndarray:
-        # rows of L: diagonal and the one below
-        return np.asarray(scipy.linalg.solve_banded((1, 0), self._factor, table))
-
-    @staticmethod
-    def _trimmed(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return [K] 1 or 0: 0 for rows that stand far out and that no cause explains (jumps)."""
-        scale = np.maximum(np.abs(x).max(axis=0), 1e-300)
-        coefficients = np.linalg.lstsq(x / scale, y, rcond=1e-9)[0]
-        residual = np.abs(y - (x / scale) @ coefficients)
-        kept: np.ndarray = (
-            residual <= 8.0 * 1.4826 * max(float(np.median(residual)), 1e-300)
-        ).astype(float)
-        return kept
+    if at.size < FEWEST:
+        return {}
+    excess, seconds, variance = np.diff(pose[at]) - between(known), between(dt), (dt * rate) ** 2
+    table = between(np.stack([part for parts in columns.values() for part in parts], axis=-1))
+    usable = np.isfinite(excess) & np.isfinite(table).all(axis=1) & np.isfinite(between(rate))
+    keep = np.flatnonzero(usable & (seconds <= 3.0 * float(np.median(seconds))))
+    if keep.size < FEWEST:
+        return {}
+    total = between(variance)[keep]
+    shared = variance[np.minimum(at[keep], variance.size - 1)]
+    shared = np.where(np.isfinite(shared), np.minimum(shared, total), total)
+    floor = 1e-3 * float(np.median(np.abs(excess[keep]))) + 1e-12
+    # the trapezoid shares half a sample with its neighbour, which noise of the pose hides at least
+    # in part: increments are never taken as more alike than independent ones, or the whitening
+    # would look at the highest frequencies alone
+    ends = np.maximum(noise**2 - 0.25 * shared, 0.0)
+    adjacent = np.append(keep[1:] == keep[:-1] + 1, False)
+    # noise of the pose alone is singular in the limit: a little of the diagonal keeps the factor
+    band = np.stack((1.0001 * (total + 2.0 * ends + floor**2), np.where(adjacent, -ends, 0.0)))
+    factor = scipy.linalg.cholesky_banded(band, lower=True)
+    y, *x = (
+        scipy.linalg.solve_banded((1, 0), factor, part)
+        for part in (excess[keep], *np.moveaxis(table[keep], 1, 0))
+    )
+    # real and imaginary parts of a sample side by side, so that sections hold both
+    rows = np.stack((y, *x), axis=-1)
+    if np.iscomplexobj(rows):
+        rows = np.stack((rows.real, rows.imag), axis=1).reshape(-1, rows.shape[1])
+    y, table = rows[:, 0], rows[:, 1:]
+    # rows that stand far out and that no cause explains are jumps
+    scale = np.maximum(np.abs(table).max(axis=0), 1e-300)
+    rest = np.abs(y - (table / scale) @ np.linalg.lstsq(table / scale, y, rcond=1e-9)[0])
+    trust = rest <= 8.0 * SIGMA_OF_MAD * max(float(np.median(rest)), 1e-300)
+    names = np.array([name for name, parts in columns.items() for _ in parts])
+    return _pursuit(np.where(trust, y, 0.0), np.where(trust[:, None], table, 0.0), names)
 
 
-def _pursuit(
-    y: np.ndarray, x: np.ndarray, names: np.ndarray, section: np.ndarray
-) -> dict[str, Cause]:
+def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray) -> dict[str, Cause]:
     """Select groups of columns one at a time, then drop those that others made superfluous."""
     scale = np.linalg.norm(x, axis=0)
-    alive = scale > 0.0
-    x, names, scale = x[:, alive] / scale[alive], names[alive], scale[alive]
+    x, names = x[:, scale > 0.0] / scale[scale > 0.0], names[scale > 0.0]
+    scale = scale[scale > 0.0]
     gram, product, energy = x.T @ x, x.T @ y, float(y @ y)
 
-    def residual_energy(chosen: list[str]) -> float:
+    def left(chosen: list[str]) -> float:
+        """Return the sum of squares that some causes leave."""
         part = np.isin(names, chosen)
-        return (
-            energy
-            - float(
-                product[part]
-                @ np.linalg.lstsq(gram[np.ix_(part, part)], product[part], rcond=1e-9)[0]
-            )
-            if chosen
-            else energy
-        )
+        values = np.linalg.lstsq(gram[np.ix_(part, part)], product[part], rcond=1e-9)[0]
+        return energy - float(product[part] @ values) if chosen else energy
 
     every = list(dict.fromkeys(names.tolist()))
-    variance = max(residual_energy(every) / y.size, 1e-12 * energy / y.size)
+    variance = max(left(every) / y.size, 1e-12 * energy / y.size)
     price = {name: _WORTH * variance * (1.0 + 0.2 * float((names == name).sum())) for name in every}
     chosen: list[str] = []
     while len(chosen) < _MOST_CAUSES:
-        gain = {
-            name: residual_energy(chosen) - residual_energy([*chosen, name]) - price[name]
-            for name in every
-            if name not in chosen
-        }
-        best = max(gain, key=lambda name: gain[name], default="")
+        others = [name for name in every if name not in chosen]
+        gain = {name: left(chosen) - left([*chosen, name]) - price[name] for name in others}
+        best = max(others, key=lambda name: gain[name], default="")
         if not best or gain[best] <= 0.0:
             break
         chosen.append(best)
     for name in list(chosen[:-1]):
         fewer = [cause for cause in chosen if cause != name]
-        if residual_energy(fewer) - residual_energy(chosen) < price[name]:
-            chosen = fewer
-    columns = np.isin(names, chosen)
-    return (
-        _causes(y, x[:, columns], names[columns], scale[columns], section, chosen) if chosen else {}
-    )
+        chosen = fewer if left(fewer) - left(chosen) < price[name] else chosen
+    if not chosen:
+        return {}
+    part = np.isin(names, chosen)
+    columns, names, scale = x[:, part], names[part], scale[part]
+    fitted = fit(columns, y)
+    plain = np.linalg.pinv(columns.T @ columns) * fitted.left / max(y.size - columns.shape[1], 1)
+    spread = np.diag(fitted.spread) * SECTIONS / (SECTIONS - 1)
+    errors = np.sqrt(np.maximum(spread, np.diag(plain))) / scale
+    values = fitted.values / scale
+    return {name: Cause(values[names == name], errors[names == name]) for name in chosen}
 
 
-def _causes(
-    y: np.ndarray,
-    x: np.ndarray,
-    names: np.ndarray,
-    scale: np.ndarray,
-    section: np.ndarray,
-    order: list[str],
-) -> dict[str, Cause]:
-    values = np.linalg.lstsq(x, y, rcond=1e-9)[0]
-    residual = y - x @ values
-    inverse = np.linalg.pinv(x.T @ x)
-    scores = np.stack([x[section == i].T @ residual[section == i] for i in range(_SECTIONS)])
-    spread = inverse @ (scores.T @ scores) @ inverse * _SECTIONS / (_SECTIONS - 1)
-    plain = inverse * float(residual @ residual) / max(y.size - x.shape[1], 1)
-    errors = np.sqrt(np.maximum(np.diag(spread), np.diag(plain)))
-    return {
-        name: Cause(name, (values / scale)[names == name], (errors / scale)[names == name])
-        for name in order
-    }
+@dataclass(frozen=True)
+class Limit:
+    """What a cause of disagreement is called, and the size from which on it misleads.
+
+    Attributes:
+        text: before its size.
+        unit: of the size as shown.
+        least: size from which on it misleads, SI.
+        fix: what to do about it.
+        steps: least size in time steps.
+        of_speed: least size as a share of the speed.
+    """
+
+    text: str
+    unit: str
+    least: float
+    fix: str
+    steps: float = 0.0
+    of_speed: float = 0.0
+
+
+def _lag(text: str, least: float = LEAST_LAG) -> Limit:
+    fix = "shift it in time, or estimate the lag where the reader can"
+    return Limit(text, "s", least, fix, steps=1.0)
+
+
+def _gain(text: str, least: float, fix: str = "correct its unit or scale") -> Limit:
+    return Limit(f"{text} by a share of", "", least, fix)
+
+
+YAW_LIMITS = {
+    "gain": _gain("r is too large against psi", 0.06),
+    "lag": _lag("r trails psi by"),
+}
+POSITION_LIMITS = {
+    "gain_u": _gain("u is too large against the position", 0.04),
+    "gain_v": _gain("v is too large against the position", 0.25),
+    "gain": _gain("u, v are too large against the position", 0.04, "correct their unit or scale"),
+    "heading": Limit(
+        "psi is off against course and drift by",
+        "deg",
+        math.radians(3.0),
+        "take the offset off psi",
+    ),
+    "lag_u": _lag("u trails the position by"),
+    "lag_v": _lag("v trails the position by"),
+    "lag": _lag("u, v trail the position by"),
+    "lag_psi": _lag("psi trails position and velocities by", 2.0 * LEAST_LAG),
+    "lag_xy": _lag("x, y trail heading and velocities by"),
+    "lever_arm": Limit(
+        "x, y belong to a point forward and to starboard of where u, v hold by",
+        "m",
+        0.3,
+        "move it to the vessel's centre (lever arm)",
+        of_speed=0.05,
+    ),
+    "current": Limit(
+        "u, v are through water that moves north and east by",
+        "m/s",
+        0.02,
+        "give the current as an input",
+        of_speed=0.1,
+    ),
+    "bias": Limit(
+        "u, v are too large against the position by", "m/s", 0.02, "take the bias off", of_speed=0.1
+    ),
+}
+
+
+def cause_findings(
+    causes: Mapping[str, Cause], limits: Mapping[str, Limit], log: Record, found: Check
+) -> Iterator[Finding]:
+    """Return the findings for the causes that are certain and large enough to matter."""
+    for name, cause in causes.items():
+        limit = limits.get(name)
+        if limit is None or not cause.sure:
+            continue
+        size = float(np.hypot.reduce(cause.values))
+        least = max(limit.least, limit.steps * log.step, limit.of_speed * log.speed)
+        if size < 0.3 * least:
+            continue
+        early = "trail" in limit.text and cause.values[0] < 0.0
+        text = limit.text.replace("trail", "lead") if early else limit.text
+        factor = (math.degrees(1.0) if limit.unit == "deg" else 1.0) * (-1.0 if early else 1.0)
+        sizes = zip(factor * cause.values, np.abs(2.0 * factor * cause.errors), strict=True)
+        shown = ", ".join(f"{value:+.3g} +- {error:.2g}" for value, error in sizes)
+        level: Level = "will mislead" if size > least else "note"
+        figures = {f"value_{i + 1}": float(value) for i, value in enumerate(cause.values)}
+        yield found(
+            f"{text}: {shown} {limit.unit}".rstrip(),
+            {"size": size, **figures, "error": cause.errors.max()},
+            code=name,
+            level=level,
+            fix=limit.fix if level != "note" else "",
+            repair=_repair(name, cause.values, ("r",) if limits is YAW_LIMITS else ("u", "v")),
+        )
+
+
+def _repair(name: str, values: np.ndarray, pair: tuple[str, ...]) -> Callable[[Log], Log] | None:
+    """Return what corrects a cause; `pair` are the channels that are compared with the pose."""
+    what, _, channel = name.partition("_")
+    names = {"": pair, "xy": ("x", "y")}.get(channel, (channel,))
+    if what == "gain":
+        return correction(names, factor=1.0 + values[0])
+    if what == "lag":
+        return correction(names, lag=values[0])
+    if name == "heading":
+        return correction(("psi",), offset=values[0])
+    if name == "bias":
+        return lambda log: with_channels(log, u=log["u"] - values[0], v=log["v"] - values[1])
+    if name == "lever_arm":
+
+        def moved(log: Log) -> Log:
+            arm = (values[0] + 1j * values[1]) * np.exp(1j * log["psi"])
+            return with_channels(log, x=log["x"] - arm.real, y=log["y"] - arm.imag)
+
+        return moved
+    return None

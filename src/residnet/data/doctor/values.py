@@ -1,261 +1,488 @@
-"""Findings about single channels: missing, repeated, frozen, outlying, clipped, coarse values."""
+"""Findings about single channels: absent, frozen, outlying, clipped, coarse, filled values."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator
 
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.core.names import STATE, VELOCITY
+from residnet.core.names import STATE
 from residnet.core.stretches import stretches
-from residnet.data.doctor.findings import Finding, Level, share_of, show
-from residnet.data.doctor.frozen import frozen_findings, sample_and_hold
-from residnet.data.doctor.sensors.interpolated import interpolated_findings
-from residnet.data.doctor.sensors.repeated import repeated_findings
-from residnet.data.doctor.sensors.single import absurd_findings, spike_findings
-from residnet.data.doctor.signals import MEASURED, noise_of, spikes, without
-
-# a change of level is one from this share of the range on
-_LEVEL = 0.3
-# levels between the 5th and the 95th percentile below which a resolution is too coarse
-_FEWEST_LEVELS = 50
+from residnet.data.doctor.findings import Check, Finding, Level, check, share_of, show
+from residnet.data.doctor.statistics import MEASURED, Record, resolution_of
+from residnet.data.held import usual_interval
+from residnet.data.outliers import noise_of, spike_cells
+from residnet.data.plausible import beyond_belief, fills
+from residnet.data.readers.base import unwrap
 
 
-def channel_findings(log: Log) -> Iterator[Finding]:
-    """Return the names and units of the channels, and which of the state are absent."""
+@check("header", "channels", "note")
+def channels(log: Record, found: Check) -> Iterator[Finding]:
+    """Report names and units."""
     named = ", ".join(f"{name} [{unit}]" for name, unit in log.units.items())
-    yield Finding(
-        "note",
-        "channels",
-        f"{len(log.channels)} channels, {len(log)} samples, manoeuvre {log.manoeuvre}: {named}",
-    )
-    absent = [name for name in STATE if name not in log.channels]
-    if absent:
-        yield Finding(
-            "note",
-            "absent",
-            f"no {', '.join(absent)}: free runs cannot be scored on what is not measured",
-        )
+    about = f"{len(log.units)} channels, {len(log)} samples, manoeuvre {log.log.manoeuvre}"
+    yield found(f"{about}: {named}")
 
 
-def value_findings(log: Log, inputs: Sequence[str]) -> list[Finding]:
-    """Return the findings about the values of a log as recorded.
-
-    `inputs` drive the vessel and may jump, hold and rest at their limits.
-    """
-    measured = [name for name in log.channels if name not in inputs and name in MEASURED]
-    return [
-        *_missing(log),
-        *_repeats(log),
-        *absurd_findings(log),
-        *frozen_findings(log, measured),
-        *repeated_findings(log),
-        *interpolated_findings(log, measured),
-        *spike_findings(log),
-        *_outliers(log, measured),
-        *_single_channels(log, measured),
-    ]
+@check("header", "absent", "note")
+def absent(log: Record, found: Check) -> Iterator[Finding]:
+    """Report channels of the state that the log lacks."""
+    names = [name for name in STATE if name not in log]
+    if names:
+        yield found(f"no {', '.join(names)}: free runs cannot be scored on what is not measured")
 
 
-def _single_channels(log: Log, measured: Sequence[str]) -> Iterator[Finding]:
-    for name in measured:
-        if name in ("u", "v", "r", "phi", "p", "u_dot", "v_dot", "r_dot"):
-            yield from _clipping(log, name)
-        yield from _resolution(log, name)
-        yield from sample_and_hold(log, name)
-        if name in VELOCITY:
-            yield from _steps(log, name)
+# one full circle in rad, and in degrees that were taken for rad
+_CIRCLES = ((2.0 * math.pi, ""), (360.0, " of 360: degrees taken as rad"))
+_ANGLES = ("psi", "phi")
 
 
-def _missing(log: Log) -> Iterator[Finding]:
-    for name, values in log.channels.items():
-        absent = ~np.isfinite(values)
-        share = float(absent.mean())
+@check("clock", "heading_wrap", fix="unwrap it before it is filtered or differentiated")
+def wraps(log: Record, found: Check) -> Iterator[Finding]:
+    """Report headings that were not made continuous: steps by about a full circle."""
+    for name in _ANGLES:
+        for circle, what in _CIRCLES if name in log else ():
+            known = np.isfinite(log[name])
+            change = np.abs(np.diff(log[name][known]))
+            at = np.flatnonzero(known)[1:][np.abs(change - circle) < 0.25 * circle]
+            if at.size:
+                text = (
+                    f"{name} wraps {at.size} times{what}, first at t = {log.t[at[0]]:.2f} s: logs"
+                    " hold it continuous"
+                )
+                yield found(text, {"count": at.size, "t": log.t[at[0]]})
+
+
+def unwrapped(log: Log) -> Log:
+    """Return the log with its headings continuous."""
+    turned = {name: unwrap(log[name]) for name in _ANGLES if name in log.channels}
+    return log.replace(channels={**log.channels, **turned})
+
+
+@check("values", "nan", fix="split the log there (mask kind: nan)")
+def missing(log: Record, found: Check) -> Iterator[Finding]:
+    """Report samples that are missing, and channels that are slower than the log."""
+    for name in log:
+        at = ~np.isfinite(log[name])
+        share, known = float(at.mean()), np.flatnonzero(~at)
         if not share:
             continue
-        every = np.diff(np.flatnonzero(~absent))
+        every = np.diff(known)
         usual = float(np.median(every)) if every.size else 1.0
-        if (
-            usual > 1.0
-            and every.max() <= 2.0 * usual
-            and max(np.argmin(absent), np.argmin(absent[::-1])) <= 2.0 * usual
-        ):
+        # longest of the intervals and of the ends
+        most = max(every.max(initial=0), known[0], len(log) - 1 - known[-1])
+        if usual > 1.0 and most <= 2.0 * usual:
             text = (
                 f"{name} holds a value in every {usual:.0f}th sample only: its sensor is slower"
                 " than the log"
             )
-            yield Finding(
-                "note",
-                "slow_channel",
-                text,
-                {"share": share, "every": usual},
-                "give it a log of its own, or interpolate it",
-            )
+            fix = "give it a log of its own, or interpolate it"
+            figures = {"share": share, "every": usual}
+            yield found(text, figures, code="slow_channel", level="note", fix=fix)
             continue
-        starts, stops = stretches(absent)
+        starts, stops = stretches(at)
         longest = int(np.argmax(stops - starts))
-        seconds = float(log.t[min(stops[longest], len(log) - 1)] - log.t[starts[longest]])
+        first = float(log.t[starts[longest]])
+        seconds = float(log.t[min(stops[longest], len(log) - 1)]) - first
         text = (
             f"{name} is missing in {share_of(share)} of the samples, {starts.size} stretches, the"
-            f" longest {seconds:.2f} s from "
+            f" longest {seconds:.2f} s from t = {first:.2f} s"
         )
-        text += f"t = {log.t[starts[longest]]:.2f} s"
         level: Level = "fatal" if share > 0.5 else "will mislead"
-        figures = {
-            "share": share,
-            "stretches": starts.size,
-            "longest": seconds,
-            "t": float(log.t[starts[longest]]),
-        }
-        yield Finding(level, "nan", text, figures, "split the log there (mask kind: nan)", absent)
+        figures = {"share": share, "stretches": starts.size, "longest": seconds, "t": first}
+        yield found(text, figures, level=level, at=at)
 
 
-def _repeats(log: Log) -> Iterator[Finding]:
-    """Return the rows that repeat the row before in every channel, which noise never does."""
-    same = np.append(False, (np.diff(log.stack(tuple(log.channels)), axis=0) == 0.0).all(axis=1))
-    moving = [
-        name
-        for name in log.channels
-        if name in MEASURED and float((np.diff(log[name]) == 0.0).mean()) < 0.5
-    ]
+@check("values", "repeated_rows", fix="delete them, or log at the sensors' rate", certain=True)
+def repeated_rows(log: Record, found: Check) -> Iterator[Finding]:
+    """Report rows that repeat the row before in every channel, which noise never does."""
+    same = np.append(False, (np.diff(log.log.stack(list(log)), axis=0) == 0.0).all(axis=1))
+    noisy = any(float((np.diff(log[n]) == 0.0).mean()) < 0.5 for n in log if n in MEASURED)
     share = float(same.mean())
-    if not same.any() or (not moving and share <= 0.5):
+    if same.any() and (noisy or share > 0.5):
+        text = (
+            f"{int(same.sum())} rows ({share_of(share)}) repeat the row before in every channel:"
+            " logged twice, or faster than measured"
+        )
+        level: Level = "fatal" if share > 0.9 else "will mislead"
+        yield found(text, {"count": same.sum(), "share": share}, level=level, at=same)
+
+
+@check("values", "fill_values", fix="leave these cells empty", certain=True)
+def filled(log: Record, found: Check) -> Iterator[Finding]:
+    """Report values that stand for a missing measurement."""
+    for name in log:
+        at = np.flatnonzero(fills(log[name]))
+        if at.size:
+            value = float(log[name][at[0]])
+            text = (
+                f"{at.size} samples of {name} hold the fill value {value:g}, first at t ="
+                f" {log.t[at[0]]:.2f} s: nothing was measured there"
+            )
+            yield found(text, {"count": at.size, "value": value}, channels=(name,))
+
+
+@check("values", "absurd", "fatal", "correct or empty them")
+def absurd(log: Record, found: Check) -> Iterator[Finding]:
+    """Report values that no vessel can have."""
+    for name in log:
+        values = log[name]
+        at = np.flatnonzero(beyond_belief(values, log.units[name]) & ~fills(values))
+        if at.size:
+            text = (
+                f"{name} is {show(float(values[at[0]]), log.units[name])} at t ="
+                f" {log.t[at[0]]:.2f} s, which no vessel reaches ({at.size} such samples)"
+            )
+            yield found(text, {"count": at.size})
+
+
+# shortest run of equal values that counts as frozen, in steps
+_LEAST_RUN = 5
+# after a receiver's freeze its filter needs so long to recover, s
+_RECOVERY = 2.0
+# a compass may rest for so long, s, and turn by so little, rad, while a heading is steady
+_STEADY = 3.0
+_NEGLIGIBLE_ANGLE = math.radians(0.1)
+
+
+@check("values", "frozen", certain=True, spoils=True)
+def frozen(log: Record, found: Check) -> Iterator[Finding]:
+    """Report sensors that hold their last value although the vessel moves on."""
+    fix = np.zeros(len(log), dtype=bool)
+    pair = {"x", "y"} <= set(log.measured)
+    for names in (*((("x", "y"),) if pair else ()), *((name,) for name in log.measured)):
+        held = _held(log, names)
+        if len(names) == 2:
+            fix = held
+        elif pair and names[0] in ("x", "y"):
+            # the stretches of the position have a finding already, its ends included
+            held &= ~(np.convolve(fix, np.ones(3))[1:-1] > 0.5)
+        starts, stops = stretches(held)
+        if not starts.size:
+            continue
+        seconds, at = log.t[stops - 1] - log.t[starts], held.copy()
+        for stop in stops if names[0] in ("x", "y") else ():
+            at[stop : int(np.searchsorted(log.t, log.t[stop - 1] + _RECOVERY - 1e-9))] = True
+        share, longest = float(at.mean()), int(np.argmax(seconds))
+        text = (
+            f"{'position' if len(names) == 2 else names[0]} is bit-identical in {starts.size}"
+            f" stretches of {_LEAST_RUN} steps or more while the vessel moves,"
+            f" {seconds.sum():.2f} s in all, the longest {seconds[longest]:.2f} s from t ="
+            f" {log.t[starts[longest]]:.2f} s"
+        )
+        level: Level = "fatal" if share > 0.5 else "will mislead"
+        if names[0] in _ANGLES and seconds[longest] < _STEADY:
+            level = "note"
+        yield found(
+            text,
+            {
+                "count": starts.size,
+                "seconds": seconds.sum(),
+                "longest": seconds[longest],
+                "share": share,
+                "t": log.t[starts[longest]],
+            },
+            level=level,
+            fix=f"mask them and what follows (kind: frozen, channels: [{', '.join(names)}])",
+            at=at,
+            channels=names,
+        )
+
+
+def _held(log: Record, names: tuple[str, ...]) -> np.ndarray:
+    """Return [T] bool: runs of equal values that neither chance nor rest explains."""
+    out = np.zeros(len(log), dtype=bool)
+    values, together = log.log.stack(names), len(names) > 1
+    same = (np.diff(values, axis=0) == 0.0).all(axis=1)
+    starts, stops = stretches(same)
+    # a slow sensor that repeats each value has steps of its own
+    shortest = _LEAST_RUN * usual_interval(values)
+    long = stops - starts >= shortest
+    outside = same.size - int((stops - starts)[long].sum())
+    if outside < 0.02 * same.size:
+        return out
+    # share of equal neighbours where the channel moves: a coarse one repeats values anyhow
+    chance = min(float((stops - starts)[~long].sum()) / outside, 0.99)
+    # two channels that hold together are never chance
+    if chance > 0.0 and not together:
+        shortest = max(shortest, int(np.ceil(np.log(1e-4 / same.size) / np.log(chance))))
+    # the last digits of a noisy channel never rest, whatever the vessel does
+    rare = chance < (0.15 if together else 1e-3)
+    for start, stop in zip(starts, stops, strict=True):
+        run = slice(start, stop + 1)
+        if stop - start >= shortest:
+            out[run] |= (rare and _noisy(log, names[0])) or _moves(log, names, run)
+    return out
+
+
+def _noisy(log: Record, name: str) -> bool:
+    """Return whether noise is a good part of what a channel does from sample to sample."""
+    return log.noise(name) > 0.05 * float(np.nanstd(np.diff(log[name])))
+
+
+def _moves(log: Record, names: tuple[str, ...], run: slice) -> bool:
+    """Return whether channels must have changed over a run.
+
+    A pose must by what the velocities say, any other where it is noisy or goes on far from where it
+    stood.
+    """
+    name, values = names[0], log[names[0]]
+    rates = {"psi": ("r",), "phi": ("p",), "x": ("u", "v"), "y": ("u", "v")}.get(name, ())
+    given = (*rates, *(("psi",) if len(rates) == 2 else ()))
+    if not rates or any(rate not in log for rate in given):
+        after = np.abs(np.diff(values[run.stop - 1 : run.stop + 6]))
+        left = after.size > 3 and after[0] > 5.0 * float(after[1:].max())
+        return bool(_noisy(log, name) or left)
+    dt, count = float(log.t[run.stop - 1] - log.t[run.start]), run.stop - run.start
+    rate = log[rates[0]][run]
+    if len(rates) == 2:
+        ground = (rate + 1j * log["v"][run]) * np.exp(1j * log["psi"][run])
+        rate = np.abs(ground) if len(names) == 2 else ground.real if name == "x" else ground.imag
+    moved = abs(float(np.nanmean(rate))) * dt if np.isfinite(rate).any() else 0.0
+    noise = np.hypot.reduce([log.noise(one) for one in rates]) * dt
+    noise /= np.sqrt(count if len(names) == 1 else 1)
+    steps = np.abs(np.diff(values))
+    resolution = float(np.quantile(steps[steps > 0.0], 0.1)) if (steps > 0.0).any() else 0.0
+    least = _NEGLIGIBLE_ANGLE if name in _ANGLES else 0.0
+    return bool(moved > max(4.0 * noise, 3.0 * resolution, least))
+
+
+# share of the rows from which on repeats are no accident, and their longest run
+_REPEATED = 0.1
+_LONGEST_REPEAT = 5
+
+
+@check(
+    "values",
+    "repeated_fix",
+    fix="leave these cells empty, or log at the receiver's rate",
+    needs=("x", "y"),
+    certain=True,
+)
+def repeated_fix(log: Record, found: Check) -> Iterator[Finding]:
+    """Report single rows in which position stands still while the vessel moves."""
+    change = np.diff(log.log.stack(("x", "y")), axis=0)
+    same = (change == 0.0).all(axis=1)
+    short = same.copy()
+    for start, stop in zip(*stretches(same), strict=True):
+        short[start:stop] = stop - start < _LONGEST_REPEAT
+    share = float(short.mean())
+    # a position moves by far more than its resolution where it moves
+    steps = np.hypot(*change[~same].T)
+    steps = steps[np.isfinite(steps)]
+    axis = np.abs(change[:, 0])
+    least = float(axis[axis > 0.0].min(initial=np.inf))
+    if share < _REPEATED or steps.size < 20 or float(np.median(steps)) <= 4.0 * least:
         return
+    names = ["x", "y"]
+    for name in ("psi", "u", "v", "r"):
+        if name in log and float((np.diff(log[name])[short] == 0.0).mean()) > 0.8:
+            names.append(name)
     text = (
-        f"{int(same.sum())} rows ({share_of(share)}) repeat the row before in every channel: logged"
-        " twice, or faster than measured"
+        f"{int(short.sum())} rows ({share_of(share)}) repeat the last {', '.join(names)}: the fix"
+        " is older than the row"
     )
-    level: Level = "fatal" if share > 0.9 else "will mislead"
-    yield Finding(
-        level,
-        "repeated_rows",
-        text,
-        {"count": same.sum(), "share": share},
-        "delete them, or log at the sensors' rate",
-        same,
-    )
+    at = np.append(False, short)
+    yield found(text, {"count": short.sum(), "share": share}, at=at, channels=tuple(names))
 
 
-def _outliers(log: Log, measured: Sequence[str]) -> Iterator[Finding]:
-    for name in measured:
-        far = spikes(log[name])
+# shortest straight stretch, in samples and s
+_STRAIGHT_SAMPLES, _STRAIGHT_SECONDS = 8, 1.0
+# share of a channel that may be straight before this is what the channel always does
+_USUALLY_STRAIGHT = 0.4
+
+
+@check(
+    "values",
+    "interpolated",
+    fix="leave the cells between two measurements empty",
+    certain=True,
+    spoils=True,
+)
+def interpolated(log: Record, found: Check) -> Iterator[Finding]:
+    """Report stretches that were filled by straight lines between the samples at their ends."""
+    lines = {name: _straight(log, name) for name in log.measured if name in STATE}
+    names = tuple(name for name, at in lines.items() if at.any())
+    if not names:
+        return
+    at = np.logical_or.reduce([lines[name] for name in names])
+    starts, stops = stretches(at)
+    seconds, share = log.t[stops - 1] - log.t[starts], float(at.mean())
+    longest = int(np.argmax(seconds))
+    first = float(log.t[starts[longest]])
+    text = (
+        f"{', '.join(names)} run along exactly straight lines for {seconds.sum():.1f} s"
+        f" ({share_of(share)}), the longest {seconds[longest]:.1f} s from t = {first:.2f} s: they"
+        " were interpolated"
+    )
+    figures = {"seconds": seconds.sum(), "longest": seconds[longest]}
+    yield found(text, {**figures, "t": first, "share": share}, at=at, channels=names)
+
+
+def _straight(log: Record, name: str) -> np.ndarray:
+    """Return [T] bool: samples within runs without curvature, in a channel that has some."""
+    values, out = log[name], np.zeros(len(log), dtype=bool)
+    slope = np.diff(values) / np.diff(log.t)
+    bend = np.abs(np.diff(slope))
+    known = bend[np.isfinite(bend)]
+    if known.size < 100:
+        return out
+    usual = float(np.median(known))
+    rounding = 1e-9 * float(np.nanmax(np.abs(values))) / log.step
+    resolution = resolution_of(values) / log.step
+    # between few steps of its resolution a channel runs straight by itself, a smooth channel bends
+    # little anyhow: only noise bends at every sample
+    coarse = resolution > 0.0 and 8.0 * resolution >= usual
+    noise = log.noise(name) * np.sqrt(6.0)
+    noisy = noise > 0.5 * float(np.nanmedian(np.abs(np.diff(values, 2))))
+    if coarse or usual <= 10.0 * rounding or not noisy:
+        return out
+    flat = np.nan_to_num(bend, nan=np.inf) <= max(1e-5 * usual, rounding, 2.1 * resolution)
+    if float(flat.mean()) > _USUALLY_STRAIGHT:
+        return out
+    moving = np.abs(slope[:-1]) > 10.0 * rounding
+    for start, stop in zip(*stretches(flat & moving), strict=True):
+        long = log.t[stop] - log.t[start] >= _STRAIGHT_SECONDS
+        if stop - start >= _STRAIGHT_SAMPLES and long:
+            out[start : stop + 2] = True
+    return out
+
+
+@check(
+    "values",
+    "spikes",
+    fix="correct or empty these cells; a fit bridges them and leaves them out",
+    certain=True,
+    spoils=True,
+)
+def single_spikes(log: Record, found: Check) -> Iterator[Finding]:
+    """Report single samples that leave all others and return at once."""
+    for name, at in spike_cells(log.log).items():
+        values = log[name]
+        worst = int(np.argmax(np.where(at, np.abs(values - np.nanmedian(values)), -1.0)))
+        text = (
+            f"{int(at.sum())} single samples of {name} stand far out, the worst"
+            f" {show(float(values[worst]), log.units[name])} at t = {log.t[worst]:.2f} s"
+        )
+        yield found(text, {"count": at.sum(), "t": log.t[worst]}, at=at, channels=(name,))
+
+
+@check("values", "outliers", spoils=True)
+def outliers(log: Record, found: Check) -> Iterator[Finding]:
+    """Report samples far out of their neighbours, by the rule of the mask `hampel`."""
+    for name in log.measured:
+        far, values = log.spikes(name), log[name]
         count = int(far.sum())
         if not count:
             continue
-        worst = _worst(log[name], far)
+        good, samples = np.isfinite(values) & ~far, np.arange(len(log))
+        smooth = np.interp(samples, samples[good], values[good])
+        worst = int(np.argmax(np.where(far, np.abs(values - smooth), 0.0)))
+        share, t = count / len(log), float(log.t[worst])
         text = (
-            f"{count} samples of {name} ({share_of(count / len(log))}) stand far out of their"
-            f" neighbours, the worst at t = {log.t[worst]:.2f} s"
+            f"{count} samples of {name} ({share_of(share)}) stand far out of their neighbours, the"
+            f" worst at t = {t:.2f} s"
         )
         level: Level = "will mislead" if count > 2 else "note"
-        yield Finding(
-            level,
-            "outliers",
-            text,
-            {"count": count, "share": count / len(log), "t": float(log.t[worst])},
-            _HAMPEL.format(name),
-            far,
-            channels=(name,),
-        )
+        fix = f"mask them (kind: hampel, channels: [{name}])"
+        figures = {"count": count, "share": share, "t": t}
+        yield found(text, figures, level=level, fix=fix, at=far, channels=(name,))
 
 
-_HAMPEL = "mask them (kind: hampel, channels: [{}])"
+@check("values", "clipping", fix="mask them, or log with a wider range", spoils=True)
+def clipping(log: Record, found: Check) -> Iterator[Finding]:
+    """Report samples exactly at an extreme, many compared with the levels beside it."""
+    for name in log.measured:
+        known = log[name][np.isfinite(log[name])]
+        levels, counts = np.unique(known, return_counts=True)
+        if name in ("x", "y", "psi") or levels.size < 10:
+            continue
+        for end, beside in ((0, counts[1:4]), (-1, counts[-4:-1])):
+            count, share, limit = int(counts[end]), counts[end] / known.size, float(levels[end])
+            if count < max(5, 4 * int(beside.max()), 0.003 * known.size):
+                continue
+            text = (
+                f"{name} is exactly at its limit {show(limit, log.units[name])} in {count} samples"
+                f" ({share_of(share)}): the sensor clips or holds"
+            )
+            figures = {"count": count, "share": share, "limit": limit}
+            yield found(text, figures, at=log[name] == limit, channels=(name,))
 
 
-def _worst(values: np.ndarray, far: np.ndarray) -> int:
-    rest = without(values, far)
-    known = np.isfinite(rest)
-    smooth = np.interp(np.arange(values.size), np.flatnonzero(known), rest[known])
-    return int(np.argmax(np.where(far, np.abs(values - smooth), 0.0)))
+# levels between the 5th and the 95th percentile below which a resolution is too coarse
+_FEWEST_LEVELS = 50
 
 
-def _clipping(log: Log, name: str) -> Iterator[Finding]:
-    """Return the samples exactly at the largest or smallest value, where these are many.
-
-    Many is compared with the levels beside it.
-    """
-    known = log[name][np.isfinite(log[name])]
-    levels, counts = np.unique(known, return_counts=True)
-    if levels.size < 10:
-        return
-    for end, beside in ((0, counts[1:4]), (-1, counts[-4:-1])):
-        count, share = int(counts[end]), float(counts[end]) / known.size
-        if count < 5 or count < 4 * int(beside.max()) or share < 0.003:
+@check("values", "resolution", fix="decimals were dropped on the way: log more digits")
+def resolution(log: Record, found: Check) -> Iterator[Finding]:
+    """Report the step of a channel's values, too coarse where few lie between its ends."""
+    for name in log.measured:
+        known = log[name][np.isfinite(log[name])]
+        low, high = (float(value) for value in np.quantile(known, (0.05, 0.95)))
+        levels = np.unique(known)
+        if levels.size < 2 or levels.size > 0.5 * known.size:
+            continue
+        step = float(np.median(np.diff(levels)))
+        count = (high - low) / step
+        # most samples differ from the one before by whole steps of the resolution, or it is none
+        steps = np.diff(known) / step
+        if float((np.abs(steps - np.round(steps)) < 1e-3).mean()) < 0.9:
             continue
         text = (
-            f"{name} is exactly at its limit {show(levels[end], log.units[name])} in {count}"
-            f" samples ({share_of(share)}): the sensor clips or holds"
+            f"{name} has a resolution of {show(step, log.units[name])}, {count:.0f} levels between"
+            " its 5th and 95th percentile"
         )
-        at = log[name] == levels[end]
-        figures = {"count": count, "share": share, "limit": float(levels[end])}
-        yield Finding(
-            "will mislead",
-            "clipping",
-            text,
-            figures,
-            "mask them, or log with a wider range",
-            at,
-            channels=(name,),
-        )
+        fine = count >= _FEWEST_LEVELS
+        level: Level = "note" if fine else "will mislead"
+        fix = "" if fine else None
+        yield found(text, {"resolution": step, "levels": count}, level=level, fix=fix)
 
 
-def _resolution(log: Log, name: str) -> Iterator[Finding]:
-    """Return the decimals that were dropped: few levels between the ends of what a channel does."""
-    known = log[name][np.isfinite(log[name])]
-    low, high = (float(value) for value in np.quantile(known, (0.05, 0.95)))
-    levels = np.unique(known)
-    if levels.size < 2 or levels.size > 0.5 * known.size:
-        return
-    resolution = float(np.median(np.diff(levels)))
-    count = (high - low) / resolution
-    # most samples differ from the one before by whole steps of the resolution, or it is none
-    steps = np.diff(known) / resolution
-    if float((np.abs(steps - np.round(steps)) < 1e-3).mean()) < 0.9:
-        return
-    coarse = count < _FEWEST_LEVELS
-    text = (
-        f"{name} has a resolution of {show(resolution, log.units[name])}, {count:.0f} levels"
-        " between its 5th and 95th percentile"
-    )
-    action = "decimals were dropped on the way: log more digits" if coarse else ""
-    yield Finding(
-        "will mislead" if coarse else "note",
-        "resolution",
-        text,
-        {"resolution": resolution, "levels": count},
-        action,
-    )
+@check(
+    "values",
+    "held",
+    fix="leave the cells between two measurements empty: held values are late by half an interval"
+    " and their derivative is spikes; a fit takes them out of the motion and smooths it",
+)
+def held(log: Record, found: Check) -> Iterator[Finding]:
+    """Report slow sensors whose last value is repeated until the next."""
+    for name in log.measured:
+        usual = usual_interval(log[name])
+        if usual >= 2.0:
+            text = (
+                f"{name} changes in every {usual:.0f}th sample only, its last value is held in"
+                " between"
+            )
+            yield found(text, {"every": usual})
 
 
-def _steps(log: Log, name: str) -> Iterator[Finding]:
-    """Return the changes of level within one sample, which a mass does not make."""
-    values = without(log[name], spikes(log[name]))
-    change = np.abs(np.diff(values))
-    if np.isfinite(change).sum() < 50:
-        return
-    noise = noise_of(values)
-    around = np.lib.stride_tricks.sliding_window_view(
-        np.pad(np.nan_to_num(change), 4, mode="edge"), 9
-    )
-    beside = np.sort(around, axis=1)[:, -2]
-    span = float(np.nanquantile(values, 0.99) - np.nanquantile(values, 0.01))
-    over = np.nan_to_num(change) > np.maximum(np.maximum(8.0 * noise, 4.0 * beside), _LEVEL * span)
-    if over.any():
-        at = int(np.argmax(np.where(over, change, 0.0)))
-        text = (
-            f"{name} changes level {int(over.sum())} times within one sample, at most by"
-            f" {show(change[at], log.units[name])} "
-        )
-        text += f"at t = {log.t[at + 1]:.2f} s"
-        figures = {"count": over.sum(), "largest": float(change[at]), "t": float(log.t[at + 1])}
-        action = f"mask it (kind: jump, channel: {name}), or split the log there"
-        yield Finding(
-            "will mislead",
-            "jump",
-            text,
-            figures,
-            action,
-            np.append(False, over) | np.append(over, False),
-            channels=(name,),
-        )
+@check("values", "jump")
+def jumps(log: Record, found: Check) -> Iterator[Finding]:
+    """Report changes of a velocity's level within one sample, which a mass does not make."""
+    for name in (name for name in log.moving if name in log.measured):
+        values = np.where(log.spikes(name), np.nan, log[name])
+        change = np.abs(np.diff(values))
+        if np.isfinite(change).sum() < 50:
+            continue
+        change = np.nan_to_num(change)
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(change, 4, mode="edge"), 9)
+        beside = np.sort(around, axis=1)[:, -2]
+        low, high = np.nanquantile(values, (0.01, 0.99))
+        # beyond noise, beyond what goes on beside it, and a good part of the whole range
+        least = max(8.0 * noise_of(values), 0.3 * float(high - low))
+        over = change > np.maximum(least, 4.0 * beside)
+        if over.any():
+            at = int(np.argmax(np.where(over, change, 0.0)))
+            text = (
+                f"{name} changes level {int(over.sum())} times within one sample, at most by"
+                f" {show(change[at], log.units[name])} at t = {log.t[at + 1]:.2f} s"
+            )
+            yield found(
+                text,
+                {"count": over.sum(), "largest": change[at], "t": log.t[at + 1]},
+                fix=f"mask it (kind: jump, channel: {name}), or split the log there",
+                at=np.append(False, over) | np.append(over, False),
+                channels=(name,),
+            )

@@ -1,1 +1,0 @@
-"""Findings about propellers and rudders that the vessel's motion contradicts."""

@@ -1,0 +1,358 @@
+"""Findings between logs: copies, one run in several files, ranges, excitation, logs apart."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from residnet.core.arrays.paged import LARGE
+from residnet.core.log import Log
+from residnet.core.names import VELOCITY
+from residnet.core.stretches import stretches
+from residnet.data.doctor.actuators import EARLY, delays, neutral_angle, propellers
+from residnet.data.doctor.clock import EPOCH
+from residnet.data.doctor.excitation import conditioning, in_brackets
+from residnet.data.doctor.findings import (
+    Check,
+    Finding,
+    Level,
+    check,
+    share_of,
+    show,
+    slip_in_words,
+)
+from residnet.data.doctor.statistics import MEASURED, Record, apart_from_others, averaged, high
+from residnet.data.outliers import noise_of
+from residnet.data.split import row_hashes, sampled_hashes, sampling
+
+# so many rows in a row that two logs share are no chance
+_COPIED = 20
+
+
+class Together:
+    """Logs that are examined beside each other; it contains the channels that all of them have.
+
+    Args:
+        logs: each with an increasing clock.
+        inputs: channels that drive the vessel; None takes all that no sensor of the motion
+            measures.
+        splits: log's name -> train, validation or test, where a config says.
+    """
+
+    def __init__(
+        self, logs: Sequence[Log], inputs: Sequence[str] | None, splits: Mapping[str, str]
+    ) -> None:
+        common = set.intersection(*(set(log.channels) for log in logs))
+        self.channels = [name for name in logs[0].channels if name in common]
+        given = self.channels if inputs is None else inputs
+        self.inputs = [name for name in given if name in common and name not in MEASURED]
+        self.logs = [Record(log, self.inputs) for log in logs]
+        self.splits = splits
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.channels
+
+    def torn(self, *logs: Record) -> str:
+        """Return the splits of logs where these are known and differ."""
+        found = [self.splits.get(log.name, "") for log in logs]
+        return " and ".join(found) if all(found) and len(set(found)) > 1 else ""
+
+
+@check("between", "copied_part", fix="leave it out, or keep both in one split")
+def copies(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report stretches that two logs, or two places of one log, have in common."""
+    velocities = [name for name in VELOCITY if name in logs]
+    names = velocities if len(velocities) > 1 else sorted(logs.channels)
+    members = [log.log for log in logs.logs]
+    if names and (one_of := sampling(members)) > 1:
+        # of very many rows a sample tells which logs have some in common
+        few = [sampled_hashes(log, names, one_of) for log in members]
+        rows, count = np.unique(np.concatenate(few), return_counts=True)
+        twice = rows[(count > 1) & (count <= 2 * len(members))]
+        alike = [int(np.isin(part, twice).sum()) * one_of >= _COPIED for part in few]
+        members = list(itertools.compress(members, alike))
+    if not names or not members:
+        return
+    hashes = [row_hashes(log, names) for log in members]
+    owner = np.repeat(np.arange(len(members)), [part.size for part in hashes])
+    row = np.concatenate([np.arange(part.size) for part in hashes])
+    _, inverse, count = np.unique(np.concatenate(hashes), return_inverse=True, return_counts=True)
+    # rows that stand in many places are those of a vessel at rest
+    shared = np.flatnonzero((count[inverse] > 1) & (count[inverse] <= 2 * len(members)))
+    shared = shared[np.argsort(inverse[shared], kind="stable")]
+    pairs: dict[tuple[int, int, int], list[int]] = {}
+    for _, same in itertools.groupby(shared.tolist(), key=lambda i: int(inverse[i])):
+        for i, j in itertools.combinations(sorted(same), 2):
+            key = int(owner[i]), int(owner[j]), int(row[j] - row[i])
+            pairs.setdefault(key, []).append(int(row[i]))
+    records = {log.name: log for log in logs.logs}
+    for (i, j, offset), places in sorted(pairs.items()):
+        flags = np.zeros(len(members[i]) + 1, dtype=bool)
+        flags[places] = True
+        starts, stops = stretches(flags)
+        longest = int(np.argmax(stops - starts))
+        size, start = int(stops[longest] - starts[longest]), int(starts[longest])
+        if size < _COPIED or (i == j and offset == 1):
+            continue
+        figures = {"rows": size, "first": start, "offset": offset}
+        a, b = members[i], members[j]
+        if i == j:
+            text = (
+                f"{a.name}: rows {start} to {start + size - 1} stand again from row"
+                f" {start + offset} on"
+            )
+            yield found(text, figures, code="repeated_block", fix="delete one of the copies")
+            continue
+        torn = logs.torn(records[a.name], records[b.name])
+        level: Level = "fatal" if torn else "will mislead"
+        if logs.splits and not {a.name, b.name} <= logs.splits.keys():
+            # the config leaves one of them out already
+            level = "note"
+        across = f" ({torn})" if torn else ""
+        if size >= max(len(a), len(b)) - 1:
+            text, fix = f"{a.name} and {b.name} are the same{across}", "leave one of them out"
+            yield found(text, figures, code="duplicate_log", level=level, fix=fix)
+            continue
+        first = start + offset
+        if len(b) < len(a):
+            a, b, first = b, a, start
+        text = (
+            f"{a.name} is in {share_of(size / len(a))} a copy of rows {first} to"
+            f" {first + size - 1} of {b.name}{across}"
+        )
+        yield found(text, figures, level=level)
+
+
+_STATES = ("x", "y", "u", "v", "r")
+
+
+@check("between", "continued", "note")
+def continued(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report a log that goes on where another ended: one run, cut into files."""
+
+    def each(of: Callable[[np.ndarray], float]) -> np.ndarray:
+        """Return a figure of each log and state [L, 5], NaN where it is not measured."""
+        return np.array(
+            [[of(log[n]) if n in log else np.nan for n in _STATES] for log in logs.logs]
+        )
+
+    first, last = each(lambda x: float(x[:3].mean())), each(lambda x: float(x[-3:].mean()))
+    noise, fast = each(noise_of), each(lambda x: float(high(x, 0.9)))
+    usual = each(lambda x: float(np.nanmedian(np.abs(np.diff(x)))))
+    whole = [len(log) >= 20 and sum(n in log for n in _STATES) >= 4 for log in logs.logs]
+    for i, a in enumerate(logs.logs if sum(whole) > 1 else ()):
+        apart = np.abs(first - last[i]) / np.maximum(usual[i] + noise[i] + noise, 1e-12)
+        most = np.nan_to_num(np.max(np.where(np.isnan(apart), 0.0, apart), axis=1))
+        for j in np.flatnonzero(most <= 30.0):
+            b = logs.logs[j]
+            if j == i or not (whole[i] and whole[j]):
+                continue
+            pause, begins = float(b.t[0] - a.t[-1]), float(abs(b.t[0]))
+            on_time = min(abs(a.t[-1]), begins) > 2.0 * a.step and 0.0 < pause < 3.0 * a.step
+            # where both are at rest nothing tells one quay from another
+            resting = math.hypot(*last[i, 2:4]) < 0.2 * math.hypot(*fast[i, 2:4])
+            fresh = abs(b.t[0] - a.t[0]) <= 1e-9 or b.t[0] <= 2.0 * a.step
+            if not on_time and (not fresh or most[j] > 8.0 or resting):
+                continue
+            torn = logs.torn(a, b)
+            text = f"{b.name} goes on where {a.name} ends"
+            text += f", {pause:.2f} s later: one run, cut into files" if on_time else ""
+            text += f"; they stand in {torn}" if torn else ""
+            fix = "keep them in one split" if torn or not logs.splits else ""
+            yield found(text, {"pause": pause}, fix=fix)
+
+
+@check(
+    "between",
+    "overlapping",
+    "note",
+    "two vessels, or two recordings of one run? keep them in one split",
+)
+def overlapping(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report logs of the same time."""
+    for a, b in itertools.combinations(logs.logs, 2):
+        seconds = float(min(a.t[-1], b.t[-1]) - max(a.t[0], b.t[0]))
+        if min(a.t[0], b.t[0]) > EPOCH and seconds > 0.0:
+            yield found(
+                f"{a.name} and {b.name} overlap in time for {seconds:.1f} s", {"seconds": seconds}
+            )
+
+
+@check(
+    "between",
+    "same_commands",
+    "note",
+    "repeats show how far the vessel repeats itself; keep them in one split",
+)
+def same_commands(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report logs with the same commands."""
+    names = [name for name in logs.inputs if not name.startswith(("wind", "current"))]
+    for a, b in itertools.combinations(logs.logs if names else (), 2):
+        size = min(len(a), len(b))
+        moving = [name for name in names if float(np.nanstd(a[name][:size])) > 1e-9]
+        if size < 50 or not moving:
+            continue
+
+        # a few samples tell most pairs apart
+        for rows in ([0, size // 3, 2 * size // 3, size - 1], slice(size)):
+            pairs = ((a[name][rows], b[name][rows]) for name in moving)
+            if not all(np.allclose(*pair, rtol=1e-6, atol=1e-9, equal_nan=True) for pair in pairs):
+                break
+        else:
+            torn = logs.torn(a, b)
+            text = (
+                f"{a.name} and {b.name} have the same commands ({', '.join(moving)}) over {size}"
+                " samples"
+            )
+            text += f" and stand in {torn}" if torn else ""
+            yield found(text, {"samples": size})
+
+
+@check(
+    "between",
+    "extrapolation",
+    fix="add training logs that go there, or do not trust the model there",
+)
+def extrapolation(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report how much of the other logs lies outside what the training logs cover."""
+    train = [log for log in logs.logs if logs.splits.get(log.name) == "train"]
+    others = [log for log in logs.logs if logs.splits.get(log.name) in ("validation", "test")]
+    for name in logs.channels if train and others else ():
+        if name in ("x", "y", "psi"):
+            continue
+        unit = train[0].units[name]
+        low = min(float(np.nanmin(log[name])) for log in train)
+        top = max(float(np.nanmax(log[name])) for log in train)
+        margin = 0.02 * (top - low)
+        for log in others:
+            values = log[name][np.isfinite(log[name])]
+            share = float(((values < low - margin) | (values > top + margin)).mean())
+            if share > 0.01:
+                text = (
+                    f"{name} of {log.name} ({logs.splits[log.name]}) lies outside the training"
+                    f" range {show(low, unit)} to {show(top, unit)} for {share_of(share)} of the"
+                    " time"
+                )
+                level: Level = "will mislead" if share > 0.25 else "note"
+                yield found(text, {"share": share}, level=level)
+
+
+def _relative(*parts: np.ndarray) -> float:
+    """Return the spread of a channel over its size, beyond its noise."""
+    known = np.concatenate(parts)
+    known = known[np.isfinite(known)]
+    size = float(np.abs(known).max(initial=0.0))
+    return max(float(known.std()) - 1.5 * noise_of(known), 0.0) / size if size > 0.0 else 0.0
+
+
+def _awake(log: Record, name: str) -> float:
+    """Return the spread of a velocity over the least that counts; below 1 it does not vary.
+
+    Only what its averaged noise does not explain counts.
+    """
+    samples = max(round(2.0 / log.step), 5)
+    smooth = averaged(log[name], samples)
+    known = smooth[np.isfinite(smooth)]
+    speed = np.hypot(log["u"], log["v"]) if "u" in log and "v" in log else np.zeros(1)
+    least = np.radians(0.05) if name == "r" else 0.02 * float(np.abs(np.nanmean(speed)))
+    least = max(3.0 * log.noise(name) / np.sqrt(samples), least, 1e-9)
+    return float(known.std() / least) if known.size >= 10 else 0.0
+
+
+@check("between", "no_excitation", fix="record manoeuvres: zigzag, 3-2-1-1")
+def excitation(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report whether a fit to all logs together has something to learn from."""
+    count, velocities = len(logs.logs), [name for name in VELOCITY if name in logs]
+    awake = {name: max(_awake(log, name) for log in logs.logs) for name in velocities}
+    if awake and max(awake.values()) < 1.0:
+        text = (
+            f"no velocity varies beyond its noise in any of {count} logs: a fit would find nothing"
+            " but noise"
+        )
+        yield found(text, {f"{n}_over_noise": v for n, v in awake.items()}, level="fatal")
+    driving = [name for name in logs.inputs if not name.startswith(("wind", "current"))]
+    within = {name: max(_relative(log[name]) for log in logs.logs) for name in driving}
+    among = {name: _relative(*(log[name] for log in logs.logs)) for name in driving}
+    # constant in each, but not the same in all, tells something
+    if driving and max(within.values()) < 1e-3 and max(among.values()) <= 1e-2:
+        text = f"no input ({', '.join(driving)}) varies within any of {count} logs"
+        text += ": what they do cannot be identified"
+        yield found(text, {"spread": max(within.values())})
+    held = [name for name in driving if max(within[name], among[name]) < 1e-3]
+    if held:
+        text = f"{', '.join(held)} never varies: its effect cannot be separated from a constant"
+        yield found(text, {"count": len(held)}, code="constant_inputs", level="note", fix="")
+    moving = [name for name in (*velocities, *driving) if name not in held]
+    # of very many samples evenly spread ones tell the same
+    every = -(-sum(len(log) for log in logs.logs) // LARGE)
+    columns = np.concatenate([log.log.stack(moving)[::every] for log in logs.logs])
+    columns = columns[np.isfinite(columns).all(axis=1)]
+    if driving and len(moving) > 1 and columns.shape[0] >= 10 * len(moving):
+        number, worst = conditioning(columns, moving)
+        text = f"{count} logs together: condition number of {in_brackets(moving)} {number:.3g}"
+        if number > 30.0:
+            text += (
+                f"; {', '.join(worst)} move together: give one of them, or add manoeuvres that move"
+                " them apart"
+            )
+        yield found(text, {"condition": number}, code="condition", level="note", fix="")
+
+
+@check("between", "unit_between", fix="correct its unit in the channel map", needs=("u",))
+def units_between(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report logs whose revolutions are out of proportion to those of the others."""
+    for name in logs.inputs:
+        if all(name in log.of(propellers) for log in logs.logs):
+            turns = [
+                math.log(max(high(log[name], 0.9), 1e-9) / max(high(log["u"], 0.9), 1e-12))
+                for log in logs.logs
+            ]
+            # beyond what the logs of one vessel differ by in the ratio of speed to revolutions
+            for i, apart, _ in apart_from_others(turns, [0.0] * len(turns), math.log(8.0)):
+                ratio = math.exp(apart)
+                text = (
+                    f"{logs.logs[i].name}: {name} is {ratio:.3g} times as large for its speed as in"
+                    f" the other logs{slip_in_words(ratio)}"
+                )
+                yield found(text, {"ratio": ratio})
+
+
+@check("between", "rudder_bias", fix="take the offset off this log's rudder", needs=("delta",))
+def neutrals_between(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report logs whose neutral rudder angle differs from that of the others."""
+    known = [(log, log.of(neutral_angle)) for log in logs.logs if "delta" in logs.inputs]
+    told = [(log, neutral) for log, neutral in known if neutral is not None]
+    angles, errors = [one.angle for _, one in told], [one.error for _, one in told]
+    for i, apart, error in apart_from_others(angles, errors, math.radians(2.0)):
+        text = (
+            f"{told[i][0].name}: the vessel goes straight at {math.degrees(apart):+.1f} deg of"
+            f" delta more than in {len(told) - 1} other logs"
+        )
+        yield found(text, {"angle": apart, "error": error})
+
+
+@check(
+    "between",
+    "timing",
+    fix="the clocks of inputs and motion differ in this log: shift one of them",
+)
+def delays_between(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report logs in which the motion answers at another delay than in the others."""
+    told: dict[str, list[tuple[Record, float, float]]] = {}
+    # the delays of two logs alone say nothing
+    for log in logs.logs if len(logs.logs) > 2 else ():
+        for (channels, _), (_, delay) in log.of(delays).items():
+            if delay.error < max(0.3, 0.5 * log.step) and delay.sharp > 1.1:
+                told.setdefault(channels, []).append((log, delay.seconds, delay.error))
+    for channels, members in told.items():
+        records, seconds, errors = zip(*members, strict=True)
+        least = max(EARLY, 1.5 * max(log.step for log in records))
+        for i, apart, error in apart_from_others(seconds, errors, least, sure=3.0):
+            text = (
+                f"{records[i].name}: the motion answers {channels} {apart:+.2f} s later than in"
+                f" {len(members) - 1} other logs"
+            )
+            yield found(text, {"lag": apart, "error": error})

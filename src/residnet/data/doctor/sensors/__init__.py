@@ -1,1 +1,0 @@
-"""Findings about receivers and compasses that show what they did not measure."""

@@ -1,0 +1,335 @@
+"""What several checks need to know of a log: noise, smoothed channels, robust fits, agreement.
+
+A log under examination (`Record`) computes each of them once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import scipy
+
+from residnet.core.log import Log
+from residnet.core.names import VELOCITY
+from residnet.data.outliers import SIGMA_OF_MAD, noise_of, spikes
+
+MEASURED = ("x", "y", "psi", "u", "v", "r", "phi", "p", "u_dot", "v_dot", "r_dot")
+"""Channels that a sensor or filter measures; all others drive the vessel."""
+STEERING = ("delta", "tau_n", "acting_tau_n", "cmd_delta", "nozzle", "cmd_nozzle")
+"""Channels of which a positive value turns the vessel."""
+SECTIONS = 20
+"""Parts of a log whose errors are taken as independent of each other, and of nothing shorter."""
+FEWEST = 50
+"""Samples below which nothing is compared."""
+WINDOW = 15
+"""Samples of the parabola that smooths a channel."""
+
+_T = TypeVar("_T")
+
+
+class Record:
+    """A log under examination, with what checks find out about it computed once.
+
+    Args:
+        log: with an increasing clock.
+        inputs: channels that drive the vessel.
+    """
+
+    def __init__(self, log: Log, inputs: Sequence[str] = ()) -> None:
+        self.log, self.t, self.units, self.name = log, log.t, log.units, log.name
+        self.inputs = tuple(inputs)
+        self.noise = cache(lambda name: noise_of(log[name]))
+        """Standard deviation of a channel's white noise."""
+        self.spikes = cache(lambda name: spikes(log[name]))
+        """[T] bool: samples of a channel that stand far out of their neighbours."""
+        self.smooth = cache(lambda name: smoothed(self.t, log[name]))
+        """A channel [T] smoothed by a parabola over 15 samples, NaN bridged."""
+        self._shared: dict[Hashable, Any] = {}
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.log.channels
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.log.channels)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.log[name]
+
+    def __len__(self) -> int:
+        return len(self.log)
+
+    @cached_property
+    def step(self) -> float:
+        """Usual time between samples in s."""
+        return float(np.median(np.diff(self.t)))
+
+    @cached_property
+    def measured(self) -> list[str]:
+        """Channels of the motion, inputs left out."""
+        return [name for name in self if name in MEASURED and name not in self.inputs]
+
+    @cached_property
+    def moving(self) -> list[str]:
+        """Velocities that the log has."""
+        return [name for name in VELOCITY if name in self]
+
+    @cached_property
+    def speed(self) -> float:
+        """Root mean square of the speed where it is known, m/s; 0 where it is not."""
+        square = self["u"] ** 2 + self["v"] ** 2 if "u" in self and "v" in self else np.zeros(1)
+        return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else 0.0
+
+    def of(self, statistic: Callable[..., _T], *about: Hashable) -> _T:
+        """Return a statistic of this record, `statistic(record, *about)`, computed once."""
+        key = (statistic, *about)
+        if key not in self._shared:
+            self._shared[key] = statistic(self, *about)
+        found: _T = self._shared[key]
+        return found
+
+    def without(self, bad: np.ndarray) -> Record:
+        """Return the record with NaN in the measured channels where bad [T]."""
+        channels = {
+            name: np.where(bad, np.nan, values) if name in MEASURED else values
+            for name, values in self.log.channels.items()
+        }
+        return Record(self.log.replace(channels=channels), self.inputs) if bad.any() else self
+
+
+def bridged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values [T] with straight lines where some are missing, 0 where all are."""
+    known = np.isfinite(values)
+    if known.all() or not known.any():
+        return np.asarray(np.nan_to_num(values))
+    return np.asarray(np.interp(t, t[known], values[known]))
+
+
+def smoothed(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values [T] smoothed by a parabola over 15 samples, NaN bridged by sample."""
+    filled = bridged(np.arange(t.size), values)
+    return np.asarray(scipy.signal.savgol_filter(filled, WINDOW, 2))
+
+
+def averaged(values: np.ndarray, samples: int) -> np.ndarray:
+    """Return the moving average [T] over so many samples, NaN left out; NaN where none is known."""
+    kernel = np.ones(min(samples, values.size))
+    known = np.isfinite(values)
+    count = np.convolve(known, kernel, mode="same")
+    total = np.convolve(np.where(known, values, 0.0), kernel, mode="same")
+    return np.where(count > 0.5, total / np.maximum(count, 1.0), np.nan)
+
+
+def high(values: np.ndarray, share: float = 0.95) -> float:
+    """Return the size that a channel reaches, by a quantile of its absolute values."""
+    return float(np.nanquantile(np.abs(values), share))
+
+
+def resolution_of(values: np.ndarray) -> float:
+    """Return the least step between the values of a channel; 0 where it has no grid."""
+    change = np.abs(np.diff(values))
+    change = change[np.isfinite(change) & (change > 0.0)]
+    if change.size < FEWEST:
+        return 0.0
+    least = float(np.quantile(change, 0.01))
+    steps = change / least
+    return least if float((np.abs(steps - np.round(steps)) < 0.02).mean()) > 0.95 else 0.0
+
+
+class Fit(NamedTuple):
+    """A least-squares fit: values [k], their covariance [k, k], what is left [N]."""
+
+    values: np.ndarray
+    spread: np.ndarray
+    rest: np.ndarray
+
+    @property
+    def left(self) -> float:
+        """Sum of squares of what is left."""
+        return float(self.rest @ self.rest)
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Standard errors [k]."""
+        return np.sqrt(np.maximum(np.diag(self.spread), 1e-300))
+
+    @property
+    def sure(self) -> float:
+        """The last value in its standard errors."""
+        return float(self.values[-1] / self.errors[-1])
+
+
+def fit(x: np.ndarray, y: np.ndarray) -> Fit:
+    """Return y [N] fitted by the columns of x [N, k].
+
+    The covariance is a sandwich over sections: what filters leave hangs together, but not for
+    longer than a twentieth of the log. A column of zeros keeps a coefficient of zero.
+    """
+    length = np.linalg.norm(x, axis=0)
+    size = np.where(length > 0.0, length, 1.0)
+    x = x / size
+    inverse = np.linalg.pinv(x.T @ x, rcond=1e-10)
+    values = inverse @ (x.T @ y)
+    rest = y - x @ values
+    first = np.searchsorted(np.arange(y.size) * SECTIONS // y.size, np.arange(SECTIONS))
+    scores = np.add.reduceat(x * rest[:, None], first, axis=0)
+    spread = inverse @ (scores.T @ scores) @ inverse
+    return Fit(values / size, spread / np.outer(size, size), rest)
+
+
+# a block covers so many samples and so many seconds at least
+_BLOCK_SAMPLES, _BLOCK_SECONDS = 16, 3.0
+# blocks begin so many times in the length of one
+_OVERLAP = 4
+# over a block each velocity changes by so many standard deviations of its noise, where it can
+_OVER_NOISE = 10.0
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Overlapping blocks of a log over which equations of motion are integrated.
+
+    Noise then needs no derivative and averages out.
+
+    Attributes:
+        t: times of the log [T].
+        first: sample at which each block begins [K].
+        size: number of samples in a block.
+    """
+
+    t: np.ndarray
+    first: np.ndarray
+    size: int
+
+    def change(self, values: np.ndarray, shift: int = 0) -> np.ndarray:
+        """Return the changes [K, ...] of values [T, ...] over the blocks, `shift` samples early."""
+        first = self.first - shift
+        return np.asarray(values[first + self.size] - values[first])
+
+    def clear_of(self, bad: np.ndarray, shift: int = 0) -> np.ndarray:
+        """Return the blocks [K] bool that touch none of the samples bad [T]."""
+        count, first = np.append(0, np.cumsum(bad)), self.first - shift
+        return np.asarray(count[first + self.size + 1] == count[first])
+
+    def integrals(self, table: np.ndarray) -> Callable[[int], np.ndarray]:
+        """Return the integrals [K, k] of columns [T, k] over the blocks, by shift in samples.
+
+        They are NaN where a sample of the block is.
+        """
+        bad = ~np.isfinite(table).all(axis=1)
+        total = np.zeros(table.shape)
+        filled = np.where(bad[:, None], 0.0, table)
+        np.cumsum(
+            0.5 * np.diff(self.t)[:, None] * (filled[1:] + filled[:-1]), axis=0, out=total[1:]
+        )
+
+        def at(shift: int) -> np.ndarray:
+            clear = self.clear_of(bad, shift)[:, None]
+            return np.where(clear, self.change(total, shift), np.nan)
+
+        return at
+
+
+def blocks_of(log: Record, *moving: str) -> Blocks:
+    """Return blocks over which some velocities change by more than their noise."""
+    least = max(_BLOCK_SAMPLES, round(_BLOCK_SECONDS / log.step))
+    size = min(3 * least, max(least, len(log) // 20))
+    for longer in (least, 2 * least, 3 * least):
+        if longer > len(log) // 20:
+            break
+        changes = {name: log[name][longer:] - log[name][:-longer] for name in moving}
+        over = [
+            float(np.nanstd(change)) / max(log.noise(name), 1e-12)
+            for name, change in changes.items()
+            if np.isfinite(change).any()
+        ]
+        if min(over, default=_OVER_NOISE) >= _OVER_NOISE:
+            size = longer
+            break
+    return Blocks(log.t, np.arange(0, len(log) - size, max(size // _OVERLAP, 1)), size)
+
+
+def regressors(
+    velocity: Mapping[str, np.ndarray], inputs: Mapping[str, np.ndarray], count: int
+) -> np.ndarray:
+    """Return a polynomial [T, k] of second degree in velocities and inputs that knows no vessel."""
+    columns = [np.ones(count), *velocity.values()]
+    columns += [values * np.abs(values) for values in velocity.values()]
+    if "u" in velocity:
+        columns += [velocity["u"] * velocity[name] for name in ("v", "r") if name in velocity]
+    if "v" in velocity and "r" in velocity:
+        columns.append(velocity["v"] * velocity["r"])
+    driving = [values for values in inputs.values() if np.nanstd(values) > 0.0]
+    columns += driving
+    # beyond four inputs each enters linearly only
+    if len(driving) <= 4:
+        columns += [values * np.abs(values) for values in driving]
+        if "u" in velocity:
+            columns += [velocity["u"] * np.abs(velocity["u"]) * values for values in driving]
+    return np.stack(columns, axis=-1)
+
+
+class Agreement(NamedTuple):
+    """How one channel follows another.
+
+    Attributes:
+        correlation: means removed, at the lag where it is largest.
+        gain: least squares through the origin at that lag.
+        lag: in s, positive where the channel trails.
+        spread: standard deviation of the reference.
+    """
+
+    correlation: float
+    gain: float
+    lag: float
+    spread: float
+
+
+def agreement(reference: np.ndarray, measured: np.ndarray, step: float) -> Agreement | None:
+    """Return how `measured` [T] follows `reference` [T], at lags of up to 3 s.
+
+    None where fewer than 50 samples can be compared at all lags, or either does not vary.
+    """
+    reach = max(round(3.0 / step), 10)
+    if reference.size < 2 * reach + FEWEST:
+        return None
+    # the same samples for every lag, or the comparison of lags would be one of samples
+    known = np.lib.stride_tricks.sliding_window_view(np.isfinite(measured), 2 * reach + 1)
+    at = np.flatnonzero(np.isfinite(reference[reach:-reach]) & known.all(axis=1)) + reach
+    if at.size < FEWEST:
+        return None
+    a, lags = reference[at], range(-reach, reach + 1)
+    spread, std = float(a.std()), np.array([measured[at + k].std() for k in lags])
+    if spread == 0.0 or std.min() <= 1e-12 * np.nanmax(np.abs(measured)):
+        return None
+    values = np.array([(a - a.mean()) @ measured[at + k] for k in lags]) / (at.size * spread * std)
+    best = int(np.argmax(np.abs(values)))
+    shift = 0.0
+    if 0 < best < 2 * reach:
+        before, peak, after = np.abs(values[best - 1 : best + 2])
+        curvature = before - 2.0 * peak + after
+        shift = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
+    gain = float(a @ measured[at + lags[best]] / (a @ a))
+    return Agreement(float(values[best]), gain, (best - reach + shift) * step, spread)
+
+
+def apart_from_others(
+    values: Sequence[float], errors: Sequence[float], least: float, sure: float = 6.0
+) -> Iterator[tuple[int, float, float]]:
+    """Return the logs whose value is not that of the others: number, distance, standard error.
+
+    Each of at least three is compared with the median of the others, by more than `least`, four
+    times their robust scatter, and `sure` standard errors.
+    """
+    for i, (value, error) in enumerate(zip(values, errors, strict=True)):
+        others = np.delete(np.asarray(values), i)
+        if others.size < 2:
+            return
+        apart = float(value - np.median(others))
+        scatter = SIGMA_OF_MAD * float(np.median(np.abs(others - np.median(others))))
+        whole = float(np.hypot(error, np.median(np.delete(np.asarray(errors), i))))
+        if abs(apart) > max(least, 4.0 * scatter, sure * whole):
+            yield i, apart, whole
