@@ -16,7 +16,7 @@ import residnet
 
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
-    "api": (829, 102),
+    "api": (684, 79),
     "baselines": (809, 124),
     "control": (3232, 352),
     "core": (1268, 183),
@@ -33,10 +33,10 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2840, 320),
     "runs": (337, 47),
     "simulators": (362, 45),
-    "tasks": (3169, 278),
+    "tasks": (2994, 256),
     "testing": (485, 33),
     "training": (1344, 150),
-    "": (433, 50),
+    "": (428, 50),
 }
 
 

@@ -66,8 +66,8 @@ def eager(run: Path, card: dict[str, Any]) -> Any:
     from residnet.core.config import load_config
     from residnet.export.policy import ExportedCourse
     from residnet.runs.folder import RunFolder
-    from residnet.tasks.course.running import load_policy, plan_for, ready
-    from residnet.tasks.course.task import CourseTaskConfig
+    from residnet.tasks.course import CourseTaskConfig
+    from residnet.tasks.course_run import load_policy, plan_for, ready
 
     folder = RunFolder.open(run)
     config = load_config(folder.resolved, [], CourseTaskConfig)

@@ -33,8 +33,8 @@ from residnet.control.heading.controllers import Steering
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ResidnetError
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.course.running import fly
-from residnet.tasks.course.task import Vessels
+from residnet.tasks.course import Vessels
+from residnet.tasks.course_run import fly
 
 
 def arguments() -> argparse.Namespace:

@@ -16,52 +16,35 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from residnet.api.data import Data, prepare
-    from residnet.api.drafting import draft
-    from residnet.api.fitting import Models, fit, metrics, select
-    from residnet.api.logs import inspect, read_logs
-    from residnet.api.models import Model, export_model, load, save
-    from residnet.api.monitoring import Monitor
-    from residnet.api.parts import available, baseline, head
-    from residnet.api.runs import FreeRuns, free_run
-    from residnet.api.simulation import Trials, manoeuvre, simulate, vessel
-    from residnet.api.tasks import Result, autopilot, run
+    from residnet.api.data import Data, draft, inspect, prepare, read_logs
+    from residnet.api.fitting import FreeRuns, Models, fit, free_run, metrics, select
+    from residnet.api.models import Model, Monitor, export_model, load, save
+    from residnet.api.tasks import (
+        Result,
+        Trials,
+        autopilot,
+        available,
+        baseline,
+        head,
+        manoeuvre,
+        run,
+        simulate,
+        vessel,
+    )
     from residnet.core.errors import ResidnetError
     from residnet.core.log import Log
     from residnet.core.progress import Progress
     from residnet.core.version import __version__
 
 _HOME = {
-    "__version__": "core.version",
-    "Data": "api.data",
-    "FreeRuns": "api.runs",
-    "Log": "core.log",
-    "Model": "api.models",
-    "Models": "api.fitting",
-    "Monitor": "api.monitoring",
-    "Progress": "core.progress",
-    "ResidnetError": "core.errors",
-    "Result": "api.tasks",
-    "Trials": "api.simulation",
-    "autopilot": "api.tasks",
-    "available": "api.parts",
-    "baseline": "api.parts",
-    "draft": "api.drafting",
-    "export_model": "api.models",
-    "fit": "api.fitting",
-    "free_run": "api.runs",
-    "head": "api.parts",
-    "inspect": "api.logs",
-    "load": "api.models",
-    "manoeuvre": "api.simulation",
-    "metrics": "api.fitting",
-    "prepare": "api.data",
-    "read_logs": "api.logs",
-    "run": "api.tasks",
-    "save": "api.models",
-    "select": "api.fitting",
-    "simulate": "api.simulation",
-    "vessel": "api.simulation",
+    "core.version": "__version__",
+    "core.errors": "ResidnetError",
+    "core.log": "Log",
+    "core.progress": "Progress",
+    "api.data": "Data draft inspect prepare read_logs",
+    "api.models": "Model Monitor export_model load save",
+    "api.fitting": "FreeRuns Models fit free_run metrics select",
+    "api.tasks": "Result Trials autopilot available baseline head manoeuvre run simulate vessel",
 }
 
 __all__ = [
@@ -99,9 +82,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    home = next((module for module, names in _HOME.items() if name in names.split()), None)
+    if home is None:
         raise AttributeError(f"module 'residnet' has no attribute '{name}'")
-    value = getattr(importlib.import_module(f"residnet.{_HOME[name]}"), name)
+    value = getattr(importlib.import_module(f"residnet.{home}"), name)
     globals()[name] = value
     return value
 

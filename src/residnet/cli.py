@@ -157,7 +157,7 @@ def new(
     Channels, units, frames, inputs, splits, protocols and models are proposed. What the logs do
     not tell is asked on a terminal; elsewhere the default is taken and marked as a guess.
     """
-    from residnet.tasks.drafting.draft import new_config
+    from residnet.tasks.drafting import new_config
 
     limit_threads()
     with drawn_progress(quiet=quiet):

@@ -20,7 +20,7 @@ from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.angles import degrees_of
 from residnet.data.readers.tables import CsvConfig
-from residnet.tasks.drafting.draft import drafted
+from residnet.tasks.drafting import drafted
 
 pytest.importorskip("pyproj")
 CHANNELS = {

@@ -16,8 +16,8 @@ from tiny import call
 from residnet.control.heading.controllers import PtosConfig
 from residnet.core.config import load_config
 from residnet.report.sections.autopilot import cost_verdict
-from residnet.tasks.autopilot.running import stored_policy
-from residnet.tasks.autopilot.task import AutopilotConfig, tuned_before
+from residnet.tasks.autopilot import AutopilotConfig, tuned_before
+from residnet.tasks.autopilot_run import stored_policy
 
 pytestmark = pytest.mark.long
 

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from residnet.control.heading.turning import Turning
-from residnet.tasks.autopilot.task import AutopilotConfig, least_time, paced
+from residnet.tasks.autopilot import AutopilotConfig, least_time, paced
 
 CONFIG: dict[str, Any] = {
     "task": "autopilot",

@@ -8,7 +8,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from residnet.tasks.course.task import CourseSpreadConfig
+from residnet.tasks.course import CourseSpreadConfig
 
 
 def test_vessels_and_currents_fill_their_ranges_and_come_again_with_their_seed() -> None:

@@ -21,7 +21,7 @@ from residnet.core.log import Log
 from residnet.data.drafting.questions import Question
 from residnet.data.readers import ReaderConfig
 from residnet.identification.recipe import window_length
-from residnet.tasks.drafting.draft import new_config
+from residnet.tasks.drafting import new_config
 from residnet.tasks.registry import load_task
 
 
@@ -68,7 +68,7 @@ def test_a_config_from_logs_alone(folder: Path) -> None:
     assert (channels["r"]["unit"], channels["u"]["unit"]) == ("deg/min", "kn")
     assert channels["delta"]["sign"] == -1
     assert content["signals"]["inputs"] == ["delta", "n"]
-    assert content["baselines"]["physics"]["sets"] == ["fossen"]
+    assert (content["recipe"], content["effort"]) == ("standard", 0.1)
     assert {name: len(content["data"]["split"][name]) for name in ("train", "test")} == {
         "train": 4,
         "test": 1,
@@ -88,7 +88,7 @@ def test_the_same_from_python(folder: Path) -> None:
 def test_the_standard_recipe_where_it_is_asked_for(folder: Path) -> None:
     draft = residnet.draft(folder / "trials", name="boat", folder=folder, recipe="standard")
     assert draft.config["recipe"] == "standard"
-    assert not {"baseline", "baselines", "heads", "training"} & set(draft.config)
+    assert not {"baseline", "baselines", "heads", "training", "effort"} & set(draft.config)
     load_task(draft.save(folder / "standard.yaml")).check()
     with pytest.raises(UsageError, match="no recipe 'standart'; did you mean 'standard'"):
         residnet.draft(folder / "trials", recipe="standart")

@@ -1,13 +1,14 @@
-"""From logs to identification data: grid, masks, derivatives, splits, protocols and scales."""
+"""Logs into Python: read, looked at by the data doctor, and prepared for a fit; configs drafted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import glob
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from residnet.api.logs import LogsGiven, read_logs
-from residnet.api.values import described, hearing, plain
+from residnet.api.values import PartGiven, PathGiven, described, hearing, part, path, plain
 from residnet.core.arrays import paged
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
@@ -15,10 +16,15 @@ from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback, report, say
 from residnet.data.division import divided
-from residnet.data.drafting.questions import Marks
+from residnet.data.doctor import inspect as examine
+from residnet.data.doctor import inspect_together
+from residnet.data.drafting.questions import Marks, Question
+from residnet.data.drafting.reading import log_files, read_each
 from residnet.data.motion import MotionConfig, complete_motion
+from residnet.data.parts import log_names
 from residnet.data.prepare import PrepareConfig, Prepared
 from residnet.data.prepare import prepare as prepare_log
+from residnet.data.readers import ReaderConfig
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.data.sources import read_logs as read_splits
@@ -26,10 +32,199 @@ from residnet.data.split import SPLITS, check_leaks
 from residnet.identification.recipe import Preparation, judging, window_length
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.tasks.drafting.inputs import driving
+from residnet.tasks.drafting import Draft, commented, drafted
+from residnet.tasks.driving import driving
 
 if TYPE_CHECKING:
     import pandas as pd
+
+LogsGiven = PathGiven | Log | Sequence[PathGiven] | Sequence[Log]
+"""Logs that were read, or where to read them."""
+RECIPES = ("standard",)
+"""Recipes by name."""
+
+
+def read_logs(
+    source: LogsGiven,
+    *,
+    channels: Mapping[str, Any] | None = None,
+    time: str | tuple[str, str] | Mapping[str, str] = "t",
+    manoeuvre: str | None = None,
+    reader: PartGiven | None = None,
+    progress: ProgressCallback | None = None,
+) -> list[Log]:
+    """Read logs from files, patterns or folders.
+
+    A table (csv, foreign Parquet) needs to be told what its columns are: by `channels`, or by a
+    `reader` as YAML has it. Without either the reader is drafted as `draft` does it, by names,
+    headers, values and physics; it is reported to `progress`, with a comment at each guess.
+
+    Args:
+        source: a path, a pattern such as `trials/*.csv`, a folder, or a list of these.
+        channels: channel -> (column, unit), for example `{"u": ("speed", "kn")}`, or a mapping with
+            column, unit, sign and frame as YAML has it.
+        time: column that holds time, in s, or (column, unit).
+        manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder.
+        reader: kind or settings of a reader, in place of `channels`.
+        progress: is told how far the reading is.
+
+    Returns:
+        The logs in the order of the files: channels [T] in SI units and radians.
+
+    Raises:
+        UsageError: where there is no such file, or a column or unit is wrong.
+        DataError: where the contents of a file cannot be used.
+
+    Example:
+        logs = residnet.read_logs("trials/*.csv", channels={"u": ("speed", "kn"), ...})
+    """
+    given: list[Any] = list(source) if isinstance(source, list | tuple) else [source]
+    if not given:
+        raise UsageError("read_logs: no log is given; name files, a pattern or a folder")
+    read = [isinstance(entry, Log) for entry in given]
+    if all(read):
+        return given
+    if any(read):
+        raise UsageError("read_logs: give either paths or logs that were read, not both")
+    if reader is not None and channels is not None:
+        raise UsageError("read_logs: give channels or a reader, not both")
+    with hearing(progress):
+        files = log_files([file for entry in given for file in _matching(entry)], folders=True)
+        names, logs = log_names(files), dict[Path, Log]()
+        settings: Any = None if reader is None else part(reader, "reader")
+        if channels is not None:
+            settings = {
+                "kind": "parquet" if files[0].suffix == ".parquet" else "csv",
+                "time": _column(time, "time", "s"),
+                "channels": {name: _column(entry, name) for name, entry in channels.items()},
+                "manoeuvre": manoeuvre,
+            }
+        if settings is None:
+            for draft in read_each(files):
+                for error in draft.left_out.values():
+                    raise error
+                if "channels" in draft.reader:
+                    say(f"{next(iter(draft.logs))}: channel map as guessed, to be checked")
+                    content = {"data": {"reader": draft.reader}}
+                    for line in commented(content, draft.marks.comments).splitlines():
+                        say(f"  {line}")
+                logs |= draft.logs
+        else:
+            chosen = validate(plain(settings), ReaderConfig, "read_logs").build()
+            for number, file in enumerate(files):
+                report("reading logs", number, len(files))
+                logs[file] = chosen.read(file)
+            report("reading logs", len(files), len(files))
+    return [logs[file].replace(name=names[file]) for file in files]
+
+
+def _matching(entry: Any) -> list[Path]:
+    file = path(entry, "read_logs")
+    if file.exists() or not glob.has_magic(str(file)):
+        return [file]
+    found = sorted(Path(name) for name in glob.glob(str(file), recursive=True))  # noqa: PTH207
+    if not found:
+        raise UsageError(f"read_logs: '{file}' matches no file")
+    return found
+
+
+def _column(given: Any, name: str, unit: str | None = None) -> Any:
+    if isinstance(given, tuple | list) and len(given) == 2:
+        return {"column": given[0], "unit": given[1]}
+    if isinstance(given, str) and unit is not None:
+        return {"column": given, "unit": unit}
+    if isinstance(given, str):
+        raise UsageError(
+            f"read_logs: channels: {name}: give the column and its unit, for example"
+            f" ('{given}', 'm/s')"
+        )
+    if isinstance(given, Mapping):
+        return given
+    raise UsageError(f"read_logs: channels: {name}: expected (column, unit), {described(given)}")
+
+
+def inspect(
+    logs: LogsGiven, *, inputs: Sequence[str] | None = None, masks: Sequence[Any] = ()
+) -> pd.DataFrame:
+    """Look at logs as a doctor would: clocks, gaps, jumps, frames, lags, copies, excitation.
+
+    Args:
+        logs: from `read_logs`, or what it takes.
+        inputs: channels that drive the vessel; all that no sensor of the motion measures where
+            None.
+        masks: rules that will leave samples out, as YAML has them.
+
+    Returns:
+        One row for each finding, with the columns log (`together` for what concerns several), level
+        (`note`, `will mislead`, `fatal`), code, text and action. A fit would be misled where any
+        level is above `note`.
+
+    Raises:
+        UsageError: where a log lacks an input, or a path is wrong.
+        DataError: where a log cannot be examined.
+
+    Example:
+        findings = residnet.inspect(logs); findings[findings.level != "note"]
+    """
+    import pandas as pd
+
+    members = read_logs(logs)
+    settings = {"grid": {"step": 1.0}, "masks": plain(masks)}
+    rules = validate(settings, PrepareConfig, "inspect").masks
+    reports = [*(examine(log, inputs, rules) for log in members), inspect_together(members, inputs)]
+    columns = ["level", "code", "text", "action"]
+    rows = [
+        [doctor.name, *(getattr(finding, name) for name in columns)]
+        for doctor in reports
+        for finding in doctor.findings
+    ]
+    return pd.DataFrame(rows, columns=["log", *columns])
+
+
+def draft(
+    logs: PathGiven | Sequence[PathGiven],
+    *,
+    name: str = "my_boat",
+    folder: PathGiven = ".",
+    answer: Callable[[Question], str] | None = None,
+    recipe: str | None = None,
+    progress: ProgressCallback | None = None,
+) -> Draft:
+    """Draft a complete config of a fit from logs of any format.
+
+    Channels, units, frames, inputs, splits, protocols and scales are proposed by names, headers,
+    values and physics, models by the standard recipe. What the logs do not tell is a guess, and
+    marked as one.
+
+    Args:
+        logs: files, folders and bags: one, or a list of these.
+        name: of the run.
+        folder: where the config will lie; its paths start from there.
+        answer: is given each question that the logs leave open, and returns its answer; None takes
+            the defaults.
+        recipe: `standard` trains the networks of the recipe at full length, in place of a quick
+            look.
+        progress: is told how far the reading is.
+
+    Returns:
+        The draft: `config` for `residnet.run`, `guesses` as pairs of key and reason, `text` as
+        YAML with comments, and `save(file)`.
+
+    Raises:
+        UsageError: where a path does not exist, or nothing in the logs drives the vessel.
+        DataError: where no log can be used.
+
+    Example:
+        draft = residnet.draft("trials/"); draft.save("my_boat.yaml"); residnet.run("my_boat.yaml")
+    """
+    given = list(logs) if isinstance(logs, list | tuple) else [logs]
+    if not given:
+        raise UsageError("draft: no log is given; name files, folders or bags")
+    if recipe not in (None, *RECIPES):
+        raise UsageError(f"draft: no recipe '{recipe}'{nearest(str(recipe), RECIPES)}")
+    with hearing(progress):
+        paths = [path(one, "draft") for one in given]
+        return drafted(paths, Path(folder), name, answer, standard=recipe is not None)
 
 
 @dataclass(frozen=True)
@@ -86,20 +281,10 @@ def prepare(
     inputs: Sequence[str] | None = None,
     *,
     step: float | str | None = None,
-    exogenous: Sequence[str] | None = None,
-    forces: Any = None,
-    masks: Sequence[Any] = (),
-    derivative: Mapping[str, Any] | None = None,
-    trim: float | str = 0.0,
-    hold: str | None = None,
     held: Sequence[str] | None = None,
-    protocols: Mapping[str, Any] | None = None,
-    selection: str | None = None,
-    scales: Mapping[str, Any] | None = None,
-    groups: Mapping[str, Sequence[str]] | None = None,
-    divergence: float = 3.0,
     like: Data | None = None,
     progress: ProgressCallback | None = None,
+    **settings: Any,
 ) -> Data:
     """Bring logs to a grid, smooth and differentiate them, and say what models are judged by.
 
@@ -116,21 +301,13 @@ def prepare(
         inputs: command channels that drive the model, in order; an empty list for a model without
             any.
         step: of the grid in s.
-        exogenous: channels that nobody commands: wind_speed and wind_dir, where all logs hold them.
-        forces: a vessel whose thrusters turn the inputs into tau_x, tau_y, tau_n.
-        masks: rules that leave samples out, as YAML has them.
-        derivative: how velocities are smoothed and differentiated, as YAML has it.
-        trim: seconds left out at both ends of every log before samples are learned from.
-        hold: whether an input over a step is the sample at its `start` or the `mean` of its ends;
-            the former where all inputs rest most of the time, as commands do.
         held: channels whose last value holds until the next; others are interpolated.
-        protocols: by name, as YAML has them.
-        selection: name of the protocol that chooses between models.
-        scales: what nrmse divides by: u, v in m/s, r in rad/s, or texts with a unit.
-        groups: named sets of manoeuvre kinds that get rows of their own.
-        divergence: a free run diverges beyond this many times the largest training velocity.
         like: data whose settings are taken over; all logs then form the split `external`.
         progress: is told how far the work is.
+        settings: further keys of the sections `signals` (exogenous, forces), `prepare` (masks,
+            derivative, trim, hold) and `evaluation` (protocols, selection, scales, groups,
+            divergence) of a config, as YAML has them; without `selection` the first of `protocols`
+            chooses between models.
 
     Returns:
         The data: y, smooth [T, 6], nu_dot [T, 3], w [T, m] of each log, float64, SI.
@@ -145,7 +322,8 @@ def prepare(
     """
     with hearing(progress):
         if like is not None:
-            return _external(logs, like)
+            prepared = _prepared({"external": read_logs(logs)}, like.signals, like.prepare)  # type: ignore[arg-type]
+            return Data(prepared, like.signals, like.prepare, like.evaluation)
         splits, source = _splits(logs)
         whole = {
             name: [complete_motion(log, MotionConfig()) for log in members]
@@ -162,48 +340,32 @@ def prepare(
         known = [name for name in taken if all(name in log.channels for log in every)]
         chosen = Preparation.of(every, known)
         say(f"recipe: {chosen.reason}")
-        settings = {
-            "inputs": list(taken) if not isinstance(taken, str) else taken,
-            "exogenous": chosen.exogenous if exogenous is None else exogenous,
-            "forces": forces,
-        }
-        signals: SignalsConfig = validate(plain(settings), SignalsConfig, "prepare")
-        content = chosen.content()
-        grid = content["grid"] if step is None else {**content["grid"], "step": step}
-        if held is not None:
-            grid = {**grid, "held": held}
-        config: PrepareConfig = validate(
-            plain(
-                {
-                    "grid": grid,
-                    "masks": masks,
-                    "derivative": derivative or content["derivative"],
-                    "trim": trim,
-                    "hold": hold or content["hold"],
-                }
-            ),
-            PrepareConfig,
-            "prepare",
-        )
-        prepared = _prepared(splits, signals, config)
         length = window_length([whole[name] for name in SPLITS[1:]], chosen.memory)
-        given = {"protocols": protocols, "selection": selection, "scales": scales}
-        judged = judging(whole, length) | {k: v for k, v in given.items() if v is not None}
-        if not isinstance(judged["protocols"], Mapping):
-            raise UsageError(
-                f"prepare: protocols: expected a mapping by name, given {described(protocols)}"
-            )
-        if protocols is not None and selection is None:
-            judged["selection"] = next(iter(protocols), "")
-        judged |= {"groups": groups or {}, "divergence": divergence}
-        evaluation: EvaluationConfig = validate(plain(judged), EvaluationConfig, "prepare")
-    return Data(prepared, signals, config, evaluation, source)
-
-
-def _external(logs: Any, like: Data) -> Data:
-    members = read_logs(logs)
-    prepared = _prepared({"external": members}, like.signals, like.prepare)
-    return Data(prepared, like.signals, like.prepare, like.evaluation)
+        judged = judging(whole, length)
+        content = chosen.content()
+        grid = {"step": step, "held": held}
+        content["grid"] |= {key: value for key, value in grid.items() if value is not None}
+        if settings.get("protocols") is not None:
+            if not isinstance(settings["protocols"], Mapping):
+                given = described(settings["protocols"])
+                raise UsageError(f"prepare: protocols: expected a mapping by name, given {given}")
+            judged["selection"] = next(iter(settings["protocols"]), "")
+        signals = {
+            "inputs": taken if isinstance(taken, str) else list(taken),
+            "exogenous": chosen.exogenous,
+        }
+        # what no section knows is refused as an unknown key of `prepare`
+        homes: Any = (
+            (SignalsConfig, signals),
+            (EvaluationConfig, judged),
+            (PrepareConfig, content),
+        )
+        for key, value in settings.items():
+            home = next((c for kind, c in homes if key in kind.model_fields), content)
+            if value is not None:
+                home[key] = value
+        built: list[Any] = [validate(plain(part), kind, "prepare") for kind, part in homes]
+        return Data(_prepared(splits, built[0], built[2]), built[0], built[2], built[1], source)
 
 
 def _prepared(
@@ -226,9 +388,7 @@ def _prepared(
     return out
 
 
-def _splits(
-    logs: Any,
-) -> tuple[dict[str, list[Log]], MeasuredLogs | SimulatedTrials | None]:
+def _splits(logs: Any) -> tuple[dict[str, list[Log]], MeasuredLogs | SimulatedTrials | None]:
     if isinstance(logs, Mapping) and "kind" in logs:
         source = validate(plain(logs), DataConfig, "prepare")
         return read_splits(source), source

@@ -1,39 +1,219 @@
-"""The fit in Python: baselines, heads and ensembles by name, judged in free run."""
+"""The fit in Python: baselines, heads and ensembles by name, judged in free run along logs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, final
 
+import numpy as np
 import torch
 
-from residnet.api.data import Data, prepare
-from residnet.api.logs import LogsGiven
-from residnet.api.models import Model
-from residnet.api.runs import FreeRuns, free_run
+from residnet.api.data import Data, LogsGiven, prepare
+from residnet.api.models import Model, require
 from residnet.api.values import PartGiven, described, hearing, named_parts, part, plain
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
-from residnet.core.names import nearest
+from residnet.core.names import STATE, nearest
 from residnet.core.processes import spread
 from residnet.core.progress import ProgressCallback
 from residnet.identification.fit import fit as identify
-from residnet.identification.identified import Identified
-from residnet.identification.prepared import require_window, through_currents
-from residnet.identification.settings import FitSettings
-from residnet.judge.band import BandsConfig
+from residnet.identification.identified import Evaluation, Identified, candidates, evaluate
+from residnet.identification.prepared import require_window, through_currents, velocity_limit
+from residnet.identification.settings import FitSettings, Parts
 from residnet.judge.metrics import metrics_table
 from residnet.judge.selection import Selection
 from residnet.judge.verdict import Evidence, verdict
+from residnet.report.run_reader import COLUMNS, StoredWindow
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 
-_BANDS = BandsConfig()
+@final
+class FreeRuns:
+    """Models run freely along logs: every window of every protocol, measured beside predicted.
+
+    Attributes:
+        rows: errors as rows of metrics.json.
+        logs: names of the logs.
+        protocols: names of the protocols that have a window.
+
+    Example:
+        runs.plot_track("zigzag_01").savefig("track.png")
+    """
+
+    def __init__(self, evaluation: Evaluation) -> None:
+        self.evaluation = evaluation
+        self.rows: list[dict[str, Any]] = evaluation.rows
+        self.logs = [log.log.name for log in evaluation.logs]
+        self.protocols = [run.protocol for run in evaluation.runs]
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """Errors as a table, see `residnet.metrics`."""
+        return metrics_table(self.rows)
+
+    @cached_property
+    def windows(self) -> list[StoredWindow]:
+        """Every window, as `residnet.report.run_reader.RunFiles` reads them of a run."""
+        order, out = [STATE.index(name) for name in COLUMNS], []
+        for run in self.evaluation.runs:
+            counted = dict.fromkeys(range(len(self.logs)), 0)
+            for i, window in sorted(enumerate(run.windows), key=lambda pair: pair[1].log):
+                log, rows = self.evaluation.logs[window.log], slice(window.start, window.stop)
+                found = {name: runs[i] for name, runs in run.predictions.items()}
+                out.append(
+                    StoredWindow(
+                        log=log.log.name,
+                        manoeuvre=log.log.manoeuvre,
+                        protocol=run.protocol,
+                        number=counted[window.log],
+                        t=log.log.t[rows],
+                        usable=log.usable[rows],
+                        measured=log.y[rows][:, order],
+                        predicted={name: one.states[:, order] for name, one in found.items()},
+                        diverged={name: one.diverged for name, one in found.items()},
+                    )
+                )
+                counted[window.log] += 1
+        return out
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """One row for each log, protocol, model, window and time step.
+
+        Columns log, protocol, model, window, t (s, the log's clock), usable, diverged, then u, v
+        (m/s), r (rad/s), psi (rad), x, y (m) as measured, and with `_hat` as predicted.
+        """
+        import pandas as pd
+
+        parts = [
+            pd.DataFrame(
+                {"log": one.log, "protocol": one.protocol, "model": model, "window": one.number}
+                | {"diverged": one.diverged[model], "t": one.t, "usable": one.usable}
+                | dict(zip(COLUMNS, one.measured.T, strict=True))
+                | dict(zip((f"{name}_hat" for name in COLUMNS), states.T, strict=True))
+            )
+            for one in self.windows
+            for model, states in one.predicted.items()
+        ]
+        return pd.concat(parts, ignore_index=True)
+
+    def plot_track(self, log: str | None = None, **chosen: Any) -> Figure:
+        """Draw the measured track and those of models; north up, equal scales.
+
+        Args:
+            log: name of the log; the first where None.
+            chosen: `models`, their names, all but `zero` where there are none; `protocol`,
+                `manoeuvre` where there is such a one, else the first; `window`, number of the
+                window in the log, the longest where None.
+
+        Raises:
+            UsageError: where there is no such log, model, protocol or window.
+        """
+        return self._drawn(log, [0], **chosen)
+
+    def plot_history(self, log: str | None = None, **chosen: Any) -> Figure:
+        """Draw velocities and heading against time, measured and predicted.
+
+        Args:
+            log: name of the log; the first where None.
+            chosen: as of `plot_track`.
+
+        Raises:
+            UsageError: where there is no such log, model, protocol or window.
+        """
+        return self._drawn(log, [1, 2, 3, 4], **chosen)
+
+    def _drawn(
+        self,
+        log: str | None,
+        panels: Sequence[int],
+        models: str | Sequence[str] = (),
+        protocol: str | None = None,
+        window: int | None = None,
+    ) -> Figure:
+        from residnet.report.sections.runs import window_figure
+        from residnet.report.still import still
+
+        usual = "manoeuvre" if "manoeuvre" in self.protocols else self.protocols[0]
+        kind = _named(protocol or usual, self.protocols, "protocol")
+        found = [one for one in self.windows if one.protocol == kind]
+        name = _named(log or found[0].log, self.logs, "log")
+        found = [one for one in found if one.log == name]
+        if not found:
+            raise UsageError(f"log {name} has no window of the protocol {kind}")
+        if window is not None and not 0 <= window < len(found):
+            raise UsageError(f"log {name} has {len(found)} windows of {kind}, no number {window}")
+        one = max(found, key=lambda one: len(one.t)) if window is None else found[window]
+        given = [models] if isinstance(models, str) else models
+        shown = [_named(model, one.predicted, "model") for model in given]
+        shown = shown or [model for model in one.predicted if model != "zero"]
+        predicted = {model: one.predicted[model] for model in shown}
+        one = replace(one, predicted=predicted, diverged={})
+        figure: Figure = still(window_figure(one, f"{name}, {kind}"), only=list(panels))
+        return figure
+
+
+def _named(name: Any, known: Any, what: str) -> str:
+    if name not in known:
+        raise UsageError(f"no {what} '{name}'{nearest(str(name), known)}")
+    return str(name)
+
+
+def free_run(
+    models: Model | Sequence[Model] | Mapping[str, Model],
+    data: Data,
+    split: str | None = None,
+    *,
+    progress: ProgressCallback | None = None,
+) -> FreeRuns:
+    """Run models freely along logs: from a measured state on, with the inputs alone.
+
+    A window whose prediction is not finite, or leaves the training envelope by far, has diverged
+    and counts with the prediction that holds the initial velocities.
+
+    Args:
+        models: from `fit` or `load`; one or several.
+        data: from `prepare`.
+        split: of the data; `test` where there is one, else the first.
+        progress: is told how far the free runs are.
+
+    Raises:
+        UsageError: where the data have no such split, or a model has other inputs or another step.
+
+    Example:
+        runs = residnet.free_run(models, data); runs.metrics
+    """
+    require(data, Data, "free_run: expected data from residnet.prepare")
+    found: Any = [models] if isinstance(models, Model) else models
+    found = list(found.values()) if isinstance(found, Mapping) else found
+    if not isinstance(found, list | tuple) or not found:
+        raise UsageError(f"free_run: expected one or several models, given {described(models)}")
+    step = data.prepare.grid.step
+    for model in found:
+        require(model, Model, "free_run: expected a model")
+        if model.inputs != data.signals.columns:
+            raise UsageError(
+                f"free_run: model {model.name} has the inputs {', '.join(model.inputs)}, the data"
+                f" have {', '.join(data.signals.columns)}; prepare them with the model's inputs"
+            )
+        if abs(model.dt - step) > 1e-9:
+            raise UsageError(
+                f"free_run: model {model.name} steps by {model.dt:g} s, the data by {step:g} s;"
+                f" prepare them with step={model.dt:g}"
+            )
+    logs = data.logs(split or ("test" if "test" in data.splits else next(iter(data.splits))))
+    spec, divergence = found[0].spec, data.evaluation.divergence
+    limit = velocity_limit(np.array(spec.low), np.array(spec.high), divergence)
+    with hearing(progress):
+        judged = candidates([model.fitted for model in found], data.source)
+        return FreeRuns(evaluate(judged, logs, data.evaluation, step, limit))
 
 
 @final
@@ -41,6 +221,7 @@ class Models(Mapping[str, Model]):
     """Fitted models by name: zero, the baselines, heads and ensembles, in this order.
 
     Attributes:
+        identified: what the fit made.
         data: what they were fitted on and are judged on.
         settings: of the fit, as YAML would have them.
 
@@ -49,8 +230,7 @@ class Models(Mapping[str, Model]):
     """
 
     def __init__(self, identified: Identified, data: Data) -> None:
-        self.identified = identified
-        self.data = data
+        self.identified, self.data = identified, data
         self.settings: FitSettings = identified.settings
         self._models = {name: Model(fitted) for name, fitted in identified.items()}
 
@@ -78,34 +258,24 @@ class Models(Mapping[str, Model]):
         """
         split = "test" if "test" in self.runs else "validation"
         judged, protocol = self.runs[split].evaluation, self.settings.evaluation.selection
-        whole = [
-            row for row in judged.rows if (row["protocol"], row["manoeuvre"]) == (protocol, "all")
-        ]
-        return verdict(
-            Evidence(
-                self.selected,
-                split,
-                {row["model"]: row for row in whole},
-                "baseline",
-                self.selection.content(),
-                judged.limits.get(protocol, {}),
-            )
-        )
+        whole = {
+            row["model"]: row
+            for row in judged.rows
+            if (row["protocol"], row["manoeuvre"]) == (protocol, "all")
+        }
+        selection, limits = self.selection.content(), judged.limits.get(protocol, {})
+        return verdict(Evidence(self.selected, split, whole, "baseline", selection, limits))
 
     @property
     def metrics(self) -> pd.DataFrame:
         """Free-run errors of all models over all splits, see `residnet.metrics`."""
-        rows = [
-            {**row, "selected": row["model"] == self.selected}
-            for runs in self.runs.values()
-            for row in runs.rows
-        ]
-        return metrics_table(rows)
+        return self._table([row for runs in self.runs.values() for row in runs.rows])
+
+    def _table(self, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+        return metrics_table([{**r, "selected": r["model"] == self.selected} for r in rows])
 
     def __getitem__(self, name: str) -> Model:
-        if name not in self._models:
-            raise UsageError(f"no model '{name}'{nearest(str(name), self._models)}")
-        return self._models[name]
+        return self._models[_named(name, self._models, "model")]
 
     def get(self, name: str, default: Any = None) -> Any:
         """Return the model of that name, or the default."""
@@ -129,21 +299,11 @@ def fit(
     baseline: PartGiven | None = None,
     heads: PartGiven | Sequence[str] | Mapping[str, PartGiven] = (),
     *,
-    recipe: str | None = None,
-    effort: float = 1.0,
     baselines: Mapping[str, PartGiven] | None = None,
-    base_of: Mapping[str, str] | None = None,
-    ensembles: Mapping[str, Sequence[str]] | None = None,
-    gates: Mapping[str, Any] | None = None,
-    training: Mapping[str, Any] | None = None,
-    refit: Mapping[str, Any] | None = None,
-    current: Mapping[str, Any] | None = None,
-    bands: Mapping[str, Any] | BandsConfig | None = _BANDS,
-    integrator: str | None = None,
-    seed: int = 0,
     threads: int = 1,
     workers: int = 1,
     progress: ProgressCallback | None = None,
+    **settings: Any,
 ) -> Models:
     """Fit baselines, then heads on what each leaves, then ensembles.
 
@@ -157,26 +317,16 @@ def fit(
             line in every channel, and is taken where there are heads but no baseline.
         heads: what is learned on top: kinds such as `["plsr", "lstm"]`, or a mapping from names to
             kinds, mappings or config objects.
-        recipe: `standard`, in place of all parts.
-        effort: how long the recipe trains its networks, 1 for usual, less for a quick look.
         baselines: further baselines by name.
-        base_of: the baseline that a head stands on, by the head's name.
-        ensembles: models whose mean acceleration makes another model, by its name.
-        gates: models that fade the residual `of` another one to its baseline outside the data.
-        training: of network heads by the name of the head; `epochs` and so on, as YAML has them.
-        refit: baselines whose coefficients are moved through rollouts.
-        current: the logs ran in constant currents that are estimated first.
-        bands: how far free runs may be off, calibrated over logs that were left out: `level`,
-            `folds` and so on, as YAML has them; None for none.
-        integrator: of the models: rk4, heun, euler or semi_implicit_euler; by default the last for
-            the recipe, else the first.
-        seed: of weights and batches.
         threads: of PyTorch; one is fastest for these small products, and part of what makes a fit
             repeatable.
         workers: models that may be fitted side by side, each in a process of its own, where they
             take long; the numbers stay the same. With more than one, a script has to keep its calls
             under `if __name__ == "__main__":`, since each process imports it again.
         progress: is told what is being fitted, and how far it is.
+        settings: further keys of a fit, as YAML has them: recipe, effort, base_of, forces,
+            ensembles, gates, training, refit, current, bands, seed, and integrator, which is
+            `semi_implicit_euler` for the recipe where it is not given.
 
     Raises:
         ConfigError: where a setting is wrong.
@@ -186,63 +336,40 @@ def fit(
     Example:
         models = residnet.fit(logs); models.selected, models.metrics
     """
-    parts: dict[str, Any] = {
-        "baselines": {} if not baselines else named_parts(baselines, "baseline"),
-        "refit": refit or {},
-        "heads": {} if _empty(heads) else named_parts(heads, "head"),
-        "base_of": base_of or {},
-        "ensembles": ensembles or {},
-        "gates": gates or {},
-        "training": training or {},
+    given = {
+        key: value for key, value in settings.items() if key not in Parts.model_fields or value
     }
-    given = {key: value for key, value in parts.items() if value}
+    given |= {"baselines": named_parts(baselines, "baseline")} if baselines else {}
+    if not (isinstance(heads, list | tuple | Mapping) and not heads):
+        given["heads"] = named_parts(heads, "head")
     if baseline is not None:
         given["baseline"] = part(baseline, "baseline")
-    if recipe is None and not given:
-        recipe = "standard"
-    if recipe is None:
+    if given.get("recipe") is None and not set(given) & set(Parts.model_fields):
+        given["recipe"] = "standard"
+    if given.get("recipe") is None:
         given.setdefault("baseline", part("regressors", "baseline"))
-    else:
-        given |= {"recipe": recipe, "effort": effort}
-    usual = "rk4" if recipe is None else "semi_implicit_euler"
+    elif given.get("integrator") is None:
+        given["integrator"] = "semi_implicit_euler"
+    if given.get("integrator", "") is None:
+        del given["integrator"]
     if not isinstance(data, Data):
-        if not isinstance(data, str | PathLike | Log | list | tuple | Mapping):
-            raise UsageError(
-                f"fit: expected logs, or data from residnet.prepare, given {described(data)}"
-            )
+        logs = (str, PathLike, Log, list, tuple, Mapping)
+        require(data, logs, "fit: expected logs, or data from residnet.prepare")  # type: ignore[arg-type]
         data = prepare(data)
-    settings: FitSettings = validate(
-        plain(
-            {
-                "seed": seed,
-                "prepare": data.prepare,
-                "signals": data.signals,
-                "integrator": integrator or usual,
-                "current": current,
-                "evaluation": data.evaluation,
-                "bands": bands,
-                **given,
-            }
-        ),
-        FitSettings,
-        "fit",
-    )
+    sections = {"prepare": data.prepare, "signals": data.signals, "evaluation": data.evaluation}
+    config: FitSettings = validate(plain({**sections, **given}), FitSettings, "fit")
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
         with hearing(progress), spread(workers):
             for split in ("validation", "test"):
                 for log in data.logs(split):
-                    require_window(log, settings)
-            logs, _ = through_currents(data.splits, settings)
-            moved = Data(logs, data.signals, data.prepare, data.evaluation, data.source)
-            return Models(identify(logs, settings), moved)
+                    require_window(log, config)
+            splits, _ = through_currents(data.splits, config)
+            moved = Data(splits, data.signals, data.prepare, data.evaluation, data.source)
+            return Models(identify(splits, config), moved)
     finally:
         torch.set_num_threads(before)
-
-
-def _empty(heads: Any) -> bool:
-    return isinstance(heads, list | tuple | Mapping) and not heads
 
 
 def metrics(
@@ -273,15 +400,10 @@ def metrics(
     Example:
         residnet.metrics(models, split="test")
     """
-    if not isinstance(models, Models):
-        raise UsageError(f"metrics: expected models from residnet.fit, given {described(models)}")
+    require(models, Models, "metrics: expected models from residnet.fit")
     with hearing(progress):
-        if data is None:
-            table = models.metrics
-        else:
-            runs = free_run(models, data, split).rows
-            marked = [{**row, "selected": row["model"] == models.selected} for row in runs]
-            table = metrics_table(marked)
+        rows = None if data is None else free_run(models, data, split).rows
+        table = models.metrics if rows is None else models._table(rows)
     for column, wanted in (("split", split), ("manoeuvre", manoeuvre)):
         if wanted is not None:
             if wanted not in set(table[column]):
@@ -299,6 +421,5 @@ def select(models: Models) -> Model:
     Example:
         residnet.select(models).name
     """
-    if not isinstance(models, Models):
-        raise UsageError(f"select: expected models from residnet.fit, given {described(models)}")
+    require(models, Models, "select: expected models from residnet.fit")
     return models[models.selected]

@@ -1,4 +1,4 @@
-"""Models in Python: stepped and rolled out with arrays, kept, loaded and exported."""
+"""Models in Python: stepped and rolled out with arrays, kept, loaded, exported and watched."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from residnet.api.data import Data
 from residnet.api.values import PathGiven, described, path
-from residnet.core.errors import UsageError
+from residnet.core.config import validate
+from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_json
 from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
@@ -21,7 +23,16 @@ from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_mo
 from residnet.export import exporter
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.models import FittedModel
-from residnet.judge.band import Band, read_bands
+from residnet.identification.monitoring import (
+    MonitorConfig,
+    Verdict,
+    Watch,
+    Watcher,
+    past_of,
+    pieces,
+)
+from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
+from residnet.judge.band import read_bands
 from residnet.runs.folder import require_sealed, seal
 
 if TYPE_CHECKING:
@@ -37,55 +48,27 @@ class Model:
 
     Example:
         x, s = model.step([0, 0, 0, 1.2, 0, 0], [20.0, 18.0])
+
+    Attributes:
+        fitted: the model with the notes of its fit.
+        name: of the model.
+        kind: what it is: zero, baseline, head or ensemble.
+        spec: everything that determines the model but its numbers.
+        module: the PyTorch module itself.
+        states: names of the columns of a state.
+        inputs: names of the columns of the inputs: commands, then exogenous channels.
+        units: SI unit of each state and input.
+        dt: time step of the model in s.
+        notes: what there is to say about the fit; empty for a model that was saved without a run.
     """
 
     def __init__(self, fitted: FittedModel) -> None:
-        self.fitted = fitted
-
-    @property
-    def name(self) -> str:
-        """Name of the model."""
-        return self.fitted.name
-
-    @property
-    def kind(self) -> str:
-        """What it is: zero, baseline, head or ensemble."""
-        return self.spec.role
-
-    @property
-    def spec(self) -> ModelSpec:
-        """Everything that determines the model but its numbers."""
-        return self.fitted.spec
-
-    @property
-    def module(self) -> HybridDynamics:
-        """The PyTorch module itself."""
-        return self.fitted.model
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of the columns of a state."""
-        return STATE
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the columns of the inputs: commands, then exogenous channels."""
-        return self.spec.signals.columns
-
-    @property
-    def units(self) -> dict[str, str]:
-        """SI unit of each state and input."""
-        return self.spec.signals.units()
-
-    @property
-    def dt(self) -> float:
-        """Time step of the model in s."""
-        return self.spec.dt
-
-    @property
-    def notes(self) -> dict[str, Any]:
-        """What there is to say about the fit; empty for a model that was saved without a run."""
-        return dict(self.fitted.notes)
+        self.fitted, self.name, self.module = fitted, fitted.name, fitted.model
+        self.spec: ModelSpec = fitted.spec
+        self.kind, self.dt = str(self.spec.role), self.spec.dt
+        self.states, self.inputs = STATE, self.spec.signals.columns
+        self.units = self.spec.signals.units()
+        self.notes = dict(fitted.notes)
 
     @property
     def coefficients(self) -> pd.DataFrame:
@@ -112,15 +95,11 @@ class Model:
         Example:
             x, s = model.step(x, w, s)
         """
-        single = np.ndim(x) == 1
-        states = self._array(x, len(STATE), "x", "states", 1)
-        inputs = self._array(w, len(self.inputs), "w", "inputs", 1)
-        self._same_rows(states, inputs)
-        memory = self._memory(s, len(states))
-        model = self._double()
+        states, inputs = self._rows(("x", x, 1), ("w", w, 1))
         with torch.no_grad():
-            after, memory = model.step(states, inputs, memory)
-        return _back(after, single), _back(memory, single)
+            found = self._double().step(states, inputs, self._memory(s, len(states)))
+        after, memory = (_back(part, np.ndim(x) == 1) for part in found)
+        return after, memory
 
     def rollout(self, x0: Any, w: Any, s: Any = None) -> np.ndarray:
         """Return the states of a free run from x0 on, [B, T+1, 6] or [T+1, 6].
@@ -136,14 +115,11 @@ class Model:
         Example:
             track = model.rollout(x0, w)[:, :2]
         """
-        single = np.ndim(x0) == 1
-        states = self._array(x0, len(STATE), "x0", "states", 1)
-        inputs = self._array(w, len(self.inputs), "w", "inputs", 2)
-        self._same_rows(states, inputs)
+        states, inputs = self._rows(("x0", x0, 1), ("w", w, 2))
         memory = self._memory(s, len(states))
         with torch.no_grad():
             found, _, _ = scripted(Rollout(self._double()), inputs.shape[1])(states, inputs, memory)
-        return _back(found, single)
+        return _back(found, np.ndim(x0) == 1)
 
     def warmup(self, y_history: Any, w_history: Any) -> np.ndarray:
         """Return the memory that a measured past leaves, [B, n_state] or [n_state].
@@ -158,17 +134,14 @@ class Model:
         Example:
             s = model.warmup(log.y[:50], log.w[:50])
         """
-        single = np.ndim(y_history) == 2
-        states = self._array(y_history, len(STATE), "y_history", "states", 2)
-        inputs = self._array(w_history, len(self.inputs), "w_history", "inputs", 2)
-        self._same_rows(states, inputs)
+        states, inputs = self._rows(("y_history", y_history, 2), ("w_history", w_history, 2))
         if states.shape[1] != inputs.shape[1]:
             raise UsageError(
                 f"model {self.name}: y_history has {states.shape[1]} samples, w_history"
                 f" {inputs.shape[1]}; give both at the same samples"
             )
         with torch.no_grad():
-            return _back(self._double().warmup(states, inputs), single)
+            return _back(self._double().warmup(states, inputs), np.ndim(y_history) == 2)
 
     def __repr__(self) -> str:
         return (
@@ -179,30 +152,33 @@ class Model:
         # a copy: float64 arrays must not change the precision of the model itself
         return copy.deepcopy(self.module).to(torch.float64).eval()
 
-    def _array(self, given: Any, width: int, name: str, what: str, axes: int) -> Tensor:
-        """Rows [B, (T,) width] of an argument, float64."""
-        try:
-            values = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise UsageError(
-                f"model {self.name}: {name}: expected numbers, given {described(given)}"
-            ) from None
-        columns = ", ".join(STATE if what == "states" else self.inputs)
-        shape = f"[B, T, {width}] or [T, {width}]" if axes == 2 else f"[B, {width}] or [{width}]"
-        if values.ndim not in (axes, axes + 1) or values.shape[-1] != width:
-            raise UsageError(
-                f"model {self.name}: {name} has the shape {list(values.shape)}, expected {shape}"
-                f" ({what} {columns})"
-            )
-        if not np.isfinite(values).all():
-            raise UsageError(f"model {self.name}: {name} holds a value that is not finite")
-        return torch.from_numpy(values if values.ndim == axes + 1 else values[None].copy())
-
-    def _same_rows(self, states: Tensor, inputs: Tensor) -> None:
+    def _rows(self, *given: tuple[str, Any, int]) -> tuple[Tensor, Tensor]:
+        """Rows [B, (T,) width] of states and inputs, each by its name, value and axes; float64."""
+        out = []
+        for (name, value, axes), what in zip(given, ("states", "inputs"), strict=True):
+            columns = self.states if what == "states" else self.inputs
+            width = len(columns)
+            try:
+                values = np.asarray(value, dtype=np.float64)
+            except (TypeError, ValueError):
+                raise UsageError(
+                    f"model {self.name}: {name}: expected numbers, given {described(value)}"
+                ) from None
+            if values.ndim not in (axes, axes + 1) or values.shape[-1] != width:
+                one = f"T, {width}" if axes == 2 else f"{width}"
+                raise UsageError(
+                    f"model {self.name}: {name} has the shape {list(values.shape)}, expected"
+                    f" [B, {one}] or [{one}] ({what} {', '.join(columns)})"
+                )
+            if not np.isfinite(values).all():
+                raise UsageError(f"model {self.name}: {name} holds a value that is not finite")
+            out.append(torch.from_numpy(values if values.ndim == axes + 1 else values[None].copy()))
+        states, inputs = out
         if len(states) != len(inputs):
             raise UsageError(
                 f"model {self.name}: {len(states)} states, but inputs for {len(inputs)}"
             )
+        return states, inputs
 
     def _memory(self, given: Any, rows: int) -> Tensor:
         width = self.module.n_state
@@ -235,7 +211,7 @@ def save(model: Model, folder: PathGiven, *, overwrite: bool = False) -> Path:
     Example:
         residnet.save(models["lstm"], "models/lstm")
     """
-    require_model(model, "save")
+    require(model, Model, "save: expected a model")
     place = path(folder, "save")
     if (place / "model.json").exists() and not overwrite:
         raise UsageError(f"{place}: a model stands there already; give overwrite=True")
@@ -260,24 +236,20 @@ def load(folder: PathGiven, name: str | None = None) -> Model:
         model = residnet.load("runs/quickstart", "selected")
     """
     place = path(folder, "load")
-    if name is not None:
-        place = place / "models" / chosen_model(place, name)
-    elif not (place / "model.json").is_file() and (place / "models").is_dir():
-        place = place / "models" / chosen_model(place, "selected")
+    if name is not None or (not (place / "model.json").is_file() and (place / "models").is_dir()):
+        place = place / "models" / chosen_model(place, name or "selected")
     require_sealed(place)
     spec, module = load_model(place)
-    return Model(FittedModel(spec, module, _notes(place), bands=_bands(place)))
-
-
-def _bands(folder: Path) -> dict[str, Band]:
-    """Return the bands that a run holds of a model in its folder; none outside of a run."""
-    file = folder.parent.parent / "bands.json"
-    return read_bands(read_json(file)).get(folder.name, {}) if file.is_file() else {}
-
-
-def _notes(folder: Path) -> dict[str, Any]:
-    file = folder / "fit.json"
-    return read_json(file) if file.is_file() else {}
+    # outside of a run there are neither notes nor bands
+    notes, bands = place / "fit.json", place.parent.parent / "bands.json"
+    return Model(
+        FittedModel(
+            spec,
+            module,
+            read_json(notes) if notes.is_file() else {},
+            bands=read_bands(read_json(bands)).get(place.name, {}) if bands.is_file() else {},
+        )
+    )
 
 
 def export_model(
@@ -303,16 +275,101 @@ def export_model(
     Example:
         card = residnet.export_model(models["lstm"], "lstm.pt")
     """
-    require_model(model, "export_model")
+    require(model, Model, "export_model: expected a model")
     exported = ExportedVessel(model.spec, model.module, list(metrics))
     return exporter(format).export(exported, path(file, "export_model"))
 
 
-def require_model(model: Any, who: str) -> None:
-    """Stop where an argument is no model.
+def require(given: Any, kind: type[Any], expected: str) -> None:
+    """Stop where an argument is of another kind.
 
     Raises:
         UsageError: with what it is instead.
     """
-    if not isinstance(model, Model):
-        raise UsageError(f"{who}: expected a model, given {described(model)}")
+    if not isinstance(given, kind):
+        raise UsageError(f"{expected}, given {described(given)}")
+
+
+@final
+class Monitor:
+    """A watch over a model in service.
+
+    Short free runs of the model are compared with what is measured. Score tests say whether a
+    change of mass, damping, thrust, rudder or of a sensor explains the last minutes better than
+    clean logs ever asked for; wind and current have their part taken out first.
+
+    Args:
+        model: of the vessel as it was.
+        clean: data of the unchanged vessel, as they were fitted.
+        settings: of `residnet.identification.monitoring.MonitorConfig`: `window`,
+            `stretch`, `false_alarm`, `group` in s.
+
+    Raises:
+        UsageError: where an argument is of another kind.
+        DataError: where the clean data are too few.
+
+    Example:
+        monitor = residnet.Monitor(models["baseline"], data); verdict = monitor.step(y, w)
+    """
+
+    def __init__(self, model: Model, clean: Data, **settings: Any) -> None:
+        require(model, Model, "Monitor: expected a model")
+        require(clean, Data, "Monitor: expected data from residnet.prepare")
+        config = validate(settings, MonitorConfig, "Monitor")
+        module, past = copy.deepcopy(model.module), past_of(model.module)
+        steps = round(config.window / model.dt)
+        logs = [log for split in ("train", "validation") for log in clean.splits.get(split, ())]
+        watch = Watch(model.spec, module, [pieces(log, steps, past) for log in logs], config)
+        self._model, self._past, self._watcher = model, past, Watcher(watch, past)
+        self.verdict: Verdict | None = None
+
+    @property
+    def threshold(self) -> float:
+        """The score at which a cause raises an alarm."""
+        return self._watcher.watch.threshold
+
+    def step(self, y: Sequence[float], w: Sequence[float]) -> Verdict | None:
+        """Take one sample, and return the verdict where a window is complete, else None.
+
+        Args:
+            y: measured x, y, psi, u, v, r, psi without jumps.
+            w: inputs held over the step after it, in the model's order.
+        """
+        found = self._watcher.step(np.asarray(y, dtype=float), np.asarray(w, dtype=float))
+        self.verdict = found or self.verdict
+        return found
+
+    def refit(self, new: Data) -> tuple[Model, Refit]:
+        """Put the changes that the monitor names into a copy of the model, log by log.
+
+        The old model stays as it is. Judge both on logs that were not given here, for example by
+        `residnet.free_run`, before the new one goes into service.
+
+        Args:
+            new: logs of the changed vessel in the order of time, as
+                `residnet.prepare(logs, like=data)` gives them.
+
+        Returns:
+            The new model, named `<name>_refit`, and what was found: `moved` holds each change with
+            size and standard error, `ended` says why no further one was taken. Where `moved` is
+            empty the model is as it was.
+
+        Raises:
+            UsageError: where the data are of another kind, or the model has no parameters to move.
+            DataError: where a log holds no window.
+        """
+        require(new, Data, "Monitor.refit: expected data from residnet.prepare")
+        watch, windows = self._watcher.watch, []
+        for log in (log for members in new.splits.values() for log in members):
+            windows.append(pieces(log, self._watcher.steps, self._past))
+            if not windows[-1]:
+                raise DataError(
+                    f"log {log.log.name}: holds no window of {watch.config.window:g} s without a"
+                    " break; leave it out"
+                )
+        refit = recursive_refit(watch, windows)
+        return Model(refitted(self._model.fitted, refit)), refit
+
+    def restart(self) -> None:
+        """Say that the next sample does not follow the last one."""
+        self._watcher.restart()

@@ -1,4 +1,4 @@
-"""Any task from Python: by a YAML file or a mapping, with or without a folder."""
+"""Any task from Python, what there is to choose from, and sea trials of vessels by name."""
 
 from __future__ import annotations
 
@@ -7,22 +7,197 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, Literal, final, get_args
 
 from residnet.api.models import Model, load
-from residnet.api.values import PathGiven, described, hearing, path, plain
+from residnet.api.values import PartGiven, PathGiven, described, hearing, part, path, plain
+from residnet.baselines import BaselineConfig
+from residnet.baselines.base import IdentifiedConfig
 from residnet.core.config import load_config, validate
 from residnet.core.errors import UsageError
 from residnet.core.files import read_table
+from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback
+from residnet.data.simulated.flying import Flight
+from residnet.heads import HeadConfig
+from residnet.heads.base import FeatureConfig
+from residnet.judge.booklet import index_rows
 from residnet.judge.metrics import metrics_table
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.manoeuvres.base import Manoeuvre
+from residnet.physics.vessel import load_vessel
+from residnet.physics.vessel_file import VesselFile
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
-from residnet.tasks.registry import TaskConfig
+from residnet.tasks.registry import TaskConfig, catalogue
+from residnet.tasks.simulate import Programme
 
 if TYPE_CHECKING:
     import pandas as pd
+
+What = Literal["vessels", "heads", "baselines", "manoeuvres", "readers", "tasks", "formats"]
+
+
+def available(what: What) -> pd.DataFrame:
+    """Return what there is to choose from, parts of other packages included: name and about.
+
+    Args:
+        what: vessels, heads, baselines, manoeuvres, readers, tasks or formats (of exports).
+
+    Raises:
+        UsageError: where it is none of these.
+
+    Example:
+        residnet.available("heads")
+    """
+    import pandas as pd
+
+    if what not in get_args(What):
+        raise UsageError(f"available: there are no '{what}'{nearest(str(what), get_args(What))}")
+    return pd.DataFrame(catalogue(what), columns=["name", "about"])
+
+
+def head(kind: PartGiven, **settings: Any) -> FeatureConfig:
+    """Return the config of a residual head, for `fit`.
+
+    Args:
+        kind: one of `available("heads")`.
+        settings: of the head, as YAML has them.
+
+    Raises:
+        ConfigError: where there is no such kind, or a setting is wrong.
+
+    Example:
+        residnet.head("lstm", hidden_size=16)
+    """
+    config: FeatureConfig = validate(part(kind, "head", **settings), HeadConfig, "head")
+    return config
+
+
+def baseline(kind: PartGiven, **settings: Any) -> IdentifiedConfig:
+    """Return the config of a baseline, for `fit`.
+
+    Args:
+        kind: one of `available("baselines")`.
+        settings: of the baseline, as YAML has them.
+
+    Raises:
+        ConfigError: where there is no such kind, or a setting is wrong.
+
+    Example:
+        residnet.baseline("regressors", sets=["fossen"])
+    """
+    given = part(kind, "baseline", **settings)
+    config: IdentifiedConfig = validate(given, BaselineConfig, "baseline")
+    return config
+
+
+def manoeuvre(kind: PartGiven, **settings: Any) -> Manoeuvre:
+    """Return a manoeuvre by its kind and settings, for `simulate`.
+
+    Args:
+        kind: one of `available("manoeuvres")`.
+        settings: of the manoeuvre; SI numbers, or texts with a unit such as "20 deg".
+
+    Raises:
+        ConfigError: where there is no such kind, or a setting is wrong.
+
+    Example:
+        residnet.manoeuvre("zigzag", drive=0.6, steer=0.4, heading="20 deg")
+    """
+    config: Manoeuvre = validate(part(kind, "manoeuvre", **settings), ManoeuvreConfig, "manoeuvre")
+    return config
+
+
+def vessel(name: str) -> VesselFile:
+    """Return a vessel by its name or file: particulars in SI, each with its source.
+
+    Args:
+        name: one of `available("vessels")`, or the path of a YAML file.
+
+    Raises:
+        ConfigError: where there is no such vessel or its file is wrong.
+
+    Example:
+        residnet.vessel("wam_v_cal").length.value
+    """
+    if not isinstance(name, str):
+        raise UsageError(f"vessel: expected a name or path, given {described(name)}")
+    return load_vessel(name)
+
+
+@final
+class Trials:
+    """Sea trials that were flown.
+
+    Attributes:
+        logs: what sensors measured, one log for each manoeuvre; those of a learned model follow
+            those of a vessel.
+        motions: the motions themselves, without noise.
+        indices: one row for each flight: log, manoeuvre, craft, fault, then manoeuvring indices in
+            SI and rad; those that a flight is too short for are missing.
+
+    Example:
+        trials.indices[["log", "first_overshoot"]]
+    """
+
+    def __init__(self, flights: Sequence[Flight], indices: pd.DataFrame) -> None:
+        self.logs: list[Log] = [flight.log for flight in flights]
+        self.motions: list[Log] = [flight.motion for flight in flights]
+        self.indices = indices
+
+    def __repr__(self) -> str:
+        return f"Trials({len(self.logs)} logs)"
+
+
+def simulate(
+    vessel: str | None = None,
+    manoeuvres: PartGiven | Sequence[PartGiven] = (),
+    *,
+    families: PartGiven | Sequence[PartGiven] = (),
+    progress: ProgressCallback | None = None,
+    **settings: Any,
+) -> Trials:
+    """Fly manoeuvres with a vessel, a learned model, or both.
+
+    The arguments are the keys of `programme` in a config of the task `simulate`, and give the same
+    logs.
+
+    Args:
+        vessel: name of a vessel, or path of its file.
+        manoeuvres: each a kind with settings, or a config object.
+        families: further ones drawn at random by `seed`.
+        progress: is told about the work.
+        settings: further keys of `programme`, as YAML has them: model, duration, step, substeps,
+            noise, disturbance, initial, length, reader, seed.
+
+    Raises:
+        ConfigError: where a setting is wrong, or the vessel cannot fly a manoeuvre.
+        DataError: where a motion is not finite from its first step on.
+
+    Example:
+        trials = residnet.simulate("wam_v_cal", {"kind": "zigzag", "drive": 0.6, "steer": 0.4,
+                                                 "heading": "20 deg"}, duration=60)
+    """
+    import pandas as pd
+
+    given: dict[str, Any] = {"vessel": vessel, **settings}
+    asked: dict[str, Any] = {"manoeuvres": manoeuvres, "families": families}
+    for key, parts in asked.items():
+        several = parts if isinstance(parts, list | tuple) else [parts]
+        given[key] = [part(entry, key) for entry in several]
+    known = {name: value for name, value in given.items() if value is not None}
+    programme: Programme = validate(plain(known), Programme, "simulate")
+    flights, rows = [], []
+    with hearing(progress):
+        for craft, sea in programme.crafts():
+            flown = programme.fly(craft, sea)
+            flights += flown
+            rows += index_rows(craft, flown, programme.hull_length)
+    names = ("log", "manoeuvre", "craft", "fault")
+    flat = [{name: row[name] for name in names} | row["indices"] for row in rows]
+    return Trials(flights, pd.DataFrame(flat))
 
 
 @final
@@ -36,8 +211,7 @@ class Result:
     """
 
     def __init__(self, folder: Path, kept: tempfile.TemporaryDirectory[str] | None) -> None:
-        self.folder = folder
-        self._kept = kept
+        self.folder, self._kept = folder, kept
 
     @cached_property
     def summary(self) -> dict[str, Any]:
@@ -136,7 +310,18 @@ def run(
     Example:
         result = residnet.run("quickstart.yaml", overrides={"seed": 3}); result.metrics
     """
-    task, source, changes = _task(config, overrides)
+    changes, source, task = _overrides(overrides), None, config
+    if isinstance(config, Task | Mapping) and changes:
+        raise UsageError("run: overrides are for a file; change the mapping itself")
+    if isinstance(config, Mapping):
+        task = validate(plain(config), TaskConfig, "run", Path.cwd())
+    elif isinstance(config, str | Path):
+        source = path(config, "run")
+        task = load_config(source, changes, TaskConfig)
+    if not isinstance(task, Task):
+        raise UsageError(
+            f"run: expected the path of a YAML file, a mapping or a task, given {described(config)}"
+        )
     kept = None if folder is not None else tempfile.TemporaryDirectory(prefix="residnet-")
     place = path(folder, "run: folder") if kept is None else Path(kept.name) / task.name
     with hearing(progress):
@@ -151,24 +336,6 @@ def run(
     return Result(place, kept)
 
 
-def _task(config: Any, overrides: Any) -> tuple[Task, Path | None, list[str]]:
-    changes = _overrides(overrides)
-    if isinstance(config, Task | Mapping) and changes:
-        raise UsageError("run: overrides are for a file; change the mapping itself")
-    if isinstance(config, Task):
-        return config, None, []
-    if isinstance(config, Mapping):
-        task: Task = validate(plain(config), TaskConfig, "run", Path.cwd())
-        return task, None, []
-    if isinstance(config, str | Path):
-        file = path(config, "run")
-        loaded: Task = load_config(file, changes, TaskConfig)
-        return loaded, file, changes
-    raise UsageError(
-        f"run: expected the path of a YAML file, a mapping or a task, given {described(config)}"
-    )
-
-
 def _overrides(given: Any) -> list[str]:
     if isinstance(given, Mapping):
         return [f"{key}={json.dumps(plain(value))}" for key, value in given.items()]
@@ -181,8 +348,6 @@ def autopilot(
     vessel: str,
     rudder: float | str,
     *,
-    test: Mapping[str, Any],
-    policies: Mapping[str, Any],
     peers: Mapping[str, Any] | None = None,
     folder: PathGiven | None = None,
     name: str = "autopilot",
@@ -196,31 +361,23 @@ def autopilot(
     Args:
         vessel: name of a vessel, or path of its file.
         rudder: largest rudder angle that controllers may use, in rad or with a unit.
-        test: the step of heading that all are compared in: heading, band, duration and so on.
-        policies: neural policies by name, with their settings; an empty mapping for the defaults.
         peers: classical controllers by name: a kind such as `pd`, or settings.
         folder: where the run is kept; without one it vanishes with the result.
         name: of the run.
         progress: is told how far the training is.
-        settings: further keys: spread, predictive, floor, tuning_points, seed, turning_time.
+        settings: further keys: test, the step of heading that all are compared in; policies,
+            learned controllers by name; conditions, predictive, floor, seed and so on.
 
     Raises:
         ConfigError: where a setting is wrong.
 
     Example:
-        residnet.autopilot("nomoto_oceanos", "5 deg", test={"duration": 12}, policies={"mine": {}})
+        residnet.autopilot("nomoto_oceanos", "5 deg", test={"duration": 12}, conditions={},
+                           policies={"mine": {"start": None}})
     """
-    config = {
-        "task": "autopilot",
-        "name": name,
-        "vessel": vessel,
-        "rudder": rudder,
-        "test": test,
-        "policies": policies,
-        "peers": {
-            peer: {"kind": given} if isinstance(given, str) else given
-            for peer, given in (peers or {}).items()
-        },
-        **settings,
+    given = {
+        peer: {"kind": kind} if isinstance(kind, str) else kind
+        for peer, kind in (peers or {}).items()
     }
-    return run(config, folder=folder, progress=progress)
+    config = {"task": "autopilot", "name": name, "vessel": vessel, "rudder": rudder}
+    return run({**config, "peers": given, **settings}, folder=folder, progress=progress)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from residnet.core.config import Config, ExistingPath
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, to_si
 from residnet.data.readers.encoding import as_utf8
 from residnet.physics.actuators.identify import (
+    Estimate,
+    StepAnswer,
+    ThrottleMap,
+    ThrustFit,
     fit_step,
     fit_throttle,
     fit_thrust,
@@ -21,10 +26,9 @@ from residnet.physics.actuators.identify import (
 from residnet.report.blocks import Section
 from residnet.report.figure import write_figures
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.actuators import sections
+from residnet.report.sections.actuators import actuator_tests, sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
-from residnet.tasks.actuator_lines import numbers, vessel_lines
 
 
 class Column(Config):
@@ -38,28 +42,25 @@ class Column(Config):
     column: str
     unit: str
 
-    @field_validator("unit")
-    @classmethod
-    def _unit(cls, unit: str) -> str:
+
+def _measures(si: str) -> Callable[[Column], Column]:
+    def check(column: Column) -> Column:
         try:
-            to_si(unit)
+            to_si(column.unit, si)
         except UsageError as error:
             raise ValueError(str(error)) from None
-        return unit
+        return column
 
-    def measures(self, si: str, key: str) -> None:
-        """Check that the unit measures what the SI unit `si` does.
-
-        Raises:
-            ValueError: naming the key.
-        """
-        try:
-            to_si(self.unit, si)
-        except UsageError as error:
-            raise ValueError(f"{key}: {error}") from None
+    return check
 
 
-class _Test(Config):
+Share = Annotated[Column, AfterValidator(_measures("-"))]
+Time = Annotated[Column, AfterValidator(_measures("s"))]
+Revolutions = Annotated[Column, AfterValidator(_measures("1/s"))]
+Force = Annotated[Column, AfterValidator(_measures("N"))]
+
+
+class ActuatorTest(Config):
     """A test of the actuators.
 
     Attributes:
@@ -68,67 +69,74 @@ class _Test(Config):
 
     files: Annotated[tuple[ExistingPath, ...], Field(min_length=1)]
 
+    def read(self) -> list[tuple[np.ndarray, ...]]:
+        """Return the columns [N] of each file in SI, in the order of the keys; rows with an empty
+        cell are left out.
 
-class ThrottleTest(_Test):
+        Raises:
+            UsageError: where a column is missing.
+            DataError: where a cell is no number, or no row is complete.
+        """
+        keys = [key for key in type(self).model_fields if key not in ("files", "thrusters")]
+        return [_read(path, [getattr(self, key) for key in keys]) for path in self.files]
+
+    def together(self) -> tuple[np.ndarray, ...]:
+        """Return the columns of all files as one."""
+        return tuple(np.concatenate(parts) for parts in zip(*self.read(), strict=True))
+
+
+class ThrottleTest(ActuatorTest):
     """Steady revolutions over throttle, one row for each point.
 
     Attributes:
-        files: csv files of the test.
         throttle: column of the throttle, from -1 to 1 (`-`) or in `%`.
         n: column of the revolutions, for example in `rpm`.
     """
 
-    throttle: Column
-    n: Column
-
-    @model_validator(mode="after")
-    def _units(self) -> ThrottleTest:
-        self.throttle.measures("-", "throttle")
-        self.n.measures("1/s", "n")
-        return self
+    throttle: Share
+    n: Revolutions
 
 
-class StepTest(_Test):
+class StepTest(ActuatorTest):
     """Revolutions over time after steps of the command, one file for each step response.
 
     Attributes:
-        files: csv files of the test.
         t: column of the time, for example in `s`.
         command: column of the commanded revolutions, for example in `rpm`.
         n: column of the measured revolutions, for example in `rpm`.
     """
 
-    t: Column
-    command: Column
-    n: Column
+    t: Time
+    command: Revolutions
+    n: Revolutions
 
-    @model_validator(mode="after")
-    def _units(self) -> StepTest:
-        self.t.measures("s", "t")
-        self.command.measures("1/s", "command")
-        self.n.measures("1/s", "n")
-        return self
+    def read(self) -> list[tuple[np.ndarray, ...]]:
+        """Return the columns of each file.
+
+        Raises:
+            DataError: where time does not go on.
+        """
+        found = super().read()
+        for path, (t, *_) in zip(self.files, found, strict=True):
+            if (bad := np.flatnonzero(np.diff(t) <= 0)).size:
+                raise DataError(
+                    f"{path}: time repeats or runs backwards in row {int(bad[0]) + 2} of the data"
+                )
+        return found
 
 
-class BollardTest(_Test):
+class BollardTest(ActuatorTest):
     """Steady pull on a tether over revolutions, of all thrusters together.
 
     Attributes:
-        files: csv files of the test.
         n: column of the revolutions, for example in `rpm`.
         pull: column of the pull, positive ahead, for example in `N`.
         thrusters: how many pull together.
     """
 
-    n: Column
-    pull: Column
+    n: Revolutions
+    pull: Force
     thrusters: int = Field(default=1, ge=1)
-
-    @model_validator(mode="after")
-    def _units(self) -> BollardTest:
-        self.n.measures("1/s", "n")
-        self.pull.measures("N", "pull")
-        return self
 
 
 class ActuatorsTaskConfig(Task):
@@ -147,14 +155,13 @@ class ActuatorsTaskConfig(Task):
 
     @model_validator(mode="after")
     def _any(self) -> ActuatorsTaskConfig:
-        if not self.files():
+        if not self._tests():
             raise ValueError("no test is named; give at least one of throttle, step, bollard")
         return self
 
-    def files(self) -> list[Path]:
-        """Return the files of all tests."""
-        tests: tuple[_Test | None, ...] = (self.throttle, self.step, self.bollard)
-        return [path for test in tests if test is not None for path in test.files]
+    def _tests(self) -> list[ActuatorTest]:
+        tests: tuple[ActuatorTest | None, ...] = (self.throttle, self.step, self.bollard)
+        return [test for test in tests if test is not None]
 
     def check(self) -> None:
         """Check that the logs can be read.
@@ -162,11 +169,12 @@ class ActuatorsTaskConfig(Task):
         Raises:
             ResidnetError: where a column is missing or holds what is no number.
         """
-        _Logs(self)
+        for test in self._tests():
+            test.read()
 
     def input_files(self) -> list[Path]:
         """Return the files of all logs that the task reads."""
-        return self.files()
+        return [path for test in self._tests() for path in test.files]
 
     def carry_out(self, folder: RunFolder) -> Outcome:
         """Identify the actuators, and write actuators.yaml, actuators.json and a figure.
@@ -174,91 +182,103 @@ class ActuatorsTaskConfig(Task):
         Raises:
             ResidnetError: where the logs cannot be used or do not determine the actuators.
         """
-        from residnet.report.sections.actuators import actuator_tests
-
-        logs = _Logs(self)
-        throttle = fit_throttle(logs.throttle[0], logs.throttle[1]) if logs.throttle else None
-        step = fit_step(logs.steps) if logs.steps else None
-        thrust = pull_of_one = None
-        if self.bollard is not None and logs.bollard:
-            n, pull = logs.bollard
-            thrust = fit_thrust(n, pull, self.bollard.thrusters)
-            pull_of_one = (n, pull / self.bollard.thrusters, thrust)
-        text = vessel_lines(self.name, self.files(), throttle, step, thrust)
-        folder.write(folder.path / "actuators.yaml", text)
-        folder.write_json(folder.path / "actuators.json", numbers(throttle, step, thrust))
-        drawing = actuator_tests(
-            self.name,
-            (logs.throttle[0], logs.throttle[1], throttle) if logs.throttle and throttle else None,
-            (logs.steps, step) if step else None,
-            pull_of_one,
-        )
-        write_figures(folder.figures, [drawing])
-        figures = {}
-        if throttle is not None:
+        throttle = step = thrust = drawn_throttle = drawn_step = drawn_pull = None
+        figures: dict[str, MainFigure] = {}
+        tests = []
+        if self.throttle is not None:
+            share, n = self.throttle.together()
+            throttle = fit_throttle(share, n)
+            drawn_throttle = (share, n, throttle)
             figures["n_max"] = MainFigure(throttle.n_max.value, "1/s")
-        if step is not None:
+            tests.append("throttle map")
+        if self.step is not None:
+            runs = [(t, command, n) for t, command, n in self.step.read()]
+            step = fit_step(runs)
+            drawn_step = (runs, step)
             figures["n_rate"] = MainFigure(step.rate.value, "1/s^2")
             figures["dead_time"] = MainFigure(step.dead_time.value, "s")
-        tests = [
-            name
-            for name, found in (
-                ("throttle map", throttle),
-                ("step response", step),
-                ("thrust curves", thrust),
-            )
-            if found is not None
-        ]
-        verdict = [
+            tests.append("step response")
+        if self.bollard is not None:
+            n, pull = self.bollard.together()
+            thrust = fit_thrust(n, pull, self.bollard.thrusters)
+            drawn_pull = (n, pull / self.bollard.thrusters, thrust)
+            tests.append("thrust curves")
+        text = self._lines(throttle, step, thrust)
+        folder.write(folder.path / "actuators.yaml", text)
+        folder.write_json(folder.path / "actuators.json", _numbers(throttle, step, thrust))
+        drawing = actuator_tests(self.name, drawn_throttle, drawn_step, drawn_pull)
+        write_figures(folder.figures, [drawing])
+        sentence = (
             f"The tests gave {' and '.join(tests)}; actuators.yaml holds the lines for a vessel"
             " file."
-        ]
-        return Outcome(verdict, figures, text)
+        )
+        return Outcome([sentence], figures, text)
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Return parameters and lines for a vessel file; the figure is that of the run."""
         return sections(RunFiles(run.path))
 
+    def _lines(
+        self,
+        throttle: ThrottleMap | None,
+        step: StepAnswer | None,
+        thrust: tuple[ThrustFit, ThrustFit] | None,
+    ) -> str:
+        """Return lines for the section `actuators` of a vessel file, intervals as comments."""
+        files = ", ".join(path.name for path in self.input_files())
+        lines = [f"# from {files}; intervals are 95 %"]
+        if throttle is not None:
+            slope, m = throttle.slope, throttle.n_max
+            lines.append(
+                f"# n = {slope.value * 60:.6g} rpm * throttle {throttle.offset.value * 60:+.4g} rpm"
+                f" (slope {_ends(slope, 60, 6)})"
+            )
+            largest = "largest measured: nothing saturated"
+            about = _ends(m, 60, 5) if throttle.saturated else largest
+            lines.append(f"n_max: {m.value * 60:.5g} rpm  # {about}")
+        if step is not None:
+            rate, dead = step.rate, step.dead_time
+            lines.append(f"n_rate: {rate.value * 60:.5g} rpm/s  # {_ends(rate, 60, 5)}")
+            lines.append(f"# dead_time: {dead.value:.3g} s  ({_ends(dead, 1, 3)})")
+        for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):
+            values = ", ".join(f"{c.value:.6g}" for c in fit.coefficients)
+            lines.append(f"{name}: [{values}]  # rms residual {fit.rms:.3g} N per thruster")
+            lines += [
+                f"#   c{i}: {_ends(c, 1, 6)} {c.unit}" for i, c in enumerate(fit.coefficients)
+            ]
+        if thrust is not None:
+            low, high = thrust[1].low * 60, thrust[0].high * 60
+            lines.append(f"curve_range: [{low:.5g} rpm, {high:.5g} rpm]")
+        lines.append(f"source: {json.dumps(f'identified by residnet, run {self.name}')}")
+        return "\n".join(lines) + "\n"
 
-class _Logs:
-    """The contents of the tests in SI: throttle and n; (t, command, n) of each step; n and pull."""
 
-    def __init__(self, config: ActuatorsTaskConfig) -> None:
-        self.throttle = (
-            _together(config.throttle.files, config.throttle.throttle, config.throttle.n)
-            if config.throttle
-            else None
-        )
-        self.bollard = (
-            _together(config.bollard.files, config.bollard.n, config.bollard.pull)
-            if config.bollard
-            else None
-        )
-        self.steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        for path in config.step.files if config.step else ():
-            assert config.step is not None
-            t, command, n = _read(path, config.step.t, config.step.command, config.step.n)
-            self.steps.append((t, command, n))
-            if (np.diff(t) <= 0).any():
-                raise DataError(
-                    f"{path}: time repeats or runs backwards in row"
-                    f" {int(np.flatnonzero(np.diff(t) <= 0)[0]) + 2} of the data"
-                )
+def _ends(estimate: Estimate, factor: float, digits: int) -> str:
+    return f"{estimate.low * factor:.{digits}g} .. {estimate.high * factor:.{digits}g}"
 
 
-def _together(paths: Sequence[Path], *columns: Column) -> tuple[np.ndarray, ...]:
-    parts = [_read(path, *columns) for path in paths]
-    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+def _numbers(
+    throttle: ThrottleMap | None,
+    step: StepAnswer | None,
+    thrust: tuple[ThrustFit, ThrustFit] | None,
+) -> dict[str, Any]:
+    """Return the identified actuators as the content of actuators.json."""
+    out: dict[str, Any] = {"schema": "residnet.actuators/1"}
+    if throttle is not None:
+        out["throttle"] = {
+            name: part._asdict() if isinstance(part, Estimate) else part
+            for name, part in throttle._asdict().items()
+        }
+    if step is not None:
+        out["step"] = {name: part._asdict() for name, part in step._asdict().items()}
+    for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):
+        entries = {f"c{i}": c._asdict() for i, c in enumerate(fit.coefficients)}
+        out[name] = entries | {"low": fit.low, "high": fit.high, "rms": fit.rms}
+    return out
 
 
-def _read(path: Path, *columns: Column) -> tuple[np.ndarray, ...]:
-    """Return columns [N] of a csv file in SI; rows with an empty cell are left out.
-
-    Raises:
-        UsageError: where a column is missing.
-        DataError: where a cell is no number, or no row is complete.
-    """
+def _read(path: Path, columns: Sequence[Column]) -> tuple[np.ndarray, ...]:
     import pandas as pd
 
     try:
@@ -271,10 +291,8 @@ def _read(path: Path, *columns: Column) -> tuple[np.ndarray, ...]:
     out = []
     for entry in columns:
         if entry.column not in table.columns:
-            raise UsageError(
-                f"{path}: no column"
-                f" '{entry.column}'{nearest(entry.column, map(str, table.columns))}"
-            )
+            near = nearest(entry.column, map(str, table.columns))
+            raise UsageError(f"{path}: no column '{entry.column}'{near}")
         values = pd.to_numeric(table[entry.column], errors="coerce").to_numpy(dtype=np.float64)
         bad = np.flatnonzero(~np.isfinite(values) & table[entry.column].notna().to_numpy())
         if bad.size:
@@ -285,7 +303,6 @@ def _read(path: Path, *columns: Column) -> tuple[np.ndarray, ...]:
         out.append(values * to_si(entry.unit))
     whole = np.isfinite(np.stack(out)).all(axis=0)
     if not whole.any():
-        raise DataError(
-            f"{path}: no row has a number in all of {', '.join(entry.column for entry in columns)}"
-        )
+        names = ", ".join(entry.column for entry in columns)
+        raise DataError(f"{path}: no row has a number in all of {names}")
     return tuple(values[whole] for values in out)

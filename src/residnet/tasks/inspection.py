@@ -31,7 +31,7 @@ from residnet.data.parts import log_names
 from residnet.data.readers.base import LogReader
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.sources import MeasuredLogs
-from residnet.tasks.drafting.yaml_text import commented
+from residnet.tasks.drafting import commented
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.import_logs import ImportConfig
 from residnet.tasks.registry import load_task

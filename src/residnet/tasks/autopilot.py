@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, final
 
 import torch
 from pydantic import Field, model_validator
@@ -47,6 +47,9 @@ from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, Outcome
 from residnet.training.policies.config import PolicyTraining
+
+if TYPE_CHECKING:
+    from residnet.export.base import Exported
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]
@@ -304,7 +307,7 @@ class AutopilotConfig(ComputingTask):
         Raises:
             FitError: where tuning or training fails.
         """
-        from residnet.tasks.autopilot.running import run_autopilot
+        from residnet.tasks.autopilot_run import run_autopilot
 
         return run_autopilot(self, folder)
 
@@ -325,32 +328,50 @@ class AutopilotConfig(ComputingTask):
         Raises:
             UsageError: where there is no such policy, or another format is given.
         """
+        from residnet.tasks.autopilot_run import export_as
+
+        def again(card: dict[str, Any]) -> Exported:
+            return export_as(self, run, card, model)
+
         if model not in self.policies:
             raise UsageError(f"{run.path}: no policy '{model}'{nearest(model, self.policies)}")
-        file = run.exports / f"{model}.pt"
-        if not file.is_file():
-            raise UsageError(f"{file}: no such file; the run writes it at its end")
-        if file_format != "torchscript":
-            from residnet.export import exporter
-            from residnet.export.policy import ExportedHeading
-            from residnet.tasks.autopilot.running import stored_policy
+        return exported_file(run, model, out, file_format, again)
 
-            # at the step and with the card of the TorchScript file
-            chosen, extra = exporter(file_format), {"card.json": ""}
-            torch.jit.load(str(file), _extra_files=extra)
-            card = json.loads(extra["card.json"])
-            policy = stored_policy(self, run.models, model, card["dt"])
-            out = out or file.with_name(f"{model}{chosen.suffix}")
-            exported = ExportedHeading(
-                model, policy, safe=self.safe, about=card, metrics=card["metrics"]
-            )
-            chosen.export(exported, out)
-            return out
-        if out is None:
-            return file
+
+def exported_file(
+    run: RunFolder,
+    name: str,
+    out: Path | None,
+    file_format: str,
+    again: Callable[[dict[str, Any]], Exported],
+) -> Path:
+    """Return the file of a policy: the TorchScript that its run wrote, or another format of it.
+
+    Args:
+        run: that exported it.
+        name: of the file without its ending.
+        out: where to write; None for beside the TorchScript file.
+        file_format: one of `residnet list formats`.
+        again: returns the policy for the card of the TorchScript file.
+
+    Raises:
+        UsageError: where the run has written no such file.
+        ExportError: where the new file does not reproduce the policy.
+    """
+    file = run.exports / f"{name}.pt"
+    if not file.is_file():
+        raise UsageError(f"{file}: no such file; the run writes it at its end")
+    if file_format != "torchscript":
+        from residnet.export import exporter
+
+        chosen, extra = exporter(file_format), {"card.json": ""}
+        torch.jit.load(str(file), _extra_files=extra)
+        out = out or file.with_name(f"{name}{chosen.suffix}")
+        chosen.export(again(json.loads(extra["card.json"])), out)
+    elif out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, out)
-        return out
+    return out or file
 
 
 def school_of(config: AutopilotConfig, name: str) -> SteeredPlant | SteeredModel:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,14 +36,16 @@ from residnet.core.progress import say
 from residnet.documents.gouletas2020.autopilot import load_predictive
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import InAmbientCurrent
+from residnet.export.policy import ExportedCoursePolicy
+from residnet.export.torchscript import TorchScriptExporter
 from residnet.judge.courses import CourseFlight, row, spread_row
 from residnet.judge.metrics import SCHEMA
 from residnet.report.sections.course import COURSES, SPREAD, TRACKS, text_of
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome
-from residnet.tasks.autopilot.running import stored_policy
-from residnet.tasks.autopilot.task import AnyController, AutopilotConfig
-from residnet.tasks.course.task import NOMINAL, CourseTaskConfig, Vessels
+from residnet.tasks.autopilot import AnyController, AutopilotConfig
+from residnet.tasks.autopilot_run import stored_policy
+from residnet.tasks.course import NOMINAL, CourseTaskConfig, Vessels
 
 _UNITS = {
     "course_time": "s",
@@ -77,7 +78,8 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> Outcome:
     trained = load_policy(known, config.policy)
     controllers = {config.policy: trained, **load_peers(config, known)}
     done = _Flown([], [], [])
-    plans, exports = [], []
+    plans: list[pd.DataFrame] = []
+    exports: dict[str, Callable[[], Path]] = {}
     for protocol in config.protocols:
         planned, guidance = plan_for(config, known, protocol)
         say(
@@ -88,9 +90,8 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> Outcome:
         for name in controllers:
             for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
                 _fly(config, planned, steering, name, controllers[name], sight, done)
-        exports.append(
-            CourseExport(folder.exports, config, planned, guidance, trained, known.autopilot)
-        )
+        work = partial(_export, folder.exports, config, known, (planned, guidance), trained)
+        exports[f"{config.policy}_{protocol}"] = partial(work, done.rows)
     shown = {
         "schema": SCHEMA,
         "run": config.name,
@@ -105,49 +106,25 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> Outcome:
     folder.write_table(folder.path / COURSES, pd.concat(plans, ignore_index=True))
     if done.spread:
         folder.write_table(folder.path / SPREAD, pd.concat(done.spread, ignore_index=True))
-    return Outcome(
-        _verdict(config, done.rows),
-        _main_figures(config, done.rows),
-        text_of(done.rows),
-        exports={export.name: partial(export.write, done.rows) for export in exports},
-    )
-
-
-def _nominal(config: CourseTaskConfig, rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the policy's row of the nominal vessel along the plan, by protocol."""
-    return {
-        row["protocol"]: row
-        for row in rows
-        if (row["model"], row["guidance"], row["split"]) == (config.policy, "course", "simulated")
-    }
-
-
-def _verdict(config: CourseTaskConfig, rows: Sequence[dict[str, Any]]) -> list[str]:
-    sentences = []
-    for protocol, flight in _nominal(config, rows).items():
-        if not flight["finished"]:
-            sentences.append(
-                f"{protocol}: '{config.policy}' did not come to the end of the course."
-            )
+    verdict, figures = [], dict[str, MainFigure]()
+    for flight in done.rows:
+        # the policy on the nominal vessel along the plan
+        nominal = (flight["model"], flight["guidance"], flight["split"])
+        if nominal != (config.policy, "course", "simulated"):
             continue
-        passes = "and passes all" if flight["passed"] else "but does NOT pass all"
-        sentences.append(
-            f"{protocol}: '{config.policy}' needs {flight['course_time']:.1f} s,"
-            f" {flight['ratio']:.3f} times the time of the reference, {passes}"
-            f" {len(config.course.buoys)} buoys as the protocol asks."
-        )
-    return sentences
-
-
-def _main_figures(
-    config: CourseTaskConfig, rows: Sequence[dict[str, Any]]
-) -> dict[str, MainFigure]:
-    figures = {}
-    for protocol, flight in _nominal(config, rows).items():
+        protocol = flight["protocol"]
         figures[f"{protocol}_course_time"] = MainFigure(flight["course_time"], "s")
         figures[f"{protocol}_ratio"] = MainFigure(flight["ratio"])
         figures[f"{protocol}_cross_track_rms"] = MainFigure(flight["cross_track_rms"], "m")
-    return figures
+        passes = "and passes all" if flight["passed"] else "but does NOT pass all"
+        verdict.append(
+            f"{protocol}: '{config.policy}' needs {flight['course_time']:.1f} s,"
+            f" {flight['ratio']:.3f} times the time of the reference, {passes}"
+            f" {len(config.course.buoys)} buoys as the protocol asks."
+            if flight["finished"]
+            else f"{protocol}: '{config.policy}' did not come to the end of the course."
+        )
+    return Outcome(verdict, figures, text_of(done.rows), exports=exports)
 
 
 class AutopilotRun(NamedTuple):
@@ -442,103 +419,58 @@ _SAME = 1e-6
 """Largest difference of a course planned again from the one that was flown, as a share."""
 
 
-class CourseExport(NamedTuple):
-    """A policy with the guidance along one plan, to be exported when the run ends.
+def _exported(
+    config: CourseTaskConfig,
+    name: str,
+    flown: tuple[PlannedCourse, CourseGuidance],
+    policy: HeadingPolicy,
+    about: dict[str, Any],
+    metrics: list[dict[str, Any]],
+) -> ExportedCoursePolicy:
+    planned, guidance = flown
+    return ExportedCoursePolicy(
+        name, policy, guidance, planned.course, safe=config.safe, about=about, metrics=metrics
+    )
 
-    Attributes:
-        folder: where files go.
-        config: of the course.
-        planned: the plan of one protocol.
-        guidance: along it.
-        policy: at the step of the course.
-        autopilot: config of the policy's own run.
-    """
 
-    folder: Path
-    config: CourseTaskConfig
-    planned: PlannedCourse
-    guidance: CourseGuidance
-    policy: HeadingPolicy
-    autopilot: AutopilotConfig
-
-    @property
-    def name(self) -> str:
-        """Name of the file without its ending."""
-        return f"{self.config.policy}_{self.planned.protocol}"
-
-    def write(self, rows: Sequence[dict[str, Any]]) -> Path:
-        """Export, with the policy's rows of metrics.json in the card; returns the file."""
-        from residnet.export.policy import ExportedCoursePolicy
-        from residnet.export.torchscript import TorchScriptExporter
-
-        config, protocol = self.config, self.planned.protocol
-        file = self.folder / f"{self.name}.pt"
-        about = {
-            "vessel": self.autopilot.vessel,
-            "course": config.course.model_dump(mode="json"),
-            "protocol": protocol,
-        }
-        metrics = [
-            row for row in rows if row["protocol"] == protocol and row["model"] == config.policy
-        ]
-        exported = ExportedCoursePolicy(
-            config.policy,
-            self.policy,
-            self.guidance,
-            self.planned.course,
-            safe=config.safe,
-            about=about,
-            metrics=metrics,
-        )
-        TorchScriptExporter().export(exported, file)
-        return file
+def _export(
+    folder: Path,
+    config: CourseTaskConfig,
+    known: AutopilotRun,
+    flown: tuple[PlannedCourse, CourseGuidance],
+    policy: HeadingPolicy,
+    rows: Sequence[dict[str, Any]],
+) -> Path:
+    """Export a policy with the guidance along a plan, its rows of metrics.json in the card."""
+    protocol = flown[0].protocol
+    about = {
+        "vessel": known.autopilot.vessel,
+        "course": config.course.model_dump(mode="json"),
+        "protocol": protocol,
+    }
+    mine = (protocol, config.policy)
+    metrics = [row for row in rows if (row["protocol"], row["model"]) == mine]
+    file = folder / f"{config.policy}_{protocol}.pt"
+    exported = _exported(config, config.policy, flown, policy, about, metrics)
+    TorchScriptExporter().export(exported, file)
+    return file
 
 
 def export_as(
-    file_format: str,
-    config: CourseTaskConfig,
-    run: RunFolder,
-    protocol: Protocol,
-    scripted: Path,
-    out: Path | None,
-) -> Path:
-    """Write a policy with the guidance of a course, planned again; returns the file.
-
-    Args:
-        file_format: one of `residnet list formats`.
-        config: of the course.
-        run: its folder.
-        protocol: that the course was planned by.
-        scripted: the TorchScript file, whose card the new file takes.
-        out: where to write; None for beside the TorchScript file.
+    config: CourseTaskConfig, run: RunFolder, card: dict[str, Any], protocol: Protocol
+) -> ExportedCoursePolicy:
+    """Return a policy with the guidance of a course, planned again, with the card of its file.
 
     Raises:
-        ExportError: where the plan is not the one that was flown, or the file does not reproduce
-            policy and guidance.
+        ExportError: where the plan is not the one that was flown.
     """
-    from residnet.export import exporter
-    from residnet.export.policy import ExportedCoursePolicy
-
-    chosen, extra = exporter(file_format), {"card.json": ""}
-    torch.jit.load(str(scripted), _extra_files=extra)
-    card = json.loads(extra["card.json"])
-    known = ready(config, run)
-    planned, guidance = plan_for(config, known, protocol)
-    length = planned.course.length
+    known, name = ready(config, run), f"{config.policy}_{protocol}"
+    flown = plan_for(config, known, protocol)
+    length = flown[0].course.length
     if not abs(length - card["length"]) <= _SAME * length:
         raise ExportError(
-            f"{scripted}: its course has {card['length']:.3f} m, planned again {length:.3f} m;"
-            " carry the run out again with this version"
+            f"{run.exports / name}.pt: its course has {card['length']:.3f} m, planned again"
+            f" {length:.3f} m; carry the run out again with this version"
         )
-    file = out or scripted.with_name(f"{scripted.stem}{chosen.suffix}")
-    exported = ExportedCoursePolicy(
-        scripted.stem,
-        load_policy(known, config.policy),
-        guidance,
-        planned.course,
-        safe=config.safe,
-        about=card,
-        metrics=card["metrics"],
-    )
-    chosen.export(exported, file)
-    return file
+    policy = load_policy(known, config.policy)
+    return _exported(config, name, flown, policy, card, card["metrics"])

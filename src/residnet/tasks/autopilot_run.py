@@ -31,6 +31,7 @@ from residnet.control.heading.vessels import SteeredPlant, fly
 from residnet.core.progress import report, say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.store import rebuilt
+from residnet.export.base import Exported
 from residnet.export.closed_loop import CompiledLoop
 from residnet.export.policy import ExportedHeading
 from residnet.export.torchscript import TorchScriptExporter
@@ -64,7 +65,7 @@ from residnet.report.sections.autopilot import (
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome
-from residnet.tasks.autopilot.task import (
+from residnet.tasks.autopilot import (
     AnyController,
     AutopilotConfig,
     JudgedConditions,
@@ -138,8 +139,7 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
     if config.conditions is not None:
         tables.insert(0, cost_table(rows))
     return Outcome(
-        _verdict(config, rows),
-        _main_figures(config, rows),
+        *_told(config, rows),
         "\n\n".join(table.text() for table in tables),
         exports={
             name: partial(
@@ -330,46 +330,30 @@ def _judge(
     return rows, pd.concat(tables, ignore_index=True)
 
 
-def _settling(
+def _told(
     config: AutopilotConfig, rows: list[dict[str, Any]]
-) -> dict[str, tuple[float, float]]:
-    """Return the settling times of what was trained in s: nominal vessel, and worst corner."""
+) -> tuple[list[str], dict[str, MainFigure]]:
+    """Return the verdict and the main figures: settling on the nominal vessel, and worst corner."""
     found = {(row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row}
-    return {
-        name: (found[name, "nominal"]["max"], found[name, "corners"]["max"])
-        for name in (config.policies or config.predictive)
-    }
-
-
-def _verdict(config: AutopilotConfig, rows: list[dict[str, Any]]) -> list[str]:
-    step = math.degrees(config.test.heading)
-    sentences = [
-        f"'{name}' settles on a new heading {step:.3g} deg away in {nominal:.2f} s on the nominal"
-        f" vessel, and in {worst:.2f} s on the slowest vessel at the corners of the spread."
-        for name, (nominal, worst) in _settling(config, rows).items()
-    ]
-    if config.floor is not None:
-        floor = next(
-            row["settling"]["max"]
-            for row in rows
-            if (row["model"], row["protocol"]) == (config.floor, "nominal")
-        )
-        sentences.append(
-            f"The fastest possible change of the nominal vessel, by '{config.floor}' that knows it"
-            f" exactly, takes {floor:.2f} s."
-        )
-    return [*cost_verdict(rows), *sentences]
-
-
-def _main_figures(config: AutopilotConfig, rows: list[dict[str, Any]]) -> dict[str, MainFigure]:
-    figures = {}
-    for name, (nominal, worst) in _settling(config, rows).items():
+    sentences, figures = cost_verdict(rows), dict[str, MainFigure]()
+    for name in config.policies or config.predictive:
+        nominal, worst = found[name, "nominal"]["max"], found[name, "corners"]["max"]
         figures[f"{name}_settling_nominal"] = MainFigure(nominal, "s")
         figures[f"{name}_settling_worst"] = MainFigure(worst, "s")
+        sentences.append(
+            f"'{name}' settles on a new heading {math.degrees(config.test.heading):.3g} deg away in"
+            f" {nominal:.2f} s on the nominal vessel, and in {worst:.2f} s on the slowest vessel at"
+            " the corners of the spread."
+        )
+    if config.floor is not None:
+        sentences.append(
+            f"The fastest possible change of the nominal vessel, by '{config.floor}' that knows it"
+            f" exactly, takes {found[config.floor, 'nominal']['max']:.2f} s."
+        )
     for row in rows:
         if row["protocol"] == "conditions" and row["model"] in config.policies:
             figures[f"{row['model']}_cost"] = MainFigure(row["cost"]["mean"], "s")
-    return figures
+    return sentences, figures
 
 
 def _export(
@@ -380,10 +364,7 @@ def _export(
     rows: list[dict[str, Any]],
 ) -> Path:
     """Export a policy, with its rows of metrics.json in the card; returns the file."""
-    about = {
-        "vessel": config.vessel,
-        "conditions": _stated(config).model_dump(mode="json"),
-    }
+    about = {"vessel": config.vessel, "conditions": _stated(config).model_dump(mode="json")}
     learned = config.policies[name].learned
     about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
     metrics = [row for row in rows if row["model"] == name]
@@ -391,3 +372,9 @@ def _export(
     exported = ExportedHeading(name, policy, safe=config.safe, about=about, metrics=metrics)
     TorchScriptExporter().export(exported, file)
     return file
+
+
+def export_as(config: AutopilotConfig, run: RunFolder, card: dict[str, Any], name: str) -> Exported:
+    """Return a stored policy at the step, and with the card, of its TorchScript file."""
+    policy = stored_policy(config, run.models, name, card["dt"])
+    return ExportedHeading(name, policy, safe=config.safe, about=card, metrics=card["metrics"])

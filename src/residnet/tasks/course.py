@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple, Self, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, final
 
 import numpy as np
 import torch
@@ -31,7 +30,10 @@ from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, Outcome
-from residnet.tasks.autopilot.task import AnyController, AutopilotConfig
+from residnet.tasks.autopilot import AnyController, AutopilotConfig, exported_file
+
+if TYPE_CHECKING:
+    from residnet.export.base import Exported
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
@@ -206,7 +208,7 @@ class CourseTaskConfig(ComputingTask):
             ConfigError: where no course fits the vessel's turns.
             FitError: where training fails.
         """
-        from residnet.tasks.course.running import run_course
+        from residnet.tasks.course_run import run_course
 
         return run_course(self, folder)
 
@@ -227,18 +229,13 @@ class CourseTaskConfig(ComputingTask):
         Raises:
             UsageError: where there is no such file, or another format is given.
         """
+        from residnet.tasks.course_run import export_as
+
         names = {f"{self.policy}_{protocol}": protocol for protocol in self.protocols}
         if model not in names:
             raise UsageError(f"{run.path}: no export '{model}'{nearest(model, names)}")
-        file = run.exports / f"{model}.pt"
-        if not file.is_file():
-            raise UsageError(f"{file}: no such file; the run writes it at its end")
-        if file_format != "torchscript":
-            from residnet.tasks.course.running import export_as
 
-            return export_as(file_format, self, run, names[model], file, out)
-        if out is None:
-            return file
-        out.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, out)
-        return out
+        def again(card: dict[str, Any]) -> Exported:
+            return export_as(self, run, card, names[model])
+
+        return exported_file(run, model, out, file_format, again)

@@ -1,1 +1,0 @@
-"""Task `autopilot`: heading policies and their classical peers."""

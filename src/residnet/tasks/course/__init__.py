@@ -1,1 +1,0 @@
-"""Task `course`: heading policies along a course past buoys."""

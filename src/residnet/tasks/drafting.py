@@ -1,0 +1,381 @@
+"""`residnet new`: a complete config of a fit from logs alone, with a comment at each guess."""
+
+from __future__ import annotations
+
+import os
+import re
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from residnet.core.config import validate
+from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.log import Log
+from residnet.core.names import POSE, VELOCITY
+from residnet.core.progress import say
+from residnet.data.division import divided, without_copies
+from residnet.data.doctor import inspect
+from residnet.data.drafting.channels import CHANNELS
+from residnet.data.drafting.questions import Answer, Marks
+from residnet.data.drafting.reading import INPUTS, log_files, read_drafted
+from residnet.data.motion import MotionConfig, complete_motion
+from residnet.data.prepare import PrepareConfig, prepare
+from residnet.data.readers.quantities import QUATERNION
+from residnet.data.split import SPLITS
+from residnet.identification.recipe import Preparation, judging, protocols, window_length
+from residnet.physics.environment.wind import WIND_INPUTS
+from residnet.tasks.driving import driving, lacks
+from residnet.tasks.fit import FitConfig
+
+_UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
+_INSPECTED = 12
+"""Logs that the data doctor looks at."""
+_SHOWN = 12
+"""Guesses that the terminal shows."""
+_WIDTH = 96
+QUICK = 0.1
+"""Effort of a first draft: its networks are trained for about a minute."""
+Comments = Callable[[tuple[str, ...]], list[str]]
+"""Path of a key -> lines about it."""
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A config that runs, and what of it is a guess.
+
+    Attributes:
+        config: the content of the YAML file.
+        guesses: key -> why its value is a guess.
+        text: the YAML with its comments.
+    """
+
+    config: dict[str, Any]
+    guesses: tuple[tuple[str, str], ...]
+    text: str
+
+    def save(self, file: Path | str) -> Path:
+        """Write the config as YAML with its comments; returns the path of the file.
+
+        Raises:
+            UsageError: where the file cannot be written.
+        """
+        path = Path(file)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(self.text, encoding="utf-8")
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be written ({error.strerror})") from error
+        return path
+
+
+def new_config(
+    logs: Sequence[Path],
+    out: Path,
+    answer: Answer | None,
+    *,
+    overwrite: bool,
+    standard: bool = False,
+) -> list[str]:
+    """Write a config for logs; returns what the terminal shows.
+
+    Args:
+        logs: files, folders and bags.
+        out: file to write.
+        answer: asks the user; None takes every default.
+        overwrite: replace the file.
+        standard: train the networks of the standard recipe at full length.
+
+    Raises:
+        UsageError: where the file exists already, or a path does not.
+        DataError: where no log can be used.
+    """
+    if out.suffix not in (".yaml", ".yml"):
+        raise UsageError(f"--out {out}: a config is a YAML file; name it {out}.yaml")
+    if out.exists() and not overwrite:
+        raise UsageError(f"--out {out}: exists; give --overwrite, or another name")
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", out.stem).strip("_.-") or "my_boat"
+    draft = drafted(logs, out.parent, name, answer, standard=standard)
+    file, count = draft.save(out), len(draft.guesses)
+    lines = [f"{key}: {why}" for key, why in draft.guesses[:_SHOWN]]
+    if count > _SHOWN:
+        lines.append(f"and {count - _SHOWN} more, marked in the file")
+    if count == 1:
+        lines.insert(0, "one value is a guess, marked in the file:")
+    elif count:
+        lines.insert(0, f"{count} values are guesses, each marked in the file:")
+    return [*lines, f"config: {file}", f"next: residnet run {file}"]
+
+
+def drafted(
+    paths: Sequence[Path],
+    folder: Path,
+    name: str,
+    answer: Answer | None = None,
+    *,
+    standard: bool = False,
+) -> Draft:
+    """Return a config for logs that the task `fit` runs as it is.
+
+    Args:
+        paths: files, folders and bags.
+        folder: where the config will lie; its paths start from there.
+        name: of the run.
+        answer: answers questions; None takes every default and marks it.
+        standard: train the networks of the standard recipe at full length.
+
+    Raises:
+        UsageError: where a path does not exist, or nothing drives the vessel in the logs.
+        DataError: where no log can be used.
+    """
+    marks = Marks(answer)
+    read = _Read(log_files(paths, folders=True), marks)
+    inputs = driving(list(read.whole.values()), marks)
+    if not inputs:
+        held = ", ".join(next(iter(read.whole.values())).channels)
+        marks.guess(
+            INPUTS,
+            "no channel of the logs is a rudder, a propeller or another command (they hold"
+            f" {held}): a model without them can only predict how the vessel coasts; name the"
+            " columns that drive it",
+        )
+    elif lacking := lacks(inputs):
+        marks.guess(
+            INPUTS,
+            f"nothing among the inputs {lacking} the vessel; where a column that no channel takes"
+            " does, name it under data.reader.channels",
+        )
+    inputs = read.keep(inputs, marks)
+    chosen = Preparation.of(list(read.whole.values()), inputs)
+    signals = {"inputs": list(inputs)}
+    signals |= {"exogenous": list(chosen.exogenous)} if chosen.exogenous else {}
+    preparation = chosen.content()
+    if "frozen" in _findings(list(read.logs.values()), inputs, marks):
+        preparation |= {"masks": [{"kind": "frozen"}]}
+    usable = read.usable((*inputs, *chosen.exogenous), preparation)
+    split, splits = _split(usable, folder, marks)
+    length = window_length([splits[name] for name in SPLITS[1:]], chosen.memory)
+    _judge_long_ones(split, splits, length, marks)
+    marks.note(("prepare", "grid"), chosen.reason)
+    marks.note(
+        ("evaluation", "protocols"), f"free runs of {length:g} s fit into most logs for judging"
+    )
+    marks.note(("evaluation", "scales"), "standard deviations over training and validation logs")
+    marks.note(("recipe",), "eight models or so, whose terms and sizes follow from the logs")
+    if not standard:
+        marks.note(("effort",), "a quick look; 1, or --recipe standard, trains the networks longer")
+    config = {
+        "task": "fit",
+        "name": name,
+        "description": f"Drafted by residnet new from {len(usable)} logs",
+        "data": {"kind": "measured", "reader": read.reader, "split": split},
+        "prepare": preparation,
+        "signals": signals,
+        "integrator": "semi_implicit_euler",
+        "recipe": "standard",
+        **({} if standard else {"effort": QUICK}),
+        "export": {"models": []},
+        "evaluation": judging(splits, length),
+    }
+    validate(config, FitConfig, "draft", folder)
+    guesses = tuple((".".join(key), text) for key, text in marks.guesses)
+    return Draft(config, guesses, commented(config, marks.comments, read.head()))
+
+
+class _Read:
+    """The logs of a draft.
+
+    Attributes:
+        reader: `data.reader` of the config.
+        logs: path -> log, in SI, as the reader gives it.
+        whole: path -> the same with the motion at every sample.
+        left_out: path -> why it is not used.
+    """
+
+    def __init__(self, paths: Sequence[Path], marks: Marks) -> None:
+        read = read_drafted(paths, marks)
+        self.reader = read.reader
+        self.left_out = {path: str(error) for path, error in read.left_out.items()}
+        self.logs: dict[Path, Log] = {}
+        self.whole: dict[Path, Log] = {}
+        for path, log in read.logs.items():
+            try:
+                self.whole[path], self.logs[path] = complete_motion(log, MotionConfig()), log
+            except ResidnetError as error:
+                self.left_out[path] = str(error)
+        if not self.whole:
+            # what the names of columns did not tell may be what is missing
+            untold = "; ".join(text for _, text in marks.notes if text.startswith(_UNTOLD))
+            reason = next(iter(self.left_out.values()))
+            raise DataError(f"{reason} ({untold})" if untold else reason)
+
+    def keep(self, inputs: Sequence[str], marks: Marks) -> tuple[str, ...]:
+        """Rename chosen forces to tau_x, tau_y, tau_n, drop channels that nothing uses; returns the
+        inputs.
+        """
+        new = {
+            name: next((f for f in ("tau_x", "tau_y", "tau_n") if name.startswith(f"{f}_")), name)
+            for name in inputs
+        }
+        if channels := self.reader.get("channels"):
+            state = [*POSE, *VELOCITY, *WIND_INPUTS]
+            state += [] if "x" in channels else ["latitude", "longitude"]
+            state += [] if "psi" in channels else QUATERNION
+            self.reader["channels"] = {
+                new.get(name, name): entry
+                for name, entry in channels.items()
+                if name in state or name in new
+            }
+            marks.rename(CHANNELS, {name: new.get(name, name) for name in (*state, *new)})
+        for logs in (self.logs, self.whole):
+            for path, log in logs.items():
+                changed = {new.get(key, key): values for key, values in log.channels.items()}
+                units = {new.get(key, key): unit for key, unit in log.units.items()}
+                logs[path] = log.replace(channels=changed, units=units)
+        return tuple(new.values())
+
+    def usable(self, columns: Sequence[str], preparation: Mapping[str, Any]) -> dict[Path, Log]:
+        """Return the logs that can be prepared; the others are left out with the reason."""
+        config = validate(dict(preparation), PrepareConfig, "draft")
+        out: dict[Path, Log] = {}
+        for path, log in self.logs.items():
+            try:
+                if prepare(log, "train", columns, config).good.any():
+                    out[path] = self.whole[path]
+                else:
+                    self.left_out[path] = "no stretch is as long as the window of the derivative"
+            except ResidnetError as error:
+                self.left_out[path] = str(error)
+        if not out:
+            raise DataError(next(iter(self.left_out.values())))
+        kept = {log.name for log in without_copies(list(out.values()))}
+        copies = [path for path, log in out.items() if log.name not in kept]
+        self.left_out |= dict.fromkeys(copies, "its rows are a copy of part of another log")
+        return {path: log for path, log in out.items() if path not in copies}
+
+    def head(self) -> list[str]:
+        """Return the lines at the top of the config."""
+        lines = [
+            "Drafted by `residnet new` from the logs alone. Lines with 'guess' say what the logs do"
+            " not tell, and why this value was taken: read them before the results are trusted."
+        ]
+        lines += [f"left out: {path.name}: {reason}" for path, reason in self.left_out.items()]
+        if made := next(iter(self.whole.values())).meta.get("smoothed"):
+            lines.append(
+                f"{', '.join(made)} are not measured at every sample: a smoother makes them from"
+                " position and heading. Where the antenna stands off the vessel's centre, or its"
+                " positions come late, add prepare.motion: {antenna: {x: ..., y: ...}, delay: ...}."
+            )
+        say(f"{len(self.logs)} logs were read, {len(self.left_out)} left out")
+        return lines
+
+
+def _findings(logs: Sequence[Log], inputs: Sequence[str], marks: Marks) -> set[str]:
+    """Return the codes of what the data doctor finds, and write its findings down."""
+    told: dict[str, list[str]] = {}
+    for log in logs[:: max(1, len(logs) // _INSPECTED)]:
+        try:
+            found = inspect(log, [name for name in inputs if name in log.channels])
+        except ResidnetError as error:
+            marks.note(("data",), f"data doctor: {log.name}: {error}")
+            continue
+        for finding in found.findings:
+            if finding.level != "note":
+                told.setdefault(finding.code, []).append(f"{log.name}: {finding.text}")
+    for texts in told.values():
+        more = f" (and {len(texts) - 1} more logs)" if len(texts) > 1 else ""
+        marks.note(("data",), f"data doctor: {texts[0][:300]}{more}")
+    return set(told)
+
+
+def _split(
+    usable: Mapping[Path, Log], folder: Path, marks: Marks
+) -> tuple[dict[str, Any], dict[str, list[Log]]]:
+    """Return the split as a config has it, and its logs with their whole motion."""
+    splits = divided(list(usable.values()))
+    paths = {log.name: path for path, log in usable.items()}
+    common = Path(os.path.commonpath([path.resolve().parent for path in usable]))
+    near = os.path.relpath(common, folder.resolve())
+    # absolute where it lies far from the config
+    root = common.as_posix() if near.count("..") > 2 else Path(near).as_posix()
+    entries: dict[str, list[Any]] = {split: [] for split in splits}
+    why = (
+        "of each five logs, in the order of their manoeuvres, one is for validation and one for the"
+        " test"
+    )
+    for split, logs in splits.items():
+        for log in logs:
+            ends = log.meta.get("stretch")
+            # the name of a stretch begins with that of its log, and may with a shorter one
+            own = [n for n in paths if n == log.name or (ends and log.name.startswith(n))]
+            path = paths[max(own, key=len)]
+            entry: Any = path.resolve().relative_to(common).as_posix()
+            if ends:
+                why, source = "few logs: each is cut in time", usable[path]
+                entry = {"log": entry}
+                entry |= {"from": f"{ends[0]:.13g} s"} if ends[0] > source.t[0] else {}
+                entry |= {"to": f"{ends[1]:.13g} s"} if ends[1] < source.t[-1] else {}
+            entries[split].append(entry)
+    marks.guess(("data", "split"), f"{why}; logs of one day may be alike, so check the choice")
+    return {"root": root, **entries}, splits
+
+
+def _judge_long_ones(
+    split: dict[str, Any], splits: dict[str, list[Log]], length: float, marks: Marks
+) -> None:
+    """Learn from the logs that are too short to be judged on, but for the last one of a split."""
+    shortest = 1.2 * min(float(entry["length"].split()[0]) for entry in protocols(length).values())
+    for name in SPLITS[1:]:
+        for entry, log in list(zip(split[name], splits[name], strict=True)):
+            if log.t[-1] - log.t[0] < shortest and len(split[name]) > 1:
+                split[name].remove(entry)
+                splits[name] = [other for other in splits[name] if other is not log]
+                split["train"].append(entry)
+                splits["train"].append(log)
+                marks.note(("data", "split"), f"{log.name} is too short to be judged on")
+
+
+def commented(content: Mapping[str, Any], comments: Comments, head: Sequence[str] = ()) -> str:
+    """Return a mapping as YAML, with comments above its keys.
+
+    Args:
+        content: of the config.
+        comments: path of a key -> lines about it.
+        head: lines at the top.
+    """
+    lines = [line for text in head for line in _comment(text, "")]
+    return "\n".join([*lines, *_entries(content, (), comments)]) + "\n"
+
+
+def _entries(content: Mapping[str, Any], above: tuple[str, ...], comments: Comments) -> list[str]:
+    out, indent = [], "  " * len(above)
+    for key, value in content.items():
+        path, flow = (*above, str(key)), _flow(value)
+        out += [line for text in comments(path) for line in _comment(text, indent)]
+        short = len(indent) + len(str(key)) + 2 + len(flow) <= _WIDTH
+        if isinstance(value, Mapping) and value:
+            below = _entries(value, path, comments)
+            deep = any(isinstance(inner, Mapping) for inner in value.values())
+            if not short or deep or any(line.lstrip().startswith("#") for line in below):
+                out += [f"{indent}{_flow(key)}:", *below]
+                continue
+        if isinstance(value, list) and value and not short:
+            out += [f"{indent}{_flow(key)}:", *(f"{indent}  - {_flow(item)}" for item in value)]
+        else:
+            out.append(f"{indent}{_flow(key)}: {flow}")
+    return out
+
+
+def _flow(value: Any) -> str:
+    text: str = yaml.safe_dump(
+        value, default_flow_style=True, width=10**6, sort_keys=False, allow_unicode=True
+    )
+    return text.strip().removesuffix("...").strip()
+
+
+def _comment(text: str, indent: str) -> list[str]:
+    lines = textwrap.wrap(" ".join(text.split()), _WIDTH - len(indent) - 2, break_long_words=False)
+    return [f"{indent}# {line}" for line in lines]

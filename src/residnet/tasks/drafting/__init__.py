@@ -1,1 +1,0 @@
-"""A complete config of a fit, drafted from logs: `residnet new`."""
