@@ -62,7 +62,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
         vessel.state, turning=vessel.turning(limit, 60.0), limit=limit, dt=DT, units=4
     )
     with torch.no_grad():
-        own.network[-1].weight.copy_(0.05 * torch.randn_like(own.network[-1].weight))  # type: ignore[union-attr, arg-type, operator]
+        own.network.out.weight.copy_(0.05 * torch.randn_like(own.network.out.weight))
     file = tmp_path_factory.mktemp("policy") / "policy.pt"
     own.requires_grad_(False)
     exported = ExportedHeading("policy", own, safe="amidships", about={}, metrics=[])

@@ -16,33 +16,11 @@ import torch
 import yaml
 from read_page import plain
 from tiny import call
+from tiny_tasks import autopilot
 
 pytestmark = pytest.mark.long
 
-AUTOPILOT: dict[str, Any] = {
-    "task": "autopilot",
-    "name": "small",
-    "vessel": "nomoto_oceanos",
-    "rudder": "5 deg",
-    "turning_time": "40 s",
-    "test": {"dt": "0.1 s", "duration": "8 s", "plants": 1, "bias_time": "10 s"},
-    "policies": {
-        "policy": {
-            "hidden": [6],
-            "training": {
-                "epochs": 1,
-                "steps": 1,
-                "batch": 16,
-                "dt": "0.1 s",
-                "horizon": "4 s",
-                "learning_rate": 1e-3,
-            },
-        }
-    },
-    "peers": {"pd": {"kind": "pd"}, "bang_bang": {"kind": "bang_bang"}},
-    "floor": "bang_bang",
-    "tuning_points": 16,
-}
+AUTOPILOT = autopilot(Path())
 COURSE: dict[str, Any] = {
     "task": "course",
     "name": "bend",
@@ -179,7 +157,7 @@ def test_report_and_exports_are_there(run: Path) -> None:
         torch.jit.load(str(run / "exports" / f"policy_{protocol}.pt"))
 
 
-def test_a_recurrent_policy_flies_the_course_and_is_exported(
+def test_a_policy_flies_the_course_and_is_exported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stated = {"dt": "0.1 s", "duration": "6 s", "hold": "0 s"}
@@ -191,16 +169,17 @@ def test_a_recurrent_policy_flies_the_course_and_is_exported(
         "epochs": 1, "steps": 1, "batch": 8, "dt": "0.1 s", "hold": "0 s", "validation": 4,
         "compiled": False, "steady": None,
     }  # fmt: skip
-    recurrent = {key: value for key, value in AUTOPILOT.items() if key not in ("policies", "floor")}
-    recurrent |= {
+    steered = {key: value for key, value in AUTOPILOT.items() if key not in ("policies", "floor")}
+    steered |= {
         "conditions": {"stated": stated, "flights": 4},
-        "recurrent": {"learned": {"start": "ptos", "units": 3, "training": training}},
+        "policies": {"learned": {"start": "ptos", "units": 3, "training": training}},
         "peers": {"ptos": law},
+        "test": {**AUTOPILOT["test"], "dt": "0.1 s"},
     }
     dropped = ("line_of_sight", "others", "spread", "integral")
     course = {key: value for key, value in COURSE.items() if key not in dropped}
     course |= {"policy": "learned", "peers": ["ptos"], "protocols": ["sides"], "dt": "0.1 s"}
-    (tmp_path / "autopilot.yaml").write_text(yaml.safe_dump(recurrent))
+    (tmp_path / "autopilot.yaml").write_text(yaml.safe_dump(steered))
     (tmp_path / "course.yaml").write_text(yaml.safe_dump(course))
     monkeypatch.chdir(tmp_path)
     assert call(monkeypatch, "run", "course.yaml", "--out", "run") == 0
