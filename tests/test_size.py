@@ -28,7 +28,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "identification": (2106, 220),
     "judge": (1887, 204),
     "manoeuvres": (990, 124),
-    "physics": (2533, 320),
+    "physics": (2112, 265),
     "regression": (1875, 207),
     "report": (2840, 320),
     "runs": (337, 47),

@@ -31,7 +31,7 @@ from residnet.documents.jervan2020.ferry import (
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.export.torchscript import TorchScriptExporter
 from residnet.physics.force_model import ForceModel
-from residnet.physics.fossen import FossenVessel
+from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs/studies/jervan2020/operation.yaml"
@@ -53,7 +53,7 @@ def believed() -> ForceModel:
         TypeError: where the vessel has another kind of hull.
     """
     built = load_vessel("milliampere").build()
-    if not isinstance(built, FossenVessel):
+    if not isinstance(built, HullPlant):
         raise TypeError("milliampere has no hull with a mass matrix")
     return ForceModel(built.hull)
 

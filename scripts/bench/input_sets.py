@@ -28,8 +28,7 @@ from symbolic import FORCE, FORCES, JET, JETS, Log, accelerations, regress, righ
 from residnet.baselines.equations import EquationsConfig
 from residnet.core.config import load_mapping
 from residnet.core.names import to_si
-from residnet.physics.candidates import CandidatesConfig
-from residnet.physics.terms import TermLibrary
+from residnet.physics.terms import CandidatesConfig, TermLibrary
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "studies" / "halvorsen2019"
 SECONDS, STEP = 300.0, 0.1

@@ -36,8 +36,7 @@ from made_odin import FORCE_TRUTH, JET_TRUTH, force_logs, jet_logs, msd_log
 
 from residnet.core.names import ACCELERATION
 from residnet.heads.symbolic import SymbolicConfig
-from residnet.physics.candidates import CandidatesConfig
-from residnet.physics.terms import TermLibrary
+from residnet.physics.terms import CandidatesConfig, TermLibrary
 from residnet.regression.equation_rows import delay_profile
 from residnet.regression.sparse import SearchConfig, find, reduce
 

@@ -18,8 +18,8 @@ import pandas as pd
 import torch
 
 from residnet.core.names import to_si
-from residnet.physics.actuators import DifferentialThrust
-from residnet.physics.fossen import FossenConfig
+from residnet.physics.actuators import Thrusters
+from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel
 
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "studies" / "woo2018" / "thruster_tests"
@@ -33,7 +33,7 @@ SAMPLE, LENGTH, AT, DELAY = 0.025, 6.0, 1.35, 0.1
 """Sampling period, length, time of the step and dead time of the shaft, in s."""
 
 
-def thrusters() -> DifferentialThrust:
+def thrusters() -> Thrusters:
     """Return the thrusters of wam_v_cal.
 
     Raises:
@@ -43,7 +43,7 @@ def thrusters() -> DifferentialThrust:
     if not isinstance(vessel, FossenConfig):
         raise TypeError("wam_v_cal is no vessel of kind fossen")
     unit = vessel.actuators.build()
-    if not isinstance(unit, DifferentialThrust):
+    if not isinstance(unit, Thrusters):
         raise TypeError("wam_v_cal has no differential thrust")
     return unit
 
@@ -51,7 +51,7 @@ def thrusters() -> DifferentialThrust:
 def tables() -> dict[str, pd.DataFrame]:
     """Return the tests by name of their file, in the units of a test engineer."""
     unit, random = thrusters(), np.random.default_rng(2018)
-    limit, rate = unit.n_max / RPM, unit.n_rate / RPM
+    limit, rate = float(unit.n_max[0]) / RPM, unit.servos[0].fastest / RPM
     throttle = np.arange(-100, 101, 5)
     rpm = np.clip(SLOPE / 100 * throttle, -limit, limit) + random.normal(0, 5, throttle.size)
     out = {"throttle": pd.DataFrame({"throttle_percent": throttle, "rpm": rpm.round(1)})}
@@ -65,7 +65,9 @@ def tables() -> dict[str, pd.DataFrame]:
         columns = {"t_s": t.round(3), "command_rpm": command, "rpm": measured}
         out[f"step_{name}"] = pd.DataFrame(columns)
     n = np.concatenate((np.linspace(-2380, -240, 16), np.linspace(240, 2380, 16)))
-    pull = 2 * unit.thrust(torch.from_numpy(n * RPM)).numpy() + random.normal(0, 3, n.size)
+    pull = 2 * unit.thrust(torch.from_numpy(n * RPM)[:, None])[:, 0].numpy() + random.normal(
+        0, 3, n.size
+    )
     shown = (n + random.normal(0, 1, n.size)).round(1)
     out["bollard"] = pd.DataFrame({"rpm": shown, "pull_N": pull.round(1)})
     return out

@@ -22,7 +22,7 @@ from residnet.documents.gouletas2020.law import DocumentAutopilot, Predictor, Si
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import NomotoDynamics, PlantDynamics
 from residnet.physics.nomoto import SteeringVessel
-from residnet.physics.patrol import PatrolVessel
+from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
 GAIN, TIME, LIMIT = 3.47, 3.94, float(np.radians(5.0))
@@ -176,7 +176,7 @@ def test_document_autopilot_creeps_as_errata_says() -> None:
 
 
 def test_a_simulated_predictor_is_the_simulation_of_each_candidate() -> None:
-    plant = of_kind(load_vessel("patrol_p06").build(), PatrolVessel).in_calm_water()
+    plant = of_kind(load_vessel("patrol_p06").build(), HullPlant).in_calm_water()
     model = PlantDynamics(plant, 0.25)
     x = plant.approach(2)
     x[1, 3], x[1, 7] = 0.3, 0.02

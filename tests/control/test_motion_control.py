@@ -25,7 +25,7 @@ from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.actuators import AzimuthThrusters
-from residnet.physics.fossen import FossenVessel
+from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
 WAYPOINTS = ((0.0, -15.0, -1.5), (15.0, -15.0, 3.0), (15.0, 0.0, 0.0))
@@ -152,9 +152,9 @@ def test_pid_by_hand() -> None:
     )
 
 
-def ferry(name: str) -> FossenVessel:
+def ferry(name: str) -> HullPlant:
     plant = load_vessel(name).build()
-    assert isinstance(plant, FossenVessel)
+    assert isinstance(plant, HullPlant)
     return plant
 
 

@@ -19,7 +19,7 @@ from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.constant import ConstantInput
 from residnet.manoeuvres.turning_circle import TurningCircle
 from residnet.manoeuvres.zigzag import Zigzag
-from residnet.physics.environment.waves import Box, JonswapSpectrum, WavesConfig
+from residnet.physics.environment import Box, JonswapSpectrum, WavesConfig
 from residnet.physics.vessel import load_vessel
 
 STEP = 0.1

@@ -34,7 +34,7 @@ from residnet.documents.jervan2020.residual import (
 from residnet.export import exporter
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.physics.force_model import FERRY_TERMS, Correction, ForceModel
-from residnet.physics.fossen import FossenVessel
+from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 
@@ -63,7 +63,7 @@ def short() -> Study:
 
 def hull(name: str) -> Any:
     built = load_vessel(name).build()
-    assert isinstance(built, FossenVessel)
+    assert isinstance(built, HullPlant)
     return built.hull
 
 

@@ -35,7 +35,6 @@ from residnet.documents.halvorsen2019.standard_model import (
     fit,
     truth,
 )
-from residnet.physics.odin import AccelerationHull
 from residnet.tasks.registry import load_task
 
 CONFIG = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019" / "standard_model.yaml"
@@ -97,9 +96,7 @@ def test_accelerations_equal_the_matrices() -> None:
 def test_truth_is_the_vessel() -> None:
     nu, tau = states(30)
     vessel = odin("odin_steady")
-    known = AccelerationHull(vessel.gains, vessel.terms)(
-        torch.from_numpy(nu), torch.from_numpy(tau)
-    ).numpy()
+    known = vessel.hull()(torch.from_numpy(nu), torch.from_numpy(tau)).numpy()
     # the vessel's Coriolis terms are exactly v r and -u r, those of its 4935.8 kg differ by the
     # added mass of -0.7 kg
     np.testing.assert_allclose(matrices(truth(vessel, MASS), nu, tau), known, atol=2e-3)

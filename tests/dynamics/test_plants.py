@@ -4,7 +4,6 @@ against the plain one.
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -75,25 +74,3 @@ def test_what_a_step_holds_changes_nothing(name: str) -> None:
     )
     w = torch.randn(6, len(plant.inputs), generator=rng, dtype=torch.float64)
     assert torch.equal(plant.held_rate(x, plant.prepare(x, w)), plant.rate(x, w))
-
-
-def test_the_compact_hull_holds_with_coupling_and_has_the_same_gradient() -> None:
-    """Off-diagonal mass, so that no Coriolis term vanishes."""
-    from residnet.core.config import load_config
-    from residnet.physics.fossen import FossenConfig, FossenVessel
-    from residnet.physics.vessel import vessel_files
-
-    skewed = [
-        "rigid_body.x_G.value=0.4",
-        "added_mass.Y_rdot.value=-60",
-        "added_mass.N_vdot.value=-90",
-    ]
-    plain, compact = (
-        load_config(vessel_files()["wam_v_cal"], skewed, FossenConfig).build() for _ in range(2)
-    )
-    assert isinstance(compact, FossenVessel)
-    compact.hull.compact()
-    nu = torch.from_numpy(np.random.default_rng(0).normal(size=(50, 3)))
-    tau = torch.from_numpy(np.random.default_rng(1).normal(size=(50, 3)) * 300)
-    torch.testing.assert_close(compact.hull(nu, tau), plain.hull(nu, tau), rtol=1e-12, atol=1e-12)
-    assert torch.autograd.gradcheck(compact.hull, (nu.requires_grad_(), tau.requires_grad_()))

@@ -36,8 +36,8 @@ from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import NomotoDynamics, TracedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource
 from residnet.manoeuvres.zigzag import Zigzag
+from residnet.physics.hull import PatrolConfig
 from residnet.physics.nomoto import NomotoConfig, SteeringVessel
-from residnet.physics.patrol import PatrolConfig
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 

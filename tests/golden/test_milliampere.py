@@ -31,7 +31,8 @@ from residnet.core.config import load_config
 from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Playback, Rollout
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
-from residnet.physics.fossen import FossenVessel, MassMatrixConfig
+from residnet.physics.hull import MassMatrixConfig
+from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import vessel_files
 
 GROUP = "g3_milliampere"
@@ -98,7 +99,7 @@ def case_of(path: Path) -> Flight | OpenLoop:
     return Flight(SCALE[match[2]], "_dist" in match[3], guidance, "_FFonly" not in match[3])
 
 
-def vessel(scale: float) -> FossenVessel:
+def vessel(scale: float) -> HullPlant:
     config = load_config(
         vessel_files()["milliampere"], [f"scale={scale}", *UNLIMITED], MassMatrixConfig
     )
@@ -247,7 +248,7 @@ def test_right_hand_side_row_by_row(golden_file: Path) -> None:
     truth = frame[["du", "dv", "dr"]].to_numpy()
     # a difference of forces cannot be more exact than its largest part
     size = (
-        torch.stack([tau, hull.coriolis(nu), hull.drag(nu)]).abs().amax(0) @ hull.inverse.abs().T
+        (tau.abs() + hull.terms(nu).abs() @ hull.coefficients.abs()) @ hull.inverse.abs().T
     ).numpy()
     assert (np.abs(hull(nu, tau).numpy() - truth) <= 1e-12 * np.maximum(size, np.abs(truth))).all()
 
@@ -265,8 +266,8 @@ def test_controller_row_by_row(golden_file: Path) -> None:
     desired = tensor(frame, "xd", "yd", "psid", "ud", "vd", "rd", "dud", "dvd", "drd")
     command, memory = controller(x, desired, torch.zeros(len(frame), 3, dtype=torch.float64))
     nu_d, nu_dot_d = desired[:, 3:6], desired[:, 6:9]
-    parts = torch.stack([nu_dot_d @ believed.mass.T, believed.coriolis(nu_d), believed.drag(nu_d)])
-    size = parts.abs().amax(0).numpy()
+    water = believed.terms(nu_d).abs() @ believed.coefficients.abs()
+    size = ((nu_dot_d @ believed.mass.T).abs() + water).numpy()
     forward = frame[["ff_u", "ff_v", "ff_r"]].to_numpy()
     assert (
         np.abs(believed.required(nu_dot_d, nu_d).numpy() - forward)

@@ -22,8 +22,8 @@ from staged_plant import StagedPlantDynamics
 from torch import Tensor
 
 from residnet.dynamics.rollout import Rollout
-from residnet.physics.actuators import WaterJets
-from residnet.physics.odin import OdinVessel
+from residnet.physics.actuators.rudders import WaterJets
+from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
 GROUP = "g2_odin"
@@ -116,13 +116,13 @@ def commands(path: Path) -> Inputs:
     return lambda t: np.stack(DESIGNS[design](t), axis=-1) * units
 
 
-def plant_of(path: Path) -> OdinVessel:
+def plant_of(path: Path) -> HullPlant:
     plant = load_vessel(case_of(path)[0]).build()
-    assert isinstance(plant, OdinVessel)
+    assert isinstance(plant, HullPlant)
     return plant
 
 
-def recorded(frame: pd.DataFrame, plant: OdinVessel) -> Tensor:
+def recorded(frame: pd.DataFrame, plant: HullPlant) -> Tensor:
     """Commands [T, c] as the file has them, in SI."""
     if isinstance(plant.actuators, WaterJets):
         return tensor(frame, "rpm", "nozzle") * torch.tensor([1 / 60, 1.0], dtype=torch.float64)

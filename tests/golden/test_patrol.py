@@ -20,8 +20,8 @@ from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource, StackedSource
 from residnet.manoeuvres.zigzag import Zigzag
-from residnet.physics.actuators.stern_rudders import SternRudders
-from residnet.physics.patrol import PatrolVessel
+from residnet.physics.actuators.rudders import SternRudders
+from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
 GROUP = "g1_4dof"
@@ -77,17 +77,17 @@ def case_of(path: Path) -> Case:
     raise AssertionError(f"{name}: no run is written {run}")
 
 
-def plant_of(case: Case) -> PatrolVessel:
+def plant_of(case: Case) -> HullPlant:
     """The set with the rudder: the foil's density is the set's own, the linear rudder is the same
     for all.
     """
     vessel = load_vessel(SETS[case.parameters])
     if case.rudder == "lin":
         vessel = vessel.model_copy(update={"actuators": load_vessel(RUDDERS["lin"]).actuators})
-    return of_kind(vessel.build(), PatrolVessel)
+    return of_kind(vessel.build(), HullPlant)
 
 
-def source_of(runs: list[Run], plant: PatrolVessel, t: torch.Tensor) -> Source:
+def source_of(runs: list[Run], plant: HullPlant, t: torch.Tensor) -> Source:
     """Manoeuvres of runs, first those without, then those with zigzags; angles as shares of the
     largest rudder angle.
     """

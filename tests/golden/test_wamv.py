@@ -28,8 +28,8 @@ from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 from residnet.manoeuvres.constant import ConstantInput
 from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne
 from residnet.manoeuvres.zigzag import Zigzag
-from residnet.physics.actuators import DifferentialThrust
-from residnet.physics.fossen import FossenVessel
+from residnet.physics.actuators import Thrusters
+from residnet.physics.plant import HullPlant
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -120,7 +120,7 @@ def trajectories(
 def test_thrust_columns(golden_file: Path) -> None:
     frame = table(golden_file)
     vessel = load_vessel(case_of(golden_file).vessel)
-    thrusters = of_kind(vessel.actuators.build(), DifferentialThrust)
+    thrusters = of_kind(vessel.actuators.build(), Thrusters)
     thrust = thrusters.thrust(tensor(frame, "n_port", "n_stbd") / 60.0).numpy()
     truth = frame[["T_port", "T_stbd"]].to_numpy()
     # the printed polynomial cancels near zero thrust, where only its largest term bounds the
@@ -131,7 +131,7 @@ def test_thrust_columns(golden_file: Path) -> None:
 @on_plant
 def test_right_hand_side_row_by_row(golden_file: Path) -> None:
     frame = table(golden_file)
-    plant = of_kind(load_vessel(case_of(golden_file).vessel).build(), FossenVessel)
+    plant = of_kind(load_vessel(case_of(golden_file).vessel).build(), HullPlant)
     x = torch.cat(
         (tensor(frame, "x", "y", "psi", "u", "v", "r"), tensor(frame, "n_port", "n_stbd") / 60.0),
         dim=1,
@@ -142,9 +142,9 @@ def test_right_hand_side_row_by_row(golden_file: Path) -> None:
         ).numpy()
         hull = plant.hull
         nu = x[:, 3:6]
-        parts = [plant.actuators(x[:, 6:8]), hull.coriolis(nu), hull.drag(nu)]
         # a difference of forces cannot be more exact than its largest part
-        size = (torch.stack(parts).abs().amax(0) @ hull.inverse.abs().T).numpy()
+        parts = plant.actuators(x[:, 6:8]).abs() + hull.terms(nu).abs() @ hull.coefficients.abs()
+        size = (parts @ hull.inverse.abs().T).numpy()
     truth = frame[["du", "dv", "dr"]].to_numpy()
     assert (np.abs(rate[:, 3:6] - truth) <= 1e-12 * np.maximum(size, np.abs(truth))).all()
     nu_rows = frame[["u", "v", "r"]].to_numpy()

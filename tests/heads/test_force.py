@@ -24,7 +24,7 @@ from residnet.heads.mlp import MlpConfig
 from residnet.heads.plsr import PlsrConfig
 from residnet.heads.ridge import RidgeConfig
 from residnet.heads.symbolic import SymbolicConfig
-from residnet.physics.fossen import FossenVessel
+from residnet.physics.plant import HullPlant
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -54,7 +54,7 @@ TERMS = (
 
 def hull(name: str) -> Any:
     vessel = load_vessel(name).build()
-    assert isinstance(vessel, FossenVessel)
+    assert isinstance(vessel, HullPlant)
     return vessel.hull
 
 

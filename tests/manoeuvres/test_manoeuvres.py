@@ -36,7 +36,7 @@ from residnet.manoeuvres.excitation import MultiSine
 from residnet.manoeuvres.indices import UNITS
 from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne
 from residnet.manoeuvres.zigzag import Zigzag
-from residnet.physics.actuators import DifferentialThrust
+from residnet.physics.actuators import Thrusters
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
@@ -95,7 +95,7 @@ def test_what_was_drawn_can_be_written_down_and_read_back(kind: str) -> None:
 
 def test_commands_are_within_bounds(kind: str, plant: Plant) -> None:
     states, commands = fly(plant, drawn(kind))
-    n_max = of_kind(plant.actuators, DifferentialThrust).n_max
+    n_max = of_kind(plant.actuators, Thrusters).n_max
     assert bool(torch.isfinite(states).all())
     assert float(commands.abs().max()) <= n_max
     assert float(commands.abs().max()) > 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from residnet.core.errors import ConfigError
-from residnet.physics.candidates import CandidatesConfig, rated
+from residnet.physics.terms import CandidatesConfig, rated
 
 JETS = CandidatesConfig(
     inputs=("rpm",), input_degree=2, coupling=("u",), coupling_degree=2, angles=("nozzle",)

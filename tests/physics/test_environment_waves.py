@@ -13,7 +13,7 @@ from scipy.integrate import quad
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.physics.environment.waves import (
+from residnet.physics.environment import (
     GRAVITY,
     IttcSpectrum,
     JonswapSpectrum,

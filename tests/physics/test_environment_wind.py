@@ -10,13 +10,13 @@ import torch
 
 from residnet.core.config import load_config, validate
 from residnet.core.errors import ConfigError
-from residnet.physics.environment.wind import (
+from residnet.physics.environment import (
     SymmetricWindConfig,
     TabulatedWindConfig,
     WindLoads,
     WindLoadsConfig,
 )
-from residnet.physics.fossen import FossenConfig
+from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel, vessel_files
 
 AREAS: dict[str, Any] = {

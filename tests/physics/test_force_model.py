@@ -14,13 +14,13 @@ from residnet.physics.force_model import (
     column_scale,
     order_of,
 )
-from residnet.physics.fossen import FossenVessel
+from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
 
-def hull(name: str) -> FossenVessel:
+def hull(name: str) -> HullPlant:
     built = load_vessel(name).build()
-    assert isinstance(built, FossenVessel)
+    assert isinstance(built, HullPlant)
     return built
 
 

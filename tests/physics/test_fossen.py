@@ -11,7 +11,7 @@ from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.actuators import DifferentialThrustConfig
-from residnet.physics.fossen import Fossen3, FossenConfig
+from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel, vessel_files
 
 # centre of gravity off the origin and off-diagonal added mass, so that nothing vanishes by luck
@@ -68,7 +68,7 @@ def test_right_hand_side_written_out(vessel: FossenConfig) -> None:
         "v|v|": lambda u, v, r: v * abs(v), "r|r|": lambda u, v, r: r * abs(r),
         "|u|v": lambda u, v, r: abs(u) * v,
     }  # fmt: skip
-    hull = Fossen3(vessel)
+    hull = vessel.hull()
     got = hull(torch.from_numpy(nu), torch.from_numpy(tau)).numpy()
     for (u, v, r), force, out in zip(nu, tau, got, strict=True):
         coriolis = np.array(
@@ -90,7 +90,7 @@ def test_right_hand_side_written_out(vessel: FossenConfig) -> None:
 
 def test_coriolis_does_no_work(vessel: FossenConfig) -> None:
     nu = motions()
-    force = Fossen3(vessel).coriolis(nu)
+    force = vessel.model_copy(update={"damping": type(vessel.damping)()}).hull().load(nu)
     power = (nu * force).sum(-1)
     assert float(power.abs().max()) < 1e-12 * float((nu * force).abs().max())
 
@@ -98,7 +98,8 @@ def test_coriolis_does_no_work(vessel: FossenConfig) -> None:
 def test_damping_takes_energy(vessel: FossenConfig) -> None:
     """At the motions of a vessel; the weather-vane moment of CAL may feed yaw, never the whole."""
     nu = motions()
-    drag = Fossen3(vessel).drag(nu)
+    free = vessel.model_copy(update={"damping": type(vessel.damping)()})
+    drag = free.hull().load(nu) - vessel.hull().load(nu)
     surge_and_sway = (nu[:, :2] * drag[:, :2]).sum(-1)
     assert bool((surge_and_sway > 0).all())
 
@@ -148,7 +149,7 @@ def test_inertia_alone_keeps_energy(vessel: FossenConfig) -> None:
 
 
 def test_port_and_starboard_are_mirror_images(vessel: FossenConfig) -> None:
-    hull, nu = Fossen3(vessel), motions()
+    hull, nu = vessel.hull(), motions()
     tau = torch.from_numpy(np.random.default_rng(6).normal(size=(200, 3)) * 200)
     mirror = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     torch.testing.assert_close(
@@ -252,7 +253,7 @@ def test_a_mass_matrix_that_is_not_positive_stops() -> None:
     with pytest.raises(
         ConfigError, match=r"wam_v_cal.*mass matrix is not positive definite"
     ) as caught:
-        Fossen3(config)
+        config.hull()
     assert "\n" not in str(caught.value)
     coupled = load_config(
         vessel_files()["wam_v_cal"],
@@ -260,7 +261,7 @@ def test_a_mass_matrix_that_is_not_positive_stops() -> None:
         FossenConfig,
     )
     with pytest.raises(ConfigError, match="positive definite"):
-        Fossen3(coupled)
+        coupled.hull()
 
 
 def test_a_force_held_in_earth_axes_turns_with_the_hull() -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from residnet.core.errors import FitError
-from residnet.physics.actuators import DifferentialThrust, DifferentialThrustConfig
+from residnet.physics.actuators import DifferentialThrustConfig, Thrusters
 from residnet.physics.actuators.identify import (
     Estimate,
     fit_step,
@@ -17,7 +17,7 @@ from residnet.physics.actuators.identify import (
     fit_thrust,
     follow_command,
 )
-from residnet.physics.fossen import FossenConfig
+from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel
 
 SEEDS = range(20)
@@ -32,7 +32,7 @@ def config() -> DifferentialThrustConfig:
 
 
 @pytest.fixture(scope="module")
-def unit(config: DifferentialThrustConfig) -> DifferentialThrust:
+def unit(config: DifferentialThrustConfig) -> Thrusters:
     return config.build()
 
 
@@ -69,7 +69,7 @@ def test_throttle_map_that_never_saturates() -> None:
     assert fit.n_max.value * 60 == pytest.approx(2830, rel=0.03)
 
 
-def shaft(unit: DifferentialThrust, command: np.ndarray, dt: float, late: int) -> np.ndarray:
+def shaft(unit: Thrusters, command: np.ndarray, dt: float, late: int) -> np.ndarray:
     """Revolutions [T] of one thruster under held commands, by the plant's own actuator after `late`
     samples of dead time.
     """
@@ -83,7 +83,7 @@ def shaft(unit: DifferentialThrust, command: np.ndarray, dt: float, late: int) -
 
 
 def step_test(
-    unit: DifferentialThrust, seed: int, noise: float = 25.0
+    unit: Thrusters, seed: int, noise: float = 25.0
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     dt, random = 0.02, np.random.default_rng(seed)
     t = dt * np.arange(300)
@@ -96,14 +96,14 @@ def step_test(
     return runs
 
 
-def test_the_follower_is_the_plants_own(unit: DifferentialThrust) -> None:
+def test_the_follower_is_the_plants_own(unit: Thrusters) -> None:
     (t, command, n), _ = step_test(unit, 0, noise=0.0)
     np.testing.assert_allclose(
         follow_command(t, command, 1500 / 60, 0.14, 0.0), n, atol=1500 / 60 * 0.02
     )
 
 
-def test_rate_limit_and_dead_time(unit: DifferentialThrust) -> None:
+def test_rate_limit_and_dead_time(unit: Thrusters) -> None:
     """25 rpm of noise at 50 Hz: 1500 rpm/s to 1 %, 0.14 s to one sample."""
     fits = [fit_step(step_test(unit, seed)) for seed in range(6)]
     for fit in fits:
@@ -112,32 +112,28 @@ def test_rate_limit_and_dead_time(unit: DifferentialThrust) -> None:
     assert sum(inside(fit.rate, 25.0) for fit in fits) >= 4
 
 
-def bollard_test(
-    unit: DifferentialThrust, seed: int, noise: float = 5.0
-) -> tuple[np.ndarray, np.ndarray]:
+def bollard_test(unit: Thrusters, seed: int, noise: float = 5.0) -> tuple[np.ndarray, np.ndarray]:
     n = np.concatenate((np.linspace(-2380, -200, 12), np.linspace(200, 2380, 12))) / 60
-    pull = 2 * unit.thrust(torch.from_numpy(n)).numpy()
+    pull = 2 * unit.thrust(torch.from_numpy(n)[:, None])[:, 0].numpy()
     return n, pull + np.random.default_rng(seed).normal(size=n.size) * noise
 
 
 def changed_pull(
-    unit: DifferentialThrust, change: Callable[[np.ndarray], np.ndarray]
+    unit: Thrusters, change: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Revolutions and pull of a bollard test, both changed in the same way."""
     n, pull = bollard_test(unit, 0)
     return change(n), change(pull)
 
 
-def first_samples(
-    unit: DifferentialThrust, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def first_samples(unit: Thrusters, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The first samples of a step response: times, commands and revolutions."""
     t, command, n = step_test(unit, 0)[0]
     return t[:count], command[:count], n[:count]
 
 
 def test_thrust_curves_of_both_directions(
-    config: DifferentialThrustConfig, unit: DifferentialThrust
+    config: DifferentialThrustConfig, unit: Thrusters
 ) -> None:
     """Exact without noise; with 5 N on the tether the curve to 1.5 % of full thrust, and honest
     intervals.
@@ -152,7 +148,7 @@ def test_thrust_curves_of_both_directions(
             fit_thrust(*bollard_test(unit, seed), 2), (config.forward, config.reverse), strict=True
         ):
             n = np.linspace(fit.low, fit.high, 50)
-            full = np.abs(unit.thrust(torch.from_numpy(n)).numpy()).max()
+            full = np.abs(unit.thrust(torch.from_numpy(n)[:, None])[:, 0].numpy()).max()
             known = truth[0] + n * (truth[1] + n * truth[2])
             assert np.abs(fit(n) - known).max() < 0.03 * full
             assert fit.rms == pytest.approx(2.5, rel=0.9)
@@ -194,7 +190,7 @@ def test_thrust_curves_of_both_directions(
         "cut off",
     ],
 )
-def test_tests_that_say_too_little(unit: DifferentialThrust, call: object, message: str) -> None:
+def test_tests_that_say_too_little(unit: Thrusters, call: object, message: str) -> None:
     with pytest.raises(FitError, match=message) as caught:
         call(unit)  # type: ignore[operator]
     assert "\n" not in str(caught.value)

@@ -14,8 +14,8 @@ from kinds import of_kind
 from residnet.core.config import load_config
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
-from residnet.physics.actuators.stern_rudders import SternRudders
-from residnet.physics.patrol import PatrolVessel
+from residnet.physics.actuators.rudders import SternRudders
+from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import VesselConfig, load_vessel, vessel_files
 
 NAMES = ("patrol_p06", "patrol_hyb", "patrol_mss", "patrol_p06_linear")
@@ -108,20 +108,18 @@ def motions(count: int = 100, seed: int = 0) -> np.ndarray:
 
 
 @pytest.fixture(params=NAMES)
-def plant(request: pytest.FixtureRequest) -> PatrolVessel:
-    return of_kind(load_vessel(request.param).build(), PatrolVessel)
+def plant(request: pytest.FixtureRequest) -> HullPlant:
+    return of_kind(load_vessel(request.param).build(), HullPlant)
 
 
-def inputs(
-    plant: PatrolVessel, rows: int, delta: float = 0.0, thrust: float = THRUST
-) -> torch.Tensor:
+def inputs(plant: HullPlant, rows: int, delta: float = 0.0, thrust: float = THRUST) -> torch.Tensor:
     w = torch.zeros(rows, len(plant.inputs), dtype=torch.float64)
     w[:, 0], w[:, 1] = delta, thrust
     return w
 
 
 def flown(
-    plant: PatrolVessel, x0: torch.Tensor, w: torch.Tensor, steps: int, dt: float = 0.05
+    plant: HullPlant, x0: torch.Tensor, w: torch.Tensor, steps: int, dt: float = 0.05
 ) -> torch.Tensor:
     with torch.no_grad():
         return Rollout(TracedPlantDynamics(plant, dt))(
@@ -131,7 +129,7 @@ def flown(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_right_hand_side_written_out(name: str) -> None:
-    plant, c = of_kind(load_vessel(name).build(), PatrolVessel), SETS[name]
+    plant, c = of_kind(load_vessel(name).build(), HullPlant), SETS[name]
     states = motions()
     thrusts = np.random.default_rng(1).uniform(0, THRUST, len(states))
     x, w = torch.from_numpy(states), inputs(plant, len(states))
@@ -191,7 +189,7 @@ def test_rudders_at_rest() -> None:
     assert bool(torch.isfinite(slope).all())
 
 
-def test_commands_are_kept_within_their_limits(plant: PatrolVessel) -> None:
+def test_commands_are_kept_within_their_limits(plant: HullPlant) -> None:
     one = torch.ones(1, dtype=torch.float64)
     assert plant.demand(one, -0.2 * one).tolist() == [
         [pytest.approx(-np.radians(7.0)), pytest.approx(THRUST)]
@@ -204,7 +202,7 @@ def test_commands_are_kept_within_their_limits(plant: PatrolVessel) -> None:
     np.testing.assert_allclose(moved[:, 8], -np.radians(1.0), rtol=1e-12)
 
 
-def test_gradients_of_the_right_hand_side(plant: PatrolVessel) -> None:
+def test_gradients_of_the_right_hand_side(plant: HullPlant) -> None:
     """Away from the kinks of |.| and of the limits."""
     x = torch.from_numpy(
         np.array(
@@ -238,7 +236,7 @@ DISSIPATIVE = (
 )  # fmt: skip
 
 
-def energy(plant: PatrolVessel, states: torch.Tensor, stiffness: float) -> torch.Tensor:
+def energy(plant: HullPlant, states: torch.Tensor, stiffness: float) -> torch.Tensor:
     nu = states[..., 4:8]
     return (
         0.5 * torch.einsum("bti,ij,btj->bt", nu, plant.hull.mass, nu)
@@ -266,7 +264,7 @@ def test_energy_falls_with_damping_and_is_kept_without(braked: bool) -> None:
         assert float((now / now[:, :1] - 1).abs().max()) < 1e-7
 
 
-def test_port_and_starboard_are_mirror_images(plant: PatrolVessel) -> None:
+def test_port_and_starboard_are_mirror_images(plant: HullPlant) -> None:
     x = torch.from_numpy(motions())
     w = inputs(plant, len(x))
     mirrored = plant.rate(x * MIRROR, w)
@@ -274,7 +272,7 @@ def test_port_and_starboard_are_mirror_images(plant: PatrolVessel) -> None:
 
 
 def test_mirrored_commands_give_the_mirrored_track_and_none_keeps_straight(
-    plant: PatrolVessel,
+    plant: HullPlant,
 ) -> None:
     w = torch.cat([inputs(plant, 1, delta) for delta in (0.15, -0.15, 0.0)])
     states = flown(plant, plant.approach(3), w, 600)
@@ -306,7 +304,7 @@ def test_heel_and_steady_turns_are_those_of_errata() -> None:
 
 def test_roll_decays_with_the_period_of_errata() -> None:
     """From 10 deg: 6.63 s at 7.71 m/s, 6.69 s at rest; document 004, Table 5.2 prints 6.76 s."""
-    plant = of_kind(load_vessel("patrol_p06").build(), PatrolVessel)
+    plant = of_kind(load_vessel("patrol_p06").build(), HullPlant)
     x0 = plant.approach(2)
     x0[1, 4] = 0.0
     x0[:, 2] = np.radians(10.0)
@@ -320,7 +318,7 @@ def test_roll_decays_with_the_period_of_errata() -> None:
         assert np.abs(phi[-600:]).max() < 0.5 * phi[0]
 
 
-def test_a_current_that_carries_the_upright_vessel_exerts_no_force(plant: PatrolVessel) -> None:
+def test_a_current_that_carries_the_upright_vessel_exerts_no_force(plant: HullPlant) -> None:
     psi = torch.linspace(-3, 3, 7, dtype=torch.float64)
     x = torch.zeros(7, 9, dtype=torch.float64)
     x[:, 3] = psi
@@ -335,7 +333,7 @@ def test_a_current_that_carries_the_upright_vessel_exerts_no_force(plant: Patrol
     assert float(rate[:, 2:].abs().max()) < 1e-12
 
 
-def test_calm_water_held_forces_and_single_rows_are_the_same(plant: PatrolVessel) -> None:
+def test_calm_water_held_forces_and_single_rows_are_the_same(plant: HullPlant) -> None:
     x = torch.from_numpy(motions(5))
     w = inputs(plant, 5, 0.1)
     full = plant.rate(x, w)

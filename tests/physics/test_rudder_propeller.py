@@ -15,14 +15,9 @@ from residnet.core.config import load_config, validate
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.physics.actuators import (
-    DifferentialThrust,
-    RudderPropeller,
-    RudderPropellerConfig,
-    Thrusters,
-    ThrustersConfig,
-)
-from residnet.physics.fossen import FossenConfig
+from residnet.physics.actuators import RudderPropellerConfig, Thrusters, ThrustersConfig
+from residnet.physics.actuators.rudders import RudderPropeller
+from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel, vessel_files
 
 BOAT = vessel_files()["example_rudder_boat"]
@@ -147,10 +142,10 @@ def test_fixed_thrusters_push_where_they_stand() -> None:
 def test_two_of_them_are_the_differential_thrusters() -> None:
     known = load_vessel("wam_v_cal")
     assert isinstance(known, FossenConfig)
-    twin = of_kind(known.actuators.build(), DifferentialThrust)
+    twin = of_kind(known.actuators.build(), Thrusters)
     shared = {
-        "forward": twin.curve.ahead.tolist(),
-        "reverse": twin.curve.astern.tolist(),
+        "forward": known.actuators.forward,
+        "reverse": known.actuators.reverse,
         "n_max": "2380 rpm",
         "n_rate": "1500 rpm/s",
     }

@@ -11,15 +11,15 @@ from torch import Tensor
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.physics.abkowitz import SteeringGearConfig
-from residnet.physics.actuators.servo import Servo
+from residnet.physics.actuators.base import Servo
+from residnet.physics.actuators.rudders import SteeringGearConfig
 
 LIMIT = 0.6
 
 
 def servo(**content: Any) -> Servo:
     config: SteeringGearConfig = validate({"limit": LIMIT} | content, SteeringGearConfig, "here")
-    return config.follow("delta", config.limit, config.rate)
+    return config.follow(config.limit, config.rate, "delta")
 
 
 def follow(unit: Servo, command: np.ndarray, dt: float) -> np.ndarray:
@@ -29,7 +29,7 @@ def follow(unit: Servo, command: np.ndarray, dt: float) -> np.ndarray:
     a = torch.zeros(1, len(unit.state), dtype=torch.float64)
     out = []
     for value in command:
-        c = torch.tensor([value], dtype=torch.float64)
+        c = torch.tensor([[value]], dtype=torch.float64)
         out.append(float(unit.value(a, c)))
 
         def rate(state: Tensor, c: Tensor = c) -> Tensor:
@@ -40,7 +40,9 @@ def follow(unit: Servo, command: np.ndarray, dt: float) -> np.ndarray:
         k3 = rate(a + 0.5 * dt * k2)
         k4 = rate(a + dt * k3)
         a = unit.advance(a + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4), c, dt)
-    return np.array([*out, float(unit.value(a, torch.tensor([command[-1]], dtype=torch.float64)))])
+    return np.array(
+        [*out, float(unit.value(a, torch.tensor([[command[-1]]], dtype=torch.float64)))]
+    )
 
 
 def step(value: float, steps: int = 300) -> np.ndarray:
@@ -127,7 +129,7 @@ def test_gradients_flow_through_lag_and_delay() -> None:
         response={"kind": "second_order", "frequency": 4.0, "damping": 0.6},
     )
     a = torch.tensor([[0.1, 0.2, 0.05, -0.1, 0.3]], dtype=torch.float64, requires_grad=True)
-    c = torch.tensor([0.2], dtype=torch.float64, requires_grad=True)
+    c = torch.tensor([[0.2]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(unit.rate, (a, c))
     assert torch.autograd.gradcheck(lambda s, x: unit.advance(s, x, 0.01), (a, c))
 

@@ -12,7 +12,7 @@ import torch
 from kinds import of_kind
 from torch import Tensor
 
-from residnet.physics.fossen import Fossen3, FossenConfig
+from residnet.physics.hull import FossenConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import channel_parity, mirrored_channels, term_parity, wrong_parity
 from residnet.physics.terms import TermLibrary
@@ -92,7 +92,7 @@ def test_a_symmetric_hull_has_no_wrong_term() -> None:
     for axis, row in enumerate((vessel.damping.X, vessel.damping.Y, vessel.damping.N)):
         assert row
         assert not any(wrong_parity(term, axis, ("u", "v", "r")) for term in row)
-    hull, nu = Fossen3(vessel), random_channels(20, 3)
+    hull, nu = vessel.hull(), random_channels(20, 3)
     tau = random_channels(20, 3) * torch.tensor([100.0, 50.0, 50.0], dtype=torch.float64)
     torch.testing.assert_close(hull(nu * TURNED, tau * TURNED), hull(nu, tau) * TURNED)
 

@@ -15,8 +15,8 @@ from kinds import of_kind
 from tiny import call
 
 from residnet.core.config import validate
-from residnet.physics.actuators import DifferentialThrust, DifferentialThrustConfig
-from residnet.physics.fossen import FossenConfig
+from residnet.physics.actuators import DifferentialThrustConfig, Thrusters
+from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel
 
 
@@ -25,7 +25,7 @@ def config(tmp_path: Path) -> dict[str, Any]:
     """Made logs of the WAM-V's thrusters and the config that names them."""
     vessel, random = load_vessel("wam_v_cal"), np.random.default_rng(0)
     assert isinstance(vessel, FossenConfig)
-    unit = of_kind(vessel.actuators.build(), DifferentialThrust)
+    unit = of_kind(vessel.actuators.build(), Thrusters)
     throttle = np.arange(-100, 101, 5)
     rpm = np.clip(28 * throttle, -2380, 2380) + random.normal(size=throttle.size) * 5
     pd.DataFrame({"throttle": throttle, "rpm": rpm}).to_csv(tmp_path / "throttle.csv", index=False)
@@ -39,7 +39,9 @@ def config(tmp_path: Path) -> dict[str, Any]:
         }
     ).to_csv(tmp_path / "step.csv", index=False)
     n = np.concatenate((np.linspace(-2380, -200, 15), np.linspace(200, 2380, 15)))
-    pull = 2 * unit.thrust(torch.from_numpy(n / 60)).numpy() + random.normal(size=n.size)
+    pull = 2 * unit.thrust(torch.from_numpy(n / 60)[:, None])[:, 0].numpy() + random.normal(
+        size=n.size
+    )
     pd.DataFrame({"rpm": n, "pull": pull / 1000}).to_csv(tmp_path / "bollard.csv", index=False)
     rev = {"column": "rpm", "unit": "rpm"}
     return {
@@ -83,8 +85,8 @@ def test_logs_become_lines_of_a_vessel_file(
     vessel = load_vessel("wam_v_cal")
     assert isinstance(vessel, FossenConfig)
     n = torch.linspace(-2300, 2300, 50, dtype=torch.float64) / 60
-    known = of_kind(vessel.actuators.build(), DifferentialThrust).thrust(n)
-    assert float((found.build().thrust(n) - known).abs().max()) < 0.01 * float(known.max())
+    known = of_kind(vessel.actuators.build(), Thrusters).thrust(n[:, None])
+    assert float((found.build().thrust(n[:, None]) - known).abs().max()) < 0.01 * float(known.max())
     assert found.n_rate * 60 == pytest.approx(1500, rel=0.01)
     numbers = json.loads((tmp_path / "run" / "actuators.json").read_text())
     assert numbers["throttle"]["n_max"]["value"] * 60 == pytest.approx(2380, rel=0.005)

@@ -17,8 +17,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
-from residnet.physics.fossen import HullConfig
-from residnet.physics.odin import OdinConfig
+from residnet.physics.hull import HullConfig, OdinConfig
 from residnet.physics.signals import FORCE_CHANNELS
 from residnet.physics.terms import TermLibrary, parse_term
 from residnet.physics.vessel import load_vessel
@@ -137,7 +136,7 @@ class BelievedConfig(IdentifiedConfig):
                     f"vessel: '{self.vessel}' is of kind '{vessel.kind}'; a believed hull needs one"
                     " of kind fossen, mass_matrix or odin"
                 )
-            terms, coefficients = vessel.equations()
+            terms, coefficients = vessel.hull().equations()
         except ConfigError as error:
             raise ValueError(str(error)) from None
         rows: list[Row] = []

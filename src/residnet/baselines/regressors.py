@@ -15,7 +15,7 @@ from residnet.baselines.damping import own_slopes, undamped, undamped_terms
 from residnet.baselines.sets import Roles, SetName, expand, merged
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
-from residnet.physics.bounds import VelocityBound
+from residnet.physics.signals import VelocityBound
 from residnet.physics.symmetry import dissipates, mirrored_terms, wrong_parity
 from residnet.physics.terms import TermLibrary
 from residnet.regression.estimator import chosen, regressors

@@ -12,7 +12,6 @@ from residnet.core.errors import ConfigError
 from residnet.core.frames import to_earth
 from residnet.core.layout import heading, surge
 from residnet.dynamics.base import Dynamics
-from residnet.physics.actuators.servo import Immediate, RateLimited
 from residnet.physics.nomoto import SteeringVessel
 from residnet.physics.plant import Plant
 
@@ -111,7 +110,7 @@ class NomotoDynamics(Dynamics):
 
     def __init__(self, plant: SteeringVessel, dt: float) -> None:
         super().__init__(dt, "rk4")
-        if not isinstance(plant.servo.response, Immediate | RateLimited):
+        if plant.servo.lags:
             raise ConfigError(
                 "an exact step holds the rudder: give the rudder the response 'immediate' (with or"
                 " without a rate), or step by RK4"

@@ -14,7 +14,7 @@ from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead
 from residnet.heads.quick_tanh import Tanh, quick_tanh
-from residnet.physics.bounds import VelocityBound
+from residnet.physics.signals import VelocityBound
 
 _FARTHEST = 1e3
 """Largest cell state that a memory may hold: a gain of at most one each step, the gates open."""

@@ -18,9 +18,8 @@ from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.heads.delay_line import DelayConfig, DelayLine, Past, best_delay
-from residnet.physics.candidates import CandidatesConfig, rated
 from residnet.physics.symmetry import wrong_parity
-from residnet.physics.terms import TermLibrary, parse_term
+from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term, rated
 from residnet.regression.equation_rows import (
     Rows,
     RowsConfig,

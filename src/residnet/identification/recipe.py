@@ -16,7 +16,7 @@ from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
 from residnet.judge.protocol import EvaluationConfig, Windows
-from residnet.physics.environment.wind import WIND_INPUTS
+from residnet.physics.environment import WIND_INPUTS
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
 from residnet.physics.symmetry import mirrored_channels, wrong_parity
 

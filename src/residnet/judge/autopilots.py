@@ -17,7 +17,7 @@ from residnet.control.heading.conditions import (
 )
 from residnet.control.heading.vessels import Flights, SteeredPlant, SteeredVessel, fly
 from residnet.data.simulated.environment import Disturbance
-from residnet.physics.environment.waves import WavesConfig
+from residnet.physics.environment import WavesConfig
 from residnet.physics.plant import Plant
 
 QUANTITIES = {

@@ -40,7 +40,7 @@ from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec
-from residnet.physics.environment.wind import WIND_INPUTS
+from residnet.physics.environment import WIND_INPUTS
 from residnet.physics.symmetry import channel_parity, pair_parity, partners_of
 
 SCHEMA = "residnet.sanity/1"

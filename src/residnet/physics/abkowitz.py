@@ -5,45 +5,25 @@ A vessel file holds all coefficients (Abkowitz 1964).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal, final
 
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor, nn
+from torch import Tensor
 
-from residnet.core.config import (
-    Config,
-    MetresPerSecond,
-    Radians,
-    RadiansPerSecond,
-    RevRate,
-    RevsPerSecond,
-)
-from residnet.core.errors import ConfigError
-from residnet.physics.actuators.base import Actuators
-from residnet.physics.actuators.servo import ServoConfig, Servos
-from residnet.physics.environment.wind import WindLoadsConfig
-from residnet.physics.kinematics import Planar
-from residnet.physics.mass import inverse_mass
+from residnet.core.config import Config, MetresPerSecond, RevRate, RevsPerSecond
+from residnet.core.names import VELOCITY
+from residnet.physics.actuators.base import Actuators, ServoConfig
+from residnet.physics.actuators.rudders import SteeringGearConfig
+from residnet.physics.environment import WindLoadsConfig
 from residnet.physics.parameters import Density
-from residnet.physics.plant import HullPlant
-from residnet.physics.terms import TermLibrary, parse_term
+from residnet.physics.plant import Hull, HullPlant
+from residnet.physics.terms import TermLibrary, read_rows
 from residnet.physics.vessel_file import VesselFile
 
 SERIES = ("du", "v", "r", "delta", "dn")
 """What the terms are made of: u - U0, sway, yaw rate, rudder angle, n - n0."""
-
-
-class SteeringGearConfig(ServoConfig):
-    """The steering gear: how far and how fast the rudder turns.
-
-    Attributes:
-        limit: largest rudder angle of either side in rad.
-        rate: largest rudder rate in rad/s; None for no limit.
-    """
-
-    limit: Radians = Field(gt=0, lt=1.5707)
-    rate: RadiansPerSecond | None = Field(default=None, gt=0)
 
 
 class ShaftConfig(ServoConfig):
@@ -99,19 +79,12 @@ class Derivatives(Config):
 
     @model_validator(mode="after")
     def _terms(self) -> Derivatives:
-        for axis, row in (("X", self.X), ("Y", self.Y), ("N", self.N)):
-            for term in row:
-                try:
-                    factors = parse_term(term, SERIES)
-                except ConfigError as error:
-                    raise ValueError(f"{axis}: {error}") from None
-                if any(factor.power < 0 for factor in factors):
-                    raise ValueError(f"{axis}: term '{term}' divides by what may be zero")
+        read_rows(dict(self), SERIES)
         return self
 
-    def rows(self) -> tuple[dict[str, float], ...]:
-        """Return X, Y, N."""
-        return self.X, self.Y, self.N
+    def channels(self) -> set[str]:
+        """Return what the terms are made of."""
+        return {f.name for _, _, factors in read_rows(dict(self), SERIES) for f in factors}
 
 
 class AbkowitzConfig(VesselFile):
@@ -157,13 +130,7 @@ class AbkowitzConfig(VesselFile):
 
     @model_validator(mode="after")
     def _consistent(self) -> AbkowitzConfig:
-        used = {
-            factor.name
-            for row in self.coefficients.rows()
-            for term in row
-            for factor in parse_term(term, SERIES)
-        }
-        if ("dn" in used) != (self.shaft is not None):
+        if ("dn" in self.coefficients.channels()) != (self.shaft is not None):
             raise ValueError(
                 "terms in dn and the section 'shaft' belong together: the series needs both or"
                 " neither"
@@ -176,13 +143,35 @@ class AbkowitzConfig(VesselFile):
             )
         return self
 
-    def build(self) -> AbkowitzVessel:
-        """Build the plant of this vessel.
+    def build(self) -> HullPlant:
+        """Build the plant of this vessel; trials start straight ahead at service speed.
 
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
         """
-        return AbkowitzVessel(self)
+        wind = self.wind.build() if self.wind is not None else None
+        start = {"u": self.speed, "n": self.shaft.n_0 if self.shaft is not None else 0.0}
+        return HullPlant(self.hull(), SeriesForces(self), wind, start)
+
+    def hull(self) -> Hull:
+        """Build the inertia in SI, with the rigid body's Coriolis force where the series lacks it.
+
+        The forces of the water are those of `SeriesForces`.
+        """
+        body, length = self.mass, self.length.value
+        prime = self.units == "prime"
+        unit, arm = (0.5 * self.density * length**3, length) if prime else (1.0, 1.0)
+        moment = body.m * body.x_G
+        m, m_x = body.m * unit, moment * unit * arm
+        mass = [
+            [unit * (body.m - body.X_udot), 0.0, 0.0],
+            [0.0, unit * (body.m - body.Y_vdot), unit * arm * (moment - body.Y_rdot)],
+            [0.0, unit * arm * (moment - body.N_vdot), unit * arm**2 * (body.I_z - body.N_rdot)],
+        ]
+        rows: tuple[Mapping[str, float], ...] = ({}, {}, {})
+        if self.coriolis == "rigid_body":
+            rows = ({"v r": m, "r^2": m_x}, {"u r": -m}, {"u r": -m_x})
+        return Hull(mass, rows, VELOCITY, self.name)
 
 
 @final
@@ -190,38 +179,28 @@ class SeriesForces(Actuators):
     """The whole series as forces of rudder, propeller and motion: tau [..., 3] in N, N, N m."""
 
     def __init__(self, config: AbkowitzConfig) -> None:
-        super().__init__()
-        servos = [config.rudder.follow("delta", config.rudder.limit, config.rudder.rate)]
-        self.commands: tuple[str, ...] = ("cmd_delta",)
-        limits = [config.rudder.limit]
-        self.n_0 = 1.0
-        if config.shaft is not None:
-            servos.append(config.shaft.follow("n", config.shaft.n_max, config.shaft.n_rate))
-            self.commands += ("cmd_n",)
-            limits.append(config.shaft.n_max)
-            self.n_0 = config.shaft.n_0
-        self.servos = Servos(servos)
-        self.state = self.servos.state
+        rudder, shaft = config.rudder, config.shaft
+        servos, limits = [rudder.follow(rudder.limit, rudder.rate, "delta")], [rudder.limit]
+        if shaft is not None:
+            servos.append(shaft.follow(shaft.n_max, shaft.n_rate, "n"))
+            limits.append(shaft.n_max)
+        super().__init__(*servos)
+        self.turns, self.n_0 = shaft is not None, shaft.n_0 if shaft is not None else 1.0
+        self.commands = ("cmd_delta", "cmd_n")[: len(servos)]
         self.prime = config.units == "prime"
-        self.length, self.speed, self.sign = (
-            config.length.value,
-            config.speed,
-            float(config.delta_sign),
-        )
-        self.turns = config.shaft is not None
+        self.length, self.speed = config.length.value, config.speed
+        self.sign = float(config.delta_sign)
         self.dynamic = 0.5 * config.density * self.length**2
-        rows = config.coefficients.rows()
-        terms = sorted({term for row in rows for term in row})
-        self.terms = TermLibrary(terms, SERIES)
-        values = torch.tensor(
-            [[row.get(term, 0.0) for row in rows] for term in terms], dtype=torch.float64
-        ).reshape(len(terms), 3)
-        self.register_buffer("coefficients", values, persistent=False)
-        self.register_buffer("limits", torch.tensor(limits, dtype=torch.float64), persistent=False)
+        rows = [row for _, row in config.coefficients]
+        self.terms = TermLibrary(sorted({term for row in rows for term in row}), SERIES)
+        values = [[row.get(term, 0.0) for row in rows] for term in self.terms.terms]
         # moments carry one length more than forces
-        self.register_buffer(
-            "lengths", torch.tensor([1.0, 1.0, self.length], dtype=torch.float64), persistent=False
-        )
+        for name, numbers in (
+            ("coefficients", values),
+            ("limits", limits),
+            ("lengths", [1.0, 1.0, self.length]),
+        ):
+            self.register_buffer(name, torch.tensor(numbers, dtype=torch.float64), persistent=False)
         self.coefficients: Tensor
         self.limits: Tensor
         self.lengths: Tensor
@@ -236,14 +215,13 @@ class SeriesForces(Actuators):
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """Return tau [..., 3] of the whole series at velocities through the water nu [..., 3]."""
-        position = self.servos.value(a, command)
+        position = self.positions(a, command)
         u, v, r, delta = nu[..., 0], nu[..., 1], nu[..., 2], self.sign * position[..., 0]
         dn = position[..., 1] - self.n_0 if self.turns else torch.zeros_like(u)
         coefficients = self.coefficients.to(nu.dtype)
         if not self.prime:
-            force: Tensor = (
-                self.terms(torch.stack((u - self.speed, v, r, delta, dn), dim=-1)) @ coefficients
-            )
+            motion = torch.stack((u - self.speed, v, r, delta, dn), dim=-1)
+            force: Tensor = self.terms(motion) @ coefficients
             return force
         speed = torch.sqrt((u * u + v * v).clamp(min=(0.1 * self.speed) ** 2))
         motion = torch.stack(
@@ -251,78 +229,4 @@ class SeriesForces(Actuators):
             dim=-1,
         )
         force = self.dynamic * (speed * speed).unsqueeze(-1) * (self.terms(motion) @ coefficients)
-        scaled: Tensor = force * self.lengths.to(nu.dtype)
-        return scaled
-
-    def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Return the derivative [..., k] of the states."""
-        return self.servos.rate(a, command)
-
-    def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """Return the states [..., k] after a step of dt seconds."""
-        return self.servos.advance(a, command, dt)
-
-
-class SeriesInertia(nn.Module):
-    """The mass matrix of the series in SI, its inverse, and the rigid body's Coriolis force.
-
-    The Coriolis force is added only where the series leaves it out.
-    """
-
-    def __init__(self, config: AbkowitzConfig) -> None:
-        super().__init__()
-        body, length = config.mass, config.length.value
-        prime = config.units == "prime"
-        unit = 0.5 * config.density * length**3 if prime else 1.0
-        arm = length if prime else 1.0
-        self.m, self.x_G = body.m * unit, body.x_G * arm
-        self.added = config.coriolis == "rigid_body"
-        moment = body.m * body.x_G
-        rows = [
-            [body.m - body.X_udot, 0.0, 0.0],
-            [0.0, body.m - body.Y_vdot, (moment - body.Y_rdot) * arm],
-            [0.0, (moment - body.N_vdot) * arm, (body.I_z - body.N_rdot) * arm**2],
-        ]
-        mass = unit * torch.tensor(rows, dtype=torch.float64)
-        self.register_buffer("mass", mass, persistent=False)
-        self.register_buffer("inverse", inverse_mass(mass, config.name), persistent=False)
-        self.mass: Tensor
-        self.inverse: Tensor
-
-    def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
-        """Return nu_dot [..., 3]."""
-        if self.added:
-            u, v, r = nu[..., 0], nu[..., 1], nu[..., 2]
-            tau = tau + self.m * torch.stack(
-                (r * (v + self.x_G * r), -u * r, -self.x_G * u * r), dim=-1
-            )
-        return tau @ self.inverse.to(nu.dtype).T
-
-
-@final
-class AbkowitzVessel(HullPlant):
-    """The vessel of an Abkowitz series in current, wind and external force.
-
-    State x [B, 6 + k]: x, y, psi, u, v, r, then rudder and shaft.
-    """
-
-    def __init__(self, config: AbkowitzConfig) -> None:
-        super().__init__(
-            Planar(), SeriesForces(config), config.wind.build() if config.wind is not None else None
-        )
-        self.inertia = SeriesInertia(config)
-        self.speed = config.speed
-        self.n_0 = config.shaft.n_0 if config.shaft is not None else 0.0
-
-    def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """Return nu_dot [B, 3]."""
-        acceleration: Tensor = self.inertia(nu, tau)
-        return acceleration
-
-    def approach(self, rows: int) -> Tensor:
-        """Return straight ahead at service speed and service revolutions, [B, nx]."""
-        x = super().approach(rows)
-        x[:, 3] = self.speed
-        if "n" in self.state:
-            x[:, self.state.index("n")] = self.n_0
-        return x
+        return force * self.lengths.to(nu.dtype)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.frames import to_body
 from residnet.core.names import ACCELERATION, VELOCITY
-from residnet.physics.fossen import Fossen3
+from residnet.physics.plant import Hull
 from residnet.physics.terms import TermLibrary, parse_term
 
 MOTION = (*ACCELERATION, *VELOCITY)
@@ -99,7 +99,7 @@ class Correction(nn.Module):
 class HullForce(nn.Module):
     """The force [..., 3] that a believed hull says a motion needs."""
 
-    def __init__(self, hull: Fossen3) -> None:
+    def __init__(self, hull: Hull) -> None:
         super().__init__()
         self.hull = hull
 
@@ -134,7 +134,7 @@ class ForceModel(nn.Module):
     """
 
     def __init__(
-        self, hull: Fossen3, corrections: Sequence[Correction] = (), earth: Tensor | None = None
+        self, hull: Hull, corrections: Sequence[Correction] = (), earth: Tensor | None = None
     ) -> None:
         super().__init__()
         self.hull = hull

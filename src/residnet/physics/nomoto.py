@@ -6,7 +6,7 @@ Source: document 004, section 5.1.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Annotated, Literal, NamedTuple, final
+from typing import Annotated, ClassVar, Literal, NamedTuple, final
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from residnet.core.config import MetresPerSecond
 from residnet.core.frames import to_earth
 from residnet.core.layout import SURGE, SWAY, heading, surge, sway, yaw_rate
-from residnet.physics.abkowitz import SteeringGearConfig
+from residnet.physics.actuators.rudders import SteeringGearConfig
 from residnet.physics.parameters import Parameter, measured_in
 from residnet.physics.plant import Plant
 from residnet.physics.vessel_file import VesselFile
@@ -47,6 +47,8 @@ class SteeringConfig(VesselFile, ABC):
         rudder: largest angle, rate and lag.
     """
 
+    poles: ClassVar[tuple[str, ...]]
+    """Names of the time constants of the poles."""
     speed: MetresPerSecond = Field(gt=0)
     K: Gain
     rudder: SteeringGearConfig
@@ -55,14 +57,11 @@ class SteeringConfig(VesselFile, ABC):
     def steering(self) -> LinearSteering:
         """Return the model in state space."""
 
-    @abstractmethod
-    def times(self) -> dict[str, float]:
-        """Return the time constants of the poles in s, by name."""
-
     @model_validator(mode="after")
     def _sense(self) -> SteeringConfig:
         product = self.K.value
-        for name, time in self.times().items():
+        for name in self.poles:
+            time = getattr(self, name).value
             if time == 0:
                 raise ValueError(f"{name} must not be zero")
             product /= time
@@ -86,18 +85,14 @@ class NomotoConfig(SteeringConfig):
         T: time constant in s.
     """
 
+    poles = ("T",)
     kind: Literal["nomoto"]
     T: TimeConstant
 
-    def times(self) -> dict[str, float]:
-        """Return the time constant T in s."""
-        return {"T": self.T.value}
-
     def steering(self) -> LinearSteering:
         """Return the model of r alone; v stays as it is."""
-        return LinearSteering(
-            np.diag([0.0, -1.0 / self.T.value]), np.array([0.0, self.K.value / self.T.value])
-        )
+        k, t = self.K.value, self.T.value
+        return LinearSteering(np.diag([0.0, -1.0 / t]), np.array([0.0, k / t]))
 
 
 class SecondOrderConfig(SteeringConfig, ABC):
@@ -111,14 +106,15 @@ class SecondOrderConfig(SteeringConfig, ABC):
     Source: document 004 eq. (5.3).
     """
 
+    poles = ("T1", "T2")
     T1: TimeConstant
     T2: TimeConstant
     T3: TimeConstant
 
-    @final
-    def times(self) -> dict[str, float]:
-        """Return T1 and T2."""
-        return {"T1": self.T1.value, "T2": self.T2.value}
+    def companion(self) -> np.ndarray:
+        """Return the companion form [2, 2] of the denominator."""
+        product, total = self.T1.value * self.T2.value, self.T1.value + self.T2.value
+        return np.array([[0.0, 1.0], [-1.0 / product, -total / product]])
 
 
 class SecondOrderNomotoConfig(SecondOrderConfig):
@@ -135,14 +131,11 @@ class SecondOrderNomotoConfig(SecondOrderConfig):
 
     def steering(self) -> LinearSteering:
         """Return v, r and q."""
-        product, total = self.T1.value * self.T2.value, self.T1.value + self.T2.value
-        direct = self.K.value * self.T3.value / product
-        a = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0 / product, -total / product]])
-        return LinearSteering(
-            a,
-            np.array([0.0, direct, self.K.value / product - total / product * direct]),
-            ("_yaw_lag",),
-        )
+        k, yaw = self.K.value, self.companion()
+        direct = -k * self.T3.value * yaw[1, 0]
+        a, b = np.zeros((3, 3)), np.array([0.0, direct, -k * yaw[1, 0] + yaw[1, 1] * direct])
+        a[1:, 1:] = yaw
+        return LinearSteering(a, b, ("_yaw_lag",))
 
 
 class SideslipNomotoConfig(SecondOrderConfig):
@@ -173,12 +166,10 @@ class SideslipNomotoConfig(SecondOrderConfig):
 
     def steering(self) -> LinearSteering:
         """Return v and r, from the companion form of the common denominator."""
-        product, total = self.T1.value * self.T2.value, self.T1.value + self.T2.value
-        k, k_v = self.K.value, self.K_v.value
+        k, k_v, companion = self.K.value, self.K_v.value, self.companion()
         out = np.array([[k_v, k_v * self.T_v.value], [k, k * self.T3.value]])
-        companion = np.array([[0.0, 1.0], [-1.0 / product, -total / product]])
         return LinearSteering(
-            out @ companion @ np.linalg.inv(out), out @ np.array([0.0, 1.0 / product])
+            out @ companion @ np.linalg.inv(out), out @ np.array([0.0, -companion[1, 0]])
         )
 
 
@@ -194,15 +185,15 @@ class SteeringVessel(Plant):
         super().__init__()
         a, b, extra = config.steering()
         self.speed, self.delta_max = config.speed, config.rudder.limit
-        self.servo = config.rudder.follow("delta", config.rudder.limit, config.rudder.rate)
+        self.servo = config.rudder.follow(config.rudder.limit, config.rudder.rate, "delta")
         self.free = 2 + len(extra)
         self.turning_columns = slice(SWAY, SWAY + self.free)
         self.rudder_columns = slice(SWAY + self.free, None)
         self.state = ("x", "y", "psi", "u", "v", "r", *extra, *self.servo.state)
         self.inputs = ("cmd_delta",)
         self.commands = 1
-        self.register_buffer("a", torch.from_numpy(a), persistent=False)
-        self.register_buffer("b", torch.from_numpy(b), persistent=False)
+        for name, value in (("a", a), ("b", b)):
+            self.register_buffer(name, torch.from_numpy(value), persistent=False)
         self.a: Tensor
         self.b: Tensor
 
@@ -215,7 +206,7 @@ class SteeringVessel(Plant):
 
     def delta(self, x: Tensor, w: Tensor) -> Tensor:
         """Return the rudder angle [B] in rad."""
-        return self.servo.value(x[:, self.rudder_columns], w[:, 0])
+        return self.servo.value(x[:, self.rudder_columns], w[:, :1])[:, 0]
 
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
         """Return x_dot [B, nx] under inputs w [B, 1]."""
@@ -223,11 +214,11 @@ class SteeringVessel(Plant):
         turning = z @ self.a.to(x.dtype).T + self.delta(x, w).unsqueeze(-1) * self.b.to(x.dtype)
         north, east = to_earth(surge(x), sway(x), heading(x))
         pose = torch.stack((north, east, yaw_rate(x), torch.zeros_like(north)), dim=-1)
-        return torch.cat((pose, turning, self.servo.rate(rudder, w[:, 0])), dim=-1)
+        return torch.cat((pose, turning, self.servo.rate(rudder, w[:, :1])), dim=-1)
 
     def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
         """Return the state [B, nx] with the rudder moved on by a step of dt seconds."""
-        rudder = self.servo.advance(x[:, self.rudder_columns], w[:, 0], dt)
+        rudder = self.servo.advance(x[:, self.rudder_columns], w[:, :1], dt)
         return torch.cat((x[:, : self.rudder_columns.start], rudder), dim=-1)
 
     def approach(self, rows: int) -> Tensor:

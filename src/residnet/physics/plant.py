@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Self, final
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal, Self, final
 
 import torch
+from pydantic import AfterValidator, Field
 from torch import Tensor, nn
 
+from residnet.core.config import Config, Newtons
+from residnet.core.errors import ConfigError
+from residnet.core.frames import to_body, to_earth
+from residnet.core.layout import PLANAR, StateLayout
 from residnet.physics.actuators import Actuators
-from residnet.physics.environment.wind import WIND_INPUTS, WindLoads
-from residnet.physics.kinematics import Kinematics
+from residnet.physics.environment import WIND_INPUTS, WindLoads
+from residnet.physics.parameters import Mass, Parameter, above_zero, of_dimension
+from residnet.physics.terms import TermLibrary
+
+ROLLING = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
+"""Surge, sway, roll and yaw, without heave and pitch (document 004 and its corrections)."""
+_AXES = {PLANAR.dof: ("x", "y", "n"), ROLLING.dof: ("x", "y", "k", "n")}
 
 
 class Plant(nn.Module, ABC):
@@ -47,8 +58,6 @@ class Plant(nn.Module, ABC):
         """Return x_dot [B, nx] within a step that holds p = prepare(x, w).
 
         It equals `rate` under the same inputs.
-
-        Equals `rate` under the same inputs.
         """
         return self.rate(x, p)
 
@@ -56,8 +65,6 @@ class Plant(nn.Module, ABC):
         """Return the state [rows, nx] that trials start from, float64.
 
         It is at rest; a model that only holds near its service speed starts there.
-
-        a model that only holds near its service speed starts there.
         """
         return torch.zeros(rows, len(self.state), dtype=torch.float64)
 
@@ -66,59 +73,137 @@ class Plant(nn.Module, ABC):
         return x
 
 
-class HullPlant(Plant, ABC):
-    """A hull with actuators in current, wind and external forces.
+def inverse_mass(mass: Tensor, vessel: str) -> Tensor:
+    """Return the inverse [n, n] of a mass matrix [n, n] in float64.
 
-    A subclass gives the acceleration of the hull.
+    Raises:
+        ConfigError: where an eigenvalue is zero or has no positive real part, or the matrix is as
+            good as singular.
+    """
+    if bool((torch.linalg.eigvals(mass).real <= 0).any()):
+        raise ConfigError(
+            f"vessel {vessel}: the mass matrix is not positive definite; added mass (X_udot,"
+            " Y_vdot, N_rdot) is negative for a hull"
+        )
+    scale = mass.diagonal().sqrt()
+    condition = float(torch.linalg.cond(mass / torch.outer(scale, scale)))
+    if condition > 1e8:
+        raise ConfigError(
+            f"vessel {vessel}: the mass matrix is singular (condition {condition:.1e} after"
+            " scaling); check the coupling terms x_G, Y_rdot, N_vdot"
+        )
+    inverse: Tensor = torch.linalg.inv(mass)
+    return inverse
 
-    Inputs: commands; force_x, force_y, (force_k,) force_n in body axes [N, N, (N m,) N m];
-    current_north, current_east [m/s]; force_north, force_east [N], constant in earth axes; where
-    the vessel has wind coefficients, wind_speed [m/s] and wind_dir [rad], the true wind and where
-    it comes from. A current is constant in earth axes and acts through the velocity relative to the
-    water.
+
+@final
+class Hull(nn.Module):
+    """A hull M nu_dot = terms(motion) C + tau, in n degrees of freedom.
+
+    Buffers are float64; results take the dtype of the input.
+
+    Args:
+        mass: M with added mass, [n][n].
+        rows: for each axis the coefficients C of its force by term; terms that brake are negative.
+        channels: of the motion: the velocities through the water, then phi where the hull rolls.
+        vessel: name for messages.
+
+    Raises:
+        ConfigError: where the mass matrix is not positive definite or is singular.
     """
 
     def __init__(
-        self, kinematics: Kinematics, actuators: Actuators, wind: WindLoads | None = None
+        self,
+        mass: Sequence[Sequence[float]],
+        rows: Sequence[Mapping[str, float]],
+        channels: Sequence[str],
+        vessel: str,
     ) -> None:
         super().__init__()
-        self.kinematics = kinematics
-        self.actuators = actuators
-        self.wind = wind
+        self.terms = TermLibrary(list(dict.fromkeys(t for row in rows for t in row)), channels)
+        coefficients = [[row.get(term, 0.0) for row in rows] for term in self.terms.terms]
+        for name, value in (
+            ("mass", torch.tensor(mass, dtype=torch.float64)),
+            ("coefficients", torch.tensor(coefficients, dtype=torch.float64).view(-1, len(rows))),
+        ):
+            self.register_buffer(name, value, persistent=False)
+        self.register_buffer("inverse", inverse_mass(self.mass, vessel), persistent=False)
+        self.mass: Tensor
+        self.inverse: Tensor
+        self.coefficients: Tensor
+
+    def load(self, motion: Tensor) -> Tensor:
+        """Return the forces [..., n] in N and N m of water, weight and rotation."""
+        force: Tensor = self.terms(motion) @ self.coefficients.to(motion.dtype)
+        return force
+
+    def forward(self, motion: Tensor, tau: Tensor) -> Tensor:
+        """Return the acceleration nu_dot [..., n] under the further forces tau [..., n]."""
+        if self.terms.count:
+            tau = tau + self.load(motion)
+        return tau @ self.inverse.to(tau.dtype).T
+
+    def required(self, nu_dot: Tensor, motion: Tensor) -> Tensor:
+        """Return the forces [..., n] that accelerate the vessel by nu_dot [..., n].
+
+        Source: document 002 eq. (2.10).
+        """
+        return nu_dot @ self.mass.to(motion.dtype).T - self.load(motion)
+
+    def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
+        """Return nu_dot as J terms of the motion, and coefficients [n][J + n] on each axis.
+
+        The coefficients of tau stand behind those of the terms.
+        """
+        response = torch.cat((self.inverse @ self.coefficients.T, self.inverse), dim=1)
+        return self.terms.terms, response.tolist()
+
+
+@final
+class HullPlant(Plant):
+    """A hull with actuators in current, wind and external forces.
+
+    State x [B, 2 n + k]: pose, velocities over ground, then the actuators' states. In 3 degrees of
+    freedom these are x, y, psi and u, v, r; in 4 x, y, phi, psi and u, v, p, r.
+
+    Inputs: commands; force_x, force_y, (force_k,) force_n in body axes [N, N, (N m,) N m];
+    current_north, current_east [m/s]; force_north, force_east [N], constant in earth axes; where
+    the vessel file has a section `wind`, the true wind (`WIND_INPUTS`). Hull forces are those of
+    the velocities relative to the water, wind loads those of the velocities relative to the air.
+
+    Args:
+        hull: of 3 or 4 degrees of freedom.
+        actuators: that push it.
+        wind: loads of the air; None where it feels none.
+        start: states that trials start from, where not at rest, by name.
+    """
+
+    def __init__(
+        self,
+        hull: Hull,
+        actuators: Actuators,
+        wind: WindLoads | None = None,
+        start: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__()
+        self.hull, self.actuators, self.wind = hull, actuators, wind
+        self.n = len(hull.mass)
+        self.rolls = self.n == ROLLING.dof
         self.weather = True
-        self.n = len(kinematics.velocity)
-        self.state = (*kinematics.pose, *kinematics.velocity, *actuators.state)
+        self.state = (*(ROLLING if self.rolls else PLANAR).names, *actuators.state)
         self.parts = [self.n, self.n, len(actuators.state)]
         self.commands = len(actuators.commands)
-        forces = tuple(f"force_{axis}" for axis in kinematics.axes)
         self.inputs = (
             *actuators.commands,
-            *forces,
+            *(f"force_{axis}" for axis in _AXES[self.n]),
             "current_north",
             "current_east",
             "force_north",
             "force_east",
+            *(WIND_INPUTS if wind is not None else ()),
         )
-        if wind is not None:
-            self.inputs += WIND_INPUTS
-        self.register_buffer(
-            "blown",
-            torch.tensor(["xykn".index(axis) for axis in kinematics.axes]),
-            persistent=False,
-        )
-        self.blown: Tensor
+        self.start = {self.state.index(n): v for n, v in (start or {}).items() if n in self.state}
 
-    @abstractmethod
-    def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """Return nu_dot [B, n].
-
-        Args:
-            pose: pose [B, n].
-            nu: velocities through the water [B, n].
-            tau: forces [B, n] in N and N m.
-        """
-
-    @final
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
         return self.actuators.demand(drive, steer)
@@ -132,7 +217,13 @@ class HullPlant(Plant, ABC):
         self.inputs = self.actuators.commands
         return self
 
-    @final
+    def approach(self, rows: int) -> Tensor:
+        """Return the state [rows, nx] that trials start from, float64."""
+        x = super().approach(rows)
+        for column, value in self.start.items():
+            x[:, column] = value
+        return x
+
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
         """Return the inputs with the actuators' forces added to the body forces.
 
@@ -146,12 +237,10 @@ class HullPlant(Plant, ABC):
             force = force + w[:, c : c + n]
         return torch.cat((w[:, :c], force, w[:, c + n :]), dim=-1)
 
-    @final
     def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
         """Return x_dot [B, nx] within a step, from p = prepare(x, w)."""
         return self._rate(x, p, self.actuators.held)
 
-    @final
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
         """Return x_dot [B, nx] under inputs w [B, m]."""
         return self._rate(x, w, False)
@@ -166,38 +255,62 @@ class HullPlant(Plant, ABC):
         pose, nu, a = torch.split(x, self.parts, dim=-1)
         command = w.narrow(-1, 0, c)
         moving = torch.zeros_like(a) if held else self.actuators.rate(a, command)
+        moved = self._pose_rate(pose, nu)
         if not self.weather:
             tau = w.narrow(-1, c, n) if held else self.actuators.force(a, command, nu)
-            return torch.cat(
-                (self.kinematics.rate(pose, nu), self.acceleration(pose, nu, tau), moving), dim=-1
-            )
-        water, turned = self.kinematics.body_components_and_rate(
-            w[:, c + n], w[:, c + n + 1], pose, nu
-        )
-        relative = nu - water
-        body = (
-            w[:, c : c + n]
-            if held
-            else self.actuators.force(a, command, relative) + w[:, c : c + n]
-        )
-        tau = body + self.kinematics.body_components(w[:, c + n + 2], w[:, c + n + 3], pose)
+            return torch.cat((moved, self.hull(self._motion(pose, nu), tau), moving), dim=-1)
+        water, turned = self._water(w[:, c + n], w[:, c + n + 1], pose, nu)
+        relative, tau = nu - water, w[:, c : c + n]
+        if not held:
+            tau = tau + self.actuators.force(a, command, relative)
+        tau = tau + self._body(w[:, c + n + 2], w[:, c + n + 3], pose)
         if self.wind is not None:
             tau = tau + self._wind(w[:, c + n + 4], w[:, c + n + 5], pose, nu)
-        nu_dot = self.acceleration(pose, relative, tau) + turned
-        return torch.cat((self.kinematics.rate(pose, nu), nu_dot, moving), dim=-1)
+        nu_dot = self.hull(self._motion(pose, relative), tau) + turned
+        return torch.cat((moved, nu_dot, moving), dim=-1)
+
+    def _motion(self, pose: Tensor, nu: Tensor) -> Tensor:
+        return torch.cat((nu, pose[..., 2:3]), dim=-1) if self.rolls else nu
+
+    def _pose_rate(self, pose: Tensor, nu: Tensor) -> Tensor:
+        """Return the derivative [B, n] of the pose (document 003 eq. (1), document 004)."""
+        u, v = nu[..., 0], nu[..., 1]
+        if not self.rolls:
+            return torch.stack((*to_earth(u, v, pose[..., 2]), nu[..., 2]), dim=-1)
+        cos_phi = torch.cos(pose[..., 2])
+        north, east = to_earth(u, v * cos_phi, pose[..., 3])
+        return torch.stack((north, east, nu[..., 2], nu[..., 3] * cos_phi), dim=-1)
+
+    def _body(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
+        """Return an earth-fixed horizontal vector along the (rolled) body axes, [B, n]."""
+        along, across = to_body(north, east, pose[..., -1])
+        zero = torch.zeros_like(along)
+        if self.rolls:
+            return torch.stack((along, across * torch.cos(pose[..., 2]), zero, zero), dim=-1)
+        return torch.stack((along, across, zero), dim=-1)
+
+    def _water(
+        self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the current in body axes and its derivative while the body turns, each [B, n]."""
+        along, across = to_body(north, east, pose[..., -1])
+        zero, r = torch.zeros_like(along), nu[..., -1]
+        if not self.rolls:
+            body = torch.stack((along, across, zero), dim=-1)
+            return body, torch.stack((r * across, -r * along, zero), dim=-1)
+        cos_phi, sin_phi = torch.cos(pose[..., 2]), torch.sin(pose[..., 2])
+        turning, p = r * cos_phi, nu[..., 2]
+        sideways = -turning * along * cos_phi - p * across * sin_phi
+        body = torch.stack((along, across * cos_phi, zero, zero), dim=-1)
+        return body, torch.stack((turning * across, sideways, zero, zero), dim=-1)
 
     def _wind(self, speed: Tensor, direction: Tensor, pose: Tensor, nu: Tensor) -> Tensor:
         """Return the forces [B, n] of the true wind on a vessel with velocities over ground nu."""
         assert self.wind is not None
-        air = self.kinematics.body_components(
-            -speed * torch.cos(direction), -speed * torch.sin(direction), pose
-        )
-        force: Tensor = self.wind(air[:, 0] - nu[:, 0], air[:, 1] - nu[:, 1]).index_select(
-            -1, self.blown
-        )
-        return force
+        air = self._body(-speed * torch.cos(direction), -speed * torch.sin(direction), pose)
+        force: Tensor = self.wind(air[:, 0] - nu[:, 0], air[:, 1] - nu[:, 1])
+        return force if self.rolls else torch.cat((force[:, :2], force[:, 3:]), dim=-1)
 
-    @final
     def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
         """Return the state [B, nx] with the actuators moved on by a step of dt seconds.
 
@@ -205,3 +318,55 @@ class HullPlant(Plant, ABC):
         """
         after = self.actuators.advance(x[:, 2 * self.n :], w[:, : self.commands], dt)
         return torch.cat((x[:, : 2 * self.n], after), dim=-1)
+
+
+class MassSpringDamperConfig(Config):
+    """The mass-spring-damper m x_ddot + d x_dot + k x = tau (document 000, eqs. (4.1), (4.2)).
+
+    Attributes:
+        m: mass in kg; by default that of section 5.3. (4.3) is another system: m = 20 kg,
+            d = 10 kg/s, k = 12 N/m (correction H24).
+        d: damping in kg/s.
+        k: stiffness in N/m.
+        tau_max: force that the full drive of a manoeuvre stands for.
+    """
+
+    kind: Literal["mass_spring_damper"] = "mass_spring_damper"
+    m: Annotated[Mass, AfterValidator(above_zero)] = Parameter(
+        value=10.0, unit="kg", source="document 000, section 5.3, (5.13)"
+    )
+    d: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -1))] = Parameter(
+        value=13.0, unit="kg/s", source="document 000, section 5.3, (5.13)"
+    )
+    k: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -2))] = Parameter(
+        value=5.0, unit="N/m", source="document 000, section 5.3, (5.13)"
+    )
+    tau_max: Newtons = Field(default=1.0, gt=0)
+
+    def build(self) -> MassSpringDamper:
+        """Build the plant of this vessel."""
+        return MassSpringDamper(self)
+
+
+@final
+class MassSpringDamper(Plant):
+    """A mass on a spring: displacement x [m] and its rate u [m/s] in x [B, 2]; input tau_x [N]."""
+
+    state = ("x", "u")
+    inputs = ("tau_x",)
+    commands = 1
+
+    def __init__(self, config: MassSpringDamperConfig) -> None:
+        super().__init__()
+        self.m, self.d, self.k = config.m.value, config.d.value, config.k.value
+        self.tau_max = config.tau_max
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Return the force [..., 1] from the drive [...]; there is nothing to steer."""
+        return (drive.clamp(-1.0, 1.0) * self.tau_max).unsqueeze(-1)
+
+    def rate(self, x: Tensor, w: Tensor) -> Tensor:
+        """Return x_dot [B, 2] under the force w [B, 1]."""
+        displacement, speed = x[:, 0], x[:, 1]
+        pull = w[:, 0] - self.d * speed - self.k * displacement
+        return torch.stack((speed, pull / self.m), dim=-1)

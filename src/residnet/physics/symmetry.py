@@ -8,13 +8,10 @@ from typing import final
 from residnet.core.names import VELOCITY
 from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 
-_ODD = ("v", "r", "delta", "tau_y", "tau_n", "wind_v")
+_PARITY = dict.fromkeys(("v", "r", "delta", "tau_y", "tau_n", "wind_v"), -1) | dict.fromkeys(
+    ("u", "n", "tau_x", "wind_u", "wind_mag"), 1
+)
 _ANGLES = ("delta", "rudder", "azimuth")
-_EVEN = ("u", "n", "tau_x", "wind_u", "wind_mag")
-
-
-_SIDES = (("port", "stbd"),)
-"""Endings of names of a channel on one side and of its partner on the other."""
 
 
 @final
@@ -29,7 +26,9 @@ class ChannelNames(tuple[str, ...]):
     def __new__(cls, names: Iterable[str], pairs: Iterable[tuple[str, str]] = ()) -> ChannelNames:
         """From the names, and the pairs that are declared."""
         made = super().__new__(cls, names)
-        both = [*pairs, *_by_ending(made)]
+        port = [name.removesuffix("_port") for name in made if name[:-5] and name.endswith("_port")]
+        ending = [(f"{stem}_port", f"{stem}_stbd") for stem in port if f"{stem}_stbd" in made]
+        both = [*pairs, *ending]
         made.partners = {**dict(both), **{b: a for a, b in both}}
         return made
 
@@ -39,39 +38,34 @@ def partners_of(names: Sequence[str]) -> Mapping[str, str]:
     return (names if isinstance(names, ChannelNames) else ChannelNames(names)).partners
 
 
-def _by_ending(names: Sequence[str]) -> list[tuple[str, str]]:
-    out = []
-    for name in names:
-        stem, _, side = name.rpartition("_")
-        for one, other in _SIDES:
-            if stem and side == one and f"{stem}_{other}" in names:
-                out.append((name, f"{stem}_{other}"))
-    return out
-
-
 def channel_parity(name: str) -> int | None:
     """Return +1 where a channel keeps its sign in the mirror, -1 where it changes it, else None.
 
     None means that the channel's parity is not known.
     """
-    return -1 if name in _ODD else 1 if name in _EVEN else None
+    return _PARITY.get(name)
+
+
+def pair_parity(name: str) -> int:
+    """Return the sign that a channel of a pair changes places with: -1 for an angle, else +1."""
+    return -1 if name.removeprefix("cmd_").startswith(_ANGLES) else 1
+
+
+def _parity(factors: Iterable[Factor], parities: Mapping[str, float]) -> int:
+    """Return the sign that a product changes by where its channels change theirs."""
+    sign = 1
+    for factor in factors:
+        even = factor.magnitude or factor.function in EVEN_FUNCTIONS or factor.power % 2 == 0
+        if parities[factor.name] < 0 and not even:
+            sign = -sign
+    return sign
 
 
 def term_parity(term: str, names: Sequence[str]) -> int | None:
     """Return the parity of a product of channels; None where a channel's is not known."""
-    parity = 1
-    for factor in parse_term(term, names):
-        factor_parity = channel_parity(factor.name)
-        if factor_parity is None:
-            return None
-        if (
-            factor_parity < 0
-            and not factor.magnitude
-            and factor.function not in EVEN_FUNCTIONS
-            and factor.power % 2 == 1
-        ):
-            parity = -parity
-    return parity
+    factors = parse_term(term, names)
+    known = all(factor.name in _PARITY for factor in factors)
+    return _parity(factors, _PARITY) if known else None
 
 
 def wrong_parity(term: str, axis: int, names: Sequence[str]) -> bool:
@@ -80,31 +74,20 @@ def wrong_parity(term: str, axis: int, names: Sequence[str]) -> bool:
     The axes are 0 surge, 1 sway, 2 yaw.
     """
     parity = term_parity(term, names)
-    return parity is not None and parity != (1 if VELOCITY[axis] == "u" else -1)
+    return parity is not None and parity != _PARITY[VELOCITY[axis]]
 
 
 def mirrored_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | None:
     """Return how channels look in the mirror: the column that each is taken from, and the sign.
 
-    The result is None where the parity of one is not known.
-
-    Channels of a port/starboard pair change places.
+    The result is None where the parity of one is not known. Channels of a port/starboard pair
+    change places.
     """
     partners = partners_of(names)
-    index, sign = [], []
-    for place, name in enumerate(names):
-        parity = pair_parity(name) if name in partners else channel_parity(name)
-        if parity is None:
-            return None
-        index.append(names.index(partners[name]) if name in partners else place)
-        sign.append(float(parity))
-    return index, sign
-
-
-def pair_parity(name: str) -> int:
-    """Return the sign that a channel of a pair changes places with: -1 for an angle, else +1."""
-    plain = name.removeprefix("cmd_")
-    return -1 if plain.startswith(_ANGLES) else 1
+    index = [names.index(partners.get(name, name)) for name in names]
+    signs = [pair_parity(name) if name in partners else channel_parity(name) for name in names]
+    known = [float(sign) for sign in signs if sign is not None]
+    return (index, known) if len(known) == len(names) else None
 
 
 def mirrored_terms(terms: Sequence[str], names: Sequence[str]) -> dict[int, tuple[int, int]] | None:
@@ -115,18 +98,15 @@ def mirrored_terms(terms: Sequence[str], names: Sequence[str]) -> dict[int, tupl
     mirror = mirrored_channels(names)
     if mirror is None:
         return None
-    image = {name: (names[i], s) for name, i, s in zip(names, *mirror, strict=True)}
+    index, signs = mirror
+    renamed = {name: names[i] for name, i in zip(names, index, strict=True)}
+    parities = dict(zip(names, signs, strict=True))
     meanings = {meaning(term, names, {}): place for place, term in enumerate(terms)}
     out = {}
     for place, term in enumerate(terms):
-        sign = 1
-        for factor in parse_term(term, names):
-            even = factor.magnitude or factor.function in EVEN_FUNCTIONS
-            if image[factor.name][1] < 0 and not even and factor.power % 2 == 1:
-                sign = -sign
-        found = meanings.get(meaning(term, names, {n: other for n, (other, _) in image.items()}))
+        found = meanings.get(meaning(term, names, renamed))
         if found is not None:
-            out[place] = (found, sign)
+            out[place] = (found, _parity(parse_term(term, names), parities))
     return out
 
 
@@ -162,5 +142,4 @@ def dissipates(term: str, axis: int, names: Sequence[str]) -> bool:
     """
     parts = meaning(term, names, {})
     odd = {thing.name for thing, _, changes in parts if changes}
-    functions = any(thing.function for thing, _, _ in parts)
-    return odd == {VELOCITY[axis]} and not functions
+    return odd == {VELOCITY[axis]} and not any(thing.function for thing, _, _ in parts)

@@ -12,10 +12,8 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.core.registry import vessel_files
 from residnet.physics.abkowitz import AbkowitzConfig
-from residnet.physics.fossen import FossenConfig, MassMatrixConfig
+from residnet.physics.hull import FossenConfig, MassMatrixConfig, OdinConfig, PatrolConfig
 from residnet.physics.nomoto import NomotoConfig, SecondOrderNomotoConfig, SideslipNomotoConfig
-from residnet.physics.odin import OdinConfig
-from residnet.physics.patrol import PatrolConfig
 
 __all__ = [
     "AnyVessel",

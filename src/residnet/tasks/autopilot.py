@@ -40,7 +40,7 @@ from residnet.data.simulated.environment import Disturbance, WindField
 from residnet.documents.gouletas2020.law import DocumentConfig, PredictiveConfig
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.store import chosen_model, load_model
-from residnet.physics.environment.waves import WavesConfig
+from residnet.physics.environment import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles

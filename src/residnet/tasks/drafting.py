@@ -27,7 +27,7 @@ from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers.quantities import QUATERNION
 from residnet.data.split import SPLITS
 from residnet.identification.recipe import Preparation, judging, protocols, window_length
-from residnet.physics.environment.wind import WIND_INPUTS
+from residnet.physics.environment import WIND_INPUTS
 from residnet.tasks.driving import driving, lacks
 from residnet.tasks.fit import FitConfig
 

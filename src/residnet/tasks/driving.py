@@ -12,7 +12,7 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.reading import INPUTS
 from residnet.data.drafting.words import input_channel, state_channel, words_of
 from residnet.data.readers.quantities import QUATERNION
-from residnet.physics.environment.wind import WIND_INPUTS
+from residnet.physics.environment import WIND_INPUTS
 
 _PASSIVE = (
     *(*STATE, *ACCELERATION, "phi", "p", "latitude", "longitude", *QUATERNION),

@@ -19,7 +19,7 @@ from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.steering_variation import PushedSteering
-from residnet.physics.environment.waves import JonswapSpectrum
+from residnet.physics.environment import JonswapSpectrum
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
 _EXTRA = ("push", "reference", "noise_psi", "noise_r", "delay")

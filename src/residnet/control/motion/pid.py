@@ -18,7 +18,7 @@ from residnet.core.config import Config
 from residnet.core.frames import to_body, wrap
 from residnet.core.layout import pose, velocities
 from residnet.physics.actuators import ForceActuators
-from residnet.physics.fossen import Fossen3
+from residnet.physics.plant import Hull
 
 Gain = Annotated[float, Field(ge=0)]
 Gains = tuple[Gain, Gain, Gain]
@@ -45,7 +45,7 @@ class NoFeedForward(FeedForward):
 class HullFeedForward(FeedForward):
     """F0(nu_dot_d, nu_d) = M nu_dot_d + C(nu_d) nu_d + D(nu_d) nu_d of the believed hull (2.10)."""
 
-    def __init__(self, hull: Fossen3) -> None:
+    def __init__(self, hull: Hull) -> None:
         super().__init__()
         self.hull = hull
 

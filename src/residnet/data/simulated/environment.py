@@ -12,8 +12,7 @@ from torch import Tensor
 from residnet.core.config import Config, MetresPerSecond, NewtonMetres, Newtons, Radians, Seconds
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Source
-from residnet.physics.environment.waves import Waves, WavesConfig
-from residnet.physics.environment.wind import WIND_INPUTS
+from residnet.physics.environment import WIND_INPUTS, Waves, WavesConfig
 from residnet.physics.plant import Plant
 
 

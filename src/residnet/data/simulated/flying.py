@@ -19,7 +19,7 @@ from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, Watched
-from residnet.physics.environment.wind import WIND_INPUTS
+from residnet.physics.environment import WIND_INPUTS
 from residnet.physics.plant import Plant
 
 

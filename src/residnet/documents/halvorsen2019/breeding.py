@@ -14,7 +14,7 @@ from residnet.core.config import Config, Seconds, load_config
 from residnet.core.files import read_json
 from residnet.documents.cells import pictures
 from residnet.heads.genetic import GeneticConfig
-from residnet.physics.mass_spring_damper import MassSpringDamperConfig
+from residnet.physics.plant import MassSpringDamperConfig
 from residnet.regression.expressions import Algebra
 from residnet.regression.genetic import breed, limits_of, validating
 from residnet.regression.writing import term

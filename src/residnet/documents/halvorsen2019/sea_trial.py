@@ -46,8 +46,7 @@ from residnet.judge.goodness import table as goodness_table
 from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.zigzag import Zigzag
-from residnet.physics.froude import PHASES, froude_number, phase_of
-from residnet.physics.odin import AccelerationHull, OdinConfig
+from residnet.physics.hull import PHASES, OdinConfig, froude_number, phase_of
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text, table_of
 from residnet.report.figure import (
@@ -592,7 +591,7 @@ def _judged(
     """
     z, a = trial.samples.z, trial.samples.target.numpy()
     known = Fitted(
-        AccelerationHull(vessel.gains, vessel.terms)(z[:, RANGE_VELOCITIES], z[:, 5:]).numpy(),
+        vessel.hull()(z[:, RANGE_VELOCITIES], z[:, 5:]).numpy(),
         (0.0, 0.0, 0.0),
         {},
     )

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.documents import published
-from residnet.physics.odin import OdinConfig
+from residnet.physics.hull import OdinConfig
 from residnet.regression.equation_rows import correlation_time
 
 _RANK = 1e-6

@@ -78,7 +78,8 @@ from residnet.manoeuvres import FamilyConfig
 from residnet.manoeuvres.zigzag import ZigzagFamily
 from residnet.physics.actuators import ForceActuators
 from residnet.physics.force_model import ForceModel
-from residnet.physics.fossen import FossenVessel, HullConfig
+from residnet.physics.hull import HullConfig
+from residnet.physics.plant import HullPlant
 from residnet.physics.signals import FORCE_CHANNELS, SignalsConfig
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text, table_of
@@ -405,7 +406,7 @@ class Flight:
     tracking: Tracking
 
 
-def force_hull(name: str) -> tuple[FossenVessel, ForceActuators]:
+def force_hull(name: str) -> tuple[HullPlant, ForceActuators]:
     """Return a vessel by name or file, and its actuators, which make all three forces.
 
     Raises:
@@ -435,8 +436,8 @@ class Ferry:
         seed: seed of the noise.
     """
 
-    true: FossenVessel
-    believed: FossenVessel
+    true: HullPlant
+    believed: HullPlant
     loop: LoopConfig
     disturbance: Disturbance
     noise: MotionNoise | None

@@ -42,7 +42,8 @@ from residnet.documents.jervan2020.residual import (
 )
 from residnet.judge.metrics import Blocks, blocks, intervals
 from residnet.physics.force_model import ForceModel
-from residnet.physics.fossen import Fossen3, FossenVessel, HullConfig
+from residnet.physics.hull import HullConfig
+from residnet.physics.plant import Hull, HullPlant
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Bullets, Cell, Section, Table, Text, table_of
 from residnet.report.figure import (
@@ -214,7 +215,7 @@ class ForceResidualConfig(ComputingTask):
             raise ValueError(str(error)) from None
         return self
 
-    def hull(self) -> Fossen3:
+    def hull(self) -> Hull:
         """Return the known hull.
 
         Raises:
@@ -222,7 +223,7 @@ class ForceResidualConfig(ComputingTask):
         """
         config = load_vessel(self.believed)
         vessel = config.build() if isinstance(config, HullConfig) else None
-        if not isinstance(vessel, FossenVessel):
+        if not isinstance(vessel, HullPlant):
             raise ConfigError(
                 f"believed: '{self.believed}' is of kind '{config.kind}'; a believed hull needs one"
                 " of kind fossen or mass_matrix"

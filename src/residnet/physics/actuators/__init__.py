@@ -1,4 +1,4 @@
-"""Actuators: one file per kind, listed once in `ActuatorsConfig`."""
+"""Actuators: what a vessel is driven and steered by, listed once in `ActuatorsConfig`."""
 
 from __future__ import annotations
 
@@ -6,16 +6,22 @@ from typing import Annotated
 
 from pydantic import Field
 
-from residnet.physics.actuators.azimuth import AzimuthThrusters, AzimuthThrustersConfig
 from residnet.physics.actuators.base import ActuatorConfig, Actuators, ForceActuators
-from residnet.physics.actuators.differential_thrust import (
-    DifferentialThrust,
-    DifferentialThrustConfig,
+from residnet.physics.actuators.rudders import (
+    FoilRuddersConfig,
+    LinearRuddersConfig,
+    RudderPropellerConfig,
+    WaterJetsConfig,
 )
-from residnet.physics.actuators.forces import ForceCommands, ForceCommandsConfig
-from residnet.physics.actuators.rudder_propeller import RudderPropeller, RudderPropellerConfig
-from residnet.physics.actuators.thrusters import Thrusters, ThrustersConfig
-from residnet.physics.actuators.waterjet import WaterJets, WaterJetsConfig
+from residnet.physics.actuators.thrusters import (
+    AzimuthThrusters,
+    AzimuthThrustersConfig,
+    DifferentialThrustConfig,
+    ForceCommands,
+    ForceCommandsConfig,
+    Thrusters,
+    ThrustersConfig,
+)
 
 ActuatorsConfig = Annotated[
     AzimuthThrustersConfig
@@ -26,6 +32,10 @@ ActuatorsConfig = Annotated[
     | WaterJetsConfig,
     Field(discriminator="kind"),
 ]
+RollingActuatorsConfig = Annotated[
+    FoilRuddersConfig | LinearRuddersConfig, Field(discriminator="kind")
+]
+"""Of a vessel that rolls: they make a roll moment too."""
 
 __all__ = [
     "ActuatorConfig",
@@ -33,15 +43,11 @@ __all__ = [
     "ActuatorsConfig",
     "AzimuthThrusters",
     "AzimuthThrustersConfig",
-    "DifferentialThrust",
     "DifferentialThrustConfig",
     "ForceActuators",
     "ForceCommands",
     "ForceCommandsConfig",
-    "RudderPropeller",
-    "RudderPropellerConfig",
+    "RollingActuatorsConfig",
     "Thrusters",
     "ThrustersConfig",
-    "WaterJets",
-    "WaterJetsConfig",
 ]

@@ -1,13 +1,191 @@
-"""The interface of actuators: what turns commands into forces on the hull."""
+"""What turns commands into forces on the hull, and how each actuator follows its command."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from typing import Annotated, ClassVar, Literal, Protocol, final
 
 import torch
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.core.config import Config
+from residnet.core.config import Config, RadiansPerSecond, RevsPerSecond, Seconds
+from residnet.core.errors import ConfigError
+
+
+class ResponseConfig(Config, ABC):
+    """The lag between a command and the position.
+
+    Attributes:
+        kind: kind of the lag.
+    """
+
+    suffixes: ClassVar[tuple[str, ...]]
+    """Of the actuator's name, one for each state of the lag."""
+    kind: str
+
+    @abstractmethod
+    def rate(self, a: Tensor, target: Tensor, fastest: float) -> Tensor:
+        """Return the derivative of the states a [..., k c], towards target [..., c]."""
+
+
+@final
+class ImmediateConfig(ResponseConfig):
+    """A position that follows at once, or as fast as the rate limit allows."""
+
+    suffixes = ()
+    kind: Literal["immediate"] = "immediate"
+
+    def rate(self, a: Tensor, target: Tensor, fastest: float) -> Tensor:
+        """Return zeros: the position moves once per step."""
+        return torch.zeros_like(a)
+
+
+@final
+class FirstOrderConfig(ResponseConfig):
+    """A lag of first order, a_dot = (target - a) / T within the rate limit.
+
+    Attributes:
+        time: time constant in s.
+    """
+
+    suffixes = ("",)
+    kind: Literal["first_order"] = "first_order"
+    time: Seconds = Field(gt=0)
+
+    def rate(self, a: Tensor, target: Tensor, fastest: float) -> Tensor:
+        """Return the derivative of the positions."""
+        return ((target - a) / self.time).clamp(-fastest, fastest)
+
+
+@final
+class SecondOrderConfig(ResponseConfig):
+    """A lag of second order, a_dotdot = w^2 (target - a) - 2 zeta w a_dot.
+
+    At the rate limit it accelerates no further.
+
+    Attributes:
+        frequency: natural frequency in rad/s.
+        damping: relative damping.
+    """
+
+    suffixes = ("", "_rate")
+    kind: Literal["second_order"] = "second_order"
+    frequency: RadiansPerSecond = Field(gt=0)
+    damping: float = Field(gt=0)
+
+    def rate(self, a: Tensor, target: Tensor, fastest: float) -> Tensor:
+        """Return the derivatives of the positions, then of their rates."""
+        position, moving = a.chunk(2, dim=-1)
+        speed = moving.clamp(-fastest, fastest)
+        pull = self.frequency**2 * (target - position) - 2.0 * self.damping * self.frequency * speed
+        held = (moving.abs() >= fastest) & (pull * moving > 0)
+        return torch.cat((speed, torch.where(held, torch.zeros_like(pull), pull)), dim=-1)
+
+
+class ServoConfig(Config):
+    """The part that all actuators which follow a command share.
+
+    Limit and rate limit stand, with their units, in the subclass' own keys.
+
+    Attributes:
+        response: lag.
+        dead_time: between a command and its first effect; a whole number of `delay_step`.
+        delay_step: step of the plant that the delay line moves by, once per step; the simulation
+            must step by just this.
+    """
+
+    response: Annotated[
+        ImmediateConfig | FirstOrderConfig | SecondOrderConfig, Field(discriminator="kind")
+    ] = ImmediateConfig()
+    dead_time: Seconds = Field(default=0.0, ge=0)
+    delay_step: Seconds | None = Field(default=None, gt=0)
+
+    @model_validator(mode="after")
+    def _delay(self) -> ServoConfig:
+        if (self.dead_time > 0) != (self.delay_step is not None):
+            raise ValueError(
+                "dead_time and delay_step belong together: delay_step is the step of the plant"
+                " (data.step over data.substeps)"
+            )
+        if self.delay_step is not None:
+            taps = self.dead_time / self.delay_step
+            if abs(taps - round(taps)) > 1e-6 * taps or not 1 <= round(taps) <= 1000:
+                raise ValueError(
+                    f"dead_time ({self.dead_time:g} s) must be 1 to 1000 times delay_step"
+                    f" ({self.delay_step:g} s)"
+                )
+        return self
+
+    def follow(self, limit: float, rate: float | None, *names: str) -> Servo:
+        """Return the servo of actuators that are alike, within their limits."""
+        return Servo(self, limit, rate, names)
+
+
+@final
+class Servo(nn.Module):
+    """Actuators alike: each command [..., c] is saturated, waits in a delay line, and is followed.
+
+    States a [..., k c] stand in blocks of c: positions, what else the lag needs, then the delayed
+    commands, newest first. Those that begin with `_` are internal: no sensor measures them.
+    """
+
+    def __init__(
+        self, config: ServoConfig, limit: float, rate: float | None, names: Sequence[str]
+    ) -> None:
+        super().__init__()
+        self.response, self.limit, self.count = config.response, limit, len(names)
+        self.lags = len(config.response.suffixes) > 0
+        self.fastest = float("inf") if rate is None else rate
+        suffixes = config.response.suffixes or (() if rate is None else ("",))
+        self.width = len(suffixes) * self.count
+        self.delay_step = config.delay_step or 0.0
+        self.taps = round(config.dead_time / self.delay_step) if self.delay_step else 0
+        self.state = (
+            *(f"{'_' if end else ''}{name}{end}" for end in suffixes for name in names),
+            *(f"_{name}_delay{i + 1}" for i in range(self.taps) for name in names),
+        )
+
+    def target(self, a: Tensor, command: Tensor) -> Tensor:
+        """Return what the actuators follow now, [..., c]."""
+        if self.taps == 0:
+            return command.clamp(-self.limit, self.limit)
+        return a[..., -self.count :]
+
+    def value(self, a: Tensor, command: Tensor) -> Tensor:
+        """Return the positions [..., c], within the limit."""
+        if self.width == 0:
+            return self.target(a, command)
+        return a[..., : self.count].clamp(-self.limit, self.limit)
+
+    def rate(self, a: Tensor, command: Tensor) -> Tensor:
+        """Return the derivative [..., k c] of the states."""
+        if not self.lags:
+            return torch.zeros_like(a)
+        moving = self.response.rate(a[..., : self.width], self.target(a, command), self.fastest)
+        return torch.cat((moving, torch.zeros_like(a[..., self.width :])), dim=-1)
+
+    def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
+        """Return the states [..., k c] after a step of dt seconds: rate limits and delay lines.
+
+        Raises:
+            ConfigError: where the delay line does not move by dt.
+        """
+        moved = a[..., : self.width]
+        if self.width > 0 and not self.lags:
+            step = self.fastest * dt
+            moved = moved + (self.target(a, command) - moved).clamp(-step, step)
+        if self.taps == 0:
+            return moved
+        if abs(dt - self.delay_step) > 1e-9:
+            raise ConfigError(
+                f"actuator with dead time: its delay_step is {self.delay_step:g} s, but the plant"
+                f" steps by {dt:g} s; set delay_step to the step of the plant (data.step over"
+                " data.substeps)"
+            )
+        newest = command.clamp(-self.limit, self.limit)
+        return torch.cat((moved, newest, a[..., self.width : -self.count]), dim=-1)
 
 
 class Actuators(nn.Module, ABC):
@@ -22,13 +200,20 @@ class Actuators(nn.Module, ABC):
         state: names of the states; empty where the commands act at once. What no sensor measures
             begins with `_` and enters no log.
         commands: names of the commands.
-        held: whether forces stay the same over a step: no state moves continuously, and the
-            vessel's speed does not matter.
+        in_flow: whether forces depend on the vessel's speed.
+        held: whether forces stay the same over a step.
     """
 
-    state: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
-    held: bool = False
+    in_flow: bool = True
+
+    def __init__(self, *servos: Servo) -> None:
+        super().__init__()
+        self.servos = nn.ModuleList(servos)
+        self.state = tuple(name for servo in servos for name in servo.state)
+        self.widths = [len(servo.state) for servo in servos]
+        self.counts = [servo.count for servo in servos]
+        self.held = not (self.in_flow or any(servo.lags for servo in servos))
 
     @abstractmethod
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
@@ -44,17 +229,35 @@ class Actuators(nn.Module, ABC):
             nu: velocities through the water [..., n].
         """
 
+    def followed(self, command: Tensor) -> Tensor:
+        """Return the commands [..., c] that servos follow, in their order."""
+        return command
+
+    def _each(self, a: Tensor, command: Tensor) -> Iterator[tuple[Servo, Tensor, Tensor]]:
+        parts = torch.split(a, self.widths, dim=-1)
+        wanted = torch.split(self.followed(command), self.counts, dim=-1)
+        yield from zip(self.servos, parts, wanted, strict=True)
+
+    def positions(self, a: Tensor, command: Tensor) -> Tensor:
+        """Return where all servos stand, [..., c]."""
+        each = [servo.value(part, wanted) for servo, part, wanted in self._each(a, command)]
+        return torch.cat(each, dim=-1)
+
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
         """Return the derivative [..., k] of the states."""
-        return torch.zeros_like(a)
+        each = [servo.rate(part, wanted) for servo, part, wanted in self._each(a, command)]
+        return torch.cat(each, dim=-1)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
         """Return the states [..., k] after a step of dt seconds, of what moves once per step."""
-        return a
+        each = [servo.advance(part, wanted, dt) for servo, part, wanted in self._each(a, command)]
+        return torch.cat(each, dim=-1)
 
 
 class ForceActuators(Actuators, ABC):
     """Actuators that push a hull in surge, sway and yaw, each as asked for, within their limits."""
+
+    in_flow = False
 
     @abstractmethod
     def allocate(self, tau: Tensor) -> Tensor:
@@ -79,3 +282,60 @@ class ActuatorConfig(Config, ABC):
     @abstractmethod
     def build(self) -> Actuators:
         """Build the module that turns commands into forces."""
+
+
+Coefficients = tuple[float, float, float]
+CurveRange = tuple[RevsPerSecond, RevsPerSecond]
+"""Revolutions (astern, ahead) between which a curve was measured."""
+
+
+class Curved(Protocol):
+    """A config with a thrust curve and the limits of its shaft, n_max in 1/s."""
+
+    @property
+    def n_max(self) -> float: ...
+
+    @property
+    def curve_range(self) -> CurveRange | None: ...
+
+
+def require_range(config: Curved) -> None:
+    """Stop where a shaft may turn faster than its thrust curve is known.
+
+    Raises:
+        ValueError: naming both.
+    """
+    if config.curve_range is None:
+        return
+    low, high = config.curve_range
+    if low > -config.n_max or high < config.n_max:
+        raise ValueError(
+            f"curve_range {low * 60:g} to {high * 60:g} rpm does not reach n_max"
+            f" (+-{config.n_max * 60:g} rpm); lower n_max or measure the curve further"
+        )
+
+
+@final
+class ThrustCurve(nn.Module):
+    """The curves T = c0 + c1 n + c2 n^2 [N] of c propellers, others for n < 0 [1/s].
+
+    Thrust never opposes the sense of rotation (correction W5).
+
+    Args:
+        forward: coefficients (c0, c1, c2) of each propeller for n > 0.
+        reverse: the same for n < 0.
+    """
+
+    def __init__(self, forward: Sequence[Coefficients], reverse: Sequence[Coefficients]) -> None:
+        super().__init__()
+        for name, rows in (("ahead", forward), ("astern", reverse)):
+            self.register_buffer(name, torch.tensor(rows, dtype=torch.float64).T, persistent=False)
+        self.ahead: Tensor
+        self.astern: Tensor
+
+    def forward(self, n: Tensor) -> Tensor:
+        """Return the thrusts [N] at revolutions n [..., c] in 1/s."""
+        f, b = self.ahead.to(n.dtype), self.astern.to(n.dtype)
+        ahead = (f[0] + n * (f[1] + n * f[2])).clamp(min=0.0)
+        astern = (b[0] + n * (b[1] + n * b[2])).clamp(max=0.0)
+        return torch.where(n > 0, ahead, torch.where(n < 0, astern, torch.zeros_like(n)))

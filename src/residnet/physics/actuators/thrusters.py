@@ -1,22 +1,50 @@
-"""Any number of fixed thrusters anywhere on the hull."""
+"""Thrusters: fixed ones, two side by side, azimuths with their allocation, or forces alone."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Annotated, Literal, final
 
+import numpy as np
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.core.config import Metres, Radians, RevRate, RevsPerSecond
-from residnet.physics.actuators.base import ActuatorConfig, Actuators
-from residnet.physics.actuators.servo import ServoConfig, Servos
-from residnet.physics.actuators.thrust_curve import (
+from residnet.core.config import (
+    Config,
+    Metres,
+    NewtonMetres,
+    Newtons,
+    Radians,
+    RadiansPerSecond,
+    RevRate,
+    RevsPerSecond,
+)
+from residnet.physics.actuators.base import (
+    ActuatorConfig,
+    Actuators,
     Coefficients,
     CurveRange,
+    FirstOrderConfig,
+    ForceActuators,
+    ImmediateConfig,
+    SecondOrderConfig,
+    Servo,
+    ServoConfig,
     ThrustCurve,
     require_range,
 )
+
+_TABLE = 401
+"""Points of the thrust curve from which its inverse starts; between them it is known to rise."""
+_NEWTON_STEPS = 4
+"""Steps of Newton's method; each doubles the digits that a line between two points has."""
+
+
+def _different(names: Sequence[str]) -> None:
+    if repeated := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"two thrusters are named '{repeated[0]}'")
 
 
 class ThrusterConfig(ServoConfig):
@@ -67,76 +95,344 @@ class ThrustersConfig(ActuatorConfig):
 
     @model_validator(mode="after")
     def _names(self) -> ThrustersConfig:
-        names = [thruster.name for thruster in self.thrusters]
-        if repeated := [name for name in names if names.count(name) > 1]:
-            raise ValueError(f"two thrusters are named '{repeated[0]}'")
+        _different([thruster.name for thruster in self.thrusters])
         return self
 
     def build(self) -> Thrusters:
         """Build the module that turns commands into forces."""
-        return Thrusters(self)
+        units = self.thrusters
+        return Thrusters(
+            units, [unit.follow(unit.n_max, unit.n_rate, f"n_{unit.name}") for unit in units]
+        )
+
+
+class DifferentialThrustConfig(ActuatorConfig):
+    """Two fixed thrusters side by side (document 003 section 4.1; revolutions in 1/s).
+
+    The thrust curve is clipped so that thrust never opposes the sense of rotation, which closes the
+    jump that the printed polynomials have at zero (correction W5).
+
+    Attributes:
+        spacing: distance between the thrusters in m.
+        n_max: largest revolutions of either direction in 1/s.
+        n_rate: largest change of revolutions in 1/s^2.
+        forward: coefficients (c0 [N], c1 [N s], c2 [N s^2]) of T = c0 + c1 n + c2 n^2 per thruster,
+            for n > 0.
+        reverse: coefficients for n < 0 (signed).
+        curve_range: revolutions (astern, ahead) in 1/s that the curves were measured between; they
+            must include +-n_max.
+    """
+
+    kind: Literal["differential_thrust"] = "differential_thrust"
+    spacing: Metres = Field(gt=0)
+    n_max: RevsPerSecond = Field(gt=0)
+    n_rate: RevRate = Field(gt=0)
+    forward: Coefficients
+    reverse: Coefficients
+    curve_range: CurveRange | None = None
+
+    @model_validator(mode="after")
+    def _range(self) -> DifferentialThrustConfig:
+        require_range(self)
+        return self
+
+    def build(self) -> Thrusters:
+        """Build the module of a thruster to port and one to starboard, in this order."""
+        units = [
+            ThrusterConfig(
+                name=name, y=y, n_max=self.n_max, forward=self.forward, reverse=self.reverse
+            )
+            for name, y in (("port", -0.5 * self.spacing), ("stbd", 0.5 * self.spacing))
+        ]
+        return Thrusters(units, [units[0].follow(self.n_max, self.n_rate, "n_port", "n_stbd")])
 
 
 @final
 class Thrusters(Actuators):
-    """Revolutions of each thruster -> tau [..., 3]."""
+    """Revolutions n [..., c] of fixed thrusters in 1/s make forces tau [..., 3].
 
-    def __init__(self, config: ThrustersConfig) -> None:
-        super().__init__()
-        units = config.thrusters
+    Source: document 003 eqs. (6), (21), (22), clipped as in correction W5.
+    """
+
+    in_flow = False
+
+    def __init__(self, units: Sequence[ThrusterConfig], servos: Sequence[Servo]) -> None:
+        super().__init__(*servos)
         self.commands = tuple(f"cmd_{unit.name}" for unit in units)
-        self.servos = Servos(
-            [unit.follow(f"n_{unit.name}", unit.n_max, unit.n_rate) for unit in units]
-        )
-        self.state = self.servos.state
-        self.curves = torch.nn.ModuleList(
-            [ThrustCurve(unit.forward, unit.reverse) for unit in units]
-        )
-        angle = torch.tensor([unit.angle for unit in units], dtype=torch.float64)
-        x, y = (
-            torch.tensor([getattr(unit, axis) for unit in units], dtype=torch.float64)
-            for axis in ("x", "y")
-        )
+        self.thrust = ThrustCurve([unit.forward for unit in units], [u.reverse for u in units])
+        x, y, angle, n_max = torch.tensor(
+            [[unit.x, unit.y, unit.angle, unit.n_max] for unit in units], dtype=torch.float64
+        ).unbind(-1)
         along, across = torch.cos(angle), torch.sin(angle)
         lever = x * across - y * along
         self.register_buffer("map", torch.stack((along, across, lever), dim=-1), persistent=False)
-        self.register_buffer(
-            "ahead",
-            torch.where(along.abs() < 1e-9, torch.zeros_like(along), along),
-            persistent=False,
-        )
-        self.register_buffer(
-            "turn",
-            torch.where(lever.abs() < 1e-9, torch.zeros_like(lever), torch.sign(lever)),
-            persistent=False,
-        )
-        self.register_buffer(
-            "n_max",
-            torch.tensor([unit.n_max for unit in units], dtype=torch.float64),
-            persistent=False,
-        )
+        # what a thruster adds to surge and yaw as far as it does so at all
+        wish = torch.stack((along, torch.sign(lever)))
+        small = torch.stack((along, lever)).abs() < 1e-9
+        self.register_buffer("wish", torch.where(small, 0.0, wish), persistent=False)
+        self.register_buffer("n_max", n_max, persistent=False)
         self.map: Tensor
-        self.ahead: Tensor
-        self.turn: Tensor
+        self.wish: Tensor
         self.n_max: Tensor
 
+    def forward(self, n: Tensor) -> Tensor:
+        """Return tau [..., 3] in N, N, N m of revolutions n [..., c] in 1/s."""
+        thrust: Tensor = self.thrust(n)
+        return thrust @ self.map.to(n.dtype)
+
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the revolutions [..., c]: each thruster's share of drive and steer, within +-1."""
-        both = drive.unsqueeze(-1) * self.ahead.to(drive.dtype) + steer.unsqueeze(
-            -1
-        ) * self.turn.to(drive.dtype)
+        """Return the revolutions [..., c]: each thruster's share of drive and steer, within +-1.
+
+        Of two side by side these are mean and difference (document 003 eqs. (30), (31)).
+        """
+        both = torch.stack((drive, steer), dim=-1) @ self.wish.to(drive.dtype)
         return both.clamp(-1.0, 1.0) * self.n_max.to(drive.dtype)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """Return tau [..., 3] in N, N, N m."""
-        n = self.servos.value(a, command)
-        thrust = torch.stack([curve(n[..., i]) for i, curve in enumerate(self.curves)], dim=-1)
-        return thrust @ self.map.to(thrust.dtype)
+        return self.forward(self.positions(a, command))
 
-    def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Return the derivative [..., k] of the states."""
-        return self.servos.rate(a, command)
 
-    def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """Return the states [..., k] after a step of dt seconds."""
-        return self.servos.advance(a, command, dt)
+class PropellerShaftConfig(ServoConfig):
+    """A propeller shaft that turns in either direction.
+
+    Attributes:
+        n_max: largest revolutions of either direction in 1/s.
+        n_rate: largest change of revolutions in 1/s^2; None for at once.
+    """
+
+    n_max: RevsPerSecond = Field(gt=0)
+    n_rate: RevRate | None = Field(default=None, gt=0)
+
+
+class AzimuthConfig(ServoConfig):
+    """The drive that turns a thruster to either side of the bow, not through its limit.
+
+    Attributes:
+        limit: largest angle from the bow in rad.
+        rate: largest rate of turn in rad/s; None for at once.
+    """
+
+    limit: Radians = Field(default=math.pi, gt=0)
+    rate: RadiansPerSecond | None = Field(default=None, gt=0)
+
+
+class PlaceConfig(Config):
+    """The name and place of one thruster.
+
+    Attributes:
+        name: what ends the names of its channels.
+        x: distance forward of the body origin in m.
+        y: distance to starboard of the body origin in m.
+    """
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]*$")
+    x: Metres
+    y: Metres = 0.0
+
+
+class AzimuthThrustersConfig(ActuatorConfig):
+    """Equal thrusters that turn, commanded by revolutions and angles.
+
+    The commands are cmd_n_<name> [1/s], then cmd_alpha_<name> [rad] from the bow, clockwise.
+
+    Attributes:
+        places: of the thrusters.
+        thrust: coefficients c0, c1, ... of the force T = c0 + c1 n + c2 n^2 + ... in N, n in 1/s.
+        curve_range: revolutions (astern, ahead) that the curve was measured between; it must rise
+            between +-n_max.
+        shaft: limits of the revolutions.
+        azimuth: limits of the angles.
+    """
+
+    kind: Literal["azimuth_thrusters"]
+    places: Annotated[tuple[PlaceConfig, ...], Field(min_length=1)]
+    thrust: Annotated[tuple[float, ...], Field(min_length=2)]
+    curve_range: CurveRange | None = None
+    shaft: PropellerShaftConfig
+    azimuth: AzimuthConfig = AzimuthConfig()
+
+    @property
+    def n_max(self) -> float:
+        """Largest revolutions of either direction in 1/s."""
+        return self.shaft.n_max
+
+    @model_validator(mode="after")
+    def _consistent(self) -> AzimuthThrustersConfig:
+        _different([place.name for place in self.places])
+        require_range(self)
+        n = np.linspace(-self.n_max, self.n_max, _TABLE)
+        falling = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
+        if len(falling):
+            raise ValueError(
+                f"thrust falls with the revolutions at {falling[0] * 60:.0f} rpm: a force has no"
+                " one speed there; lower n_max"
+            )
+        if len({(place.x, place.y) for place in self.places}) == 1:
+            raise ValueError(
+                "thrusters at one place cannot make surge, sway and yaw independently; give two"
+                " places"
+            )
+        return self
+
+    def build(self) -> AzimuthThrusters:
+        """Build the module that turns commands into forces."""
+        return AzimuthThrusters(self)
+
+
+@final
+class AzimuthThrusters(ForceActuators):
+    """Revolutions and angles of k thrusters -> tau [..., 3] (document 002 eqs. (5.1), (5.2))."""
+
+    def __init__(self, config: AzimuthThrustersConfig) -> None:
+        shaft, azimuth = config.shaft, config.azimuth
+        names = [place.name for place in config.places]
+        super().__init__(
+            shaft.follow(shaft.n_max, shaft.n_rate, *(f"n_{name}" for name in names)),
+            azimuth.follow(azimuth.limit, azimuth.rate, *(f"alpha_{name}" for name in names)),
+        )
+        self.commands = tuple(f"cmd_{kind}_{name}" for kind in ("n", "alpha") for name in names)
+        self.count = len(names)
+        self.coefficients = list(config.thrust)
+        self.slope = [i * c for i, c in enumerate(config.thrust)][1:]
+        # tau = map [3, 2k] of the components forward, then to starboard, of every thruster
+        ones, zeros = [1.0] * self.count, [0.0] * self.count
+        rows = [
+            ones + zeros,
+            zeros + ones,
+            [-place.y for place in config.places] + [place.x for place in config.places],
+        ]
+        self.register_buffer("map", torch.tensor(rows, dtype=torch.float64), persistent=False)
+        self.map: Tensor
+        self.register_buffer("share", torch.linalg.pinv(self.map), persistent=False)
+        self.share: Tensor
+        grid = torch.linspace(-shaft.n_max, shaft.n_max, _TABLE, dtype=torch.float64)
+        self.register_buffer("table", torch.stack((grid, self.thrust(grid))), persistent=False)
+        self.table: Tensor
+        self.strongest = float(self.table[1, -1])
+
+    def thrust(self, n: Tensor) -> Tensor:
+        """Return the force [N] of one thruster along its axis at revolutions n [1/s], any shape."""
+        return _polynomial(self.coefficients, n)
+
+    def revolutions(self, force: Tensor) -> Tensor:
+        """Return the revolutions n [1/s] within +-n_max that make a force [N], any shape.
+
+        Without gradient.
+        """
+        # Newton's method from a table of the curve, which rises, within the table's interval
+        table = self.table.to(force.dtype)
+        after = torch.searchsorted(table[1].contiguous(), force.contiguous())
+        after = after.clamp(1, table.shape[1] - 1)
+        low, high = table[0][after - 1], table[0][after]
+        share = (force - table[1][after - 1]) / (table[1][after] - table[1][after - 1])
+        n = low + share.clamp(0.0, 1.0) * (high - low)
+        for _ in range(_NEWTON_STEPS):
+            n = n - (self.thrust(n) - force) / _polynomial(self.slope, n)
+            n = torch.minimum(torch.maximum(n, low), high)
+        return n
+
+    def allocate(self, tau: Tensor) -> Tensor:
+        """Return the commands [..., 2k] that make forces tau [..., 3] with the least thrust.
+
+        The sum of squared thrusts is smallest; thrusts beyond the largest saturate.
+        """
+        along, across = (tau @ self.share.to(tau.dtype).T).chunk(2, dim=-1)
+        size = torch.hypot(along, across)
+        angle = torch.where(size > 0, torch.atan2(across, along), torch.zeros_like(size))
+        return torch.cat((self.revolutions(size.clamp(max=self.strongest)), angle), dim=-1)
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Return the commands [..., 2k] for drive and steer, each within +-1.
+
+        Drive is surge force and steer the yaw moment, as shares of what the thrusters make
+        together; each thruster saturates.
+        """
+        lever = self.map[2].abs().sum() / 2.0
+        surge, yaw = drive.clamp(-1, 1) * self.count, steer.clamp(-1, 1) * lever.to(drive.dtype)
+        both = torch.stack((surge, torch.zeros_like(drive), yaw), dim=-1)
+        return self.allocate(both * self.strongest)
+
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        """Return tau [..., 3] in N, N, N m."""
+        return self.asked(self.positions(a, command))
+
+    def asked(self, command: Tensor) -> Tensor:
+        """Return the forces tau [..., 3] that revolutions and angles [..., 2k] ask for."""
+        n, angle = command.chunk(2, dim=-1)
+        thrust = self.thrust(n)
+        parts = torch.cat((thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=-1)
+        return parts @ self.map.to(parts.dtype).T
+
+
+def _polynomial(coefficients: Sequence[float], x: Tensor) -> Tensor:
+    """Return c0 + c1 x + c2 x^2 + ..., any shape."""
+    out = torch.full_like(x, coefficients[-1])
+    for c in coefficients[-2::-1]:
+        out = c + x * out
+    return out
+
+
+class ForceCommandsConfig(ActuatorConfig):
+    """The commands tau_x, tau_y [N], tau_n [N m], each within its limit.
+
+    Attributes:
+        x_max: largest surge force of either direction in N.
+        y_max: largest sway force of either side in N.
+        n_max: largest yaw moment of either side in N m.
+        response: lag of the forces behind the commands; immediate by default.
+    """
+
+    kind: Literal["forces"] = "forces"
+    x_max: Newtons = Field(gt=0)
+    y_max: Newtons = Field(ge=0)
+    n_max: NewtonMetres = Field(gt=0)
+    response: Annotated[
+        ImmediateConfig | FirstOrderConfig | SecondOrderConfig, Field(discriminator="kind")
+    ] = ImmediateConfig()
+
+    def build(self) -> ForceCommands:
+        """Build the module that turns commands into forces."""
+        return ForceCommands(self)
+
+
+@final
+class ForceCommands(ForceActuators):
+    """The forces tau [..., 3], which follow the saturated commands [..., 3].
+
+    With a lag the states are the forces, then what else the response needs.
+    """
+
+    commands = ("tau_x", "tau_y", "tau_n")
+
+    def __init__(self, config: ForceCommandsConfig) -> None:
+        # a lag of second order may overshoot the limits of the commands
+        servo = ServoConfig(response=config.response)
+        super().__init__(
+            servo.follow(math.inf, None, *(f"acting_{name}" for name in self.commands))
+        )
+        limit = torch.tensor([config.x_max, config.y_max, config.n_max], dtype=torch.float64)
+        self.register_buffer("limit", limit, persistent=False)
+        self.limit: Tensor
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Return tau [..., 3] for drive (surge force) and steer (yaw moment), each within +-1."""
+        both = torch.stack((drive, torch.zeros_like(drive), steer), dim=-1)
+        return both.clamp(-1.0, 1.0) * self.limit.to(drive.dtype)
+
+    def allocate(self, tau: Tensor) -> Tensor:
+        """Return the forces tau [..., 3] themselves."""
+        return tau
+
+    def asked(self, command: Tensor) -> Tensor:
+        """Return the commands [..., 3] themselves."""
+        return command
+
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        """Return the forces tau [..., 3] in N, N, N m."""
+        return self.positions(a, command)
+
+    def followed(self, command: Tensor) -> Tensor:
+        """Return the commands [..., 3] within the limits."""
+        limit = self.limit.to(command.dtype)
+        return torch.maximum(torch.minimum(command, limit), -limit)

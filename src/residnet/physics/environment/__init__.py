@@ -1,1 +1,0 @@
-"""The environment that acts on a vessel: wind and waves."""

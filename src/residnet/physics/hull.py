@@ -1,0 +1,515 @@
+"""Vessel files of hulls: rigid body, added mass and terms, as forces or as accelerations.
+
+Sources: document 003 eqs. (5)-(9), corrections W1, W2; document 002 eqs. (2.3)-(2.6), appendix A;
+document 000 eqs. (6.6)-(6.8), corrections H1 to H5; document 004, section 5.2 with its corrections.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar, Literal, final
+
+import torch
+from pydantic import Field, field_validator, model_validator
+from torch import Tensor
+
+from residnet.core.config import Config, MetresPerSecond
+from residnet.core.names import VELOCITY
+from residnet.physics.actuators import ActuatorConfig, ActuatorsConfig, RollingActuatorsConfig
+from residnet.physics.environment import WindLoadsConfig
+from residnet.physics.parameters import (
+    Inertia,
+    Length,
+    Mass,
+    MassArm,
+    MassDensity,
+    Parameter,
+    Volume,
+    above_zero,
+    dimension,
+    of_dimension,
+    unit_text,
+)
+from residnet.physics.plant import ROLLING, Hull, HullPlant
+from residnet.physics.terms import read_rows
+from residnet.physics.vessel_file import VesselFile
+
+GRAVITY = 9.81
+_METRES = {"X": 1, "Y": 1, "K": 2, "N": 2, "u": 1, "v": 1, "r": 0}
+"""Power of metre in the unit of the force or acceleration of each axis."""
+
+
+class RigidBody(Config):
+    """The rigid body: mass, yaw inertia and centre of gravity.
+
+    Attributes:
+        m: mass in kg.
+        I_z: moment of inertia in yaw about the body origin in kg m^2.
+        x_G: centre of gravity ahead of the body origin in m.
+    """
+
+    m: Mass
+    I_z: Inertia
+    x_G: Length
+
+    _positive = field_validator("m", "I_z")(above_zero)
+
+
+class AddedMass(Config):
+    """The hydrodynamic derivatives of the accelerations (SNAME: negative for a normal hull).
+
+    Attributes:
+        X_udot: surge force by surge acceleration in kg.
+        Y_vdot: sway force by sway acceleration in kg.
+        Y_rdot: sway force by yaw acceleration in kg m.
+        N_vdot: yaw moment by sway acceleration in kg m.
+        N_rdot: yaw moment by yaw acceleration in kg m^2.
+    """
+
+    X_udot: Mass
+    Y_vdot: Mass
+    Y_rdot: MassArm
+    N_vdot: MassArm
+    N_rdot: Inertia
+
+
+class TermRows(Config):
+    """The terms of each axis by name, each coefficient in the SI unit that its term asks for."""
+
+    channels: ClassVar[tuple[str, ...]] = VELOCITY
+    mass: ClassVar[int] = 1
+    """Power of mass in the units: 1 for forces, 0 for accelerations."""
+
+    def rows(self) -> list[dict[str, Parameter]]:
+        """Return the terms of each axis."""
+        return [getattr(self, axis) for axis in type(self).model_fields]
+
+    def values(self, factor: float = 1.0) -> list[dict[str, float]]:
+        """Return the coefficients of each axis, times a factor."""
+        return [{term: factor * p.value for term, p in row.items()} for row in self.rows()]
+
+    @model_validator(mode="after")
+    def _units(self) -> TermRows:
+        named = dict(zip(type(self).model_fields, self.rows(), strict=True))
+        for axis, term, factors in read_rows(named, self.channels, functions=False):
+            metres = _METRES[axis] - sum(f.power for f in factors if f.name in ("u", "v"))
+            seconds = -2 + sum(f.power for f in factors if f.name != "phi")
+            unit = named[axis][term].unit
+            if dimension(unit, self.mass) != (metres, seconds):
+                raise ValueError(
+                    f"{axis}.{term}: its unit must be {unit_text(metres, seconds, self.mass)},"
+                    f" given '{unit}'"
+                )
+        return self
+
+
+class Damping(TermRows):
+    """The damping force of each axis as terms of (u, v, r), for example `X: {u: ..., "u|u|": ...}`.
+
+    Positive coefficients brake.
+
+    Attributes:
+        X: coefficients of the surge force, each in the SI unit that its term asks for.
+        Y: coefficients of the sway force.
+        N: coefficients of the yaw moment.
+    """
+
+    X: dict[str, Parameter] = Field(default_factory=dict)
+    Y: dict[str, Parameter] = Field(default_factory=dict)
+    N: dict[str, Parameter] = Field(default_factory=dict)
+
+
+class HullVessel(VesselFile, ABC):
+    """A hull with actuators in the weather.
+
+    A file may name another one as `base` and give only what differs.
+
+    Attributes:
+        actuators: what the vessel is driven and steered by.
+        wind: coefficients of the hull above water; without them the vessel feels no wind.
+    """
+
+    actuators: ActuatorConfig
+    wind: WindLoadsConfig | None = None
+
+    @abstractmethod
+    def hull(self) -> Hull:
+        """Build the hull.
+
+        Raises:
+            ConfigError: where the mass matrix is not positive definite or is singular.
+        """
+
+    def start(self) -> Mapping[str, float]:
+        """Return the states that trials start from, where not at rest."""
+        return {}
+
+    @final
+    def build(self) -> HullPlant:
+        """Build the plant of this vessel.
+
+        Raises:
+            ConfigError: where the mass matrix is not positive definite or is singular.
+        """
+        wind = self.wind.build() if self.wind is not None else None
+        return HullPlant(self.hull(), self.actuators.build(), wind, self.start())
+
+
+class HullConfig(HullVessel, ABC):
+    """A 3-DOF vessel M nu_dot + C(nu) nu + D(nu) nu = tau.
+
+    A file may name another one as `base` and give only what differs.
+
+    Attributes:
+        scale: what M, C and D are all multiplied by: a true vessel beside the believed one of its
+            `base` (document 002 eq. (4.2)).
+        damping: terms of D(nu) nu.
+        actuators: what the vessel is driven and steered by.
+    """
+
+    scale: float = Field(default=1.0, gt=0)
+    damping: Damping
+    actuators: ActuatorsConfig
+
+    @abstractmethod
+    def mass_matrix(self) -> list[list[float]]:
+        """Return M [3, 3], without the scale."""
+
+    @abstractmethod
+    def coupling(self) -> float:
+        """Return the factor of r in the sway momentum of C(nu), in kg m, without the scale."""
+
+    @final
+    def hull(self) -> Hull:
+        """Build the hull, with the Coriolis matrix in Fossen's skew form of the mass matrix.
+
+        Inertia does no work where that is symmetric.
+        """
+        mass = [[self.scale * value for value in row] for row in self.mass_matrix()]
+        (surge, sway), cross = (mass[0][0], mass[1][1]), self.scale * self.coupling()
+        rows = self.damping.values(-self.scale)
+        for row, coriolis in zip(
+            rows,
+            ({"v r": sway, "r^2": cross}, {"u r": -surge}, {"u v": surge - sway, "u r": -cross}),
+            strict=True,
+        ):
+            for term, value in coriolis.items():
+                row[term] = row.get(term, 0.0) + value
+        return Hull(mass, rows, VELOCITY, self.name)
+
+
+@final
+class FossenConfig(HullConfig):
+    """A 3-DOF vessel in matrix form.
+
+    Attributes:
+        rigid_body: mass, inertia and centre of gravity.
+        added_mass: hydrodynamic derivatives of the accelerations.
+    """
+
+    kind: Literal["fossen"]
+    rigid_body: RigidBody
+    added_mass: AddedMass
+
+    def mass_matrix(self) -> list[list[float]]:
+        """Return rigid body and added mass, [3, 3]."""
+        body, added = self.rigid_body, self.added_mass
+        m, arm = body.m.value, body.m.value * body.x_G.value
+        return [
+            [m - added.X_udot.value, 0.0, 0.0],
+            [0.0, m - added.Y_vdot.value, arm - added.Y_rdot.value],
+            [0.0, arm - added.N_vdot.value, body.I_z.value - added.N_rdot.value],
+        ]
+
+    def coupling(self) -> float:
+        """Return the mean of m23 and m32, which makes C that of the symmetric part of M.
+
+        Source: Fossen 2011, section 6.3.
+        """
+        mass = self.mass_matrix()
+        return 0.5 * (mass[1][2] + mass[2][1])
+
+
+class MassEntries(Config):
+    """The mass matrix with added mass; the entries that are not here are zero.
+
+    Attributes:
+        m11: surge in kg.
+        m22: sway in kg.
+        m23: sway force by yaw acceleration in kg m.
+        m32: yaw moment by sway acceleration in kg m.
+        m33: yaw in kg m^2.
+    """
+
+    m11: Mass
+    m22: Mass
+    m23: MassArm
+    m32: MassArm
+    m33: Inertia
+
+
+@final
+class MassMatrixConfig(HullConfig):
+    """A 3-DOF vessel whose mass matrix was identified as a whole, as that of milliAmpere.
+
+    Attributes:
+        mass: entries of the mass matrix.
+
+    Source: document 002 eqs. (2.3)-(2.6), appendix A.
+    """
+
+    kind: Literal["mass_matrix"]
+    mass: MassEntries
+
+    def mass_matrix(self) -> list[list[float]]:
+        """Return the mass matrix [3, 3] of the file; it need not be symmetric."""
+        m = self.mass
+        return [
+            [m.m11.value, 0.0, 0.0],
+            [0.0, m.m22.value, m.m23.value],
+            [0.0, m.m32.value, m.m33.value],
+        ]
+
+    def coupling(self) -> float:
+        """Return m23 alone, as (2.5) has it (correction J4)."""
+        return self.mass.m23.value
+
+
+class Gains(Config):
+    """The acceleration per force or moment on each axis.
+
+    Attributes:
+        x: surge in 1/kg.
+        y: sway in 1/kg.
+        n: yaw in 1/(kg m^2).
+    """
+
+    x: Parameter
+    y: Parameter
+    n: Parameter
+
+    _linear = field_validator("x", "y")(of_dimension(-1, 0, 0))
+    _angular = field_validator("n")(of_dimension(-1, -2, 0))
+    _positive = field_validator("x", "y", "n")(above_zero)
+
+
+class AccelerationTerms(TermRows):
+    """The accelerations without force as terms of (u, v, r); terms that brake are negative.
+
+    Attributes:
+        u: terms of the surge acceleration, each in the SI unit that its term asks for.
+        v: terms of the sway acceleration.
+        r: terms of the yaw acceleration.
+    """
+
+    mass = 0
+
+    u: dict[str, Parameter] = Field(default_factory=dict)
+    v: dict[str, Parameter] = Field(default_factory=dict)
+    r: dict[str, Parameter] = Field(default_factory=dict)
+
+
+@final
+class OdinConfig(HullVessel):
+    """A 3-DOF vessel known by its accelerations, nu_dot = gain tau + terms of the velocities.
+
+    A file may name another one as `base` and give only what differs.
+
+    Attributes:
+        gains: acceleration per force.
+        terms: acceleration without force.
+        actuators: what the vessel is driven and steered by.
+    """
+
+    kind: Literal["odin"]
+    gains: Gains
+    terms: AccelerationTerms
+    actuators: ActuatorsConfig
+
+    def hull(self) -> Hull:
+        """Build the hull, whose masses are one over the gains."""
+        mass = [1.0 / gain.value for gain in (self.gains.x, self.gains.y, self.gains.n)]
+        rows = [
+            {term: m * value for term, value in row.items()}
+            for m, row in zip(mass, self.terms.values(), strict=True)
+        ]
+        return Hull(
+            torch.diag(torch.tensor(mass, dtype=torch.float64)).tolist(), rows, VELOCITY, self.name
+        )
+
+
+class RollingBody(RigidBody):
+    """The rigid body of a vessel that rolls.
+
+    Attributes:
+        m: mass in kg.
+        I_x: moment of inertia in roll about the body origin in kg m^2.
+        I_z: moment of inertia in yaw about the body origin in kg m^2.
+        x_G: centre of gravity ahead of the body origin in m.
+        z_G: centre of gravity below the body origin in m; negative above it.
+    """
+
+    I_x: Inertia
+    z_G: Length
+
+    _positive_roll = field_validator("I_x")(above_zero)
+
+
+class RollingAddedMass(AddedMass):
+    """The hydrodynamic derivatives of the accelerations in surge, sway, roll and yaw (SNAME).
+
+    Attributes:
+        X_udot: surge force by surge acceleration in kg.
+        Y_vdot: sway force by sway acceleration in kg.
+        Y_pdot: sway force by roll acceleration in kg m.
+        Y_rdot: sway force by yaw acceleration in kg m.
+        K_vdot: roll moment by sway acceleration in kg m.
+        K_pdot: roll moment by roll acceleration in kg m^2.
+        K_rdot: roll moment by yaw acceleration in kg m^2.
+        N_vdot: yaw moment by sway acceleration in kg m.
+        N_pdot: yaw moment by roll acceleration in kg m^2.
+        N_rdot: yaw moment by yaw acceleration in kg m^2.
+    """
+
+    Y_pdot: MassArm
+    K_vdot: MassArm
+    K_pdot: Inertia
+    K_rdot: Inertia
+    N_pdot: Inertia
+
+
+class HullForces(TermRows):
+    """The forces of the water on the hull as terms of (u, v, p, r, phi).
+
+    Terms that brake are negative.
+
+    Attributes:
+        X: terms of the surge force, each in the SI unit that its term asks for.
+        Y: terms of the sway force.
+        K: terms of the roll moment.
+        N: terms of the yaw moment.
+    """
+
+    channels = (*ROLLING.velocities, "phi")
+
+    X: dict[str, Parameter] = Field(default_factory=dict)
+    Y: dict[str, Parameter] = Field(default_factory=dict)
+    K: dict[str, Parameter] = Field(default_factory=dict)
+    N: dict[str, Parameter] = Field(default_factory=dict)
+
+
+class Hydrostatics(Config):
+    """Roll restoring K = -rho g V GM phi.
+
+    Attributes:
+        density: of the water.
+        volume: displaced.
+        GM: transverse metacentric height.
+    """
+
+    density: MassDensity
+    volume: Volume
+    GM: Length
+
+    _positive = field_validator("density", "volume", "GM")(above_zero)
+
+    @property
+    def stiffness(self) -> float:
+        """rho g V GM in N m per rad."""
+        return self.density.value * GRAVITY * self.volume.value * self.GM.value
+
+
+@final
+class PatrolConfig(HullVessel):
+    """A vessel in surge, sway, roll and yaw, given by its derivatives.
+
+    Attributes:
+        speed: service speed, which trials start from.
+        actuators: rudders as foils in the propellers' race, or linear ones.
+        hydrostatics: roll restoring.
+        rigid_body: mass, inertia and centre of gravity.
+        added_mass: hydrodynamic derivatives of the accelerations.
+        forces: terms of the forces of the water.
+    """
+
+    kind: Literal["patrol"]
+    speed: MetresPerSecond = Field(gt=0)
+    hydrostatics: Hydrostatics
+    rigid_body: RollingBody
+    added_mass: RollingAddedMass
+    forces: HullForces
+    actuators: RollingActuatorsConfig
+
+    def start(self) -> Mapping[str, float]:
+        """Return the service speed, at which the source's thrust compensates the resistance."""
+        return {"u": self.speed}
+
+    def hull(self) -> Hull:
+        """Build the hull, with the inertia of the rigid body about the origin (eq. (5.12)).
+
+        The water's Coriolis forces are among the terms, as far as the source has them (X_vr).
+        """
+        body, added = self.rigid_body, self.added_mass
+        m = body.m.value
+        along, down = m * body.x_G.value, m * body.z_G.value
+        roll_row = [-(down + added.K_vdot.value), body.I_x.value - added.K_pdot.value]
+        mass = [
+            [m - added.X_udot.value, 0.0, 0.0, 0.0],
+            [
+                0.0,
+                m - added.Y_vdot.value,
+                -(down + added.Y_pdot.value),
+                along - added.Y_rdot.value,
+            ],
+            [0.0, *roll_row, -added.K_rdot.value],
+            [
+                0.0,
+                along - added.N_vdot.value,
+                -added.N_pdot.value,
+                body.I_z.value - added.N_rdot.value,
+            ],
+        ]
+        # centripetal terms of the rigid body, (5.12), and the restoring moment, which (5.17) leaves
+        # out
+        inertia: tuple[dict[str, float], ...] = (
+            {"v r": m, "r r": along, "p r": -down},
+            {"u r": -m},
+            {"u r": down, "phi": -self.hydrostatics.stiffness},
+            {"u r": -along},
+        )
+        rows = self.forces.values()
+        for row, more in zip(rows, inertia, strict=True):
+            for term, value in more.items():
+                row[term] = row.get(term, 0.0) + value
+        return Hull(mass, rows, HullForces.channels, self.name)
+
+
+Phase = Literal["displacement", "semi_displacement", "planing"]
+PHASES: tuple[Phase, ...] = ("displacement", "semi_displacement", "planing")
+BOUNDARIES = (0.4, 1.0)
+"""Froude numbers at which the phases meet (document 000, appendix D).
+
+The document puts the beginning of planing between 1.0 and 1.2.
+"""
+
+
+def froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
+    """Return the fn = sqrt(u^2 + v^2) / sqrt(g L) (9.10), any shape, for a hull of `length` in m.
+
+    Raises:
+        ValueError: where the length is not positive.
+    """
+    if not length > 0:
+        raise ValueError(f"the Froude number needs the length of a hull, given {length:g} m")
+    return torch.hypot(u, v) / math.sqrt(GRAVITY * length)
+
+
+def phase_of(froude: Tensor, boundaries: tuple[float, float] = BOUNDARIES) -> Tensor:
+    """Return the number of the phase in `PHASES` at each Froude number, integers of the same shape.
+
+    A boundary belongs to the phase above it.
+    """
+    edges = torch.tensor(boundaries, dtype=froude.dtype, device=froude.device)
+    return torch.bucketize(froude, edges, right=True)
