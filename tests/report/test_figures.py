@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,16 @@ def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
         "foreign.json",
         "mine.png",
     }
+
+
+def test_no_cell_of_a_surface_is_thinned_out(tmp_path: Path) -> None:
+    x, y = (one.ravel() for one in np.meshgrid(np.arange(30.0), np.arange(31.0)))
+    figure = surfaces()
+    case = Case("yaw", [{"surface": (x, y)}, {}, {}], heights=x + y + 1.0, chosen=(1.0, 1.0))
+    write_figures(tmp_path, [replace(figure, cases=[case])])
+    (again,) = read_figures(tmp_path)
+    assert len(again.cases[0].curves[0]["surface"][0]) == len(again.cases[0].heights) == 930
+    assert json.loads(draw([again]).cases[again.key])["cases"][0]["title"] == "yaw"
 
 
 def test_still_pictures_show_what_is_switched_on() -> None:

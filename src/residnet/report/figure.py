@@ -299,7 +299,11 @@ _PLAIN = ("name", "title", "caption", "chooser", "columns")
 def _stored(figure: Figure, case: Case) -> dict[str, Any]:
     panels = []
     for of_panel in case.curves:
-        light = {name: _light(*curve) for name, curve in of_panel.items()}
+        # every cell of a surface has its height
+        light = {
+            name: curve if figure.looks[name].kind == "cells" else _light(*curve)
+            for name, curve in of_panel.items()
+        }
         # packed curves of NaN alone are gaps
         panels.append(
             packed(
