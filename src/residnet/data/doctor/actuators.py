@@ -121,9 +121,7 @@ def _reversed(log: Record, names: Sequence[str]) -> dict[str, float]:
     thrusts = np.stack([log[name] * np.abs(log[name]) for name in names], axis=-1)
     table = np.column_stack((np.ones(len(log)), u, u * np.abs(u), *drift, thrusts))
     x, y = blocks.integrals(table)(0), blocks.change(u)
-    good = np.isfinite(x).all(axis=1) & np.isfinite(y)
-    x, y = x[good], y[good]
-    if y.size < 40:
+    if (np.isfinite(x).all(axis=1) & np.isfinite(y)).sum() < 40:
         return {}
     known, each = x[:, : -len(names)], x[:, -len(names) :]
 
@@ -189,10 +187,9 @@ def _yaw_fit(log: Record, *further: np.ndarray) -> Fit | None:
     if "wind_speed" in log and "wind_dir" in log:
         side = log["wind_dir"] - (log["psi"] if "psi" in log else np.zeros(len(log)))
         columns += [log["wind_speed"] ** 2 * np.sin(k * side) for k in (1.0, 2.0)]
-    x, y = blocks.integrals(np.stack(columns, axis=-1))(0), blocks.change(r)
-    good = np.isfinite(x).all(axis=1) & np.isfinite(y)
+    found = fit(blocks.integrals(np.stack(columns, axis=-1))(0), blocks.change(r))
     varies = float(np.nanstd(log["delta"])) >= math.radians(1.0)
-    return fit(x[good], y[good]) if good.sum() >= 60 and varies else None
+    return found if found.rest.size >= 60 and varies else None
 
 
 @check("actuators", "rudder_bias", needs=("delta",), certain=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +14,7 @@ from residnet.core.log import Log
 from residnet.data.doctor.findings import Check, Finding, Level, check, share_of
 from residnet.data.doctor.statistics import Record
 from residnet.data.readers.encoding import as_utf8
+from residnet.data.readers.times import parse_numbers, parse_texts
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,8 +111,6 @@ def start(log: Record, found: Check) -> Iterator[Finding]:
 
 
 _NAMED = re.compile(r"date|time|stamp|utc|gps|clock|epoch", re.IGNORECASE)
-# seconds, milliseconds, microseconds and nanoseconds since 1970 of the years 2001 to 2065
-_EPOCHS = {1.0: (1e9, 3e9), 1e-3: (1e12, 3e12), 1e-6: (1e15, 3e15), 1e-9: (1e18, 3e18)}
 _ROWS = 50_000
 # a clock that is off by more than this share misleads
 _LEAST_RATE = 0.005
@@ -175,17 +173,19 @@ def _dated_columns(path: Path) -> pd.DataFrame | None:
 
 
 def _seconds(column: pd.Series) -> np.ndarray:
-    """Return a column of dates as seconds [T]; empty where it holds none."""
+    """Return a column of dates as seconds [T], NaN where empty; no samples where it holds none."""
     import pandas as pd
 
-    if pd.api.types.is_numeric_dtype(column):
-        values = column.to_numpy(dtype=float)
-        middle = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
-        units = [unit for unit, (low, high) in _EPOCHS.items() if low < middle < high]
-        return (values - values[np.isfinite(values)][0]) * units[0] if units else np.zeros(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        dates = pd.to_datetime(column.astype("string"), errors="coerce", utc=True)
-    if dates.notna().mean() < 0.9:
+    try:
+        if pd.api.types.is_numeric_dtype(column):
+            values = column.to_numpy(dtype=float)
+            known = np.isfinite(values)
+            stamps = parse_numbers(values[known])
+            out = np.full(values.size, np.nan)
+            out[known] = stamps.since(0)
+        else:
+            stamps = parse_texts(column.astype("string"), dates=True)
+            out = stamps.since(0)
+    except DataError:
         return np.zeros(0)
-    return np.asarray((dates - dates.dropna().iloc[0]).dt.total_seconds(), dtype=float)
+    return out if stamps.absolute and np.isfinite(out).mean() >= 0.9 else np.zeros(0)

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.signal import find_peaks
 
 from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import (
@@ -23,7 +24,6 @@ from residnet.data.doctor.findings import (
     slip_in_words,
 )
 from residnet.data.doctor.statistics import FEWEST, STEERING, Record, bridged, fit, high
-from residnet.data.outliers import noise_of
 
 _LATITUDE = ("latitude", "lat", "gps_lat", "gnss_lat", "latitude_deg", "lat_deg")
 _LONGITUDE = ("longitude", "lon", "lng", "long", "gps_lon", "gnss_lon", "longitude_deg", "lon_deg")
@@ -157,40 +157,6 @@ def rudder_unit(log: Record, found: Check) -> Iterator[Finding]:
             yield found(text, {"largest": largest})
 
 
-@check("inputs", "outliers")
-def excursions(log: Record, found: Check) -> Iterator[Finding]:
-    """Report values far outside the rest of an input that return within a second."""
-    half = max(round(1.5 / log.step), 3)
-    for name in _driving(log):
-        # a direction may go anywhere at once, as that of a light wind does
-        direction = log.units[name] == "rad" and name not in STEERING
-        if direction or np.isfinite(log[name]).sum() < 10 * half:
-            continue
-        known = bridged(log.t, log[name])
-        padded = np.pad(known, half, mode="edge")
-        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
-        distance = np.abs(known - np.median(windows, axis=1))
-        low, top = (float(value) for value in np.quantile(known, (0.01, 0.99)))
-        beyond = np.maximum(low - known, known - top)
-        least = 0.25 * max(top - low, 1e-12)
-        far = (np.minimum(distance, beyond) > least) & (distance > 8.0 * noise_of(known))
-        change = np.abs(np.diff(known, prepend=known[0], append=known[-1]))
-        for start, stop in zip(*stretches(far), strict=True):
-            # an actuator takes its time, an outlier goes and comes within a step or two
-            edges = change[max(start - 1, 0) : start + 1].max(), change[stop : stop + 2].max()
-            far[start:stop] = min(edges) > 0.5 * distance[start:stop].max()
-        starts, _ = stretches(far)
-        if starts.size:
-            furthest = show(float(known[far][np.argmax(distance[far])]), log.units[name])
-            text = (
-                f"{name} leaves its range for a moment {starts.size} times ({int(far.sum())}"
-                f" samples), to {furthest}"
-            )
-            fix = f"mask them (kind: hampel, channels: [{name}])"
-            figures = {"count": starts.size, "samples": far.sum(), "t": log.t[starts[0]]}
-            yield found(text, figures, fix=fix, at=far, channels=(name,))
-
-
 # words that tell a demand from what the actuator does
 _DEMAND = re.compile(
     r"^(cmd|ref|command|commanded|set|desired)_|_(cmd|ref|command|commanded|set|desired)(?=_|$)"
@@ -252,13 +218,8 @@ def idle(log: Record, found: Check) -> Iterator[Finding]:
     for name in driving:
         still &= np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * high(log[name], 1.0)
     for start, stop in zip(*stretches(still), strict=True):
-        turns, low, top, way = 0, psi[start], psi[start], 0
-        for angle in psi[start : stop + 1].tolist():
-            low, top = min(low, angle), max(top, angle)
-            if way <= 0 and angle - low > _SWING:
-                turns, way, top = turns + (way < 0), 1, angle
-            elif way >= 0 and top - angle > _SWING:
-                turns, way, low = turns + (way > 0), -1, angle
+        run = psi[start : stop + 1]
+        turns = sum(find_peaks(side, prominence=_SWING)[0].size for side in (run, -run))
         if turns >= 2:
             at = np.zeros(len(log), dtype=bool)
             at[start : stop + 1] = True

@@ -140,7 +140,7 @@ def resolution_of(values: np.ndarray) -> float:
 
 
 class Fit(NamedTuple):
-    """A least-squares fit: values [k], their covariance [k, k], what is left [N]."""
+    """A least-squares fit: values [k], their covariance [k, k], what is left of known rows [N]."""
 
     values: np.ndarray
     spread: np.ndarray
@@ -163,19 +163,20 @@ class Fit(NamedTuple):
 
 
 def fit(x: np.ndarray, y: np.ndarray) -> Fit:
-    """Return y [N] fitted by the columns of x [N, k].
+    """Return y [N] fitted by the columns of x [N, k], over the rows that are known.
 
     The covariance is a sandwich over sections: what filters leave hangs together, but not for
     longer than a twentieth of the log. A column of zeros keeps a coefficient of zero.
     """
+    known = np.isfinite(x).all(axis=1) & np.isfinite(y)
+    x, y = x[known], y[known]
     length = np.linalg.norm(x, axis=0)
     size = np.where(length > 0.0, length, 1.0)
     x = x / size
     inverse = np.linalg.pinv(x.T @ x, rcond=1e-10)
     values = inverse @ (x.T @ y)
     rest = y - x @ values
-    first = np.searchsorted(np.arange(y.size) * SECTIONS // y.size, np.arange(SECTIONS))
-    scores = np.add.reduceat(x * rest[:, None], first, axis=0)
+    scores = np.stack([part.sum(axis=0) for part in np.array_split(x * rest[:, None], SECTIONS)])
     spread = inverse @ (scores.T @ scores) @ inverse
     return Fit(values / size, spread / np.outer(size, size), rest)
 

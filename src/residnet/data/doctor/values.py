@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.core.names import STATE
+from residnet.core.names import POSE, STATE
 from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import Check, Finding, Level, check, share_of, show
-from residnet.data.doctor.statistics import MEASURED, Record, resolution_of
+from residnet.data.doctor.statistics import MEASURED, STEERING, Record, resolution_of
 from residnet.data.held import usual_interval
 from residnet.data.outliers import noise_of, spike_cells
 from residnet.data.plausible import beyond_belief, fills
@@ -213,7 +213,8 @@ def _held(log: Record, names: tuple[str, ...]) -> np.ndarray:
     for start, stop in zip(starts, stops, strict=True):
         run = slice(start, stop + 1)
         if stop - start >= shortest:
-            out[run] |= (rare and _noisy(log, names[0])) or _moves(log, names, run)
+            noisy = (rare or names[0] not in POSE) and _noisy(log, names[0])
+            out[run] |= noisy or _moves(log, names, run)
     return out
 
 
@@ -223,30 +224,14 @@ def _noisy(log: Record, name: str) -> bool:
 
 
 def _moves(log: Record, names: tuple[str, ...], run: slice) -> bool:
-    """Return whether channels must have changed over a run.
-
-    A pose must by what the velocities say, any other where it is noisy or goes on far from where it
-    stood.
-    """
-    name, values = names[0], log[names[0]]
-    rates = {"psi": ("r",), "phi": ("p",), "x": ("u", "v"), "y": ("u", "v")}.get(name, ())
-    given = (*rates, *(("psi",) if len(rates) == 2 else ()))
-    if not rates or any(rate not in log for rate in given):
-        after = np.abs(np.diff(values[run.stop - 1 : run.stop + 6]))
-        left = after.size > 3 and after[0] > 5.0 * float(after[1:].max())
-        return bool(_noisy(log, name) or left)
-    dt, count = float(log.t[run.stop - 1] - log.t[run.start]), run.stop - run.start
-    rate = log[rates[0]][run]
-    if len(rates) == 2:
-        ground = (rate + 1j * log["v"][run]) * np.exp(1j * log["psi"][run])
-        rate = np.abs(ground) if len(names) == 2 else ground.real if name == "x" else ground.imag
-    moved = abs(float(np.nanmean(rate))) * dt if np.isfinite(rate).any() else 0.0
-    noise = np.hypot.reduce([log.noise(one) for one in rates]) * dt
-    noise /= np.sqrt(count if len(names) == 1 else 1)
-    steps = np.abs(np.diff(values))
-    resolution = float(np.quantile(steps[steps > 0.0], 0.1)) if (steps > 0.0).any() else 0.0
-    least = _NEGLIGIBLE_ANGLE if name in _ANGLES else 0.0
-    return bool(moved > max(4.0 * noise, 3.0 * resolution, least))
+    """Return whether channels have moved over a run: they go on far from where they stood."""
+    for name in names:
+        change = np.abs(np.diff(log[name]))
+        after = change[run.stop - 1 : run.stop + 5]
+        resolution = float(np.quantile(change[change > 0.0], 0.1)) if (change > 0.0).any() else 0.0
+        if after.size > 3 and after[0] > max(3.0 * float(np.nanmax(after[1:])), 3.0 * resolution):
+            return True
+    return False
 
 
 # share of the rows from which on repeats are no accident, and their longest run
@@ -371,9 +356,18 @@ def single_spikes(log: Record, found: Check) -> Iterator[Finding]:
 
 @check("values", "outliers", spoils=True)
 def outliers(log: Record, found: Check) -> Iterator[Finding]:
-    """Report samples far out of their neighbours, by the rule of the mask `hampel`."""
-    for name in log.measured:
+    """Report samples far out of their neighbours, by the rule of the mask `hampel`.
+
+    An input may jump: its outliers leave the range of all others too.
+    """
+    for name in (*log.measured, *log.inputs):
         far, values = log.spikes(name), log[name]
+        if name not in log.measured:
+            low, top = np.nanquantile(values, (0.01, 0.99))
+            # a direction may go anywhere at once, as that of a light wind does
+            turns = log.units[name] == "rad" and name not in STEERING
+            beyond = np.maximum(low - values, values - top)
+            far = far & (beyond > 0.25 * max(top - low, 1e-12)) & (not turns)
         count = int(far.sum())
         if not count:
             continue
