@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (809, 124),
     "control": (3232, 352),
     "core": (1268, 183),
-    "data": (8100, 738),
+    "data": (7949, 728),
     "documents": (2550, 274),
     "dynamics": (877, 134),
     "export": (2191, 262),

@@ -14,11 +14,10 @@ from planted_channels import CHANNEL_FAULTS, Undecidable
 from random_vessels import random_logs, ship_of
 
 from residnet.core.log import Log
+from residnet.data.channels import beyond_belief, fills, spike_cells, without_spikes
 from residnet.data.doctor import inspect, inspect_together
 from residnet.data.doctor.findings import run
 from residnet.data.doctor.statistics import Record
-from residnet.data.outliers import spike_cells, without_spikes
-from residnet.data.plausible import beyond_belief, fills
 
 
 @cache

@@ -15,8 +15,8 @@ from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.drafting.words import input_channel, state_channel, words_of
-from residnet.data.parts import stretch_of
 from residnet.data.readers import ReaderConfig
+from residnet.data.split import stretch_of
 from residnet.tasks.driving import driving
 
 T = np.arange(0.0, 60.0, 0.2)
@@ -228,8 +228,8 @@ def test_a_second_compass_is_no_input() -> None:
 
 def test_times_of_unix_keep_their_digits(tmp_path: Path) -> None:
     log = Log("log", 1.75e9 + T, {"x": NORTH}, {"x": "m"})
-    first = stretch_of(log, None, 1.75e9 + 20.0)
-    second = stretch_of(log, 1.75e9 + 20.0, None)
+    first = stretch_of(log, -np.inf, 1.75e9 + 20.0)
+    second = stretch_of(log, 1.75e9 + 20.0, np.inf)
     assert first.name != second.name
     assert len(first) + len(second) == len(log)
     path = tmp_path / "log.csv"

@@ -13,8 +13,7 @@ from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.data.doctor import inspect_together
-from residnet.data.parts import log_names
-from residnet.data.split import SplitConfig, check_leaks
+from residnet.data.split import SplitConfig, check_leaks, log_names
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from known_logs import wavy
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
-from residnet.data.division import divided
 from residnet.data.sources import MeasuredLogs, read_logs
+from residnet.data.split import divided
 
 
 def saved(folder: Path, *names: str, seconds: float = 60.0) -> list[Log]:

@@ -15,20 +15,18 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback, report, say
-from residnet.data.division import divided
 from residnet.data.doctor import inspect as examine
 from residnet.data.doctor import inspect_together
 from residnet.data.drafting.questions import Marks, Question
 from residnet.data.drafting.reading import log_files, read_each
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.parts import log_names
 from residnet.data.prepare import PrepareConfig, Prepared
 from residnet.data.prepare import prepare as prepare_log
 from residnet.data.readers import ReaderConfig
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.data.sources import read_logs as read_splits
-from residnet.data.split import SPLITS, check_leaks
+from residnet.data.split import SPLITS, check_leaks, divided, log_names
 from residnet.identification.recipe import Preparation, judging, window_length
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig

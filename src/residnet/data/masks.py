@@ -20,8 +20,7 @@ from pydantic import Field
 from residnet.core.config import Config, Seconds
 from residnet.core.log import Log
 from residnet.core.stretches import stretch_numbers, stretches
-from residnet.data.held import usual_interval
-from residnet.data.outliers import far_from_median, spike_cells, steps_above
+from residnet.data.channels import far_from_median, spike_cells, steps_above, usual_interval
 from residnet.data.readers.base import unwrap
 
 HARD = "hard:"
@@ -234,7 +233,7 @@ class Hampel(Mask):
 class Spike(Mask):
     """Single samples, or pairs, that leave all others and return at once.
 
-    Every run leaves them out by itself (`residnet.data.outliers.spike_cells`).
+    Every run leaves them out by itself (`residnet.data.channels.spike_cells`).
     """
 
     kind: Literal["spike"] = "spike"

@@ -6,23 +6,28 @@ and how old its positions are.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from residnet.core.config import Config, Metres, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, POSE, STATE
-from residnet.data.held import without_held
-from residnet.data.outliers import noise_of, spikes
+from residnet.data.channels import noise_of, spikes, without_held
 from residnet.data.readers.base import unwrap
 from residnet.data.readers.recording import remark
-from residnet.data.sparse_smoother import Track, smooth_track
 
 _DENSE = 0.9
 """Share of the samples that hold a value in a channel that is measured at every sample."""
 _BRIDGED = 3.0
 """Usual intervals between the values of a channel that are bridged."""
+_LEVELS = 10.0 ** (0.5 * np.arange(-8, 5))
+"""Jerk in units of the noise over the cube of the usual interval between positions."""
+_TRIED = 4000
+"""Samples from which the intensity of the jerk is found."""
 
 
 class Antenna(Config):
@@ -72,34 +77,27 @@ def complete_motion(log: Log, config: MotionConfig) -> Log:
         DataError: where these hold hardly a value.
     """
     told = without_held(log)
-    sparse = [name for name in STATE if name in told.channels and not _dense(told[name])]
     lacking = [name for name in STATE if name not in log.channels]
-    if not (sparse or lacking or config.moves):
+    made = {name for name in STATE if name in lacking or not _dense(told[name])}
+    if not (made or config.moves):
         return log
     if missing := [name for name in POSE if name in lacking]:
         raise UsageError(
             f"log {log.name}: no channel {', '.join(missing)}; position and heading are needed,"
             " and give the velocities where these were not measured: name their columns"
         )
-    made = _smoothed(told, config)
-    kept = set(STATE) - set(sparse) - set(lacking) - (set(POSE) if config.moves else set())
-    if config.always:
-        kept = set()
-    new = {name: log[name] if name in kept else made[name] for name in STATE}
-    names = [name for name in STATE if name not in kept]
-    text = f"{', '.join(names)} come from a smoother of the measured motion: " + ", ".join(
-        f"{name} {_told(told, name)}" for name in names
+    made |= set(STATE) if config.always else set(POSE) if config.moves else set()
+    names = [name for name in STATE if name in made]
+    smooth = _smoothed(told, config)
+    text = f"{', '.join(names)} come from a smoother of the measured motion: "
+    text += ", ".join(f"{name} {_told(told, name)}" for name in names)
+    note = remark("note", "smoothed_motion", text, channels=len(names))
+    findings = [*log.meta.get("findings", ()), note]
+    return log.replace(
+        channels={**log.channels, **{n: smooth[n] if n in made else log[n] for n in STATE}},
+        units={**log.units, **{name: CHANNEL_UNITS[name] for name in STATE}},
+        meta={**log.meta, "smoothed": names, "findings": findings},
     )
-    meta = {
-        **log.meta,
-        "smoothed": names,
-        "findings": [
-            *log.meta.get("findings", ()),
-            remark("note", "smoothed_motion", text, channels=len(names)),
-        ],
-    }
-    units = {**log.units, **{name: CHANNEL_UNITS[name] for name in STATE}}
-    return log.replace(channels={**log.channels, **new}, units=units, meta=meta)
 
 
 def fill_sparse(log: Log, names: tuple[str, ...], held: tuple[str, ...]) -> Log:
@@ -115,14 +113,13 @@ def fill_sparse(log: Log, names: tuple[str, ...], held: tuple[str, ...]) -> Log:
         if _dense(values) or known.sum() < 2:
             continue
         at = log.t[known]
-        before = np.clip(np.searchsorted(at, log.t, side="right") - 1, 0, at.size - 1)
-        near = _near(log.t, at)
         if name in held:
+            before = np.clip(np.searchsorted(at, log.t, side="right") - 1, 0, at.size - 1)
             filled = np.where(log.t >= at[0], values[known][before], np.nan)
         else:
             steady = unwrap(values) if log.units[name] == "rad" else values
             filled = np.interp(log.t, at, steady[known], left=np.nan, right=np.nan)
-        new[name] = np.where(near, filled, np.nan)
+        new[name] = np.where(_near(log.t, at), filled, np.nan)
     return log.replace(channels={**log.channels, **new}) if new else log
 
 
@@ -131,10 +128,8 @@ def _dense(values: np.ndarray) -> bool:
 
     One that fails in stretches, and is there at every sample otherwise, counts as such.
     """
-    known = np.flatnonzero(np.isfinite(values))
-    if known.size < 2:
-        return False
-    return bool(np.median(np.diff(known)) == 1 and np.quantile(np.diff(known), _DENSE) == 1)
+    every = np.diff(np.flatnonzero(np.isfinite(values)))
+    return bool(every.size and np.median(every) == 1 and np.quantile(every, _DENSE) == 1)
 
 
 def _told(log: Log, name: str) -> str:
@@ -149,12 +144,16 @@ def _told(log: Log, name: str) -> str:
 def _near(t: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Return [T] bool: samples between values at `at` that are no further apart than usual."""
     usual = float(np.median(np.diff(at)))
-    after = np.searchsorted(at, t, side="left")
     inside = (t >= at[0] - 1e-9) & (t <= at[-1] + 1e-9)
-    right = at[np.clip(after, 0, at.size - 1)]
+    right = at[np.clip(np.searchsorted(at, t, side="left"), 0, at.size - 1)]
     left = at[np.clip(np.searchsorted(at, t, side="right") - 1, 0, at.size - 1)]
-    near: np.ndarray = inside & (right - left <= _BRIDGED * usual * (1.0 + 1e-6))
-    return near
+    return np.asarray(inside & (right - left <= _BRIDGED * usual * (1.0 + 1e-6)))
+
+
+def _turned(x: np.ndarray, y: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return vectors [T] turned by angles [T]."""
+    c, s = np.cos(angle), np.sin(angle)
+    return c * x - s * y, s * x + c * y
 
 
 def _smoothed(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
@@ -170,55 +169,149 @@ def _smoothed(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
             f"log {log.name}: {fixes.size} positions and {headings.size} headings, at least 5 of"
             " each are needed to tell the motion; leave the log out"
         )
-    nothing = np.full(t.size, np.nan)
-    turning = log.channels.get("r", nothing)
-    yaw = smooth_track(t, psi[:, None], turning[:, None], _ratio(psi, turning))
-    clock, index = _with_delay(t, t[fixes], config.delay)
-    angle = np.interp(clock, t, yaw.position[:, 0])
-    seen = np.full((clock.size, 2), np.nan)
-    seen[index] = place[fixes]
-    c, s = np.cos(angle), np.sin(angle)
+    u, v, r = (log.channels.get(name, np.full(t.size, np.nan)) for name in ("u", "v", "r"))
+    ratio = max(noise_of(r), 1e-7) / max(noise_of(psi), 1e-7)
+    turning = smooth_track(t, np.stack((psi, r), axis=1)[:, :, None], (1.0, ratio))
+    heading, rate = turning[:, 0, 0], turning[:, 1, 0]
+    # positions belong to times between the samples where they are older than their row
+    seen_at = t[fixes] - config.delay
+    clock = np.union1d(t, seen_at) if config.delay else t
+    at, angle = np.searchsorted(clock, t), np.interp(clock, t, heading)
+    seen = np.full((clock.size, 2, 2), np.nan)
+    seen[np.searchsorted(clock, seen_at), 0] = place[fixes]
     lever = config.antenna or Antenna()
-    seen -= np.stack((c * lever.x - s * lever.y, s * lever.x + c * lever.y), axis=1)
-    track = _translation(log, clock, seen, angle)
-    at = np.searchsorted(clock, t)
-    speed = track.rate[at]
-    c, s = np.cos(yaw.position[:, 0]), np.sin(yaw.position[:, 0])
-    motion = {
-        "x": track.position[at, 0],
-        "y": track.position[at, 1],
-        "psi": yaw.position[:, 0],
-        "u": c * speed[:, 0] + s * speed[:, 1],
-        "v": c * speed[:, 1] - s * speed[:, 0],
-        "r": yaw.rate[:, 0],
-    }
-    there = _near(t, t[fixes] - config.delay) & _near(t, t[headings])
-    return {name: np.where(there, values, np.nan) for name, values in motion.items()}
-
-
-def _translation(log: Log, clock: np.ndarray, seen: np.ndarray, angle: np.ndarray) -> Track:
-    """Return the track of the centre from positions [C, 2] and the log's u, v where it has both."""
-    rates = np.full_like(seen, np.nan)
+    seen[:, 0] -= np.stack(_turned(np.array(lever.x), np.array(lever.y), angle), axis=1)
     ratio = 1.0
-    if {"u", "v"} <= set(log.channels):
-        at = np.searchsorted(clock, log.t)
-        c, s = np.cos(angle[at]), np.sin(angle[at])
-        u, v = log["u"], log["v"]
-        rates[at] = np.stack((c * u - s * v, s * u + c * v), axis=1)
-        places = seen[np.isfinite(seen).all(axis=1)]
+    if "u" in log.channels and "v" in log.channels:
+        seen[at, 1] = np.stack(_turned(u, v, angle[at]), axis=1)
+        places = seen[np.isfinite(seen[:, 0]).all(axis=1), 0]
         noise = max(noise_of(places[:, 0]), noise_of(places[:, 1]))
         ratio = max(noise_of(u), noise_of(v), 1e-6) / max(noise, 1e-6)
-    return smooth_track(clock, seen, rates, ratio)
+    track = smooth_track(clock, seen, (1.0, ratio))[at]
+    u, v = _turned(track[:, 1, 0], track[:, 1, 1], -heading)
+    there = _near(t, seen_at) & _near(t, t[headings])
+    motion = zip(STATE, (track[:, 0, 0], track[:, 0, 1], heading, u, v, rate), strict=True)
+    return {name: np.where(there, values, np.nan) for name, values in motion}
 
 
-def _ratio(position: np.ndarray, rate: np.ndarray) -> float:
-    """Return the noise of a rate over that of what it is the rate of, 1/s."""
-    return max(noise_of(rate), 1e-7) / max(noise_of(position), 1e-7)
+def smooth_motion(seen: np.ndarray, noise: Sequence[float], dt: float) -> np.ndarray:
+    """Return the smoothed motion [N, 9] from x, y, psi, u, v, r, u_dot, v_dot, r_dot [N, 9], SI.
+
+    Heading and its rates are smoothed first, then north and east in the earth with the smoothed
+    heading.
+
+    Args:
+        seen: measured, the heading unwrapped; a quantity without a measurement has an infinite
+            noise.
+        noise: standard deviations of the nine.
+        dt: sampling interval in s.
+
+    Raises:
+        DataError: where a value is not finite.
+    """
+    if not np.isfinite(seen).all():
+        row, column = (int(part[0]) for part in np.nonzero(~np.isfinite(seen)))
+        raise DataError(
+            f"measured motion: column {column} is not finite at sample {row}; mask or fill the gap"
+            " first"
+        )
+    t, spread = dt * np.arange(len(seen)), np.asarray(noise)
+    x, y, psi, u, v, r, along, across, turning = seen.T
+    yaw = np.stack((psi, r, turning), axis=1)[:, :, None]
+    psi, r, turning = smooth_track(t, yaw, spread[[2, 5, 8]])[:, :, 0].T
+    rates = _turned(u, v, psi), _turned(along - r * v, across + r * u, psi)
+    earth = np.moveaxis(np.array(((x, y), *rates)), 2, 0)
+    tracks = [smooth_track(t, earth[:, :, [a]], spread[[a, 3 + a, 6 + a]])[:, :, 0] for a in (0, 1)]
+    (x, north, north_dot), (y, east, east_dot) = (track.T for track in tracks)
+    u, v = _turned(north, east, -psi)
+    along, across = _turned(north_dot, east_dot, -psi)
+    return np.stack((x, y, psi, u, v, r, along + r * v, across - r * u, turning), axis=1)
 
 
-def _with_delay(t: np.ndarray, fixes: np.ndarray, delay: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times of samples and of what the fixes saw, and the places [F] of the latter."""
-    if delay == 0.0:
-        return t, np.searchsorted(t, fixes)
-    clock = np.union1d(t, fixes - delay)
-    return clock, np.searchsorted(clock, fixes - delay)
+def smooth_track(t: np.ndarray, seen: np.ndarray, noise: ArrayLike) -> np.ndarray:
+    """Return smoothed position, rate and acceleration [T, 3, A] along axes measured together.
+
+    A triple integrator driven by white jerk is filtered forwards and smoothed backwards (Rauch,
+    Tung and Striebel, 1965), so that past and future of a sample count alike and nothing lags. The
+    intensity of the jerk, and the size of the noise, are those under which the measurements are
+    likeliest.
+
+    Args:
+        t: times [T] in s, increasing.
+        seen: measured positions, then rates, then accelerations as far as there are any, [T, k, A];
+            a row of NaN where there is no measurement.
+        noise: standard deviations [k], of which ratios count; infinite where nothing is measured.
+    """
+    noise = np.maximum(np.asarray(noise, dtype=np.float64), 1e-9)
+    seen = np.where(np.isfinite(noise)[None, :, None], seen, np.nan)
+    there = np.isfinite(seen).all(axis=2)
+    order = int(np.argmax(there.any(axis=0)))
+    at = t[there[:, order]]
+    usual = float(np.median(np.diff(at))) if at.size > 1 else 1.0
+    jerks = _LEVELS * float(noise[order]) / usual ** (3 - order)
+    head = slice(0, min(t.size, _TRIED))
+    cost, _ = _filtered(t[head], seen[head], noise, jerks)
+    level = int(np.argmin(cost))
+    _, ((xb, pb), (xa, pa)) = _filtered(t, seen, noise, jerks[level : level + 1])
+    steps = _transitions(np.diff(t, prepend=t[0]))
+    gains = pa[:-1] @ steps[1:].transpose(0, 2, 1) @ np.linalg.pinv(pb[1:])
+    for k in range(len(t) - 2, -1, -1):
+        xa[k] += gains[k] @ (xa[k + 1] - xb[k + 1])
+    return xa
+
+
+_States = tuple[np.ndarray, np.ndarray]
+
+
+def _filtered(
+    t: np.ndarray, seen: np.ndarray, noise: np.ndarray, jerks: np.ndarray
+) -> tuple[np.ndarray, tuple[_States, _States]]:
+    """Return the cost of each intensity of jerk [K], and states and covariances of the first.
+
+    Before each sample's measurements and after them: states [T, 3, A], covariances [T, 3, 3].
+    """
+    size, axes, dt = t.size, seen.shape[2], np.diff(t, prepend=t[0])
+    there = np.isfinite(seen).all(axis=2)
+    order = int(np.argmax(there.any(axis=0)))
+    steps, driven = _transitions(dt), jerks[:, None, None] ** 2 * _driven(dt)[:, None]
+    known = seen[there[:, order], order]
+    x = np.zeros((jerks.size, 3, axes))
+    x[:, order] = known[0]
+    # nothing is known of what is not measured at the start
+    wide = float(np.ptp(known, axis=0).max(initial=0.0)) + 1.0
+    p = np.tile(wide**2 * np.eye(3), (jerks.size, 1, 1))
+    before = np.empty((size, 3, axes)), np.empty((size, 3, 3))
+    after = np.empty((size, 3, axes)), np.empty((size, 3, 3))
+    misfit, spread = np.zeros(jerks.size), np.zeros(jerks.size)
+    variance = noise**2
+    for k in range(size):
+        if k:
+            x, p = steps[k] @ x, steps[k] @ p @ steps[k].T + driven[k]
+        before[0][k], before[1][k] = x[0], p[0]
+        for row in np.flatnonzero(there[k]):
+            innovation = p[:, row, row] + variance[row]
+            gain = p[:, :, row] / innovation[:, None]
+            miss = seen[k, row] - x[:, row]
+            x = x + gain[:, :, None] * miss[:, None, :]
+            p = p - gain[:, :, None] * p[:, row, None, :]
+            misfit += (miss**2).sum(axis=1) / innovation
+            spread += axes * np.log(innovation)
+        after[0][k], after[1][k] = x[0], p[0]
+    # the size of the noise is the one that suits each intensity best
+    count = axes * int(there.sum())
+    cost = count * np.log(np.maximum(misfit / max(count, 1), 1e-60)) + spread
+    return cost, (before, after)
+
+
+def _transitions(dt: np.ndarray) -> np.ndarray:
+    """Return the transition over each step, [T, 3, 3]."""
+    out = np.tile(np.eye(3), (dt.size, 1, 1))
+    out[:, 0, 1] = out[:, 1, 2] = dt
+    out[:, 0, 2] = dt**2 / 2
+    return out
+
+
+def _driven(dt: np.ndarray) -> np.ndarray:
+    """Return the covariance that white jerk of unit intensity adds over each step, [T, 3, 3]."""
+    a, b, c, d, e = dt**5 / 20, dt**4 / 8, dt**3 / 6, dt**3 / 3, dt**2 / 2
+    return np.array([[a, b, c], [b, d, e], [c, e, dt]]).transpose(2, 0, 1)

@@ -19,11 +19,10 @@ from residnet.core.names import STATE
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretch_numbers
 from residnet.data.align import GridConfig, align
+from residnet.data.channels import beyond_belief, without_spikes
 from residnet.data.derivatives import DerivativeConfig, SavitzkyGolay
 from residnet.data.masks import HARD, MaskConfig, apply_masks, scored, segments
 from residnet.data.motion import MotionConfig, complete_motion, fill_sparse
-from residnet.data.outliers import without_spikes
-from residnet.data.plausible import beyond_belief
 from residnet.physics.signals import Signals
 
 # share of the samples at either end of a velocity's range that may be bad

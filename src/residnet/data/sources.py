@@ -12,11 +12,9 @@ from residnet.core.config import Config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.progress import report
-from residnet.data.division import divided
-from residnet.data.parts import data_files, log_names
 from residnet.data.readers import ReaderConfig
 from residnet.data.simulated.trials import SimulatedTrials, simulate
-from residnet.data.split import SplitConfig, check_leaks
+from residnet.data.split import SplitConfig, check_leaks, data_files, divided, log_names
 
 Splits = dict[str, list[Log]]
 

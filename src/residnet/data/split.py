@@ -1,22 +1,135 @@
-"""The split of log files into training, validation and test, and the check that none share data."""
+"""Which logs, and which stretches of them, are for training, validation and test.
+
+Files are named by patterns; a log may be cut in time. Where nobody said which is which they are
+divided here, and no two splits may share measurements.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.arrays.paged import LARGE, forget
-from residnet.core.config import Config, ConfigPath, load_mapping, validate
+from residnet.core.arrays.paged import LARGE, forget, lies_on_disk
+from residnet.core.config import Config, ConfigPath, Seconds, load_mapping, validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import nearest
-from residnet.data.parts import LogPart, Part, matches, parts_of
+from residnet.data.readers.base import files_of
+from residnet.data.readers.detect import LOG_ENDINGS, format_of
 
 SPLITS = ("train", "validation", "test")
+_ENOUGH = 5
+"""Logs from which whole ones are taken for each split."""
+_SHARES = (("train", 0.0, 0.3), ("validation", 0.3, 0.5), ("train", 0.5, 0.8), ("test", 0.8, 1.0))
+"""Stretches of each log where there are fewer."""
+_COPIED = 100
+"""Rows that two logs may share before one is a copy of part of the other."""
+
+
+class LogPart(Config):
+    """Logs, or a stretch of one, that belong to a split.
+
+    Attributes:
+        log: path or pattern of files, folders and bags, relative to `root`.
+        from: time in s on the log's own clock at which the stretch begins; null for its start.
+        to: time in s at which it ends; null for the log's end.
+        manoeuvre: only logs of this kind of manoeuvre; null for all.
+    """
+
+    log: str
+    start: Seconds | None = Field(default=None, alias="from")
+    stop: Seconds | None = Field(default=None, alias="to")
+    manoeuvre: str | None = None
+
+    @model_validator(mode="after")
+    def _order(self) -> LogPart:
+        if self.start is not None and self.stop is not None and self.stop <= self.start:
+            raise ValueError(
+                f"a stretch from {self.start:.10g} s to {self.stop:.10g} s holds nothing"
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class Part:
+    """One file or recording of a split, or a stretch of it.
+
+    Attributes:
+        path: of the file or folder.
+        start: time at which it begins, s; None for the log's start.
+        stop: time at which it ends, s; None for the log's end.
+        manoeuvre: it is left out unless the log is of this kind; None takes any.
+    """
+
+    path: Path
+    start: float | None = None
+    stop: float | None = None
+    manoeuvre: str | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is the log from end to end."""
+        return self.start is None and self.stop is None
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Times at which it begins and ends, s; infinite for those of the log."""
+        start, stop = self.start, self.stop
+        return -np.inf if start is None else start, np.inf if stop is None else stop
+
+    def overlaps(self, other: Part) -> bool:
+        """Return whether two parts of one log share a stretch of time, whatever its kind."""
+        apart = self.manoeuvre != other.manoeuvre and None not in (self.manoeuvre, other.manoeuvre)
+        return not apart and max(self.ends[0], other.ends[0]) < min(self.ends[1], other.ends[1])
+
+    def of(self, log: Log) -> Log | None:
+        """Return this part of a log; None where the log is of another manoeuvre.
+
+        Raises:
+            DataError: where the stretch holds fewer than two samples.
+        """
+        if self.manoeuvre not in (None, log.manoeuvre):
+            return None
+        return log if self.whole else stretch_of(log, *self.ends)
+
+
+def stretch_of(log: Log, start: float, stop: float) -> Log:
+    """Return the samples of a log with start <= t < stop, under a name of their own.
+
+    Raises:
+        DataError: where there are fewer than two.
+    """
+    inside = (log.t >= start - 1e-9) & (log.t < stop - 1e-9)
+    first, last = float(log.t[0]), float(log.t[-1])
+    ends = [start if np.isfinite(start) else first, stop if np.isfinite(stop) else last]
+    if inside.sum() < 2:
+        raise DataError(
+            f"log {log.name}: {int(inside.sum())} samples from {ends[0]:.10g} s to"
+            f" {ends[1]:.10g} s; the log runs from {first:.10g} s to {last:.10g} s"
+        )
+    name = "_".join([log.name, *(f"{end:.13g}s".replace(".", "p") for end in ends)])
+    part = log.rows(inside).replace(name=name, meta={**log.meta, "stretch": ends})
+    return part.on_disk() if lies_on_disk(log.t) else part
+
+
+def parts_of(root: Path, entries: Sequence[str | LogPart], where: str) -> list[Part]:
+    """Return the parts that a split's entries name, each once.
+
+    Raises:
+        ConfigError: where an entry matches nothing.
+    """
+    out: dict[Part, None] = {}
+    for entry in entries:
+        wanted = entry if isinstance(entry, LogPart) else LogPart(log=entry)
+        for path in matches(root, [wanted.log], where):
+            out[Part(path, wanted.start, wanted.stop, wanted.manoeuvre)] = None
+    return list(out)
 
 
 class SplitConfig(Config):
@@ -120,43 +233,76 @@ def _from_file(file: Path) -> dict[str, tuple[str | LogPart, ...]]:
     for key in content:
         if key not in SPLITS:
             raise ConfigError(f"{file}: unknown split '{key}'{nearest(key, SPLITS)}")
+    out = {}
     for name in SPLITS:
         entries = content.get(name)
-        if (
-            not isinstance(entries, list)
-            or not entries
-            or not all(isinstance(entry, str | dict) for entry in entries)
-        ):
+        listed = entries if isinstance(entries, list) else []
+        if not listed or not all(isinstance(entry, str | dict) for entry in listed):
             raise ConfigError(
                 f"{file}: {name}: expected a list of at least one path or pattern, found"
                 f" {entries!r}"
             )
-    return {
-        name: tuple(
+        out[name] = tuple(
             entry if isinstance(entry, str) else validate(entry, LogPart, f"{file}: {name}")
-            for entry in content[name]
+            for entry in listed
         )
-        for name in SPLITS
-    }
+    return out
 
 
 def _require_distinct(parts: Mapping[str, Sequence[Part]], where: str) -> None:
     """Stop where two splits name the same stretch."""
-    seen: list[tuple[Path, str, Part]] = []
-    for split, members in parts.items():
-        for part in members:
-            real = part.path.resolve()
-            for other, owner, taken in seen:
-                if other == real and owner != split and part.overlaps(taken):
-                    what = "" if part.whole else "the same stretch of "
-                    raise ConfigError(
-                        f"{where}: {what}{part.path} stands in {owner} and in {split}; a"
-                        f" {'file' if part.whole else 'stretch'} belongs to one split"
-                    )
-            seen.append((real, split, part))
+    seen = [(part.path.resolve(), split, part) for split, some in parts.items() for part in some]
+    for number, (real, split, part) in enumerate(seen):
+        for other, owner, taken in seen[:number]:
+            if other == real and owner != split and part.overlaps(taken):
+                what = "" if part.whole else "the same stretch of "
+                raise ConfigError(
+                    f"{where}: {what}{part.path} stands in {owner} and in {split}; a"
+                    f" {'file' if part.whole else 'stretch'} belongs to one split"
+                )
 
 
-def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:
+def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
+    """Return the logs by split (train, validation, test); copies are left out.
+
+    Of each five logs, in the order of their manoeuvres, the third is for validation and the fifth
+    for the test. Where there are fewer than five, each is cut in time: its first three tenths and
+    those from the middle on are for training, the rest for validation and test.
+
+    Raises:
+        DataError: where a log is too short to be cut.
+    """
+    kept = without_copies(logs)
+    out: dict[str, list[Log]] = {split: [] for split in SPLITS}
+    if len(kept) >= _ENOUGH:
+        for place, log in enumerate(sorted(kept, key=lambda log: log.manoeuvre)):
+            out[{2: "validation", 4: "test"}.get(place % 5, "train")].append(log)
+        return out
+    for log in kept:
+        first, length = float(log.t[0]), float(log.t[-1] - log.t[0])
+        # whole numbers read better, where the log is long enough for them
+        digits = max(0, 2 - int(np.log10(max(length, 1e-9))))
+        for split, *shares in _SHARES:
+            low, high = (round(first + share * length, digits) for share in shares)
+            start, stop = low if shares[0] else -np.inf, high if shares[1] < 1.0 else np.inf
+            out[split].append(stretch_of(log, start, stop))
+    return out
+
+
+def without_copies(logs: Sequence[Log]) -> list[Log]:
+    """Return the logs without those whose rows another one holds; the longest stay."""
+    from residnet.data.split import row_hashes
+
+    common = sorted(set.intersection(*(set(log.channels) for log in logs))) if logs else []
+    hashes = [set(row_hashes(log, common).tolist()) if common else set() for log in logs]
+    kept: list[int] = []
+    for i in sorted(range(len(logs)), key=lambda i: -len(logs[i])):
+        if all(len(hashes[i] & hashes[j]) <= _COPIED for j in kept):
+            kept.append(i)
+    return [logs[i] for i in sorted(kept)]
+
+
+def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = _COPIED) -> None:
     """Stop where two logs of different splits hold the same measurements.
 
     Compared are rows of all channels that the logs have in common, without time and with angles
@@ -173,10 +319,8 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:
     from scipy.sparse import coo_array
 
     flat = [(split, log) for split, members in logs.items() for log in members]
-    if len({split for split, _ in flat}) < 2:
-        return
-    common = sorted(set.intersection(*(set(log.channels) for _, log in flat)))
-    if not common:
+    common = sorted(set.intersection(*(set(log.channels) for _, log in flat))) if flat else []
+    if len({split for split, _ in flat}) < 2 or not common:
         return
     one_of = sampling([log for _, log in flat])
     hashes = [np.unique(sampled_hashes(log, common, one_of)) for _, log in flat]
@@ -187,7 +331,7 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:
     shared = np.where(split_of[:, None] != split_of[None, :], (holds.T @ holds).toarray(), 0.0)
     first, second = np.unravel_index(int(np.argmax(shared)), shared.shape)
     (split_a, a), (split_b, b) = flat[first], flat[second]
-    if shared[first, second] == 0.0:
+    if not shared[first, second]:
         return
     same = np.intersect1d(row_hashes(a, common), row_hashes(b, common)).size
     if same > rows:
@@ -230,3 +374,101 @@ def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
             else values + 0.0
         )
     return np.asarray(pd.util.hash_pandas_object(pd.DataFrame(columns), index=False).to_numpy())
+
+
+def logs_below(folder: Path) -> list[Path]:
+    """Return the recordings and files of logs in a folder, in order; a recording is one log."""
+    if format_of(folder) is not None and not _holds_recordings(folder):
+        return [folder]
+    found: list[Path] = []
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            found += logs_below(path)
+        elif path.suffix.lower() in LOG_ENDINGS:
+            found.append(path)
+    return found
+
+
+def _holds_recordings(folder: Path) -> bool:
+    """Return whether the folders in a folder hold files of the same names, as recordings do."""
+    below = [path for path in folder.iterdir() if path.is_dir()]
+    names = [frozenset(f.relative_to(path) for f in files_of(path)) for path in below]
+    return any(names.count(held) > 1 and len(held) > 1 for held in names)
+
+
+def log_names(paths: Iterable[Path]) -> dict[Path, str]:
+    """Return the name of each log: that of its file without the ending, or of its folder.
+
+    Where several files or folders have one name, as with a folder for each trial, the folders above
+    come before it as far as they are needed to tell the logs apart; of files in one folder the
+    ending comes behind it.
+
+    Args:
+        paths: files and recordings; one that is given twice is one log.
+    """
+    given = list(dict.fromkeys(paths))
+    real = {path: path.resolve() for path in given}
+    above = dict.fromkeys(given, 0)
+    beside = Counter((own.parent, path.stem) for own, path in {real[p]: p for p in given}.items())
+    while True:
+        names = {path: _name(path, real[path], above[path], beside) for path in given}
+        owners: dict[str, set[Path]] = {}
+        for path, name in names.items():
+            owners.setdefault(name, set()).add(real[path])
+        again = [
+            path
+            for path, name in names.items()
+            if len(owners[name]) > 1 and above[path] < len(real[path].parents) - 1
+        ]
+        if not again:
+            return names
+        for path in again:
+            above[path] += 1
+
+
+def _name(path: Path, real: Path, above: int, beside: Mapping[tuple[Path, str], int]) -> str:
+    alone = path.is_dir() or beside[real.parent, path.stem] == 1
+    own = (path.name if path.is_dir() else path.stem) if alone else path.name.replace(".", "_")
+    return "_".join([*(parent.name for parent in reversed(real.parents[:above])), own])
+
+
+def data_files(paths: Iterable[Path]) -> list[Path]:
+    """Return the files that logs consist of: those below a folder that is a recording, too."""
+    return [file for path in dict.fromkeys(paths) for file in files_of(path)]
+
+
+def matches(root: Path, patterns: Sequence[str], where: str) -> list[Path]:
+    """Return logs of all patterns, each once: files, recordings, and what lies below folders."""
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        # a plain path may hold characters that a pattern would read otherwise
+        path = root / pattern
+        named = [path] if path.exists() else _globbed(root, pattern, where)
+        logs = [log for one in named for log in (logs_below(one) if one.is_dir() else [one])]
+        if not logs:
+            parent = path.parent
+            near = (
+                nearest(Path(pattern).name, (path.name for path in parent.iterdir()))
+                if parent.is_dir()
+                else f"; there is no folder {parent}"
+            )
+            raise ConfigError(f"{where}: '{pattern}' matches no file in {root}{near}")
+        found.update(dict.fromkeys(logs))
+    return list(found)
+
+
+def _globbed(root: Path, pattern: str, where: str) -> list[Path]:
+    """Return files and recordings below `root` that a pattern matches, in order."""
+    why = "it is an absolute path" if Path(pattern).is_absolute() else ""
+    try:
+        if not why:
+            found = sorted(root.glob(pattern))
+            files = [path for path in found if path.is_file()]
+            return files or [path for path in found if path.is_dir() and format_of(path)]
+    except ValueError as error:
+        why = str(error)
+    raise ConfigError(
+        f"{where}: '{pattern}' is not a pattern relative to {root} ({why}); set `root` instead"
+    )

@@ -17,7 +17,6 @@ from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import POSE, VELOCITY
 from residnet.core.progress import say
-from residnet.data.division import divided, without_copies
 from residnet.data.doctor import inspect
 from residnet.data.drafting.channels import CHANNELS
 from residnet.data.drafting.questions import Answer, Marks
@@ -25,7 +24,7 @@ from residnet.data.drafting.reading import INPUTS, log_files, read_drafted
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers.quantities import QUATERNION
-from residnet.data.split import SPLITS
+from residnet.data.split import SPLITS, divided, without_copies
 from residnet.identification.recipe import Preparation, judging, protocols, window_length
 from residnet.physics.environment import WIND_INPUTS
 from residnet.tasks.driving import driving, lacks

@@ -17,11 +17,11 @@ from residnet.core.progress import say
 from residnet.data.doctor import inspect, inspect_together, inspection, summary
 from residnet.data.drafting.reading import log_files
 from residnet.data.masks import Spike
-from residnet.data.parts import data_files, log_names
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.split import data_files, log_names
 from residnet.dynamics.store import ModelSpec, load_model, model_names
 from residnet.export import exporter
 from residnet.export.vessel import ExportedVessel

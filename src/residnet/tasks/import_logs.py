@@ -13,9 +13,9 @@ from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import report
-from residnet.data.parts import log_names
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.base import files_of
+from residnet.data.split import log_names
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.import_logs import sections

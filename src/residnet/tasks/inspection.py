@@ -27,10 +27,10 @@ from residnet.data.doctor import (
 )
 from residnet.data.drafting.reading import DraftedLogs, log_files, read_each
 from residnet.data.masks import Mask
-from residnet.data.parts import log_names
 from residnet.data.readers.base import LogReader
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.sources import MeasuredLogs
+from residnet.data.split import log_names
 from residnet.tasks.drafting import commented
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.import_logs import ImportConfig

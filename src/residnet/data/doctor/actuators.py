@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from residnet.core.stretches import stretches
+from residnet.data.channels import SIGMA_OF_MAD
 from residnet.data.doctor.findings import Check, Finding, check, correction
 from residnet.data.doctor.statistics import (
     FEWEST,
@@ -24,7 +25,6 @@ from residnet.data.doctor.statistics import (
     high,
     regressors,
 )
-from residnet.data.outliers import SIGMA_OF_MAD
 
 _SURE = 6.0
 _TURN = "turn it in the channel map (sign: -1)"

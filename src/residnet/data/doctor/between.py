@@ -12,6 +12,7 @@ from residnet.core.arrays.paged import LARGE
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.stretches import stretches
+from residnet.data.channels import noise_of
 from residnet.data.doctor.actuators import EARLY, delays, neutral_angle, propellers
 from residnet.data.doctor.clock import EPOCH
 from residnet.data.doctor.excitation import conditioning, in_brackets
@@ -25,7 +26,6 @@ from residnet.data.doctor.findings import (
     slip_in_words,
 )
 from residnet.data.doctor.statistics import MEASURED, Record, apart_from_others, averaged, high
-from residnet.data.outliers import noise_of
 from residnet.data.split import row_hashes, sampled_hashes, sampling
 
 # so many rows in a row that two logs share are no chance

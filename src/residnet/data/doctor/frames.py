@@ -15,6 +15,7 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.core.names import POSE, VELOCITY
+from residnet.data.channels import SIGMA_OF_MAD
 from residnet.data.doctor.findings import (
     Check,
     Finding,
@@ -33,7 +34,6 @@ from residnet.data.doctor.kinematics import (
     yaw_causes,
 )
 from residnet.data.doctor.statistics import FEWEST, Record, agreement, bridged
-from residnet.data.outliers import SIGMA_OF_MAD
 
 # (change of sign, constant angle in deg) -> how a user would say it; psi, y and v reversed cover
 # all, because any two equal the third

@@ -20,9 +20,9 @@ import numpy as np
 import scipy
 
 from residnet.core.log import Log
+from residnet.data.channels import SIGMA_OF_MAD
 from residnet.data.doctor.findings import Check, Finding, Level, correction, with_channels
 from residnet.data.doctor.statistics import FEWEST, SECTIONS, WINDOW, Record, bridged, fit
-from residnet.data.outliers import SIGMA_OF_MAD
 
 LEAST_LAG = 0.2
 """A lag below this matters to no rollout of a vessel, s."""
@@ -235,7 +235,10 @@ def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray) -> dict[str, Cause
     chosen: list[str] = []
     while len(chosen) < _MOST_CAUSES:
         others = [name for name in every if name not in chosen]
-        gain = {name: left(chosen) - left([*chosen, name]) - price[name] for name in others}
+        # of causes that explain the same, as lags of all channels but one and of that one do, the
+        # first counts
+        gain = {n: left(chosen) - left([*chosen, n]) - price[n] for n in others}
+        gain = {n: round(value / energy, 9) for n, value in gain.items()}
         best = max(others, key=lambda name: gain[name], default="")
         if not best or gain[best] <= 0.0:
             break

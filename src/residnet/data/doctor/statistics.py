@@ -15,7 +15,7 @@ import scipy
 
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
-from residnet.data.outliers import SIGMA_OF_MAD, noise_of, spikes
+from residnet.data.channels import SIGMA_OF_MAD, noise_of, spikes
 
 MEASURED = ("x", "y", "psi", "u", "v", "r", "phi", "p", "u_dot", "v_dot", "r_dot")
 """Channels that a sensor or filter measures; all others drive the vessel."""

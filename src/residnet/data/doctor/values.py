@@ -10,11 +10,9 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.core.names import POSE, STATE
 from residnet.core.stretches import stretches
+from residnet.data.channels import beyond_belief, fills, noise_of, spike_cells, usual_interval
 from residnet.data.doctor.findings import Check, Finding, Level, check, share_of, show
 from residnet.data.doctor.statistics import MEASURED, STEERING, Record, resolution_of
-from residnet.data.held import usual_interval
-from residnet.data.outliers import noise_of, spike_cells
-from residnet.data.plausible import beyond_belief, fills
 from residnet.data.readers.base import unwrap
 
 

@@ -21,11 +21,11 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.recordings import draft_recordings
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.parts import log_names, logs_below
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import kind_of
 from residnet.data.readers.recording import Recording
 from residnet.data.readers.tables import column_names
+from residnet.data.split import log_names, logs_below
 
 INPUTS = ("signals", "inputs")
 """Key of a config's inputs."""

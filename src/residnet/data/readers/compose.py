@@ -17,8 +17,8 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, to_si
+from residnet.data.channels import without_fills
 from residnet.data.derivatives import SavitzkyGolay
-from residnet.data.plausible import without_fills
 from residnet.data.readers.base import LogReader, digest, require_samples, unwrap
 from residnet.data.readers.clocks import align_clocks
 from residnet.data.readers.frames import (

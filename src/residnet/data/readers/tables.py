@@ -23,7 +23,7 @@ from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import nearest, shown
 from residnet.core.units import known_unit, to_si
-from residnet.data.plausible import beyond_belief, fills, largest
+from residnet.data.channels import beyond_belief, fills, largest
 from residnet.data.readers.angles import degrees_of, side_signs
 from residnet.data.readers.base import (
     Advance,

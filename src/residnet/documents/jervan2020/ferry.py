@@ -237,7 +237,7 @@ class FerryModelConfig(ResidualModelConfig):
 
     Attributes:
         smooth: estimate the motion from all noisy measurements together before the fit
-            (`residnet.data.motion_smoother`).
+            (`residnet.data.motion`).
         on: name of the model whose remaining residual this one explains (3.26); empty for the
             believed hull.
         fly: fly the course, and the crossing where there is one, with this model as feed-forward.

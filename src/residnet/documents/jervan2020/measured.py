@@ -21,10 +21,9 @@ from residnet.core.errors import ConfigError, DataError, FitError
 from residnet.core.files import read_json
 from residnet.core.layout import ACCELERATIONS, HEADING, PLANAR, POSE, VELOCITIES
 from residnet.core.stretches import stretches
-from residnet.data.parts import log_names, matches
 from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.data.readers import ReaderConfig
-from residnet.data.split import check_leaks
+from residnet.data.split import check_leaks, log_names, matches
 from residnet.documents.cells import beside_published, listed, notes_text, pictures
 from residnet.documents.jervan2020.residual import (
     ABOUT_COEFFICIENTS,

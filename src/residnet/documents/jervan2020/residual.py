@@ -409,7 +409,7 @@ class Record:
 
     def smoothed(self) -> Record:
         """Return the record with the most likely motion under the known noise of the sensors."""
-        from residnet.data.motion_smoother import smooth_motion
+        from residnet.data.motion import smooth_motion
 
         measured = torch.cat((self.pose, self.nu, self.nu_dot), dim=-1)
         motion = torch.from_numpy(smooth_motion(measured.numpy(), self.noise, self.dt))

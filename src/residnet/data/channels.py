@@ -1,4 +1,4 @@
-"""Samples of one channel that stand out: far from their neighbours, or after a large step."""
+"""What single channels hold beside measurements: noise, outliers, spikes, fills, held values."""
 
 from __future__ import annotations
 
@@ -169,3 +169,123 @@ def _spikes(values: np.ndarray, moved: bool) -> np.ndarray:
             out[at[start:stop]] = True
     # many spikes are a fault of the sensor, not of single samples
     return out if out.sum() <= max(3, 0.01 * known.size) else np.zeros_like(out)
+
+
+# what recorders, NetCDF and spreadsheets write where nothing was measured
+_FILLS = np.array(
+    [
+        *(-99.0, -999.0, -9999.0, -99999.0, -999999.0, -99.99, -999.99, -9999.99, -999.9, -999.25),
+        *(999.0, 9999.0, 99999.0, 999999.0, 9999999.0),
+        *(-128.0, -127.0, -32768.0, -32767.0, 32767.0, 32768.0, 65535.0),
+        *(-2147483648.0, -2147483647.0, 2147483647.0, 4294967295.0, -9.2233720368547758e18),
+        *(9.9692099683868690e36, 1e20, -1e20, 1e30, -1e30, 1e31, -1e31, 1e34, -1e34, 1e35, 1e37),
+        *(3.4028234663852886e38, -3.4028234663852886e38),
+        *(1.7976931348623157e308, -1.7976931348623157e308),
+    ]
+)
+_SORTED = np.sort(_FILLS)
+# largest size that any vessel, manoeuvre or site gives a quantity, by its SI unit
+_LARGEST = {
+    "m": 5e7,
+    "m/s": 300.0,
+    "m/s^2": 1e4,
+    "rad": 1e5,
+    "rad/s": 1e3,
+    "rad/s^2": 1e5,
+    "1/s": 1e4,
+    "N": 1e10,
+    "N m": 1e13,
+    "kg": 1e10,
+    "V": 1e7,
+    "A": 1e7,
+    "W": 1e11,
+    "-": 1e15,
+}
+
+
+def fills(values: np.ndarray) -> np.ndarray:
+    """Return [T] bool: cells that hold a usual fill value far from all that was measured.
+
+    Far is by more than the whole range of the other cells, so that a distance of 999 m between
+    900 m and 1100 m is a distance.
+
+    Args:
+        values: a column as it stands in the file [T], NaN where empty.
+    """
+    known = np.isfinite(values)
+    size = np.abs(values)
+    # most columns hold nothing of the kind: one comparison is enough for them
+    if not known.any() or float(size[known].max()) < 99.0:
+        return np.zeros(values.size, dtype=bool)
+    candidate = np.zeros(values.size, dtype=bool)
+    large = np.flatnonzero(known & (size >= 99.0))
+    # single precision keeps seven digits of a fill value
+    near = np.searchsorted(_SORTED, values[large])
+    for offset in (-1, 0):
+        fill = _SORTED[np.clip(near + offset, 0, _SORTED.size - 1)]
+        candidate[large] |= np.abs(values[large] - fill) <= 2e-7 * np.abs(fill)
+    rest = values[known & ~candidate]
+    if not candidate.any() or not rest.size:
+        return np.zeros(values.size, dtype=bool)
+    low, high = float(rest.min()), float(rest.max())
+    span = high - low
+    far: np.ndarray = (values < low - span) | (values > high + span)
+    return np.asarray(candidate & far)
+
+
+def without_fills(values: np.ndarray) -> np.ndarray:
+    """Return a column [T] with NaN in place of its fill values."""
+    filled = fills(values)
+    return np.where(filled, np.nan, values) if filled.any() else values
+
+
+def largest(unit: str) -> float:
+    """Return the largest size of a quantity of this SI unit; infinite where it is not known."""
+    return _LARGEST.get(unit, np.inf)
+
+
+def beyond_belief(values: np.ndarray, unit: str) -> np.ndarray:
+    """Return [T] bool: values that no vessel, manoeuvre or site can have.
+
+    Args:
+        values: a channel [T], SI, NaN where missing.
+        unit: its SI unit; a unit that is not known has no limit.
+    """
+    return np.asarray(np.abs(values) > largest(unit))
+
+
+_TOGETHER = (("x", "y"), ("u", "v"), ("psi",), ("r",))
+"""Channels that come from one sensor: either may rest at a new measurement, both hardly ever do."""
+_FEWEST_INTERVALS = 20
+"""Intervals between measurements that are needed to tell their rule."""
+_ALIKE, _REGULAR = 0.25, 0.9
+"""So large a share of the intervals is the usual one, within this share of it."""
+
+
+def usual_interval(values: np.ndarray) -> float:
+    """Return after how many samples channels [T] or [T, k] change; 1 where there is no rule."""
+    moved = np.diff(values, axis=0) != 0.0
+    every = np.diff(np.flatnonzero(moved if moved.ndim == 1 else moved.any(axis=1)))
+    if every.size < _FEWEST_INTERVALS:
+        return 1.0
+    usual = float(np.median(every))
+    regular = float((np.abs(every - usual) <= _ALIKE * usual).mean()) >= _REGULAR
+    return usual if usual >= 2.0 and regular else 1.0
+
+
+def without_held(log: Log) -> Log:
+    """Return the log with NaN where slow sensors of the motion repeat their last value.
+
+    Such values are late by up to an interval, and their derivative is spikes; left out, they are
+    made from the other sensors like those of any channel that is measured at some samples only.
+    """
+    new: dict[str, np.ndarray] = {}
+    for group in _TOGETHER:
+        names = [name for name in group if name in log.channels]
+        if not names:
+            continue
+        values = log.stack(tuple(names))
+        if usual_interval(values) > 1.0:
+            fresh = np.append(True, (np.diff(values, axis=0) != 0.0).any(axis=1))
+            new |= {name: np.where(fresh, log[name], np.nan) for name in names}
+    return log.replace(channels={**log.channels, **new}) if new else log
