@@ -17,7 +17,7 @@ import residnet
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
     "api": (684, 79),
-    "baselines": (809, 124),
+    "baselines": (794, 117),
     "control": (3232, 352),
     "core": (1268, 183),
     "data": (7949, 728),
@@ -28,7 +28,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "identification": (2106, 220),
     "judge": (1887, 204),
     "manoeuvres": (990, 124),
-    "physics": (2112, 265),
+    "physics": (2021, 258),
     "regression": (1875, 207),
     "report": (2840, 320),
     "runs": (337, 47),

@@ -25,7 +25,7 @@ import torch
 from made_odin import FORCE_TRUTH, JET_TRUTH, Inputs, force_rate, jet_rate, simulate
 from symbolic import FORCE, FORCES, JET, JETS, Log, accelerations, regress, right
 
-from residnet.baselines.equations import EquationsConfig
+from residnet.baselines.given import EquationsConfig
 from residnet.core.config import load_mapping
 from residnet.core.names import to_si
 from residnet.physics.terms import CandidatesConfig, TermLibrary

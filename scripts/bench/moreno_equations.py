@@ -20,7 +20,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from residnet.baselines.equations import EquationsConfig
+from residnet.baselines.given import EquationsConfig
 from residnet.core.config import load_mapping
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.baselines.equations import EquationsConfig
+from residnet.baselines.given import EquationsConfig
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.tasks.fit import FitConfig

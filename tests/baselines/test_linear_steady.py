@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.linalg import expm
 
-from residnet.baselines.linear_steady import LinearSteadyConfig
+from residnet.baselines.steering import LinearSteadyConfig
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 from residnet.regression.solutions import Coefficient

@@ -6,10 +6,9 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from residnet.baselines.mmg import MMGBaseline, MMGConfig
+from residnet.baselines.mmg import PARAMETERS, MMGBaseline, MMGConfig, usual_priors
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
-from residnet.physics.mmg import PARAMETERS, usual_priors
 
 NAMES = ("u", "v", "r", "n", "delta")
 TANKER = {

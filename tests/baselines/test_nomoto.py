@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.baselines.nomoto import NomotoConfig, NomotoSideslipConfig
 from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.steering import NomotoConfig, NomotoSideslipConfig
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics

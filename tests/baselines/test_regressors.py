@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
-from residnet.baselines.still import StillConfig
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples

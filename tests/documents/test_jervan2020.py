@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import residnet
-from residnet.baselines.believed import BelievedConfig
+from residnet.baselines.given import BelievedConfig
 from residnet.control.motion.anticipation import Derivatives, Lag, course, needed_force
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, FitError

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.baselines.still import StillConfig
+from residnet.baselines.given import StillConfig
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
 from residnet.data.align import GridConfig

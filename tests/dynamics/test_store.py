@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.baselines.still import StillConfig
 from residnet.core.errors import ConfigError, UsageError
 from residnet.dynamics.store import ModelSpec, load_model, model_names, rebuilt, save_model
 from residnet.physics.signals import SignalsConfig

@@ -121,7 +121,7 @@ def test_thrust_columns(golden_file: Path) -> None:
     frame = table(golden_file)
     vessel = load_vessel(case_of(golden_file).vessel)
     thrusters = of_kind(vessel.actuators.build(), Thrusters)
-    thrust = thrusters.thrust(tensor(frame, "n_port", "n_stbd") / 60.0).numpy()
+    thrust = thrusters.forces.thrust(tensor(frame, "n_port", "n_stbd") / 60.0).numpy()
     truth = frame[["T_port", "T_stbd"]].to_numpy()
     # the printed polynomial cancels near zero thrust, where only its largest term bounds the
     # rounding
@@ -143,7 +143,9 @@ def test_right_hand_side_row_by_row(golden_file: Path) -> None:
         hull = plant.hull
         nu = x[:, 3:6]
         # a difference of forces cannot be more exact than its largest part
-        parts = plant.actuators(x[:, 6:8]).abs() + hull.terms(nu).abs() @ hull.coefficients.abs()
+        parts = (
+            plant.actuators.forces(x[:, 6:8]).abs() + hull.terms(nu).abs() @ hull.coefficients.abs()
+        )
         size = (parts @ hull.inverse.abs().T).numpy()
     truth = frame[["du", "dv", "dr"]].to_numpy()
     assert (np.abs(rate[:, 3:6] - truth) <= 1e-12 * np.maximum(size, np.abs(truth))).all()

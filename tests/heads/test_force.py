@@ -10,7 +10,7 @@ import pytest
 import torch
 from made_samples import NAMES as SURGE_YAW
 
-from residnet.baselines.believed import BelievedConfig
+from residnet.baselines.given import BelievedConfig
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples

@@ -16,7 +16,7 @@ import torch
 from made_odin import FORCE_TRUTH, MSD_TRUTH, force_logs, msd_log
 from made_samples import NAMES, made
 
-from residnet.baselines.still import StillConfig
+from residnet.baselines.given import StillConfig
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics

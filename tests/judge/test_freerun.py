@@ -10,8 +10,8 @@ import torch
 from made_logs import made, prepared, random_states
 from torch import Tensor
 
+from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.baselines.still import StillConfig
 from residnet.core.log import Log
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_logs import made
 
-from residnet.baselines.still import StillBaseline
+from residnet.baselines.given import StillConfig
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.zero import ZeroHead
@@ -26,7 +26,7 @@ def candidate(name: str, reference: str | None = None) -> Candidate:
     return Candidate(
         name,
         "head",
-        HybridDynamics(signals, StillBaseline(), ZeroHead(), STEP, "euler"),
+        HybridDynamics(signals, StillConfig().build(()), ZeroHead(), STEP, "euler"),
         reference=reference,
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_logs import made, random_states
 
-from residnet.baselines.still import StillBaseline
+from residnet.baselines.given import StillConfig
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.zero import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
@@ -26,7 +26,7 @@ def window(log: int, start: int, stop: int) -> Window:
 
 def candidate(name: str) -> Candidate:
     return Candidate(
-        name, "head", HybridDynamics(SIGNALS, StillBaseline(), ZeroHead(), 0.1, "euler")
+        name, "head", HybridDynamics(SIGNALS, StillConfig().build(()), ZeroHead(), 0.1, "euler")
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from residnet.baselines.still import StillConfig
+from residnet.baselines.given import StillConfig
 from residnet.core.log import Log
 from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.hybrid import HybridDynamics

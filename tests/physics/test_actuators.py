@@ -23,7 +23,7 @@ def thrusters() -> Thrusters:
 
 
 def thrust_of_one(thrusters: Thrusters, n: torch.Tensor) -> torch.Tensor:
-    return thrusters.thrust(n[..., None])[..., 0]
+    return thrusters.forces.thrust(n[..., None])[..., 0]
 
 
 def rpm(*values: float) -> torch.Tensor:
@@ -44,9 +44,9 @@ def test_curve_is_the_printed_one_in_rpm(thrusters: Thrusters) -> None:
 
 
 def test_full_thrust_of_two_is_what_errata_states(thrusters: Thrusters) -> None:
-    tau = thrusters(rpm(2380, 2380))
+    tau = thrusters.forces(rpm(2380, 2380))
     np.testing.assert_allclose(tau, [793.3, 0.0, 0.0], atol=0.1)
-    np.testing.assert_allclose(thrusters(rpm(-2380, -2380)), [-462.6, 0.0, 0.0], atol=0.1)
+    np.testing.assert_allclose(thrusters.forces(rpm(-2380, -2380)), [-462.6, 0.0, 0.0], atol=0.1)
 
 
 def test_dead_band_and_sign(thrusters: Thrusters) -> None:
@@ -65,22 +65,24 @@ def test_dead_band_and_sign(thrusters: Thrusters) -> None:
 
 
 def test_zero_and_not_a_number(thrusters: Thrusters) -> None:
-    assert thrusters.thrust(rpm(0.0, -0.0)).tolist() == [0.0, 0.0]
+    assert thrusters.forces.thrust(rpm(0.0, -0.0)).tolist() == [0.0, 0.0]
 
 
 def test_moment_arm_and_side(thrusters: Thrusters) -> None:
     """Port thrust turns to starboard (r > 0) about half the spacing."""
-    tau = thrusters(rpm(1200, 0))
+    tau = thrusters.forces(rpm(1200, 0))
     force = 3.54e-5 * 1200**2 + 0.084 * 1200 - 3.798
     np.testing.assert_allclose(tau, [force, 0.0, 1.22 * force], rtol=1e-4)
-    np.testing.assert_allclose(thrusters(rpm(0, 1200)), [force, 0.0, -1.22 * force], rtol=1e-4)
+    np.testing.assert_allclose(
+        thrusters.forces(rpm(0, 1200)), [force, 0.0, -1.22 * force], rtol=1e-4
+    )
 
 
 def test_shapes(thrusters: Thrusters) -> None:
     n = torch.rand(3, 5, 2, dtype=torch.float64)
-    assert thrusters(n).shape == (3, 5, 3)
-    assert thrusters(n.float()).dtype == torch.float32
-    np.testing.assert_array_equal(thrusters(n)[1, 2], thrusters(n[1, 2]))
+    assert thrusters.forces(n).shape == (3, 5, 3)
+    assert thrusters.forces(n.float()).dtype == torch.float32
+    np.testing.assert_array_equal(thrusters.forces(n)[1, 2], thrusters.forces(n[1, 2]))
 
 
 def test_rate_limit(thrusters: Thrusters) -> None:

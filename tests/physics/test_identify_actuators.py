@@ -114,7 +114,7 @@ def test_rate_limit_and_dead_time(unit: Thrusters) -> None:
 
 def bollard_test(unit: Thrusters, seed: int, noise: float = 5.0) -> tuple[np.ndarray, np.ndarray]:
     n = np.concatenate((np.linspace(-2380, -200, 12), np.linspace(200, 2380, 12))) / 60
-    pull = 2 * unit.thrust(torch.from_numpy(n)[:, None])[:, 0].numpy()
+    pull = 2 * unit.forces.thrust(torch.from_numpy(n)[:, None])[:, 0].numpy()
     return n, pull + np.random.default_rng(seed).normal(size=n.size) * noise
 
 
@@ -148,7 +148,7 @@ def test_thrust_curves_of_both_directions(
             fit_thrust(*bollard_test(unit, seed), 2), (config.forward, config.reverse), strict=True
         ):
             n = np.linspace(fit.low, fit.high, 50)
-            full = np.abs(unit.thrust(torch.from_numpy(n)[:, None])[:, 0].numpy()).max()
+            full = np.abs(unit.forces.thrust(torch.from_numpy(n)[:, None])[:, 0].numpy()).max()
             known = truth[0] + n * (truth[1] + n * truth[2])
             assert np.abs(fit(n) - known).max() < 0.03 * full
             assert fit.rms == pytest.approx(2.5, rel=0.9)

@@ -108,7 +108,7 @@ def test_order_of_the_wind_columns_is_the_config_s() -> None:
 def test_forces_are_the_vessel_s() -> None:
     signals = build(forces="wam_v_cal")
     w = torch.tensor([[20.0, -10.0]], dtype=torch.float64)
-    tau = load_vessel("wam_v_cal").actuators.build()(w)
+    tau = load_vessel("wam_v_cal").actuators.build().forces(w)
     z = signals(torch.zeros(1, 6, dtype=torch.float64), signals.prepare(w))
     assert torch.equal(z[:, 5:], tau)
 

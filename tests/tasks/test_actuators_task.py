@@ -39,7 +39,7 @@ def config(tmp_path: Path) -> dict[str, Any]:
         }
     ).to_csv(tmp_path / "step.csv", index=False)
     n = np.concatenate((np.linspace(-2380, -200, 15), np.linspace(200, 2380, 15)))
-    pull = 2 * unit.thrust(torch.from_numpy(n / 60)[:, None])[:, 0].numpy() + random.normal(
+    pull = 2 * unit.forces.thrust(torch.from_numpy(n / 60)[:, None])[:, 0].numpy() + random.normal(
         size=n.size
     )
     pd.DataFrame({"rpm": n, "pull": pull / 1000}).to_csv(tmp_path / "bollard.csv", index=False)
@@ -85,8 +85,10 @@ def test_logs_become_lines_of_a_vessel_file(
     vessel = load_vessel("wam_v_cal")
     assert isinstance(vessel, FossenConfig)
     n = torch.linspace(-2300, 2300, 50, dtype=torch.float64) / 60
-    known = of_kind(vessel.actuators.build(), Thrusters).thrust(n[:, None])
-    assert float((found.build().thrust(n[:, None]) - known).abs().max()) < 0.01 * float(known.max())
+    known = of_kind(vessel.actuators.build(), Thrusters).forces.thrust(n[:, None])
+    assert float((found.build().forces.thrust(n[:, None]) - known).abs().max()) < 0.01 * float(
+        known.max()
+    )
     assert found.n_rate * 60 == pytest.approx(1500, rel=0.01)
     numbers = json.loads((tmp_path / "run" / "actuators.json").read_text())
     assert numbers["throttle"]["n_max"]["value"] * 60 == pytest.approx(2380, rel=0.005)

@@ -25,8 +25,8 @@ from made_system import (
 )
 from torch import Tensor
 
+from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
-from residnet.baselines.still import StillConfig
 from residnet.core.errors import DataError, FitError, ResidnetError
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, samples

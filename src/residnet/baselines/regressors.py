@@ -1,4 +1,9 @@
-"""Baselines that are linear in their coefficients, nu_dot = Theta phi(z), regressors by name."""
+"""Baselines that are linear in their coefficients, nu_dot = Theta phi(z), regressors by name.
+
+Single terms such as u r in yaw may have either sign. Where sway and yaw go together in the logs,
+least squares can give such a term a sign that feeds the yaw and let the sway take it out again: the
+fit is good, and the model is not damped.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,6 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres
-from residnet.baselines.damping import own_slopes, undamped, undamped_terms
 from residnet.baselines.sets import Roles, SetName, expand, merged
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
@@ -172,8 +176,9 @@ class RegressorBaseline(ParametricBaseline):
         if not self.dissipative:
             return []
         free = self.free_indices().tolist()
-        found = undamped_terms(self.theta.detach(), own_slopes(self.library, samples))
-        places = [axis * self.library.count + term for axis, term in found]
+        slopes, theta = _own_slopes(self.library, samples), self.theta.detach()
+        found = [(axis, _undamped(theta[axis], slopes[axis])) for axis in range(3)]
+        places = [axis * self.library.count + term for axis, term in found if term is not None]
         return [free.index(place) for place in places if place in free]
 
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
@@ -210,13 +215,39 @@ class RegressorBaseline(ParametricBaseline):
         return Solution(choice, {"theta": theta}, tuple(c for fit in fits for c in fit.table))
 
 
+_POINTS = 400
+
+
+def _own_slopes(library: TermLibrary, samples: Samples) -> Tensor:
+    """Return the slopes [3, K, J] of the terms along u, v and r at samples spread evenly."""
+    z = samples.z[:: max(1, len(samples) // _POINTS)].double()
+    ahead = z.new_zeros(len(VELOCITY), *z.shape)
+    for axis, name in enumerate(VELOCITY):
+        ahead[axis, :, samples.names.index(name)] = 1.0
+    return library.along(z, ahead)
+
+
+def _undamped(theta: Tensor, slopes: Tensor) -> int | None:
+    """Return the term that feeds an axis most where half of the samples feed it; None for none.
+
+    Args:
+        theta: coefficients of the axis, [J].
+        slopes: of the terms along the velocity of the axis, [K, J].
+    """
+    if not len(slopes) or float((slopes @ theta).median()) <= 0.0:
+        return None
+    shares = slopes.mean(0) * theta
+    most = int(shares.argmax())
+    return most if float(shares[most]) > 0.0 else None
+
+
 def _turning(solutions: Sequence[Solution], terms: Sequence[str], slopes: Tensor) -> set[str]:
     """Return the term, if any, that turns an axis' damping about in every solution."""
     found = []
     for one in solutions:
         values = {c.term: c.value for c in one.table}
         theta = torch.tensor([values.get(term, 0.0) for term in terms], dtype=slopes.dtype)
-        term = undamped(theta, slopes)
+        term = _undamped(theta, slopes)
         found.append(set() if term is None else {terms[term]})
     return set.intersection(*found)
 
@@ -319,7 +350,7 @@ class RegressorsConfig(IdentifiedConfig):
             )
 
         fits = []
-        slopes = own_slopes(baseline.library, picked) if self.dissipative else None
+        slopes = _own_slopes(baseline.library, picked) if self.dissipative else None
         for axis in range(len(ACCELERATION)):
             feeding: set[str] = set()
             turning: set[str] = set()

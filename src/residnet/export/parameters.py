@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from residnet.baselines.believed import BelievedBaseline
+from residnet.baselines.given import GivenBaseline
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config_yaml import parse
 from residnet.core.errors import UsageError
@@ -105,7 +105,7 @@ def _linear(spec: ModelSpec, model: HybridDynamics) -> tuple[Matrix, list[str]]:
     if isinstance(baseline, RegressorBaseline):
         theta = (baseline.theta * baseline.allowed).detach().double().numpy()
         return theta, list(baseline.library.terms)
-    if isinstance(baseline, BelievedBaseline):
+    if isinstance(baseline, GivenBaseline) and baseline.library.count:
         return baseline.theta.double().numpy(), list(baseline.library.terms)
     raise UsageError(
         f"model {spec.name}: its baseline '{spec.baseline.kind}' is no sum of terms of velocities"

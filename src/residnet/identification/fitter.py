@@ -15,7 +15,7 @@ from torch import nn
 
 from residnet.baselines import BaselineConfig
 from residnet.baselines.base import ParametricBaseline
-from residnet.baselines.still import StillConfig
+from residnet.baselines.given import StillConfig
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples

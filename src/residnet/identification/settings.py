@@ -14,8 +14,8 @@ from pydantic import (
 
 from residnet.baselines import BaselineConfig
 from residnet.baselines.base import ParametricBaseline
+from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.baselines.still import StillConfig
 from residnet.core.config import Config, Seconds, validate
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest

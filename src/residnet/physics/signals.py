@@ -141,7 +141,7 @@ class Signals(nn.Module):
         columns = config.columns
         self.speed_column = columns.index("wind_speed") if self.wind else 0
         self.direction_column = columns.index("wind_dir") if self.wind else 0
-        self.thrusters: nn.Module = thrusters.build() if thrusters is not None else nn.Identity()
+        self.thrusters: nn.Module = nn.Identity() if thrusters is None else thrusters.build().forces
         names = VELOCITY + config.inputs
         names += FORCE_CHANNELS if self.forces else ()
         names += WIND_CHANNELS if self.wind else ()

@@ -16,7 +16,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.baselines.believed import BelievedConfig, HullEquations
+from residnet.baselines.given import BelievedConfig, HullEquations
 from residnet.control.base import ClosedLoop, GivenReference, Reference
 from residnet.control.guidance.crossing import Crossing, CrossingConfig
 from residnet.control.motion.anticipation import Assisted, Lag, course, needed_force, reference_row

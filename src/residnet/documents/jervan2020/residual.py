@@ -18,7 +18,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.baselines.believed import BelievedConfig, HullEquations
+from residnet.baselines.given import BelievedConfig, HullEquations
 from residnet.control.motion.anticipation import Lag
 from residnet.core.config import Config
 from residnet.core.errors import FitError

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, final
 import numpy as np
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.core.config import (
     Config,
@@ -148,37 +148,47 @@ class DifferentialThrustConfig(ActuatorConfig):
 
 
 @final
-class Thrusters(Actuators):
-    """Revolutions n [..., c] of fixed thrusters in 1/s make forces tau [..., 3].
+class ThrusterForces(nn.Module):
+    """Revolutions n [..., c] of fixed thrusters in 1/s make forces tau [..., 3] in N, N, N m.
 
     Source: document 003 eqs. (6), (21), (22), clipped as in correction W5.
     """
+
+    def __init__(self, units: Sequence[ThrusterConfig]) -> None:
+        super().__init__()
+        self.thrust = ThrustCurve([unit.forward for unit in units], [u.reverse for u in units])
+        rows = [[unit.x, unit.y, unit.angle] for unit in units]
+        x, y, angle = torch.tensor(rows, dtype=torch.float64).unbind(-1)
+        along, across = torch.cos(angle), torch.sin(angle)
+        lever = x * across - y * along
+        self.register_buffer("map", torch.stack((along, across, lever), dim=-1), persistent=False)
+        self.map: Tensor
+
+    def forward(self, n: Tensor) -> Tensor:
+        """Return tau [..., 3] of revolutions n [..., c]."""
+        thrust: Tensor = self.thrust(n)
+        return thrust @ self.map.to(n.dtype)
+
+
+@final
+class Thrusters(Actuators):
+    """Fixed thrusters, each on a shaft of its own or on equal ones."""
 
     in_flow = False
 
     def __init__(self, units: Sequence[ThrusterConfig], servos: Sequence[Servo]) -> None:
         super().__init__(*servos)
         self.commands = tuple(f"cmd_{unit.name}" for unit in units)
-        self.thrust = ThrustCurve([unit.forward for unit in units], [u.reverse for u in units])
-        x, y, angle, n_max = torch.tensor(
-            [[unit.x, unit.y, unit.angle, unit.n_max] for unit in units], dtype=torch.float64
-        ).unbind(-1)
-        along, across = torch.cos(angle), torch.sin(angle)
-        lever = x * across - y * along
-        self.register_buffer("map", torch.stack((along, across, lever), dim=-1), persistent=False)
+        self.forces = ThrusterForces(units)
+        along, _, lever = self.forces.map.unbind(-1)
         # what a thruster adds to surge and yaw as far as it does so at all
         wish = torch.stack((along, torch.sign(lever)))
         small = torch.stack((along, lever)).abs() < 1e-9
+        n_max = torch.tensor([unit.n_max for unit in units], dtype=torch.float64)
         self.register_buffer("wish", torch.where(small, 0.0, wish), persistent=False)
         self.register_buffer("n_max", n_max, persistent=False)
-        self.map: Tensor
         self.wish: Tensor
         self.n_max: Tensor
-
-    def forward(self, n: Tensor) -> Tensor:
-        """Return tau [..., 3] in N, N, N m of revolutions n [..., c] in 1/s."""
-        thrust: Tensor = self.thrust(n)
-        return thrust @ self.map.to(n.dtype)
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the revolutions [..., c]: each thruster's share of drive and steer, within +-1.
@@ -190,7 +200,8 @@ class Thrusters(Actuators):
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """Return tau [..., 3] in N, N, N m."""
-        return self.forward(self.positions(a, command))
+        force: Tensor = self.forces(self.positions(a, command))
+        return force
 
 
 class PropellerShaftConfig(ServoConfig):

@@ -1,0 +1,241 @@
+"""Known parts as they are given: a vessel file's hull, published equations, or nothing at all."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Sequence
+from typing import Annotated, Literal, Self, final
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.baselines.base import Baseline, IdentifiedConfig, require
+from residnet.core.config import Config
+from residnet.core.errors import ConfigError, UsageError
+from residnet.core.layout import zero_acceleration
+from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
+from residnet.core.samples import Samples
+from residnet.physics.hull import HullConfig, OdinConfig
+from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.terms import TermLibrary, parse_term, read_rows
+from residnet.physics.vessel import load_vessel
+from residnet.regression.solutions import Solution
+
+Row = dict[str, float]
+
+
+@final
+class GivenBaseline(Baseline):
+    """A baseline nu_dot = theta [3, J] phi(z) [..., J] whose numbers stay as they were given.
+
+    Args:
+        rows: coefficients of u_dot, v_dot and r_dot by term.
+        names: channels of the model.
+        fitted: whether the numbers were fitted, if to other data (correction E9 of document 000).
+    """
+
+    def __init__(self, rows: Sequence[Row], names: Sequence[str], *, fitted: bool = False) -> None:
+        super().__init__()
+        terms = list(dict.fromkeys(term for row in rows for term in row))
+        self.library = TermLibrary(terms, names)
+        self.fitted = fitted
+        theta = [[row.get(term, 0.0) for term in terms] for row in rows]
+        # a baseline without terms has nothing to store
+        self.register_buffer(
+            "theta",
+            torch.tensor(theta, dtype=torch.float64).reshape(3, len(terms)),
+            persistent=len(terms) > 0,
+        )
+        self.theta: Tensor
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Return nu_dot [..., 3] at channels z [..., nz]."""
+        if self.library.count == 0:
+            return zero_acceleration(z)
+        phi: Tensor = self.library(z)
+        return phi @ self.theta.to(z.dtype).T
+
+    def parameter_count(self) -> list[float]:
+        """Return the number of terms of each axis where they were fitted, else zeros."""
+        return [float(count) * self.fitted for count in (self.theta != 0).sum(1)]
+
+    def mass(self) -> Tensor | None:
+        """Return the inertia [3, 3], the inverse of what forces do to accelerations.
+
+        None where that has no inverse.
+        """
+        terms = self.library.terms
+        columns = [terms.index(name) for name in FORCE_CHANNELS if name in terms]
+        if len(columns) < len(FORCE_CHANNELS):
+            return None
+        by_force = self.theta[:, columns].to(torch.float64)
+        apart = float(torch.linalg.cond(by_force / by_force.abs().amax(0))) < 1e6
+        return torch.linalg.inv(by_force) if apart else None
+
+
+class GivenConfig(IdentifiedConfig, ABC):
+    """A known part of which nothing is identified."""
+
+    @final
+    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+        """Return one solution without numbers: there is nothing to fit."""
+        return [Solution({}, {})]
+
+
+class StillConfig(GivenConfig):
+    """No known part, velocities held: the model `zero`, and a black box where a head is set on it.
+
+    The head learns the whole acceleration.
+    """
+
+    kind: Literal["still"] = "still"
+
+    def build(self, names: Sequence[str]) -> GivenBaseline:
+        """Return the module; it has no parameters."""
+        return GivenBaseline([{}, {}, {}], names)
+
+
+class EquationsConfig(GivenConfig):
+    """Published equations of the accelerations; nothing is identified.
+
+    Examples are eqs. (6.24)-(6.32) and (7.2)-(7.7) of document 000.
+
+    Attributes:
+        u: coefficients of u_dot by term; a term that is left out is zero.
+        v: coefficients of v_dot by term.
+        r: coefficients of r_dot by term.
+        units: units in which the coefficients take channels, where not SI (document 000 has
+            revolutions in rpm).
+        source: where the equations stand.
+    """
+
+    kind: Literal["equations"] = "equations"
+    u: Row = Field(default_factory=dict)
+    v: Row = Field(default_factory=dict)
+    r: Row = Field(default_factory=dict)
+    units: dict[str, str] = Field(default_factory=dict)
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _any(self) -> EquationsConfig:
+        if not (self.u or self.v or self.r):
+            raise ValueError("no axis has a term; give coefficients by term under u, v or r")
+        for name, unit in self.units.items():
+            try:
+                to_si(unit, CHANNEL_UNITS.get(name))
+            except UsageError as error:
+                raise ValueError(f"units.{name}: {error}") from None
+        return self
+
+    def _in_si(self, axis: str, term: str, value: float, names: Sequence[str]) -> float:
+        for factor in parse_term(term, names):
+            if factor.name not in self.units:
+                continue
+            if factor.function:
+                raise ConfigError(
+                    f"baseline 'equations', {axis}, term '{term}': {factor.symbol} needs"
+                    f" {factor.name} in SI; leave its unit out"
+                )
+            value /= to_si(self.units[factor.name]) ** factor.power
+        return value
+
+    def build(self, names: Sequence[str]) -> GivenBaseline:
+        """Return the module with its numbers in SI, for channels `names`.
+
+        Raises:
+            ConfigError: where a term names a channel that the model lacks, or a function of one
+                that is not in SI.
+        """
+        rows = [
+            {term: self._in_si(axis, term, value, names) for term, value in row.items()}
+            for axis, row in zip(VELOCITY, (self.u, self.v, self.r), strict=True)
+        ]
+        return GivenBaseline(rows, names, fitted=True)
+
+
+class HullEquations(Config):
+    """The accelerations of a hull written out, in SI.
+
+    The terms are products of u, v, r, tau_x, tau_y and tau_n.
+
+    Attributes:
+        u: coefficients of u_dot by term.
+        v: coefficients of v_dot by term.
+        r: coefficients of r_dot by term.
+    """
+
+    u: Row
+    v: Row
+    r: Row
+
+    @model_validator(mode="after")
+    def _terms(self) -> HullEquations:
+        read_rows(dict(self), VELOCITY + FORCE_CHANNELS)
+        return self
+
+    def rows(self) -> tuple[Row, Row, Row]:
+        """Return the coefficients of u_dot, v_dot and r_dot."""
+        return self.u, self.v, self.r
+
+
+class BelievedConfig(GivenConfig):
+    """The hull of a vessel file with its parameters as they are (document 002 section 4.1.1).
+
+    A factor on its mass, Coriolis and damping matrices makes it wrong on purpose. Needs the
+    channels tau_x, tau_y and tau_n: as inputs, or made by `signals.forces`.
+
+    Attributes:
+        vessel: name or file of a vessel whose hull is given by matrices or accelerations (kinds
+            fossen, mass_matrix, odin); a saved model has the hull's equations in its place, without
+            the factor.
+        scale: factor on the mass, Coriolis and damping matrices.
+    """
+
+    kind: Literal["believed"] = "believed"
+    vessel: str | HullEquations
+    scale: Annotated[float, Field(gt=0)] = 1.0
+
+    @model_validator(mode="after")
+    def _known(self) -> BelievedConfig:
+        self.equations()
+        return self
+
+    def equations(self) -> HullEquations:
+        """Return the equations of the vessel, without the factor.
+
+        Raises:
+            ValueError: where there is no such vessel, or its hull has no equations of this form.
+        """
+        if isinstance(self.vessel, HullEquations):
+            return self.vessel
+        try:
+            vessel = load_vessel(self.vessel)
+            if not isinstance(vessel, HullConfig | OdinConfig):
+                raise ValueError(
+                    f"vessel: '{self.vessel}' is of kind '{vessel.kind}'; a believed hull needs one"
+                    " of kind fossen, mass_matrix or odin"
+                )
+            terms, coefficients = vessel.hull().equations()
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        u, v, r = (
+            {t: c for t, c in zip((*terms, *FORCE_CHANNELS), row, strict=True) if c != 0.0}
+            for row in coefficients
+        )
+        return HullEquations(u=u, v=v, r=r)
+
+    def resolved(self) -> Self:
+        """Return the config with the equations in place of the vessel's name."""
+        return self.model_copy(update={"vessel": self.equations()})
+
+    def build(self, names: Sequence[str]) -> GivenBaseline:
+        """Return the module with its numbers, for channels `names`."""
+        require(names, (*VELOCITY, *FORCE_CHANNELS), "baseline 'believed'")
+        # M, C and D times one factor: only the forces act differently
+        scales = dict.fromkeys(FORCE_CHANNELS, self.scale)
+        rows = [
+            {term: value / scales.get(term, 1.0) for term, value in row.items()}
+            for row in self.equations().rows()
+        ]
+        return GivenBaseline(rows, names)
