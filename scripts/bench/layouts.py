@@ -30,7 +30,7 @@ from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.tasks.demo import TRIALS
 
 DEG, KN = 180.0 / math.pi, 3600.0 / 1852.0

@@ -25,7 +25,7 @@ from residnet.core.config import validate
 from residnet.core.files import config_folder
 from residnet.core.log import Log
 from residnet.data.prepare import Prepared, prepare
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.identification.fit import fit
 from residnet.identification.models import FittedModel
 from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher, pieces

@@ -26,7 +26,7 @@ from torch import Tensor
 from residnet.core.config import validate
 from residnet.core.errors import ResidnetError
 from residnet.data.prepare import Prepared, samples
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.data.windows import WindowStore
 from residnet.dynamics.actuated import InputShare
 from residnet.identification.fit import fit

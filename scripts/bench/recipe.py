@@ -41,7 +41,7 @@ from residnet.core.config import validate
 from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
 from residnet.data.prepare import Prepared
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.judge.protocol import Window
 
 CHANNELS = {

@@ -26,7 +26,7 @@ from scattered import scattered
 from residnet.core.config import validate
 from residnet.core.log import Log
 from residnet.data.prepare import Prepared
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.identification.fit import fit
 from residnet.identification.identified import Identified
 from residnet.identification.prepared import prepare_logs

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import DataError
-from residnet.data.simulated.environment import Disturbance, WindField
-from residnet.data.simulated.flying import Craft, Sea, fly, log_names
-from residnet.data.simulated.sensors import SensorNoise
+from residnet.data.sea import Disturbance, SensorNoise, WindField
+from residnet.data.simulated import Craft, Sea, fly, log_names
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres.base import Helm, Manoeuvre

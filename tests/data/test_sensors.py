@@ -11,8 +11,8 @@ import pytest
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.data.simulated.sensors import SensorNoise
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.sea import SensorNoise
+from residnet.data.simulated import SimulatedTrials, simulate
 
 TRIALS: dict[str, Any] = {
     "kind": "simulated",

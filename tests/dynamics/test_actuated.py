@@ -17,10 +17,8 @@ from residnet.core.config import validate
 from residnet.core.errors import ConfigError
 from residnet.data.align import GridConfig
 from residnet.data.prepare import PrepareConfig, prepare, samples
-from residnet.data.simulated.environment import Disturbance
-from residnet.data.simulated.flying import Craft, Flight, Sea, fly
-from residnet.data.simulated.sensors import SensorNoise
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.sea import Disturbance, SensorNoise
+from residnet.data.simulated import Craft, Flight, Sea, SimulatedTrials, fly, simulate
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout

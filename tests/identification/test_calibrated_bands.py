@@ -7,7 +7,7 @@ from tiny import TINY
 
 from residnet.core.config import validate
 from residnet.core.errors import FitError
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.identification.bands import FoldModels

@@ -14,7 +14,7 @@ from tiny import TINY, call
 
 from residnet.core.config import validate
 from residnet.core.progress import Progress, listen
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.identification.fit import fit
 from residnet.identification.identified import Identified

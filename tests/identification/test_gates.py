@@ -11,7 +11,7 @@ from tiny import TINY
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics

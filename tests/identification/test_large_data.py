@@ -16,7 +16,7 @@ from tiny import TINY
 from residnet.core.arrays import paged
 from residnet.core.config import validate
 from residnet.core.log import Log
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.data.windows import WindowStore
 from residnet.identification.fit import fit

@@ -13,7 +13,7 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError
 from residnet.core.processes import free_cores, spread
 from residnet.core.progress import Progress, listen
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.identification import fit as parts
 from residnet.identification.fit import fit

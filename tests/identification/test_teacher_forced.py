@@ -9,7 +9,7 @@ from tiny import TINY
 
 from residnet.core.config import validate
 from residnet.data.prepare import channels, samples
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.data.windows import WindowStore
 from residnet.identification.fit import fit

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from residnet.control.motion.pid import MotionPIDConfig
 from residnet.core.errors import UsageError
-from residnet.data.simulated.environment import Disturbance
-from residnet.data.simulated.flying import Craft, Sea, fly
-from residnet.data.simulated.sensors import SensorNoise
+from residnet.data.sea import Disturbance, SensorNoise
+from residnet.data.simulated import Craft, Sea, fly
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics

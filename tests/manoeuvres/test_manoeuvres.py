@@ -25,7 +25,7 @@ from kinds import of_kind
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.log import Log
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres import ManoeuvreConfig

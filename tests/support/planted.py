@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 
 
 @dataclass(frozen=True)

@@ -185,7 +185,7 @@ def csv_logs(tmp_path: Path, trial_logs: list[Log]) -> Path:
 
 @pytest.fixture(scope="session")
 def trial_logs() -> list[Log]:
-    from residnet.data.simulated.trials import SimulatedTrials, simulate
+    from residnet.data.simulated import SimulatedTrials, simulate
     from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne
 
     flown = [

@@ -13,7 +13,7 @@ from tiny import TINY, call
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.tasks.fit import FitConfig
 
 CONFIG: dict[str, Any] = {

@@ -14,7 +14,7 @@ import yaml
 from tiny import call
 
 from residnet.core.config import load_config
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.tasks.fit import FitConfig
 
 pytestmark = pytest.mark.long

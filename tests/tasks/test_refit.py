@@ -11,7 +11,7 @@ import yaml
 from tiny import TINY, call
 
 from residnet.core.config import validate
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.runs.folder import require_sealed
 
 DATA: dict[str, Any] = {

@@ -14,7 +14,7 @@ from tiny import TINY, call
 
 from residnet.core.log import Log
 from residnet.data.readers.canonical import CanonicalConfig
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.tasks.registry import load_task
 
 DATA: dict[str, Any] = copy.deepcopy(TINY["data"])

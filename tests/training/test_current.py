@@ -14,7 +14,7 @@ from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate
 from residnet.core.errors import FitError
 from residnet.data.prepare import PrepareConfig, Prepared, prepare, samples
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.physics.signals import SignalsConfig
 from residnet.training import current as module
 from residnet.training.current import CurrentConfig, estimate_currents, through_water

@@ -23,7 +23,7 @@ from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.prepare import PrepareConfig, Prepared
 from residnet.data.prepare import prepare as prepare_log
 from residnet.data.readers import ReaderConfig
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.data.sources import read_logs as read_splits
 from residnet.data.split import SPLITS, check_leaks, divided, log_names

@@ -19,7 +19,7 @@ from residnet.core.files import read_table
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback
-from residnet.data.simulated.flying import Flight
+from residnet.data.simulated import Flight
 from residnet.heads import HeadConfig
 from residnet.heads.base import FeatureConfig
 from residnet.judge.booklet import index_rows

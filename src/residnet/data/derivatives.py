@@ -6,8 +6,8 @@ the smoothing that goes with it is stated.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import Annotated, Literal, final
+from abc import ABC
+from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
 from pydantic import Field
@@ -18,7 +18,13 @@ from residnet.core.stretches import stretches
 
 
 class Derivative(Config, ABC):
-    """A rule that smooths and differentiates channels on a uniform grid."""
+    """A rule that smooths and differentiates channels on a uniform grid.
+
+    Where it has no smoother the values stay as they are, and where it has no rate of its own that
+    is the difference to the next sample; the last sample of a piece is then invalid.
+    """
+
+    backward: ClassVar[bool] = False
 
     def derive(
         self, values: np.ndarray, step: float, pieces: np.ndarray
@@ -41,26 +47,30 @@ class Derivative(Config, ABC):
         Raises:
             ConfigError: where a window or cut-off does not go with the step.
         """
-        self._check(step)
+        shortest = self.shortest(step)
         smooth, rate = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
-        for start, stop in _runs(values, pieces):
+        runs = stretches(np.where(np.isfinite(values).all(axis=1), pieces, -1))
+        for start, stop in zip(*runs, strict=True):
             part = slice(start, stop)
-            if stop - start >= self._shortest(step):
-                smooth[part], rate[part] = self._piece(values[part], step)
-        valid = np.isfinite(rate).all(axis=1) & (pieces >= 0)
+            if stop - start >= shortest:
+                smooth[part], rate[part] = self.piece(values[part], step)
+        valid = np.isfinite(rate).all(axis=1)
         smooth[~valid], rate[~valid] = np.nan, np.nan
         return smooth, rate, valid
 
-    def _check(self, step: float) -> None:
-        """Raises ConfigError where the rule does not go with the step."""
+    def shortest(self, step: float) -> int:
+        """Return fewest samples of a piece that the rule can treat.
 
-    @abstractmethod
-    def _shortest(self, step: float) -> int:
-        """Return fewest samples of a piece that the rule can treat."""
+        Raises:
+            ConfigError: where the rule does not go with the step.
+        """
+        return 2
 
-    @abstractmethod
-    def _piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the smoothed values and rates of one piece, NaN where the rule has no rate."""
+    def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smoothed values and rates [T, n] of one piece, NaN where there is no rate."""
+        rate = np.full(values.shape, np.nan)
+        rate[1 if self.backward else 0 : None if self.backward else -1] = np.diff(values, axis=0)
+        return values, rate / step
 
 
 @final
@@ -85,7 +95,8 @@ class SavitzkyGolay(Derivative):
         """Return the samples in the window at a time step in s."""
         return round(self.window / step) // 2 * 2 + 1
 
-    def _check(self, step: float) -> None:
+    def shortest(self, step: float) -> int:
+        """Return the samples in the window; see `Derivative.shortest`."""
         if self.samples(step) <= self.order:
             needed = (self.order + 1 | 1) * step
             raise ConfigError(
@@ -93,25 +104,17 @@ class SavitzkyGolay(Derivative):
                 f" of {step:g} s, order {self.order} needs more; set window to {needed:g} s or"
                 " longer"
             )
-
-    def _shortest(self, step: float) -> int:
         return self.samples(step)
 
-    def _piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        size, half = self.samples(step), self.samples(step) // 2
-        # as scipy.signal.savgol_filter, whose import takes longer than most checks
-        powers = np.vander(np.linspace(-1.0, 1.0, size), self.order + 1, increasing=True)
-        fit = np.linalg.pinv(powers)
-        slopes = np.zeros_like(powers)
-        slopes[:, 1:] = powers[:, :-1] * np.arange(1, self.order + 1)
-        first, last = fit @ values[:size], fit @ values[-size:]
-        out = []
-        span = half * step
-        for rows, middle in ((powers, fit[0]), (slopes / span, fit[1] / span)):
-            inner = [np.correlate(column, middle, "valid") for column in values.T]
-            ends = rows[:half] @ first, rows[half + 1 :] @ last
-            out.append(np.concatenate((ends[0], np.stack(inner, axis=1), ends[1])))
-        return out[0], out[1]
+    def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """See `Derivative.piece`."""
+        from scipy.signal import savgol_filter
+
+        smooth, rate = (
+            savgol_filter(values, self.samples(step), self.order, deriv=k, delta=step, axis=0)
+            for k in (0, 1)
+        )
+        return smooth, rate
 
 
 @final
@@ -121,15 +124,8 @@ class BackwardDifference(Derivative):
     The first sample of a piece is invalid.
     """
 
+    backward: ClassVar[bool] = True
     kind: Literal["backward"] = "backward"
-
-    def _shortest(self, step: float) -> int:
-        return 2
-
-    def _piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        rate = np.full(values.shape, np.nan)
-        rate[1:] = np.diff(values, axis=0) / step
-        return values, rate
 
 
 @final
@@ -140,12 +136,6 @@ class ForwardDifference(Derivative):
     """
 
     kind: Literal["forward"] = "forward"
-
-    def _shortest(self, step: float) -> int:
-        return 2
-
-    def _piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        return values, _forward(values, step)
 
 
 @final
@@ -167,26 +157,22 @@ class Butterworth(Derivative):
     order: int = Field(default=2, ge=1, le=8)
     cutoff: Hertz = Field(gt=0.0)
 
-    def _check(self, step: float) -> None:
+    def shortest(self, step: float) -> int:
+        """Return more than the filter's padding; see `Derivative.shortest`."""
         if self.cutoff >= 0.5 / step:
             raise ConfigError(
                 f"butterworth: cutoff {self.cutoff:g} Hz is not below the Nyquist frequency"
                 f" {0.5 / step:g} Hz of a step of {step:g} s; lower it"
             )
+        return 3 * (self.order + 1) + 2
 
-    def _shortest(self, step: float) -> int:
-        return self._padding + 2
-
-    @property
-    def _padding(self) -> int:
-        return 3 * (self.order + 1)
-
-    def _piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """See `Derivative.piece`."""
         from scipy.signal import butter, filtfilt
 
-        b, a = butter(self.order, self.cutoff, fs=1.0 / step)
-        smooth = filtfilt(b, a, values, axis=0, padlen=self._padding)
-        return smooth, _forward(smooth, step)
+        low_pass = butter(self.order, self.cutoff, fs=1.0 / step)
+        smooth = filtfilt(*low_pass, values, axis=0, padlen=3 * (self.order + 1))
+        return super().piece(smooth, step)
 
 
 DerivativeConfig = Annotated[
@@ -194,16 +180,3 @@ DerivativeConfig = Annotated[
     Field(discriminator="kind"),
 ]
 """Any rule for derivatives; its `kind` says which."""
-
-
-def _forward(values: np.ndarray, step: float) -> np.ndarray:
-    rate = np.full(values.shape, np.nan)
-    rate[:-1] = np.diff(values, axis=0) / step
-    return rate
-
-
-def _runs(values: np.ndarray, pieces: np.ndarray) -> list[tuple[int, int]]:
-    """Return the first index and the index past the last of every contiguous, finite run."""
-    number = np.where(np.isfinite(values).all(axis=1), pieces, -1)
-    starts, stops = stretches(number)
-    return list(zip(starts.tolist(), stops.tolist(), strict=True))

@@ -11,7 +11,7 @@ fits leave the samples out (`Log.usable`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
@@ -20,7 +20,13 @@ from pydantic import Field
 from residnet.core.config import Config, Seconds
 from residnet.core.log import Log
 from residnet.core.stretches import stretch_numbers, stretches
-from residnet.data.channels import far_from_median, spike_cells, steps_above, usual_interval
+from residnet.data.channels import (
+    SIGMA_OF_MAD,
+    far_from_median,
+    spike_cells,
+    steps_above,
+    usual_interval,
+)
 from residnet.data.readers.base import unwrap
 
 HARD = "hard:"
@@ -167,30 +173,26 @@ class Outlier(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         """Return [T] bool; see `Mask.apply`."""
-        bad = np.zeros(len(log), dtype=bool)
-        for name in self.channels:
-            values = unwrap(log[name]) if log.units[name] == "rad" else log[name]
-            known = np.flatnonzero(np.isfinite(values))
-            if known.size > self.samples:
-                bad[known] |= self._outliers(values[known])
-        return bad
+        return _each(log, self.channels, self._outliers)
 
-    def _outliers(self, values: np.ndarray) -> np.ndarray:
-        """Return [T] bool for finite values [T], T > samples."""
+    def _outliers(self, channel: np.ndarray) -> np.ndarray:
+        """Return [T] bool for a channel [T]."""
+        out, known = np.zeros(channel.size, dtype=bool), np.isfinite(channel)
+        values = channel[known]
+        if values.size <= self.samples:
+            return out
         count = np.arange(values.size)
         first = np.clip(count - self.samples // 2, 0, values.size - self.samples - 1)
         windows = np.lib.stride_tricks.sliding_window_view(values, self.samples + 1)[first]
-        others = windows[np.arange(self.samples + 1) != (count - first)[:, None]].reshape(
-            values.size, self.samples
-        )
+        itself = np.arange(self.samples + 1) == (count - first)[:, None]
+        others = windows[~itself].reshape(values.size, self.samples)
         deviation = np.abs(values - others.mean(axis=1))
-        common = 1.4826 * float(np.median(deviation))
+        common = SIGMA_OF_MAD * float(np.median(deviation))
         # a spread at the level of rounding is none
         floor = 1e-9 * float(np.abs(values).max())
-        outliers: np.ndarray = deviation > self.sigmas * np.maximum(
-            others.std(axis=1, ddof=1), max(common, floor)
-        )
-        return outliers
+        spread = np.maximum(others.std(axis=1, ddof=1), max(common, floor))
+        out[known] = deviation > self.sigmas * spread
+        return out
 
 
 @final
@@ -219,14 +221,9 @@ class Hampel(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         """Return [T] bool; see `Mask.apply`."""
-        bad = np.zeros(len(log), dtype=bool)
-        for name in self.channels:
-            bad |= far_from_median(
-                unwrap(log[name]) if log.units[name] == "rad" else log[name],
-                self.sigmas,
-                self.samples,
-            )
-        return bad
+        return _each(
+            log, self.channels, lambda values: far_from_median(values, self.sigmas, self.samples)
+        )
 
 
 @final
@@ -240,8 +237,8 @@ class Spike(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         """Return [T] bool; see `Mask.apply`."""
-        cells = spike_cells(log).values()
-        return np.asarray(np.logical_or.reduce([np.zeros(len(log), dtype=bool), *cells]))
+        cells = spike_cells(log)
+        return np.asarray(np.logical_or.reduce([np.zeros(len(log), dtype=bool), *cells.values()]))
 
 
 @final
@@ -296,9 +293,7 @@ def apply_masks(log: Log, rules: Sequence[Mask]) -> Log:
     """
     masks = dict(log.masks)
     for rule in rules:
-        masks[rule.reason] = masks.get(rule.reason, np.zeros(len(log), dtype=bool)) | rule.apply(
-            log
-        )
+        masks[rule.reason] = rule.apply(log) | masks.get(rule.reason, False)
     return log.replace(masks=masks)
 
 
@@ -321,11 +316,14 @@ def segments(log: Log) -> np.ndarray:
 
 
 def _any(log: Log, names: Sequence[str]) -> np.ndarray:
-    return (
-        np.logical_or.reduce([log.masks[name] for name in names], axis=0)
-        if names
-        else np.zeros(len(log), dtype=bool)
-    )
+    bad = np.zeros(len(log), dtype=bool)
+    return np.asarray(np.logical_or.reduce([bad, *(log.masks[name] for name in names)]))
+
+
+def _each(log: Log, names: Sequence[str], rule: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return [T] bool: samples that a rule marks in any channel, angles unwrapped."""
+    marked = (rule(unwrap(log[n]) if log.units[n] == "rad" else log[n]) for n in names)
+    return np.asarray(np.logical_or.reduce([np.zeros(len(log), dtype=bool), *marked]))
 
 
 def _step(t: np.ndarray) -> float:

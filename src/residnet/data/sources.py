@@ -13,7 +13,7 @@ from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.data.split import SplitConfig, check_leaks, data_files, divided, log_names
 
 Splits = dict[str, list[Log]]

@@ -16,7 +16,7 @@ from residnet.core.errors import UsageError
 from residnet.core.names import ACCELERATION
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared, channels
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import TracedPlantDynamics

@@ -17,9 +17,8 @@ from residnet.core.config import Config, Metres, MetresPerSecond, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import POSITION, SURGE, SWAY
 from residnet.core.names import STATE
-from residnet.data.simulated.environment import Disturbance
-from residnet.data.simulated.flying import Craft, Flight, Sea, fly
-from residnet.data.simulated.sensors import SensorNoise
+from residnet.data.sea import Disturbance, SensorNoise
+from residnet.data.simulated import Craft, Flight, Sea, fly
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, commanded
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec

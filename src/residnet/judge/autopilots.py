@@ -16,7 +16,7 @@ from residnet.control.heading.conditions import (
     HeadingChanges,
 )
 from residnet.control.heading.vessels import Flights, SteeredPlant, SteeredVessel, fly
-from residnet.data.simulated.environment import Disturbance
+from residnet.data.sea import Disturbance
 from residnet.physics.environment import WavesConfig
 from residnet.physics.plant import Plant
 

@@ -13,7 +13,7 @@ from residnet.core.config import Config, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.data.simulated.flying import Craft, Flight
+from residnet.data.simulated import Craft, Flight
 from residnet.dynamics.actuated import InputShare
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Manoeuvre

@@ -36,7 +36,7 @@ from residnet.core.errors import ConfigError, FitError, UsageError
 from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.core.progress import say
-from residnet.data.simulated.environment import Disturbance, WindField
+from residnet.data.sea import Disturbance, WindField
 from residnet.documents.gouletas2020.law import DocumentConfig, PredictiveConfig
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.store import chosen_model, load_model

@@ -13,9 +13,8 @@ from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE, VELOCITY, nearest
 from residnet.data.prepare import Prepared
-from residnet.data.simulated.environment import Disturbance
-from residnet.data.simulated.flying import Craft, Flight, Sea, fly, source_of
-from residnet.data.simulated.sensors import SensorNoise
+from residnet.data.sea import Disturbance, SensorNoise
+from residnet.data.simulated import Craft, Flight, Sea, fly, source_of
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare
 from residnet.dynamics.ensemble import SampledDynamics
 from residnet.identification.models import FittedModel

@@ -13,7 +13,7 @@ from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.progress import report
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 
 TRIALS: dict[str, Any] = {
     "vessel": "example_rudder_boat",

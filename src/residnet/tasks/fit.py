@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 from pydantic import PrivateAttr, model_validator
 
 from residnet.core.config import Config
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import DataConfig, Splits, input_files, read_logs
 from residnet.documents import STUDY_MODELS, StudyName
 from residnet.identification.settings import FitSettings, require_known
@@ -101,7 +101,7 @@ class FitConfig(FitSettings, ComputingTask):
         Raises:
             ResidnetError: what the run itself would refuse before it fits anything.
         """
-        from residnet.data.simulated.trials import stand_ins
+        from residnet.data.simulated import stand_ins
         from residnet.identification.fitter import require_fit
         from residnet.identification.models import FittedModel
         from residnet.identification.prepared import prepare_logs

@@ -20,7 +20,7 @@ from residnet.data.masks import Spike
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.readers.compose import RecordingConfig
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.data.split import data_files, log_names
 from residnet.dynamics.store import ModelSpec, load_model, model_names
 from residnet.export import exporter

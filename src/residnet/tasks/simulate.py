@@ -18,10 +18,19 @@ from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.core.progress import say
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.canonical import CanonicalConfig
-from residnet.data.simulated.environment import Disturbance
-from residnet.data.simulated.flying import Craft, Flight, Sea, fly, log_names, source_of
-from residnet.data.simulated.sensors import SensorNoise
-from residnet.data.simulated.trials import SimulatedTrials, fly_trials, stand_ins, trials_craft
+from residnet.data.sea import Disturbance, SensorNoise
+from residnet.data.simulated import (
+    Craft,
+    Flight,
+    Sea,
+    SimulatedTrials,
+    fly,
+    fly_trials,
+    log_names,
+    source_of,
+    stand_ins,
+    trials_craft,
+)
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
 from residnet.dynamics.simulated import TracedPlantDynamics, check_steps
 from residnet.dynamics.store import chosen_model, load_model

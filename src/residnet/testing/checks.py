@@ -26,9 +26,8 @@ from residnet.core.names import si_unit
 from residnet.core.registry import kind_of
 from residnet.core.samples import Samples
 from residnet.data.readers.base import LogReader
-from residnet.data.simulated.environment import Disturbance
-from residnet.data.simulated.flying import Craft, Flight, Sea, fly, source_of
-from residnet.data.simulated.sensors import SensorNoise
+from residnet.data.sea import Disturbance, SensorNoise
+from residnet.data.simulated import Craft, Flight, Sea, fly, source_of
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.dynamics.store import load_model, save_model

@@ -10,7 +10,7 @@ from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.layout import RANGE_INPUTS, RANGE_VELOCITIES
 from residnet.core.samples import Samples
 from residnet.data.prepare import PrepareConfig, prepare, samples
-from residnet.data.simulated.trials import SimulatedTrials, fly_trials
+from residnet.data.simulated import SimulatedTrials, fly_trials
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.heads.base import ClosedFormHead, FeatureConfig

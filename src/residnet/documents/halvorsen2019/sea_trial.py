@@ -23,9 +23,8 @@ from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, VELOCITY, nearest
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
-from residnet.data.simulated.environment import Disturbance
-from residnet.data.simulated.flying import Craft, Sea, fly
-from residnet.data.simulated.sensors import SensorNoise
+from residnet.data.sea import Disturbance, SensorNoise
+from residnet.data.simulated import Craft, Sea, fly
 from residnet.documents import published
 from residnet.documents.cells import beside_published, listed, pictures
 from residnet.documents.halvorsen2019.standard_model import (

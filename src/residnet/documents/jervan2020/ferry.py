@@ -47,7 +47,7 @@ from residnet.core.layout import (
 )
 from residnet.core.log import Log
 from residnet.core.names import STATE, nearest
-from residnet.data.simulated.trials import SimulatedTrials, fly_trials
+from residnet.data.simulated import SimulatedTrials, fly_trials
 from residnet.documents.cells import beside_published, joined, notes_text, pictures
 from residnet.documents.jervan2020.residual import (
     ABOUT_COEFFICIENTS,

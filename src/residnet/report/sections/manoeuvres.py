@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.data.simulated.flying import Flight
+from residnet.data.simulated import Flight
 from residnet.manoeuvres.replay import Replay
 from residnet.manoeuvres.spiral import Spiral
 from residnet.manoeuvres.waypoints import Waypoints

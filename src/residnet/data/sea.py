@@ -1,7 +1,8 @@
-"""The disturbances of a simulated trial: forces, current, wind with gusts, waves."""
+"""What surrounds a simulated vessel and what measures it: forces, current, wind, waves, sensors."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, final
 
 import numpy as np
@@ -9,8 +10,18 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.core.config import Config, MetresPerSecond, NewtonMetres, Newtons, Radians, Seconds
+from residnet.core.config import (
+    Config,
+    MetresPerSecond,
+    NewtonMetres,
+    Newtons,
+    Quantity,
+    Radians,
+    RadiansPerSecond,
+    Seconds,
+)
 from residnet.core.errors import ConfigError
+from residnet.core.names import CHANNEL_UNITS, VELOCITY, nearest
 from residnet.dynamics.rollout import Source
 from residnet.physics.environment import WIND_INPUTS, Waves, WavesConfig
 from residnet.physics.plant import Plant
@@ -97,10 +108,8 @@ class Disturbance(Config):
         out = np.tile(self.current(), (rows, 1))
         if self.current_each is not None:
             random = np.random.default_rng([seed, 7])
-            speed, direction = (
-                random.uniform(*self.current_each, rows),
-                random.uniform(0.0, 2.0 * np.pi, rows),
-            )
+            speed = random.uniform(*self.current_each, rows)
+            direction = random.uniform(0.0, 2.0 * np.pi, rows)
             out += speed[:, None] * np.stack((np.cos(direction), np.sin(direction)), axis=1)
         return out
 
@@ -108,9 +117,8 @@ class Disturbance(Config):
         """Return the current of all trials towards north and east in m/s."""
         if self.current_speed is None or self.current_direction is None:
             return self.current_north, self.current_east
-        return self.current_speed * float(
-            np.cos(self.current_direction)
-        ), self.current_speed * float(np.sin(self.current_direction))
+        along = self.current_speed * np.exp(1j * self.current_direction)
+        return float(along.real), float(along.imag)
 
     @property
     def logged(self) -> tuple[str, ...]:
@@ -120,20 +128,13 @@ class Disturbance(Config):
     def needs(self) -> dict[str, str]:
         """Return the inputs that a plant must have for this disturbance, each with its key."""
         north, east = self.current()
-        requested = {
-            "force_x": self.force_x != 0, "force_y": self.force_y != 0,
-            "force_n": self.force_n != 0,
-            "force_north": self.force_north != 0, "force_east": self.force_east != 0,
-            "current_north": north != 0 or self.current_each is not None,
-            "current_east": east != 0 or self.current_each is not None,
-        }  # fmt: skip
-        needs = {name: name for name, is_needed in requested.items() if is_needed}
+        forces = ("force_x", "force_y", "force_n", "force_north", "force_east")
+        needs = {name: name for name in forces if getattr(self, name) != 0}
+        currents = {"current_north": north, "current_east": east}
+        needs |= {n: n for n, value in currents.items() if value != 0 or self.current_each}
         needs |= dict.fromkeys(WIND_INPUTS, "wind") if self.wind is not None else {}
-        return needs | (
-            dict.fromkeys(("force_x", "force_y", "force_n"), "waves")
-            if self.waves is not None
-            else {}
-        )
+        needs |= dict.fromkeys(forces[:3], "waves") if self.waves is not None else {}
+        return needs
 
     def check(self, plant: Plant, vessel: str) -> None:
         """Stop where a plant cannot feel this disturbance.
@@ -170,28 +171,21 @@ class Disturbance(Config):
         The random forces are drawn from `random` (three values per step whatever their sizes, so
         that data of one seed stay the same), the gusts from generators of their own under `seed`.
         """
-        forces = ornstein_uhlenbeck(random, (rows, steps, 3), step, self.correlation) * [
-            self.force_x,
-            self.force_y,
-            self.force_n,
-        ]
+        forces = ornstein_uhlenbeck(random, (rows, steps, 3), step, self.correlation)
+        currents = self.currents(rows, seed)
         values: dict[str, np.ndarray | float] = {
-            name: forces[:, :, j] for j, name in enumerate(("force_x", "force_y", "force_n"))
+            "force_x": self.force_x * forces[:, :, 0],
+            "force_y": self.force_y * forces[:, :, 1],
+            "force_n": self.force_n * forces[:, :, 2],
+            "force_north": self.force_north,
+            "force_east": self.force_east,
+            "current_north": currents[:, :1],
+            "current_east": currents[:, 1:],
+            **gusty_wind(self.wind, rows, steps, step, seed),
         }
-        values["current_north"], values["current_east"] = self.currents(rows, seed).T[:, :, None]
-        values |= {"force_north": self.force_north, "force_east": self.force_east}
-        if self.wind is not None:
-            values |= dict(
-                zip(
-                    WIND_INPUTS,
-                    gusty_wind(self.wind, rows, steps, step, np.random.default_rng([seed, 4])),
-                    strict=True,
-                )
-            )
         w = np.zeros((rows, steps, len(plant.inputs)))
-        for j, name in enumerate(plant.inputs):
-            if name in values:
-                w[:, :, j] = values[name]
+        for name in values.keys() & set(plant.inputs):
+            w[:, :, plant.inputs.index(name)] = values[name]
         return w
 
     def surround(self, source: Source, plant: Plant, rows: int, step: float, seed: int) -> Source:
@@ -257,12 +251,123 @@ def ornstein_uhlenbeck(
 
 
 def gusty_wind(
-    wind: WindField, rows: int, steps: int, step: float, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the speed [B, T] in m/s and direction [B, T] in rad of the wind with gusts.
+    wind: WindField | None, rows: int, steps: int, step: float, seed: int
+) -> dict[str, np.ndarray]:
+    """Return the speed in m/s and direction in rad [B, T] of the wind with gusts, by input.
 
-    The direction is where it comes from.
+    The direction is where it comes from; nothing where there is no wind.
     """
+    if wind is None:
+        return {}
+    random = np.random.default_rng([seed, 4])
     gust = wind.gust * ornstein_uhlenbeck(random, (rows, steps, 2), step, wind.correlation)
     along = wind.speed + gust[:, :, 0]
-    return np.hypot(along, gust[:, :, 1]), wind.direction + np.arctan2(gust[:, :, 1], along)
+    direction = wind.direction + np.arctan2(gust[:, :, 1], along)
+    return dict(zip(WIND_INPUTS, (np.hypot(along, gust[:, :, 1]), direction), strict=True))
+
+
+class Sensor(Config):
+    """What one channel's sensor does to it.
+
+    Attributes:
+        noise: standard deviation of white noise, in the channel's unit (`0.5 deg`); not for u, v,
+            r, which have theirs beside `sensors`.
+        bias: constant error, in the channel's unit.
+        interval: time between its samples, a multiple of the log's step; the channel is empty in
+            between. None: every sample of the log.
+        latency: age of what it reports: the log shows at t what was at t - latency.
+    """
+
+    noise: float | str = 0.0
+    bias: float | str = 0.0
+    interval: Seconds | None = Field(default=None, gt=0)
+    latency: Seconds = Field(default=0.0, ge=0)
+
+
+class SensorNoise(Config):
+    """White noise on the measured velocities; all else is exact unless `sensors` says otherwise.
+
+    Attributes:
+        u: standard deviation in m/s.
+        v: standard deviation in m/s.
+        r: standard deviation in rad/s.
+        sensors: sensors of single channels, by the channel's name.
+    """
+
+    u: MetresPerSecond = Field(default=0.03, ge=0)
+    v: MetresPerSecond = Field(default=0.03, ge=0)
+    r: RadiansPerSecond = Field(default=float(np.radians(0.2)), ge=0)
+    sensors: dict[str, Sensor] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _units(self) -> SensorNoise:
+        converted = {}
+        for name, sensor in self.sensors.items():
+            if name not in CHANNEL_UNITS:
+                raise ValueError(f"sensors: no channel '{name}'{nearest(name, CHANNEL_UNITS)}")
+            unit = Quantity(CHANNEL_UNITS[name])
+            try:
+                noise, bias = unit.convert(sensor.noise), unit.convert(sensor.bias)
+            except ValueError as error:
+                raise ValueError(f"sensors.{name}: {error}") from None
+            if noise < 0:
+                raise ValueError(
+                    f"sensors.{name}.noise: a standard deviation must not be negative, given"
+                    f" {noise:g}"
+                )
+            if noise and name in VELOCITY:
+                raise ValueError(
+                    f"sensors.{name}.noise: the white noise of {name} is given as noise.{name}"
+                )
+            converted[name] = sensor.model_copy(update={"noise": noise, "bias": bias})
+        object.__setattr__(self, "sensors", converted)
+        return self
+
+    def check(self, channels: tuple[str, ...], step: float, vessel: str) -> None:
+        """Stop where a sensor measures what the log does not have, or samples more often than it.
+
+        Raises:
+            ConfigError: naming the sensor.
+        """
+        for name, sensor in self.sensors.items():
+            if name not in channels:
+                raise ConfigError(
+                    f"noise.sensors: vessel '{vessel}' has no channel"
+                    f" '{name}'{nearest(name, channels)}"
+                )
+            every = 1.0 if sensor.interval is None else sensor.interval / step
+            if round(every) < 1 or abs(every - round(every)) > 1e-6 * every:
+                raise ConfigError(
+                    f"noise.sensors.{name}.interval: {sensor.interval:g} s is not a multiple of the"
+                    f" log's step, {step:g} s"
+                )
+
+    def measured(
+        self,
+        clean: Mapping[str, np.ndarray],
+        t: np.ndarray,
+        white: np.ndarray,
+        seed: tuple[int, ...],
+    ) -> dict[str, np.ndarray]:
+        """Return what the log holds.
+
+        Args:
+            clean: channels [T] as they were.
+            t: times [T] in s, evenly spaced.
+            white: noise [T, 3] of u, v, r.
+            seed: of the noise of all other channels.
+        """
+        out = {}
+        for name, truth in clean.items():
+            sensor = self.sensors.get(name, Sensor())
+            values = np.interp(t - sensor.latency, t, truth) if sensor.latency else truth.copy()
+            if name in VELOCITY:
+                values += white[:, VELOCITY.index(name)]
+            if name in self.sensors:
+                random = np.random.default_rng((*seed, *name.encode()))
+                values += float(sensor.bias) + float(sensor.noise) * random.standard_normal(t.size)
+            if sensor.interval is not None:
+                every = round(sensor.interval / float(t[1] - t[0]))
+                values[np.arange(t.size) % every != 0] = np.nan
+            out[name] = values
+        return out

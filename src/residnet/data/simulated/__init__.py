@@ -1,1 +1,0 @@
-"""Simulated trials: a plant, manoeuvres, disturbances and sensors."""
