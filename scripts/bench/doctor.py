@@ -16,6 +16,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,7 @@ def shipped(seeds: int) -> Iterator[Host]:
 
 def measured(seed: int) -> Iterator[Host]:
     """Measured model tankers, three logs at a time."""
-    from residnet.tasks.inspection import reading
+    from residnet.tasks.registry import load_task
 
     folder = os.environ.get("RESIDNET_DATA")
     if not folder:
@@ -75,7 +76,8 @@ def measured(seed: int) -> Iterator[Host]:
     about = {"lag": (0.7, 1.4), "bias": (0.1, 0.3)}
     hosts = []
     for name in ("esso_osaka", "kvlcc2"):
-        setup = reading(_CONFIGS / f"{name}.yaml")
+        fit: Any = load_task(_CONFIGS / f"{name}.yaml")
+        reader = fit.data.reader.build()
         files = sorted((Path(folder) / name).rglob("*.csv"))
         files = [files[i] for i in random.permutation(len(files))]
         arm = (0.6, 1.5) if name == "esso_osaka" else (1.4, 3.5)
@@ -84,8 +86,8 @@ def measured(seed: int) -> Iterator[Host]:
             demand="delta",
         )  # fmt: skip
         for start in range(0, len(files) - _ROTATED + 1, _ROTATED):
-            logs = [setup.reader.read(file) for file in files[start : start + _ROTATED]]
-            hosts.append(Host(ship, logs, setup.inputs, setup.masks))
+            logs = [reader.read(file) for file in files[start : start + _ROTATED]]
+            hosts.append(Host(ship, logs, fit.signals.columns, fit.prepare.masks))
     yield from (hosts[i] for i in random.permutation(len(hosts)))
 
 

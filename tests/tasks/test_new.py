@@ -68,7 +68,7 @@ def test_a_config_from_logs_alone(folder: Path) -> None:
     assert (channels["r"]["unit"], channels["u"]["unit"]) == ("deg/min", "kn")
     assert channels["delta"]["sign"] == -1
     assert content["signals"]["inputs"] == ["delta", "n"]
-    assert (content["recipe"], content["effort"]) == ("standard", 0.1)
+    assert (content["recipe"], content["effort"]) == ("standard", 0.3)
     assert {name: len(content["data"]["split"][name]) for name in ("train", "test")} == {
         "train": 4,
         "test": 1,

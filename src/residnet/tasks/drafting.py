@@ -36,8 +36,9 @@ _INSPECTED = 12
 _SHOWN = 12
 """Guesses that the terminal shows."""
 _WIDTH = 96
-QUICK = 0.1
-"""Effort of a first draft: its networks are trained for about a minute."""
+QUICK = 0.3
+"""Effort of a first draft. On the logs of `residnet demo` .1 gave an NRMSE of .124 in 137 s of
+processor time, .3 gave .068 in 227 s."""
 Comments = Callable[[tuple[str, ...]], list[str]]
 """Path of a key -> lines about it."""
 

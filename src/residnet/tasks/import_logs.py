@@ -10,7 +10,6 @@ from pydantic import Field
 
 from residnet.core.config import ConfigPath
 from residnet.core.errors import ConfigError
-from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
@@ -74,25 +73,32 @@ class ImportConfig(Task):
         reader, names = self.reader.build(), log_names(paths)
         findings: dict[str, Any] = {}
         lines: list[str] = []
+        loud = 0
         for number, path in enumerate(paths):
             report("reading recordings", number, len(paths))
             log = reader.read(path).replace(name=names[path])
             log.save(folder.path / "logs" / f"{log.name}.parquet")
-            findings[log.name] = log.meta.get("findings", [])
-            lines += _lines(log)
+            found = findings[log.name] = log.meta.get("findings", [])
+            told = [f"{f['level']}: {f['text']}" for f in found if f["level"] != "note"]
+            loud += bool(told)
+            span = float(log.t[-1] - log.t[0])
+            hard = [mask.sum() for reason, mask in log.masks.items() if reason.startswith("hard:")]
+            lines.append(
+                f"{log.name}: {len(log)} samples, step {span / (len(log) - 1):.4g} s, {span:.1f} s,"
+                f" {len(log.channels)} channels ({', '.join(log.channels)}), {sum(map(int, hard))}"
+                f" samples in gaps, {len(found) - len(told)} notes"
+            )
+            lines += [f"{log.name}: {text}" for text in told]
         report("reading recordings", len(paths), len(paths))
         folder.write_json(folder.path / "findings.json", findings)
         folder.write(folder.path / "import.txt", "\n".join(lines) + "\n")
-        loud = sum(
-            any(finding["level"] != "note" for finding in found) for found in findings.values()
-        )
-        verdict = [
+        sentence = (
             f"{len(paths)} recording{'s were' if len(paths) > 1 else ' was'} read;"
             f" {loud or 'none'} of them {'have findings' if loud != 1 else 'has findings'} that"
             " need a look."
-        ]
+        )
         figures = {"logs": MainFigure(len(paths)), "logs_with_findings": MainFigure(loud)}
-        return Outcome(verdict, figures, "\n".join(lines))
+        return Outcome([sentence], figures, "\n".join(lines))
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
@@ -122,20 +128,3 @@ def _globbed(root: Path, pattern: str) -> list[Path]:
         raise ConfigError(
             f"logs: '{pattern}' is not a pattern relative to {root} ({error}); set `root` instead"
         ) from error
-
-
-def _lines(log: Log) -> list[str]:
-    findings = log.meta.get("findings", [])
-    usual = (log.t[-1] - log.t[0]) / (len(log) - 1)
-    lost = sum(int(mask.sum()) for reason, mask in log.masks.items() if reason.startswith("hard:"))
-    head = (
-        f"{log.name}: {len(log)} samples, step {usual:.4g} s, {log.t[-1] - log.t[0]:.1f} s,"
-        f" {len(log.channels)} channels ({', '.join(log.channels)})"
-    )
-    notes = sum(finding["level"] == "note" for finding in findings)
-    loud = [
-        f"{log.name}: {finding['level']}: {finding['text']}"
-        for finding in findings
-        if finding["level"] != "note"
-    ]
-    return [f"{head}, {lost} samples in gaps, {notes} notes", *loud]

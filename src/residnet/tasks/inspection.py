@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core import progress
+from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageError
 from residnet.core.files import whole
 from residnet.core.log import Log
+from residnet.core.progress import report
 from residnet.data.doctor import (
     Finding,
-    Level,
     Report,
     conditioning,
     date_findings,
@@ -25,12 +25,11 @@ from residnet.data.doctor import (
     inspection,
     summary,
 )
-from residnet.data.drafting.reading import DraftedLogs, log_files, read_each
-from residnet.data.masks import Mask
-from residnet.data.readers.base import LogReader
+from residnet.data.drafting.reading import log_files, read_each
+from residnet.data.split import log_names
+from residnet.data.prepare import prepare, samples
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.sources import MeasuredLogs
-from residnet.data.split import log_names
 from residnet.tasks.drafting import commented
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.import_logs import ImportConfig
@@ -38,18 +37,6 @@ from residnet.tasks.registry import load_task
 
 _ILL_CONDITIONED = 1e6
 """Condition number from which regressors leave their coefficients to the noise."""
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What a config says about logs: reader, inputs, masks, and the split of each file."""
-
-    reader: LogReader | None = None
-    folders: bool = False
-    inputs: tuple[str, ...] | None = None
-    masks: tuple[Mask, ...] = ()
-    splits: Mapping[Path, str] | None = None
-    task: Any = None
 
 
 @dataclass(frozen=True)
@@ -91,148 +78,111 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
         ResidnetError: where a path does not exist, the config cannot be used, or the only log
             cannot be read.
     """
-    setup = Reading() if config is None else reading(config)
-    files = log_files(paths, setup.folders or config is None)
-    names = log_names(files)
+    task = None if config is None else _logs_task(config)
+    fit = task if isinstance(task, FitConfig) else None
+    inputs, masks = (fit.signals.columns, fit.prepare.masks) if fit is not None else (None, ())
+    own = None if task is None else getattr(task, "reader", None) or task.data.reader
+    files = log_files(paths, own is None or isinstance(own, RecordingConfig))
+    names, read, maps = log_names(files), dict[Path, Log | ResidnetError](), list[str]()
+    if own is None:
+        for draft in read_each(files):
+            read |= {**draft.logs, **draft.left_out}
+            if "channels" in draft.reader:
+                drafted = {"data": {"kind": "measured", "reader": draft.reader}}
+                maps += ["channel map as guessed, to check and paste into a config:"]
+                maps += commented(drafted, draft.marks.comments).splitlines()
+    else:
+        reader = own.build()
+        for file in files:
+            try:
+                read[file] = reader.read(file)
+            except DataError as error:
+                read[file] = error
     logs: list[Log] = []
     reports: list[Report] = []
-    lines: list[str] = []
-    read, drafts = _read(files, setup.reader)
     for number, path in enumerate(files):
-        progress.report("inspecting logs", number, len(files))
+        report("inspecting logs", number, len(files))
         log = read[path]
         try:
             if isinstance(log, ResidnetError):
                 raise DataError(str(log)) if len(files) > 1 else log
             log = log.replace(name=names[path])
-            found = inspect(log, setup.inputs, setup.masks).joined(date_findings(log, path))
+            found = inspect(log, inputs, masks).joined(date_findings(log, path))
+            logs.append(log)
         except DataError as error:
             if len(files) == 1:
                 raise
             unreadable = Finding("fatal", "unreadable", str(error))
-            reports.append(Report(names[path], (unreadable,), str(path)))
-        else:
-            logs.append(log)
-            reports.append(found)
-        lines += reports[-1].lines()
-    known = setup.splits or {}
-    splits = {
-        name: known[real] for path, name in names.items() if (real := path.resolve()) in known
-    }
-    together = inspect_together(logs, setup.inputs, splits) if logs else Report("together", ())
-    if setup.task is not None and logs:
-        together = Report("together", (*together.findings, *_regressors(logs, setup.task)))
-    progress.report("inspecting logs", len(files), len(files))
-    lines += together.lines()
-    for draft in drafts:
-        if "channels" in draft.reader:
-            drafted = {"data": {"kind": "measured", "reader": draft.reader}}
-            lines += ["channel map as guessed, to check and paste into a config:"]
-            lines += commented(drafted, draft.marks.comments, ()).splitlines()
+            found = Report(names[path], (unreadable,), str(path))
+        reports.append(found)
+    splits = {} if fit is None else _splits(fit, names)
+    together = inspect_together(logs, inputs, splits) if logs else Report("together", ())
+    if fit is not None and logs:
+        together = Report("together", (*together.findings, *_regressors(logs, fit)))
+    report("inspecting logs", len(files), len(files))
+    lines = [line for one in (*reports, together) for line in one.lines()]
     content = inspection(reports, together)
-    return Inspection("\n".join((*summary(content).lines, *lines)), content)
+    return Inspection("\n".join((*summary(content).lines, *lines, *maps)), content)
 
 
-def reading(config: Path) -> Reading:
-    """Return what a config says about the logs that it reads.
+def _logs_task(config: Path) -> Any:
+    """Return the task of a config that says how its logs are read.
 
     Raises:
         ConfigError: where it is no config of logs.
     """
-    task = load_task(config, [])
-    if isinstance(task, ImportConfig):
-        return Reading(task.reader.build(), isinstance(task.reader, RecordingConfig))
-    if not isinstance(task, FitConfig) or not isinstance(task.data, MeasuredLogs):
+    task = load_task(config)
+    measured = isinstance(task, FitConfig) and isinstance(task.data, MeasuredLogs)
+    if not measured and not isinstance(task, ImportConfig):
         raise ConfigError(
             f"{config}: has no channel map (data.kind is not 'measured'); leave --config out for"
             " logs that describe themselves"
         )
+    return task
+
+
+def _splits(fit: FitConfig, names: Mapping[Path, str]) -> dict[str, str]:
+    """Return the split of each log that the config names."""
+    assert isinstance(fit.data, MeasuredLogs)
     try:
-        splits = {
-            path.resolve(): split
-            for split, paths in task.data.split.resolve().items()
-            for path in paths
-        }
+        resolved = fit.data.split.resolve()
     except ConfigError:
         # the split's own files need not be here to look at others
-        splits = {}
-    reader = task.data.reader
-    return Reading(
-        reader.build(),
-        isinstance(reader, RecordingConfig),
-        task.signals.columns,
-        task.prepare.masks,
-        splits,
-        task,
-    )
+        return {}
+    known = {path.resolve(): split for split, paths in resolved.items() for path in paths}
+    return {n: known[real] for path, n in names.items() if (real := path.resolve()) in known}
 
 
-def _read(
-    files: Sequence[Path], reader: LogReader | None
-) -> tuple[dict[Path, Log | ResidnetError], list[DraftedLogs]]:
-    """Return file -> its log, or why there is none; and the readers that were drafted for them."""
-    out: dict[Path, Log | ResidnetError] = {}
-    if reader is None:
-        drafts = read_each(files)
-        for draft in drafts:
-            out |= {**draft.logs, **draft.left_out}
-        return out, drafts
-    for file in files:
-        try:
-            out[file] = reader.read(file)
-        except DataError as error:
-            out[file] = error
-    return out, []
-
-
-def _regressors(logs: Sequence[Log], task: Any) -> list[Finding]:
+def _regressors(logs: Sequence[Log], fit: FitConfig) -> list[Finding]:
     """Return how well the prepared logs condition the regressors of each baseline."""
-    from residnet.baselines.regressors import RegressorBaseline
-    from residnet.data.prepare import prepare, samples
-
     try:
-        prepared = [prepare(log, "train", task.signals.columns, task.prepare) for log in logs]
-        data = samples([log for log in prepared if log.good.any()], task.signals.build())
+        prepared = [prepare(log, "train", fit.signals.columns, fit.prepare) for log in logs]
+        data = samples([log for log in prepared if log.good.any()], fit.signals.build())
     except (DataError, UsageError) as error:
-        return [
-            Finding(
-                "will mislead", "not_prepared", f"the config cannot prepare these logs: {error}"
-            )
-        ]
+        text = f"the config cannot prepare these logs: {error}"
+        return [Finding("will mislead", "not_prepared", text)]
     out = []
-    for name, config in {"baseline": task.baseline, **task.baselines}.items():
+    for name, config in fit.all_baselines.items():
         baseline = config.build(data.names)
         if not isinstance(baseline, RegressorBaseline):
             continue
-        phi = baseline.library(data.z).numpy()
-        moving = [
-            j
-            for j in range(phi.shape[1])
-            if float(np.ptp(phi[:, j])) > 1e-12 * float(np.abs(phi[:, j]).max(initial=0.0))
-        ]
-        terms = [baseline.library.terms[j] for j in range(phi.shape[1])]
-        if len(moving) > 1 and phi.shape[0] > 2 * len(moving):
-            condition, worst = conditioning(phi[:, moving], [terms[j] for j in moving])
-            still = [term for j, term in enumerate(terms) if j not in moving and term != "1"]
-            text = (
-                f"regressors of {name} over these logs: {len(moving)} move, condition number"
-                f" {condition:.3g} (centred, scaled)"
-            )
-            text += f"; constant: {', '.join(still)}" if still else ""
-            ill = condition > _ILL_CONDITIONED
-            text += f"; {', '.join(worst)} move together" if condition > 30.0 else ""
-            action = (
-                "leave regressors out, give the baseline a ridge, or add manoeuvres" if ill else ""
-            )
-            # a log or two are looked at, not fitted: what they lack others have
-            level: Level = "will mislead" if ill and len(logs) > 2 else "note"
-            out.append(
-                Finding(
-                    level,
-                    "regressors",
-                    text,
-                    {"condition": condition, "regressors": len(moving)},
-                    action,
-                )
-            )
+        phi, terms = baseline.library(data.z).numpy(), list(baseline.library.terms)
+        moves = np.ptp(phi, axis=0) > 1e-12 * np.abs(phi).max(axis=0, initial=0.0)
+        moving = np.flatnonzero(moves)
+        if len(moving) < 2 or len(phi) <= 2 * len(moving):
+            continue
+        condition, worst = conditioning(phi[:, moving], [terms[j] for j in moving])
+        still = [term for term, free in zip(terms, moves, strict=True) if not free and term != "1"]
+        text = (
+            f"regressors of {name} over these logs: {len(moving)} move, condition number"
+            f" {condition:.3g} (centred, scaled)"
+        )
+        text += f"; constant: {', '.join(still)}" if still else ""
+        text += f"; {', '.join(worst)} move together" if condition > 30.0 else ""
+        ill = condition > _ILL_CONDITIONED
+        action = "leave regressors out, give the baseline a ridge, or add manoeuvres" if ill else ""
+        found = {"condition": condition, "regressors": len(moving)}
+        # a log or two are looked at, not fitted: what they lack others have
+        level: Any = "will mislead" if ill and len(logs) > 2 else "note"
+        out.append(Finding(level, "regressors", text, found, action))
     return out
