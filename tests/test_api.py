@@ -270,3 +270,16 @@ def _coarse(log: residnet.Log) -> residnet.Log:
     """Every eighth sample of a log."""
     channels = {name: values[::8] for name, values in log.channels.items()}
     return log.replace(t=log.t[::8], channels=channels, masks={})
+
+
+def test_a_run_without_a_folder_leaves_nothing_behind() -> None:
+    """Its files last as long as the result."""
+    flown = {"vessel": "wam_v_cal", "manoeuvres": [{"kind": "constant", "drive": 0.5, "steer": 0}]}
+    config = {"task": "simulate", "name": "gone", "programme": {**flown, "duration": 5}}
+    result = residnet.run(config)
+    assert result.read("summary.json")["figures"]["logs"]["value"] == 1
+    assert result.verdict[0].startswith("All 1 manoeuvres ended as they should")
+    assert "logs/constant_01.parquet" in result.files
+    folder = result.folder
+    del result
+    assert not folder.exists()

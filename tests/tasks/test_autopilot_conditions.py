@@ -153,38 +153,6 @@ def test_a_run_takes_the_constants_that_another_tuned(
     assert "tuned its peers for another 'conditions.stated'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"conditions": None}, "give 'conditions' to train it under"),
-        ({"peers": {"ptos": {"kind": "pd"}}}, "must name a peer of kind ptos"),
-        ({"policies": {}}, "give at least one policy"),
-        ({"policies": {"n": {"start": None, "units": 0}}}, "without a law needs a network"),
-        ({"conditions": {"stated": {**STATED, "dt": "0.05 s"}}}, "dt must be that of test"),
-        ({"conditions": {"stated": {**STATED, "duration": "1 s"}}}, "takes this vessel 2.14 s"),
-        ({"rudder": "1.5 deg"}, "leave nothing of a rudder of 1.5 deg"),
-        ({"vessel": "wam_v_cal", "rudder": "0.5 deg"}, "cmd_delta"),
-        ({"conditions": {"stated": {**STATED, "current": 0.5}}}, "no input 'current_north'"),
-        ({"conditions": {"stated": {**STATED, "delay": ["0.4 s", "0.1 s"]}}}, "in order"),
-        (
-            {"conditions": {"stated": STATED, "tuned_in": "nowhere"}},
-            "nowhere is not the folder of a finished",
-        ),
-    ],
-)
-def test_wrong_configs_are_said_in_a_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    change: dict[str, Any],
-    words: str,
-) -> None:
-    path = tmp_path / "wrong.yaml"
-    path.write_text(yaml.safe_dump({**SMALL, **change}))
-    assert call(monkeypatch, "check", path) == 2
-    assert words in capsys.readouterr().err
-
-
 def test_the_verdict_begins_with_the_cheapest_policy() -> None:
     costs = {"a": ("network", 6.3), "b": ("policy", 6.1), "law": ("classical", 6.4)}
     rows = [

@@ -10,16 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from read_page import plain
-from tiny import call
 
-from residnet.core.errors import DataError, UsageError
-from residnet.core.progress import say
-from residnet.core.version import __version__
-from residnet.runs.folder import RunFolder
-from residnet.runs.task import Outcome
+from residnet.core.errors import UsageError
 from residnet.tasks.compare import compare_runs, judged_runs, paired
 from residnet.tasks.registry import runs_below, runs_text
-from residnet.tasks.simulate import SimulateConfig
 
 
 def made_run(folder: Path, size: float, *, task: str = "fit") -> Path:
@@ -129,65 +123,3 @@ def test_the_list_of_runs(tmp_path: Path) -> None:
     assert runs_text(tmp_path / "none", []).endswith("no runs")
     with pytest.raises(UsageError, match="no such folder"):
         runs_below(tmp_path / "nowhere")
-
-
-def test_version_and_list_on_the_command_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made_run(tmp_path / "good", 0.3)
-    assert call(monkeypatch, "--version") == 0
-    assert capsys.readouterr().out.strip() == f"residnet {__version__}"
-    assert call(monkeypatch, "runs", tmp_path, "--json") == 0
-    assert json.loads(capsys.readouterr().out)[0]["best"]["value"] == 0.3
-
-
-FLY = (
-    "task: simulate\nname: fly\nprogramme:\n  vessel: wam_v_cal\n  duration: 5 s\n"
-    "  manoeuvres: [{kind: constant, name: turn, drive: 0.5, steer: 0.3}]\n"
-)
-
-
-@pytest.mark.parametrize("error", [DataError("no such wind"), KeyboardInterrupt(), ValueError("x")])
-def test_the_log_of_a_run_that_ends_badly(
-    error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its lines and the traceback stay, and the next one goes on behind them."""
-
-    def broken(self: SimulateConfig, folder: RunFolder) -> Outcome:
-        say("the wind rises")
-        raise error
-
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "fly.yaml").write_text(FLY)
-    with monkeypatch.context() as patch:
-        patch.setattr(SimulateConfig, "carry_out", broken)
-        assert call(monkeypatch, "run", "fly.yaml", "--out", "run", "-v", "--quiet") != 0
-    text = (tmp_path / "run/log.txt").read_text()
-    assert "the wind rises\n" in text
-    assert "in broken" in text
-    assert type(error).__name__ in text
-    assert call(monkeypatch, "run", "fly.yaml", "--out", "run", "-v", "--resume") == 0
-    assert (tmp_path / "run/log.txt").read_text().startswith(text)
-
-
-def test_the_log_of_a_run_without_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "fly.yaml").write_text(FLY)
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/mine.txt").write_text("not a run")
-    assert call(monkeypatch, "run", tmp_path / "fly.yaml", "--out", tmp_path / "run", "-v") == 2
-    assert "UsageError" in (tmp_path / "run.log.txt").read_text()
-    assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["mine.txt"]
-
-
-def test_a_quiet_run_for_machines(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = tmp_path / "fly.yaml"
-    config.write_text(FLY)
-    out = tmp_path / "run"
-    code = call(monkeypatch, "run", config, "--out", out, "--json", "-v")
-    assert code == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)["folder"] == str(out)
-    assert told.err == ""
-    assert (out / "log.txt").is_file()

@@ -18,9 +18,15 @@ from read_page import plain
 from tiny import call
 from tiny_tasks import autopilot
 
+from residnet.tasks.course import CourseSpreadConfig
+
 pytestmark = pytest.mark.long
 
-AUTOPILOT = autopilot(Path())
+PD = {"kind": "pd", "kp": 1.5, "damping_time": "1.3 s"}
+LAW = {
+    "kind": "ptos", "lag": "0.3 s", "steepness": 37.0, "share": 0.58, "damping": 0.84,
+    "heading_rate": 0.28, "yaw_rate_rate": 2.6, "push_rate": 4.2, "cross_rate": 0.08,
+}  # fmt: skip
 COURSE: dict[str, Any] = {
     "task": "course",
     "name": "bend",
@@ -47,6 +53,7 @@ COURSE: dict[str, Any] = {
     "dt": "0.2 s",
     "duration": "42 s",
 }
+AUTOPILOT = autopilot(Path()) | {"peers": {"pd": PD, "ptos": LAW}, "floor": None}
 FLIGHTS = {
     ("enter", "course"),
     ("enter", "lookahead"),
@@ -160,25 +167,12 @@ def test_report_and_exports_are_there(run: Path) -> None:
 def test_a_policy_flies_the_course_and_is_exported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stated = {"dt": "0.1 s", "duration": "6 s", "hold": "0 s"}
-    law = {
-        "kind": "ptos", "lag": "0.3 s", "steepness": 37.0, "share": 0.58, "damping": 0.84,
-        "heading_rate": 0.28, "yaw_rate_rate": 2.6, "push_rate": 4.2, "cross_rate": 0.08,
-    }  # fmt: skip
-    training = {
-        "epochs": 1, "steps": 1, "batch": 8, "dt": "0.1 s", "hold": "0 s", "validation": 4,
-        "compiled": False, "steady": None,
-    }  # fmt: skip
-    steered = {key: value for key, value in AUTOPILOT.items() if key not in ("policies", "floor")}
-    steered |= {
-        "conditions": {"stated": stated, "flights": 4},
-        "policies": {"learned": {"start": "ptos", "units": 3, "training": training}},
-        "peers": {"ptos": law},
-        "test": {**AUTOPILOT["test"], "dt": "0.1 s"},
-    }
+    training = AUTOPILOT["policies"]["policy"]["training"] | {"dt": "0.1 s"}
+    steered = AUTOPILOT | {"policies": {"learned": {"start": "ptos", "training": training}}}
+    steered["policies"]["learned"]["units"] = 3
     dropped = ("line_of_sight", "others", "spread", "integral")
     course = {key: value for key, value in COURSE.items() if key not in dropped}
-    course |= {"policy": "learned", "peers": ["ptos"], "protocols": ["sides"], "dt": "0.1 s"}
+    course |= {"policy": "learned", "peers": ["ptos"], "protocols": ["sides"]}
     (tmp_path / "autopilot.yaml").write_text(yaml.safe_dump(steered))
     (tmp_path / "course.yaml").write_text(yaml.safe_dump(course))
     monkeypatch.chdir(tmp_path)
@@ -199,3 +193,18 @@ def test_a_policy_flies_the_course_and_is_exported(
     assert (card["format"], card["dtype"]) == ("c", "float64")
     assert call(monkeypatch, "export", "run", "--model", "learned", "--format", "c") == 2
     assert (tmp_path / "run/autopilot/exports/learned.c").is_file()
+
+
+def test_vessels_and_currents_fill_their_ranges_and_come_again_with_their_seed() -> None:
+    settings: dict[str, Any] = {"effect": (0.8, 1.1), "time": (0.9, 1.3), "bias": 0.01}
+    spread = CourseSpreadConfig(flights=2000, seed=3, current=0.4, **settings)
+    variation, current = spread.draw()
+    assert variation.amin(0).tolist() == pytest.approx([0.8, 0.9, -0.01], abs=2e-3)
+    assert variation.amax(0).tolist() == pytest.approx([1.1, 1.3, 0.01], abs=2e-3)
+    assert current.norm(dim=1).tolist() == pytest.approx([0.4] * 2000)
+    # from all directions alike: the mean of unit vectors has a standard deviation of 1/sqrt(2 N)
+    # each way
+    assert current.mean(0).abs().max() < 0.4 * 4 / math.sqrt(4000)
+    again = CourseSpreadConfig(flights=2000, seed=3, current=0.4, **settings).draw()
+    assert torch.equal(again.variation, variation)
+    assert not torch.equal(CourseSpreadConfig(flights=2000, seed=4).draw().current, current)

@@ -13,9 +13,7 @@ import torch
 import yaml
 from tiny import call
 
-from residnet.core.config import load_config
-from residnet.data.simulated import SimulatedTrials, simulate
-from residnet.tasks.fit import FitConfig
+from residnet.data.simulated.trials import SimulatedTrials, simulate
 
 pytestmark = pytest.mark.long
 
@@ -155,32 +153,3 @@ def test_a_mass_of_the_wrong_sign_stops_the_fit(
         "residnet: head ridge: residual in force space: its mass matrix with the fitted"
         " accelerations has eigenvalues [-"
     )
-
-
-@pytest.mark.parametrize(
-    ("override", "said"),
-    [
-        ("heads.ridge.space=forces", "did you mean 'force'"),
-        ("heads.ridge.terms=[u_dot u]", "accelerations only by themselves"),
-        ("heads.ridge={kind: ridge, terms: [u_dot]}", "space: force"),
-        (
-            "baseline={kind: regressors, terms: [u, tau_x]}",
-            "heads.ridge: space: force needs a baseline that knows its mass",
-        ),
-        ("heads.mlp={kind: mlp, features: [u_dot]}", "only a residual in force space knows it"),
-    ],
-)
-def test_refused_configs(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    override: str,
-    said: str,
-) -> None:
-    assert call(monkeypatch, "check", written(tmp_path, FERRY), "-s", override) == 2
-    assert said in capsys.readouterr().err
-
-
-def test_the_space_stands_in_the_config(tmp_path: Path) -> None:
-    found = load_config(written(tmp_path, FERRY), [], FitConfig)
-    assert found.heads["ridge"].space == "force"

@@ -6,14 +6,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import written_logs
 import yaml
 from tiny import call
-from tiny_tasks import imported
 
 from residnet.core.log import Log
 from residnet.data.readers.canonical import CanonicalConfig
@@ -61,23 +59,6 @@ def test_recordings_of_different_length_become_canonical_logs(
     assert {Path(path).name for path in inputs} == {"odometry.csv", "cmd_port.csv", "cmd_stbd.csv"}
 
 
-def test_what_does_not_match_stops_before_any_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recorded(tmp_path, "rec_a", 2.0)
-    cases: list[tuple[dict[str, Any], str]] = [
-        ({"logs": ["raw_*"]}, "'raw_*' matches nothing"),
-        ({"logs": ["/rec_*"]}, "set `root` instead"),
-        ({"logs": []}, "logs"),
-    ]
-    for keys, words in cases:
-        assert call(monkeypatch, "run", config(tmp_path, **keys), "--out", tmp_path / "run") == 2
-        said = capsys.readouterr().err
-        assert words in said
-        assert said.count("\n") == 1
-        assert not (tmp_path / "run").exists()
-
-
 def test_two_recordings_of_one_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -88,17 +69,3 @@ def test_two_recordings_of_one_name(
     assert call(monkeypatch, "run", config(tmp_path, logs=["*/rec_a"]), "--out", run) == 0
     assert set(json.loads((run / "findings.json").read_text())) == {"monday_rec_a", "tuesday_rec_a"}
     assert len({path.name for path in run.rglob("*_rec_a.*")}) >= 2
-
-
-def test_a_check_reads_a_recording_as_the_run_will(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    content = imported(tmp_path)
-    content["reader"]["channels"]["u"]["column"] = "speed"
-    path = tmp_path / "import.yaml"
-    path.write_text(yaml.safe_dump(content))
-    assert call(monkeypatch, "check", path) == 2
-    assert "no column 'speed'" in capsys.readouterr().err
-    content["reader"]["channels"]["u"]["column"] = "u"
-    path.write_text(yaml.safe_dump(content))
-    assert call(monkeypatch, "check", path) == 0

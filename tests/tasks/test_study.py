@@ -71,26 +71,3 @@ def test_all_variants_and_seeds_in_one_table(
     again = {path: path.stat().st_mtime_ns for path in out.glob("variants/*/metrics.json")}
     changed = {path.parent.name for path in again if again[path] != stamps[path]}
     assert changed == {"short.1"}, "finished runs are kept"
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("reference=recpie", "did you mean 'recipe'"),
-        ("model=rigde", "no model is named 'rigde'"),
-        ("seeds=[1, 1]", "each only once"),
-        ("variants.short=[heads.ridge.degre=1]", "degre"),
-        ("base=nowhere.yaml", "nowhere.yaml"),
-    ],
-)
-def test_a_wrong_study_is_one_line(
-    override: str,
-    message: str,
-    study: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert call(monkeypatch, "check", study, "-s", override) == 2
-    text = capsys.readouterr().err
-    assert message in text
-    assert text.count("\n") == 1

@@ -142,33 +142,6 @@ def test_a_poor_trial_is_ended_early(sweep: Path, tmp_path: Path) -> None:
         heard(Progress("training ridge", 1, 2, score=2.5))
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("space.heads.ridge.degre={choices: [1]}", "space"),
-        ("space={heads.ridge.degre: {choices: [1, 2]}}", "did you mean 'degree'"),
-        ("space={heads.ridge.degree: {low: 3, high: 1}}", "low (3) must be less than high (1)"),
-        ("space={heads.ridge.penalty: {low: 0.1, high: 1.0}}", "number of points"),
-        ("space={heads.ridge.penalty: {low: 0.0, high: 1.0, log: true}}", "above zero"),
-        ("space={heads.ridge.degree: {choices: [1, 1]}}", "each only once"),
-        ("objective.model=rigde", "did you mean 'ridge'"),
-        ("objective={kind: figure, name: nrmse}", "must not choose anything"),
-        ("search={kind: tpe}", "trials"),
-    ],
-)
-def test_a_wrong_sweep_is_one_line(
-    override: str,
-    message: str,
-    sweep: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert call(monkeypatch, "check", sweep, "-s", override) == 2
-    text = capsys.readouterr().err
-    assert message in text
-    assert text.count("\n") == 1
-
-
 @pytest.mark.long
 def test_processes_end_with_a_killed_sweep_and_the_rest_follows(
     sweep: Path, tmp_path: Path

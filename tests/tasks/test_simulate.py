@@ -1,0 +1,230 @@
+"""Task `simulate`: a vessel, a learned model, or both; trials that a fit reads back."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from read_page import plain
+from tiny import TINY, call
+
+from residnet.core.log import Log
+from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.simulated.trials import SimulatedTrials, simulate
+
+STEP = 0.1
+PATTERN = {"kind": "three_two_one_one", "drive": 0.5, "steer": 0.6, "unit": 2, "duration": 25}
+ZIGZAG = {"kind": "zigzag", "drive": 0.6, "steer": 0.4, "heading": "15 deg", "start": 10}
+VESSEL: dict[str, Any] = {
+    "vessel": "wam_v_cal",
+    "duration": 60,
+    "step": STEP,
+    "substeps": 1,
+    "noise": {"u": 0, "v": 0, "r": 0},
+    "manoeuvres": [
+        ZIGZAG | {"reversals": 4},
+        {"kind": "turning_circle", "name": "circle", "drive": 0.6, "steer": 1.0, "start": 10},
+        PATTERN,
+    ],
+    "families": [{"kind": "random_steps", "count": 2}],
+}
+
+
+def flown(
+    folder: Path, patch: pytest.MonkeyPatch, content: dict[str, Any], code: int = 0
+) -> dict[str, Log]:
+    """The logs of a run in `folder`, by the name of their file within it."""
+    file = folder.with_suffix(".yaml")
+    task = {"task": "simulate", "name": "ship", **content}
+    file.write_text(yaml.safe_dump(task, sort_keys=False))
+    assert call(patch, "run", file, "--out", folder) == code
+    logs = sorted(folder.rglob("*.parquet"))
+    return {
+        f"{path.parent.name}/{path.stem}": CanonicalConfig().build().read(path) for path in logs
+    }
+
+
+def indices(folder: Path) -> dict[tuple[str, str], dict[str, Any]]:
+    content = json.loads((folder / "indices.json").read_text())["rows"]
+    return {(row["craft"], row["log"]): row for row in content}
+
+
+@pytest.fixture(scope="module")
+def ship(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("programme") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        flown(folder, patch, {"programme": VESSEL})
+    return folder
+
+
+def test_a_vessel_leaves_logs_indices_and_figures(ship: Path) -> None:
+    logs = {path.stem: Log.load(path) for path in (ship / "logs").glob("*.parquet")}
+    random = {"random_steps_01", "random_steps_02"}
+    assert set(logs) == {"zigzag_01", "circle", "three_two_one_one_01", *random}
+    assert logs["three_two_one_one_01"].t[-1] == pytest.approx(25 - STEP)
+    assert logs["random_steps_01"].t[-1] == pytest.approx(60 - STEP)
+    # the circle ends at the first sample at which the heading has changed by 540 deg
+    psi = logs["circle"]["psi"]
+    assert psi[-1] >= 3 * math.pi > psi[-2]
+    zigzag = logs["zigzag_01"]
+    steer = np.sign(zigzag["cmd_port"] - zigzag["cmd_stbd"])
+    assert (np.diff(steer[zigzag.t > 10]) != 0).sum() == 4
+    assert zigzag["psi"][-1] >= 0 > zigzag["psi"][-2]
+    content = json.loads((ship / "indices.json").read_text())
+    assert (content["schema"], content["length"]) == ("residnet.indices/1", 4.88)
+    assert content["units"]["first_overshoot"] == "rad"
+    # the peak lies between samples
+    peak = float(zigzag["psi"][zigzag.t < 16].max())
+    found = indices(ship)["wam_v_cal", "zigzag_01"]["indices"]
+    assert found["first_overshoot"] == pytest.approx(peak - math.radians(15), abs=1e-3)
+    circle = indices(ship)["wam_v_cal", "circle"]
+    assert circle["limits"]["advance"]["limit"] == pytest.approx(4.5 * 4.88)
+    assert circle["limits"]["advance"]["kept"]
+    advance = circle["indices"]["advance"]
+    assert circle["indices"]["advance_lengths"] == pytest.approx(advance / 4.88)
+    assert not any(row["timed_out"] for row in content["rows"])
+    figures = list((ship / "figures").glob("*.png"))
+    assert len(figures) == len(logs)
+    for path in figures:
+        with Image.open(path) as picture:
+            assert min(picture.size) > 600
+            assert picture.info["Title"]
+    assert "first overshoot" in plain(ship / "report.html")
+
+
+def test_a_model_flies_beside_its_vessel_and_alone(
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model of the tiny fit is no good one; here it only has to fly by itself, and both ways
+    the same; with given inputs, without a vessel, they follow within their rate.
+    """
+    model: dict[str, Any] = {"run": str(tiny_run), "name": "ridge"}
+    programme = VESSEL | {"manoeuvres": [PATTERN], "step": None, "duration": 20, "model": model}
+    both = flown(tmp_path / "both", monkeypatch, {"programme": programme})
+    programme |= {"vessel": None, "model": {**model, "actuators": "wam_v_cal"}}
+    alone = flown(tmp_path / "alone", monkeypatch, {"programme": programme})
+    names = {name.removeprefix("logs/") for name in alone}
+    assert names == {"three_two_one_one_01", "random_steps_01", "random_steps_02"}
+    assert set(both) == {f"{place}/{name}" for place in ("logs", "model_logs") for name in names}
+    for name in names:
+        log, other, true = both[f"model_logs/{name}"], alone[f"logs/{name}"], both[f"logs/{name}"]
+        for channel in log.channels:
+            np.testing.assert_array_equal(log[channel], other[channel])
+        np.testing.assert_array_equal(log["cmd_port"], true["cmd_port"])
+        np.testing.assert_allclose(log["n_port"], true["n_port"], atol=1e-9)
+        assert 0 < np.abs(log["u"] - true["u"]).max() < 0.5
+    inputs = json.loads((tmp_path / "both" / "provenance.json").read_text())["inputs"]
+    assert {Path(path).name for path in inputs} == {"model.json", "model.safetensors"}
+    share = {"drive": "2380 rpm", "limit": "2380 rpm", "rate": "600 rpm/s"}
+    sides = {"n_port": share | {"steer": "2380 rpm"}, "n_stbd": share | {"steer": "-2380 rpm"}}
+    given = {"model": {"run": str(tiny_run), "inputs": sides}, "duration": 20, "length": 4.88}
+    given |= {"noise": VESSEL["noise"], "manoeuvres": [ZIGZAG | {"drive": 0.5, "steer": 0.3}]}
+    log = flown(tmp_path / "given", monkeypatch, {"programme": given})["logs/zigzag_01"]
+    assert np.abs(np.diff(log["n_port"])).max() == pytest.approx(10 * STEP, rel=1e-9)
+    assert log["cmd_n_port"].max() == pytest.approx(0.8 * 2380 / 60)
+
+
+def test_a_manoeuvre_that_never_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of those that are listed it is an error, whose log says it too; of those drawn a line."""
+    lazy = ZIGZAG | {"steer": 0.0, "heading": "20 deg", "reversals": 2, "duration": 8}
+    programme = VESSEL | {"manoeuvres": [lazy, PATTERN]}
+    logs = flown(tmp_path / "run", monkeypatch, {"programme": programme}, code=1)
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1
+    assert "zigzag_01: timed out after 7.9 s before 2 reversals at 20 deg" in error
+    assert "(1 of 4 flights did not end as they should" in error
+    assert logs["logs/zigzag_01"].meta["timed_out"] is True
+    assert "timed_out" not in logs["logs/three_two_one_one_01"].meta
+    assert indices(tmp_path / "run")["wam_v_cal", "zigzag_01"]["timed_out"]
+    family = [{"kind": "turning_circle", "count": 1, "steer": [0.01, 0.02]}]
+    programme |= {"manoeuvres": [], "families": family, "duration": 10}
+    flown(tmp_path / "drawn", monkeypatch, {"programme": programme})
+    assert "turning_circle_01: timed out" in capsys.readouterr().err
+
+
+def test_replay_gives_the_log_again(
+    ship: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same vessel from the recorded start with the recorded commands: the recorded motion."""
+    names = ("random_steps_01", "circle")
+    replay = [{"kind": "replay", "log": str(ship / "logs" / f"{name}.parquet")} for name in names]
+    programme = VESSEL | {"manoeuvres": replay, "families": []}
+    logs = flown(tmp_path / "run", monkeypatch, {"programme": programme})
+    for name, source in zip(("replay_01", "replay_02"), names, strict=True):
+        mine, log = logs[f"logs/{name}"], Log.load(ship / "logs" / f"{source}.parquet")
+        assert len(log) - len(mine) in (0, 1)
+        for channel in log.channels:
+            np.testing.assert_allclose(mine[channel], log[channel][: len(mine)], atol=1e-9)
+        assert indices(tmp_path / "run")["wam_v_cal", name]["indices"]["rmse_u"] < 1e-9
+
+
+def test_trials_are_drawn_split_and_read_by_inspect(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trials = [TINY["data"]["trials"][0], TINY["data"]["trials"][3]]
+    counts = {"identification": {"three_two_one_one": 2}, "validation": {"constant": 2}}
+    settings = {**TINY["data"], "duration": 12, "trials": trials, **counts}
+    logs = flown(tmp_path / "run", monkeypatch, {"data": settings})
+    data = SimulatedTrials.model_validate(settings)
+    drawn = data.draw()
+    found = zip(simulate(drawn, data), data.splits(drawn), strict=True)
+    expected = {f"{split}/{log.name}": log for log, split in found}
+    assert logs.keys() == expected.keys()
+    for name, log in expected.items():
+        assert (logs[name].manoeuvre, logs[name].units) == (log.manoeuvre, log.units)
+        np.testing.assert_array_equal(logs[name].t, log.t)
+        assert logs[name].channels.keys() == log.channels.keys()
+        for channel in log.channels:
+            np.testing.assert_array_equal(logs[name][channel], log[channel])
+    provenance = json.loads((tmp_path / "run" / "provenance.json").read_text())
+    assert (provenance["seed"], provenance["inputs"]) == (0, {})
+    assert provenance["config"].endswith("run.yaml")
+    files = sorted((tmp_path / "run" / "logs").rglob("three_two_one_one_*.parquet"))
+    assert len(files) == 3
+    capsys.readouterr()
+    assert call(monkeypatch, "inspect", *files) in (0, 1)
+    text = capsys.readouterr().out
+    told = "note: 10 channels, 120 samples, manoeuvre three_two_one_one"
+    assert all(f"{path.stem}: {told}" in text for path in files)
+
+
+@pytest.mark.long
+def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Baseline and ridge see the same numbers whether they are simulated or read back."""
+    logs = flown(tmp_path / "trials", monkeypatch, {"data": TINY["data"]})
+    data = SimulatedTrials.model_validate(TINY["data"])
+    drawn = data.draw()
+    split: dict[str, Any] = {"root": str(tmp_path / "trials" / "logs")}
+    # in the order of the programme: the folds of a cross-validation follow the order of the logs
+    for log, name in zip(simulate(drawn, data), data.splits(drawn), strict=True):
+        split.setdefault(name, []).append(f"{name}/{log.name}.parquet")
+    measured = {"kind": "measured", "reader": {"kind": "canonical"}, "split": split}
+    light = {"heads": {"ridge": {"kind": "ridge"}}, "ensembles": {}, "training": {}}
+    light |= {"export": {"models": []}, "data": measured, "name": "files"}
+    (tmp_path / "files.yaml").write_text(yaml.safe_dump(TINY | light, sort_keys=False))
+    assert call(monkeypatch, "run", tmp_path / "files.yaml", "--out", tmp_path / "files") == 0
+    found = []
+    for run in (tiny_run, tmp_path / "files"):
+        fit = json.loads((run / "models" / "baseline" / "fit.json").read_text())
+        values: dict[tuple[str, ...], float] = {
+            (entry["axis"], entry["term"]): entry["value"] for entry in fit["coefficients"]
+        }
+        for row in json.loads((run / "metrics.json").read_text())["rows"]:
+            if row["model"] in ("zero", "baseline", "ridge"):
+                key = (row["model"], row["split"], row["protocol"], row["manoeuvre"])
+                values[key] = row["nrmse"]["mean"]
+        found.append(values)
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
+    assert len(found[0]) > 40
+    inputs = json.loads((tmp_path / "files" / "provenance.json").read_text())["inputs"]
+    assert len(inputs) == len(logs)
