@@ -16,7 +16,7 @@ import residnet
 
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
-    "api": (684, 79),
+    "api": (682, 79),
     "baselines": (794, 117),
     "control": (3232, 352),
     "core": (1268, 183),
@@ -28,12 +28,12 @@ STATEMENTS_AND_FUNCTIONS = {
     "identification": (2106, 220),
     "judge": (1887, 204),
     "manoeuvres": (990, 124),
-    "physics": (2021, 258),
+    "physics": (2023, 258),
     "regression": (1875, 207),
     "report": (2840, 320),
     "runs": (337, 47),
     "simulators": (362, 45),
-    "tasks": (2994, 256),
+    "tasks": (2977, 255),
     "testing": (485, 33),
     "training": (1344, 150),
     "": (428, 50),

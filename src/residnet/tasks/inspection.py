@@ -26,10 +26,10 @@ from residnet.data.doctor import (
     summary,
 )
 from residnet.data.drafting.reading import log_files, read_each
-from residnet.data.split import log_names
 from residnet.data.prepare import prepare, samples
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.sources import MeasuredLogs
+from residnet.data.split import log_names
 from residnet.tasks.drafting import commented
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.import_logs import ImportConfig
