@@ -33,7 +33,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2840, 320),
     "runs": (337, 47),
     "simulators": (362, 45),
-    "tasks": (2977, 255),
+    "tasks": (2974, 255),
     "testing": (485, 33),
     "training": (1344, 150),
     "": (428, 50),

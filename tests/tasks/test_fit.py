@@ -20,7 +20,7 @@ import yaml
 from tiny import TINY, call
 
 from residnet.core.config import validate
-from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials
 from residnet.dynamics.store import load_model
 
 ALONE: dict[str, Any] = {"ensembles": {}, "training": {}, "export": {"models": []}}

@@ -13,7 +13,7 @@ import torch
 import yaml
 from tiny import call
 
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 
 pytestmark = pytest.mark.long
 

@@ -16,7 +16,7 @@ from tiny import TINY, call
 
 from residnet.core.log import Log
 from residnet.data.readers.canonical import CanonicalConfig
-from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate
 
 STEP = 0.1
 PATTERN = {"kind": "three_two_one_one", "drive": 0.5, "steer": 0.6, "unit": 2, "duration": 25}
