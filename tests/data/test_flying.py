@@ -15,9 +15,8 @@ from residnet.data.simulated import Craft, Sea, fly, log_names
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.constant import ConstantInput
-from residnet.manoeuvres.turning_circle import TurningCircle
-from residnet.manoeuvres.zigzag import Zigzag
+from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
+from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.environment import Box, JonswapSpectrum, WavesConfig
 from residnet.physics.vessel import load_vessel
 

@@ -27,7 +27,7 @@ from residnet.heads.base import ResidualHead
 from residnet.heads.ridge import RidgeConfig
 from residnet.heads.zero import ZeroHead
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.zigzag import Zigzag
+from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 

@@ -35,7 +35,7 @@ from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import NomotoDynamics, TracedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource
-from residnet.manoeuvres.zigzag import Zigzag
+from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.hull import PatrolConfig
 from residnet.physics.nomoto import NomotoConfig, SteeringVessel
 from residnet.physics.plant import Plant

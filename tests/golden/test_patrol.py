@@ -19,7 +19,7 @@ from kinds import of_kind
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource, StackedSource
-from residnet.manoeuvres.zigzag import Zigzag
+from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.actuators.rudders import SternRudders
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel

@@ -23,11 +23,9 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.heads.zero import ZeroHead
-from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
-from residnet.manoeuvres.constant import ConstantInput
-from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne
-from residnet.manoeuvres.zigzag import Zigzag
+from residnet.manoeuvres.closed_loop import Zigzag
+from residnet.manoeuvres.open_loop import AccelerationDeceleration, ConstantInput, ThreeTwoOneOne
 from residnet.physics.actuators import Thrusters
 from residnet.physics.plant import HullPlant
 from residnet.physics.signals import SignalsConfig

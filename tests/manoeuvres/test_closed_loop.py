@@ -17,12 +17,18 @@ from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.manoeuvres.base import Helm, StackedSource, Watched
-from residnet.manoeuvres.excitation import MultiSine, RandomSteps
-from residnet.manoeuvres.four_corner import SEGMENTS, FourCorner
-from residnet.manoeuvres.spiral import Spiral
-from residnet.manoeuvres.steady import Steady, SteadyConfig
-from residnet.manoeuvres.turning_circle import TurningCircle
-from residnet.manoeuvres.zigzag import Zigzag
+from residnet.manoeuvres.closed_loop import (
+    Spiral,
+    SteadyConfig,
+    TurningCircle,
+    Zigzag,
+    is_steady,
+    restarted,
+    steadied,
+    steady_at,
+)
+from residnet.manoeuvres.courses import SEGMENTS, FourCorner
+from residnet.manoeuvres.open_loop import MultiSine, RandomSteps
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
@@ -137,23 +143,18 @@ def test_pull_out_ends_when_the_yaw_rate_is_steady() -> None:
 
 
 def test_steady_by_hand() -> None:
-    steady = Steady([SteadyConfig(window=1.0, tolerance=0.1)], 0.5)
-    memory = steady.initial(torch.tensor([0.0]))
+    given = {"window": 1.0, "tolerance": 0.1, "dt": 0.5}
+    numbers = {name: torch.tensor([value]) for name, value in given.items()}
+    memory = steady_at(torch.tensor([0.0]))
     seen = []
-    for r in (1.0, 1.0, 1.0, 1.0, 1.0, 1.0):
-        memory = steady(torch.tensor([r]), memory)
-        seen.append((round(float(memory[0, 0]), 4), bool(steady.reached(memory))))
-    # the mean halves its distance each step: within 0.1 from the fourth on, for a window of two
+    for _ in range(6):
+        memory = steadied(torch.tensor([1.0]), numbers, memory)
+        seen.append((round(float(memory[0, 0]), 4), bool(is_steady(numbers, memory))))
+    # the mean halves its distance each step: within 0.1 from the third on, for a window of two
     # steps
-    assert seen == [
-        (0.5, False),
-        (0.75, False),
-        (0.875, False),
-        (0.9375, False),
-        (0.9688, True),
-        (0.9844, True),
-    ]
-    assert not bool(steady.reached(steady.restart(memory, torch.tensor([True]))))
+    assert [mean for mean, _ in seen] == [0.5, 0.75, 0.875, 0.9375, 0.9688, 0.9844]
+    assert [steady for _, steady in seen] == [False] * 4 + [True] * 2
+    assert not bool(is_steady(numbers, restarted(memory, torch.tensor([True]))))
 
 
 def test_spiral_of_a_linear_vessel_has_no_loop() -> None:

@@ -14,13 +14,10 @@ from scipy.optimize import brentq
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.manoeuvres import imo
+from residnet.manoeuvres import indices
 from residnet.manoeuvres.base import Helm
+from residnet.manoeuvres.closed_loop import Spiral, Stopping, TurningCircle, Zigzag
 from residnet.manoeuvres.indices import IN_LENGTHS, UNITS, Track, first_crossing, turning, zigzag
-from residnet.manoeuvres.spiral import Spiral
-from residnet.manoeuvres.stopping import Stopping
-from residnet.manoeuvres.turning_circle import TurningCircle
-from residnet.manoeuvres.zigzag import Zigzag
 
 DEG = math.pi / 180
 
@@ -220,7 +217,7 @@ def test_imo_limits_of_the_10_10_zigzag(
     """MSC.137(76): 10 deg below L/V = 10 s, 20 deg from 30 s on, (5 + L/(2V)) deg between; 25, 40
     and (17.5 + 0.75 L/V) deg.
     """
-    limits = imo.zigzag_10(length, speed)
+    limits = indices.zigzag_limits(10.0, length, speed)
     assert limits["first_overshoot"] == pytest.approx(first * DEG)
     assert limits["second_overshoot"] == pytest.approx(second * DEG)
     assert limits["initial_turning_distance"] == pytest.approx(2.5 * length)
@@ -241,15 +238,14 @@ def test_which_manoeuvres_imo_limits() -> None:
     assert twin.hard_over is None
     ten = Zigzag(drive=1, rudder=10 * DEG, heading=10 * DEG)
     assert ten.share(rudder) == pytest.approx(10 / 35)
-    assert ten.limits(rudder, 100, 8) == imo.zigzag_10(100, 8)
+    assert ten.limits(rudder, 100, 8) == indices.zigzag_limits(10.0, 100, 8)
     assert (
         Zigzag(drive=1, rudder=-20 * DEG, heading=20 * DEG).limits(rudder, 100, 8)
-        == imo.zigzag_20()
+        == indices.zigzag_limits(20.0, 1.0, 1.0)
     )
     assert Zigzag(drive=1, rudder=10 * DEG, heading=20 * DEG).limits(rudder, 100, 8) == {}
-    assert Zigzag(drive=1, steer=0.5, heading=20 * DEG).limits(twin, 100, 8) == imo.zigzag_20(), (
-        "without a rudder the heading tells"
-    )
+    alone = Zigzag(drive=1, steer=0.5, heading=20 * DEG).limits(twin, 100, 8)
+    assert alone == indices.zigzag_limits(20.0, 1.0, 1.0), "without a rudder the heading tells"
     assert TurningCircle(drive=1, steer=-1).limits(rudder, 100, 8) == {
         "advance": 450,
         "tactical_diameter": 500,

@@ -5,7 +5,7 @@ import pytest
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.manoeuvres.recognise import steered_zigzag
+from residnet.manoeuvres.indices import steered_zigzag
 
 STEP = 0.1
 

@@ -23,12 +23,9 @@ from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputSh
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.models import FittedModel
-from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.excitation import MultiSine
-from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne
-from residnet.manoeuvres.turning_circle import TurningCircle
-from residnet.manoeuvres.zigzag import Zigzag
+from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
+from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne
 from residnet.training.free_runs.covariance import LeftOpen
 from residnet.training.refit_config import RefitConfig
 from residnet.training.sensitivities import step_sensitivities

@@ -1,4 +1,4 @@
-"""Manoeuvres, one file each: the manoeuvre, its source of inputs, and the family that draws it."""
+"""Manoeuvres by how they steer, the families that draw them, and their indices."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 from residnet.core.registry import Kinds
 
 if TYPE_CHECKING:
-    from residnet.manoeuvres.acceleration_deceleration import AccelerationDecelerationFamily
     from residnet.manoeuvres.base import Manoeuvre
-    from residnet.manoeuvres.constant import ConstantFamily
-    from residnet.manoeuvres.excitation import MultiSineFamily, RandomStepsFamily
-    from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOneFamily
-    from residnet.manoeuvres.turning_circle import TurningCircleFamily
-    from residnet.manoeuvres.zigzag import ZigzagFamily
+    from residnet.manoeuvres.closed_loop import TurningCircleFamily, ZigzagFamily
+    from residnet.manoeuvres.open_loop import (
+        AccelerationDecelerationFamily,
+        ConstantFamily,
+        MultiSineFamily,
+        RandomStepsFamily,
+        ThreeTwoOneOneFamily,
+    )
 
     ManoeuvreConfig: TypeAlias = Manoeuvre
     FamilyConfig: TypeAlias = (
@@ -26,24 +28,26 @@ if TYPE_CHECKING:
         | MultiSineFamily
     )
 else:
-    _LEVELS = "residnet.manoeuvres.acceleration_deceleration"
+    _OPEN, _CLOSED, _COURSES = (
+        f"residnet.manoeuvres.{name}" for name in ("open_loop", "closed_loop", "courses")
+    )
     ManoeuvreConfig = Annotated[
         Any,
         Kinds(
             "residnet.manoeuvres",
             "residnet.manoeuvres.base:Manoeuvre",
             {
-                "constant": "residnet.manoeuvres.constant:ConstantInput",
-                "zigzag": "residnet.manoeuvres.zigzag:Zigzag",
-                "turning_circle": "residnet.manoeuvres.turning_circle:TurningCircle",
-                "acceleration_deceleration": f"{_LEVELS}:AccelerationDeceleration",
-                "three_two_one_one": "residnet.manoeuvres.three_two_one_one:ThreeTwoOneOne",
-                "random_steps": "residnet.manoeuvres.excitation:RandomSteps",
-                "multi_sine": "residnet.manoeuvres.excitation:MultiSine",
-                "spiral": "residnet.manoeuvres.spiral:Spiral",
-                "stopping": "residnet.manoeuvres.stopping:Stopping",
-                "waypoints": "residnet.manoeuvres.waypoints:Waypoints",
-                "four_corner": "residnet.manoeuvres.four_corner:FourCorner",
+                "constant": f"{_OPEN}:ConstantInput",
+                "zigzag": f"{_CLOSED}:Zigzag",
+                "turning_circle": f"{_CLOSED}:TurningCircle",
+                "acceleration_deceleration": f"{_OPEN}:AccelerationDeceleration",
+                "three_two_one_one": f"{_OPEN}:ThreeTwoOneOne",
+                "random_steps": f"{_OPEN}:RandomSteps",
+                "multi_sine": f"{_OPEN}:MultiSine",
+                "spiral": f"{_CLOSED}:Spiral",
+                "stopping": f"{_CLOSED}:Stopping",
+                "waypoints": f"{_COURSES}:Waypoints",
+                "four_corner": f"{_COURSES}:FourCorner",
                 "replay": "residnet.manoeuvres.replay:Replay",
             },
         ),
@@ -54,13 +58,13 @@ else:
             "residnet.families",
             "residnet.core.config:Config",
             {
-                "constant": "residnet.manoeuvres.constant:ConstantFamily",
-                "zigzag": "residnet.manoeuvres.zigzag:ZigzagFamily",
-                "turning_circle": "residnet.manoeuvres.turning_circle:TurningCircleFamily",
-                "acceleration_deceleration": f"{_LEVELS}:AccelerationDecelerationFamily",
-                "three_two_one_one": "residnet.manoeuvres.three_two_one_one:ThreeTwoOneOneFamily",
-                "random_steps": "residnet.manoeuvres.excitation:RandomStepsFamily",
-                "multi_sine": "residnet.manoeuvres.excitation:MultiSineFamily",
+                "constant": f"{_OPEN}:ConstantFamily",
+                "zigzag": f"{_CLOSED}:ZigzagFamily",
+                "turning_circle": f"{_CLOSED}:TurningCircleFamily",
+                "acceleration_deceleration": f"{_OPEN}:AccelerationDecelerationFamily",
+                "three_two_one_one": f"{_OPEN}:ThreeTwoOneOneFamily",
+                "random_steps": f"{_OPEN}:RandomStepsFamily",
+                "multi_sine": f"{_OPEN}:MultiSineFamily",
             },
         ),
     ]

@@ -11,8 +11,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Any, ClassVar, final
 
+import numpy as np
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
@@ -26,6 +27,8 @@ from residnet.physics.plant import HullPlant, Plant
 
 Demand = Callable[[Tensor, Tensor], Tensor]
 """Turns drive [...] and steer [...] into commands [..., c], the first c columns of the inputs."""
+
+Range = tuple[float, float]
 
 RUDDERS = ("cmd_delta", "delta")
 """Names of the input that is a rudder angle."""
@@ -87,18 +90,67 @@ class Helm:
         return float(full[0, self.inputs.index(name)])
 
 
+def commanded(command: Tensor, w: Tensor) -> Tensor:
+    """Return the inputs [B, m] with commands [B, c] in the place of their first columns."""
+    return torch.cat((command, w[:, command.shape[-1] :]), dim=-1)
+
+
 @final
 class ScheduleSource(Source):
-    """Open-loop demands given in advance."""
+    """Open-loop demands [B, T] given in advance."""
 
     def __init__(self, drive: Tensor, steer: Tensor, demand: Demand) -> None:
         super().__init__()
         self.commands = demand(drive, steer)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m] with the scheduled commands in the first columns."""
-        command = self.commands[:, k].to(w.dtype)
-        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
+        """Return the inputs [B, m] with the scheduled commands."""
+        return commanded(self.commands[:, k].to(w.dtype), w), memory
+
+
+Numbers = dict[str, Tensor]
+"""What rows of a batch are told by their manoeuvres, each [B] or [B, n]."""
+
+
+@final
+class LawSource(Source):
+    """Manoeuvres of one kind that steer by the motion, side by side."""
+
+    def __init__(self, manoeuvres: Sequence[ClosedLoop], helm: Helm, t: Tensor) -> None:
+        super().__init__()
+        self.kind = type(manoeuvres[0])
+        rows = [manoeuvre.numbers(helm) for manoeuvre in manoeuvres]
+        self.numbers: Numbers = {
+            name: torch.nn.utils.rnn.pad_sequence(
+                [torch.tensor(row[name], dtype=torch.float64) for row in rows], batch_first=True
+            )
+            if isinstance(rows[0][name], list)
+            else torch.tensor([row[name] for row in rows], dtype=torch.float64)
+            for name in rows[0]
+        }
+        self.numbers["dt"] = t[1] - t[0]
+        self.columns = {name: helm.column(name) for name in self.kind.watches}
+        self.demand = helm.demand
+        self.times = t.tolist()
+        self.may_stop = any(manoeuvre.goal is not None for manoeuvre in manoeuvres)
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Return the memory [B, k] at the start."""
+        return self.kind.memory(*self._seen(x))
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the inputs [B, m]; what the motion says is tested at the start of the step."""
+        seen, numbers = self._seen(x)
+        drive, steer, memory = self.kind.law(seen, numbers, self.times[k], memory)
+        return commanded(self.demand(drive, steer), w), memory
+
+    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+        """Return the rows [B] whose manoeuvre has come to its end."""
+        return self.kind.ended(*self._seen(x), self.times[k], memory)
+
+    def _seen(self, x: Tensor) -> tuple[Numbers, Numbers]:
+        seen = {name: x[:, column] for name, column in self.columns.items()}
+        return seen, {name: value.to(x.dtype) for name, value in self.numbers.items()}
 
 
 @final
@@ -114,14 +166,10 @@ class StackedSource(Source):
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the memories of all sources, padded to the widest, [B, k]."""
-        parts = [
-            source.initial(part)
-            for source, part in zip(self.sources, x.split(self.rows), strict=True)
-        ]
-        self.widths = [part.shape[1] for part in parts]
-        return torch.cat(
-            [torch.nn.functional.pad(part, (0, max(self.widths) - part.shape[1])) for part in parts]
-        )
+        parts = zip(self.sources, x.split(self.rows), strict=True)
+        memories = [source.initial(part) for source, part in parts]
+        self.widths = [memory.shape[1] for memory in memories]
+        return torch.cat([self._padded(memory, max(self.widths)) for memory in memories])
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m], each block of rows from its source."""
@@ -131,8 +179,7 @@ class StackedSource(Source):
         ):
             acting, after = source(xs, ws, k, ms)
             inputs.append(acting)
-            # a source may need less memory than the widest of the batch
-            memories.append(torch.nn.functional.pad(after, (0, memory.shape[1] - after.shape[1])))
+            memories.append(self._padded(after, memory.shape[1]))
         return torch.cat(inputs), torch.cat(memories)
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
@@ -140,11 +187,13 @@ class StackedSource(Source):
         parts = zip(self.sources, x.split(self.rows), self._split(memory), strict=True)
         return torch.cat([source.finished(xs, k, ms) for source, xs, ms in parts])
 
+    @staticmethod
+    def _padded(memory: Tensor, width: int) -> Tensor:
+        return torch.nn.functional.pad(memory, (0, width - memory.shape[1]))
+
     def _split(self, memory: Tensor) -> list[Tensor]:
-        return [
-            part[:, :width]
-            for part, width in zip(memory.split(self.rows), self.widths, strict=True)
-        ]
+        parts = zip(memory.split(self.rows), self.widths, strict=True)
+        return [part[:, :width] for part, width in parts]
 
 
 @final
@@ -260,18 +309,63 @@ class Scheduled(Manoeuvre):
         )
 
 
-class Steering(Config):
-    """The part that manoeuvres share which hold drive and steer from `start` on.
+class ClosedLoop(Manoeuvre):
+    """A manoeuvre that demands drive and steer by the motion that it sees.
 
-    Attributes:
-        drive: share of full drive, -1 to 1.
-        steer: share of full steer, -1 to 1; positive turns to starboard.
-        start: when the steering begins in s; before, the vessel goes straight ahead.
+    Its class methods work on all rows of a batch at once. `seen` holds the states that the kind
+    `watches`, [B] each; `numbers` what the rows' manoeuvres say, and the step `dt` in s.
     """
 
-    drive: float = Field(ge=-1, le=1)
-    steer: float = Field(ge=-1, le=1)
-    start: Seconds = Field(default=5.0, ge=0)
+    watches: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def numbers(self, helm: Helm) -> dict[str, Any]:
+        """Return what the law needs to know of this manoeuvre, numbers or lists of them."""
+
+    @classmethod
+    @abstractmethod
+    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+        """Return the memory [B, k] at the start."""
+
+    @classmethod
+    @abstractmethod
+    def law(
+        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return drive [B], steer [B] and the memory [B, k] for the step that begins at `time`."""
+
+    @classmethod
+    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
+        """Return the rows [B] that have reached their goal."""
+        return torch.zeros(len(memory), dtype=torch.bool)
+
+    @classmethod
+    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        """Return the closed loop of all rows."""
+        return LawSource([m for m in manoeuvres if isinstance(m, ClosedLoop)], helm, t)
+
+
+class Family(Config, ABC):
+    """Manoeuvres of one kind that are drawn at random.
+
+    Attributes:
+        count: how many.
+    """
+
+    count: int = Field(ge=1, le=10_000)
+
+    @abstractmethod
+    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
+        """Draw a manoeuvre of at most `duration` seconds with a random generator."""
+
+    def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
+        """Draw `count` manoeuvres of `duration` seconds with a random generator."""
+        return [self.one(random, duration) for _ in range(self.count)]
+
+
+def drawn(random: np.random.Generator, span: Range) -> float:
+    """Return a number that is uniform in a range."""
+    return float(random.uniform(*span))
 
 
 class RudderSteering(Config):
@@ -332,7 +426,3 @@ def rudder_share(angle: float, helm: Helm) -> float:
             f" to {most * 57.29578:.4g} deg"
         )
     return share
-
-
-Range = tuple[float, float]
-Side = Literal["starboard", "port"]

@@ -1,17 +1,15 @@
-"""Manoeuvring indices from logged motion: turning circle, zigzag, stopping.
+"""Manoeuvring indices from logged motion: turning circle, zigzag, stopping; and IMO's limits.
 
 Crossings and peaks are found between samples. Definitions as in IMO resolution MSC.137(76) and
-ITTC procedure 7.5-02-06-01. All SI and rad; lengths also in hull lengths.
-
-Definitions as in IMO resolution MSC.137(76) and ITTC procedure 7.5-02-06-01. All SI and rad;
-lengths also in hull lengths.
+ITTC procedure 7.5-02-06-01. All SI and rad; lengths also in hull lengths. The limits are those of
+the resolution, Standards for Ship Manoeuvrability, for ships of 100 m and more.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -39,14 +37,9 @@ UNITS: dict[str, str] = {
 """Unit of each index."""
 
 IN_LENGTHS = {
-    "advance",
-    "transfer",
-    "tactical_diameter",
-    "steady_diameter",
-    "initial_turning_distance",
-    "overshoot_width",
-}
-IN_LENGTHS |= {"track_reach", "head_reach", "lateral_deviation"}
+    "advance", "transfer", "tactical_diameter", "steady_diameter", "initial_turning_distance",
+    "overshoot_width", "track_reach", "head_reach", "lateral_deviation",
+}  # fmt: skip
 
 _TURN = math.pi / 2
 
@@ -70,15 +63,10 @@ class Track:
             )
         self.t: np.ndarray = log.t[whole] - log.t[0]
         x, y, self.heading, self.u, self.v, self.r = motion[whole].T
-        self.psi = scipy.interpolate.CubicSpline(self.t, self.heading)
-        self.x, self.y = (
-            scipy.interpolate.CubicSpline(self.t, x),
-            scipy.interpolate.CubicSpline(self.t, y),
-        )
         self.speed = np.hypot(self.u, self.v)
-        steps = np.hypot(np.diff(x), np.diff(y))
-        self.travelled = scipy.interpolate.CubicSpline(
-            self.t, np.concatenate(([0.0], np.cumsum(steps)))
+        path = np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))))
+        self.psi, self.x, self.y, self.travelled = (
+            scipy.interpolate.CubicSpline(self.t, values) for values in (self.heading, x, y, path)
         )
 
     @property
@@ -130,11 +118,9 @@ def first_crossing(function: Callable[[Any], Any], t: np.ndarray, after: float) 
     if rising.size == 0:
         return None
     i = int(rising[0])
-    return (
-        float(scipy.optimize.brentq(function, times[i], times[i + 1], xtol=1e-12))
-        if values[i + 1] > 0
-        else float(times[i + 1])
-    )
+    if values[i + 1] == 0:
+        return float(times[i + 1])
+    return float(scipy.optimize.brentq(function, times[i], times[i + 1], xtol=1e-12))
 
 
 def in_lengths(indices: dict[str, Any], length: float | None) -> dict[str, Any]:
@@ -181,10 +167,9 @@ def turning(
     begin, end = (
         track.crossing(origin + side * angle, start, side) for angle in (until - math.pi, until)
     )
-    if until >= 2 * math.pi - 1e-9 and begin is not None:
-        inside = (track.t >= begin) & (track.t <= (track.end if end is None else end))
-    else:
-        inside = np.zeros(0, dtype=bool)
+    if until < 2 * math.pi - 1e-9 or begin is None:
+        return in_lengths(indices, length)
+    inside = (track.t >= begin) & (track.t <= (track.end if end is None else end))
     if inside.any():
         speed, rate = float(track.speed[inside].mean()), float(np.abs(track.r[inside].mean()))
         drift = np.arctan2(-side * track.v[inside], track.u[inside])
@@ -237,18 +222,15 @@ def zigzag(
         "largest_yaw_rate": float(np.abs(track.r[track.t >= start]).max()),
     }
     if reversals:
-        indices["initial_turning_time"] = reversals[0] - start
-        indices["initial_turning_distance"] = float(
-            track.travelled(reversals[0]) - track.travelled(start)
-        )
+        turned = track.travelled(reversals[0]) - track.travelled(start)
+        indices |= {
+            "initial_turning_time": reversals[0] - start,
+            "initial_turning_distance": float(turned),
+        }
         back = track.crossing(origin, reversals[0], -side)
         indices |= {} if back is None else {"reach": back - start}
-    indices |= {
-        name: value
-        for name, (_, value) in zip(
-            ("first_overshoot", "second_overshoot"), overshoots, strict=False
-        )
-    }
+    names = ("first_overshoot", "second_overshoot")
+    indices |= {name: value for name, (_, value) in zip(names, overshoots, strict=False)}
     if overshoots:
         indices["time_to_check_yaw"] = overshoots[0][0] - reversals[0]
     if len(reversals) > 1:
@@ -281,3 +263,108 @@ def stopping(log: Log, start: float, length: float | None) -> dict[str, Any]:
         "lateral_deviation": abs(across),
     }
     return in_lengths(indices | {"stopping_time": stop - start}, length)
+
+
+def turning_limits(length: float) -> dict[str, float]:
+    """Return IMO's largest advance and tactical diameter in m, at full rudder (section 5.3.1)."""
+    return {"advance": 4.5 * length, "tactical_diameter": 5.0 * length}
+
+
+def zigzag_limits(nominal: float, length: float, speed: float) -> dict[str, float]:
+    """Return IMO's limits of the 10/10 or the 20/20 zigzag (sections 5.3.2 and 5.3.3).
+
+    These are overshoots in rad, of the 10/10 growing with length [m] over speed [m/s] between 10 s
+    and 30 s, and its distance of the initial turn in m.
+    """
+    if nominal == 20.0:
+        return {"first_overshoot": math.radians(25.0)}
+    ratio = min(max(length / speed, 10.0), 30.0) if speed > 0 else 30.0
+    return {
+        "first_overshoot": math.radians(5.0 + 0.5 * ratio),
+        "second_overshoot": math.radians(17.5 + 0.75 * ratio),
+        "initial_turning_distance": 2.5 * length,
+    }
+
+
+def stopping_limits(length: float) -> dict[str, float]:
+    """Return IMO's limit of a full-astern stop: track reach in m (section 5.3.4)."""
+    return {"track_reach": 15.0 * length}
+
+
+_MOVING, _OVER = 0.1, 0.5
+"""Share of the largest rudder rate from which the rudder moves, and share of the angle held from
+which it is on a side."""
+
+
+class SteeredZigzag(NamedTuple):
+    """A zigzag as it was steered, so that a model can repeat it in closed loop.
+
+    Attributes:
+        start: time of the first execute in s, from the log's first sample.
+        side: of the first execute, +1 starboard, -1 port.
+        angle: rudder angle held, mean over both sides, rad.
+        heading: change of heading at which the rudder was ordered back, mean over the reversals,
+            rad.
+        leaves: change of heading at which the rudder left its side, rad; beyond `heading` by what
+            the vessel turned while the order took effect.
+        turning: rate of turn when it left, mean over the reversals, rad/s.
+    """
+
+    start: float
+    side: float
+    angle: float
+    heading: float
+    leaves: float
+    turning: float
+
+
+def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
+    """Return the zigzag of a log that holds t, psi and a rudder angle.
+
+    An order is given at the last sample before the rudder moves, at a tenth of its largest rate.
+    When the rudder left its side is known to a fraction of a sample, by its rate on the way across:
+    a sample of a coarse grid can be worth half a degree of heading.
+
+    Raises:
+        DataError: where the rudder does not change sides with the heading at least twice.
+    """
+    delta, psi = log[rudder], log["psi"] - log["psi"][0]
+    low, high = (float(level) for level in np.quantile(delta, (0.05, 0.95)))
+    middle, angle = 0.5 * (low + high), 0.5 * (high - low)
+    rate = np.abs(np.gradient(delta, log.t))
+    moving = rate > _MOVING * rate.max()
+    # -1, 0 or +1: the side that the rudder is held on, 0 between them
+    held = np.where(np.abs(delta - middle) > _OVER * angle, np.sign(delta - middle), 0.0)
+    over = np.flatnonzero(held)
+    changed = held[over[1:]] != held[over[:-1]]
+    # the rudder may rest beside the middle before the first order
+    begun = int(np.argmax(moving))
+    arrived = int(np.argmax(~moving & (np.arange(delta.size) > begun)))
+    pairs = zip(over[:-1][changed].tolist(), over[1:][changed].tolist(), strict=True)
+    reversals = [(a, b) for a, b in pairs if b > arrived]
+    if angle == 0.0 or len(reversals) < 2:
+        raise DataError(
+            f"log {log.name}: the rudder is reversed {len(reversals)} times; a zigzag needs at"
+            " least 2"
+        )
+    side = float(np.sign(delta[arrived] - delta[begun]))
+    towards = side * (-1.0) ** np.arange(len(reversals))
+    orders = [int(np.flatnonzero(~moving[:b])[-1]) for _, b in reversals]
+    crossed = []
+    for a, b in reversals:
+        travel = np.maximum.accumulate(held[b] * (delta[a : b + 1] - middle) / angle)
+        # the rudder crosses from -1/2 to +1/2, at a rate that takes it back to where it left -1
+        below, above = np.interp((-_OVER, _OVER), travel, log.t[a : b + 1])
+        crossed.append(float(below - (1.0 - _OVER) / (2.0 * _OVER) * (above - below)))
+    heading = float(np.mean(towards * psi[orders]))
+    if heading <= 0.0:
+        raise DataError(
+            f"log {log.name}: the heading does not follow the rudder at the reversals; check the"
+            f" sign of {rudder}"
+        )
+    leaves, turning = (
+        float(np.mean(towards * np.interp(crossed, log.t, values)))
+        for values in (psi, np.gradient(psi, log.t))
+    )
+    start = float(log.t[max(begun - 1, 0)] - log.t[0])
+    return SteeredZigzag(start, side, angle, heading, leaves, turning)

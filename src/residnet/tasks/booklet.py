@@ -20,8 +20,8 @@ from residnet.dynamics.ensemble import SampledDynamics
 from residnet.identification.models import FittedModel
 from residnet.judge.booklet import BookletConfig, Page, contents
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.recognise import steered_zigzag
-from residnet.manoeuvres.zigzag import Zigzag
+from residnet.manoeuvres.closed_loop import Zigzag
+from residnet.manoeuvres.indices import steered_zigzag
 from residnet.runs.folder import RunFolder
 
 _PARAMETER = "model.baseline.theta"

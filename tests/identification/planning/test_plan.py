@@ -24,7 +24,7 @@ from residnet.identification.planning import (
     spread,
     volume_gain,
 )
-from residnet.manoeuvres.constant import ConstantInput
+from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.signals import SignalsConfig
 from residnet.training.free_runs.covariance import LeftOpen, left_open
 from residnet.training.refit import refit

@@ -42,9 +42,9 @@ from residnet.heads.genetic import GeneticConfig
 from residnet.heads.symbolic import SymbolicConfig
 from residnet.judge.goodness import OneStep
 from residnet.judge.goodness import table as goodness_table
-from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.zigzag import Zigzag
+from residnet.manoeuvres.closed_loop import Zigzag
+from residnet.manoeuvres.open_loop import AccelerationDeceleration
 from residnet.physics.hull import PHASES, OdinConfig, froude_number, phase_of
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text, table_of

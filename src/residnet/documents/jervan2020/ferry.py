@@ -75,7 +75,7 @@ from residnet.heads.zero import ZeroHead
 from residnet.judge.still_fits import StillFitsConfig, Verdict, still_fits
 from residnet.judge.tracking import Tracking, mse, tracking
 from residnet.manoeuvres import FamilyConfig
-from residnet.manoeuvres.zigzag import ZigzagFamily
+from residnet.manoeuvres.closed_loop import ZigzagFamily
 from residnet.physics.actuators import ForceActuators
 from residnet.physics.force_model import ForceModel
 from residnet.physics.hull import HullConfig

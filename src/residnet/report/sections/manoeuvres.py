@@ -11,10 +11,9 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.data.simulated import Flight
+from residnet.manoeuvres.closed_loop import Spiral, Zigzag
+from residnet.manoeuvres.courses import Waypoints
 from residnet.manoeuvres.replay import Replay
-from residnet.manoeuvres.spiral import Spiral
-from residnet.manoeuvres.waypoints import Waypoints
-from residnet.manoeuvres.zigzag import Zigzag
 from residnet.report.blocks import Block, Bullets, Cell, Column, Section, Table, Text, table_of
 from residnet.report.figure import (
     DASHED,

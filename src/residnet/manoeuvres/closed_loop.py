@@ -1,0 +1,443 @@
+"""Manoeuvres that steer by the motion: zigzag, turning circle, stopping trial, spiral."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.core.config import Config, Radians, Seconds
+from residnet.core.log import Log
+from residnet.manoeuvres import indices
+from residnet.manoeuvres.base import (
+    ClosedLoop,
+    Family,
+    Helm,
+    Manoeuvre,
+    Numbers,
+    Range,
+    RudderSteering,
+    drawn,
+    rudder_share,
+)
+
+_FULL_RUDDER, _NEAR = 34.9, 0.05
+"""Rudder in deg from which IMO's limits of a turning circle hold (35 deg or as much as it goes),
+and the share by which a zigzag may differ from 10/10 or 20/20."""
+
+
+class Zigzag(RudderSteering, ClosedLoop):
+    """Steering to one side until the heading has changed by `heading`, then to the other, repeated.
+
+    Source: document 003 section 4.2.2. The memory is the side of the command (+1 starboard, -1
+    port), the heading at the start and the reversals so far.
+
+    Attributes:
+        heading: change of heading at which the steering is reversed.
+        first: side of a positive steer or rudder.
+        reversals: ends when the heading is back on its initial course after so many reversals;
+            None: lasts as long as it is given time.
+    """
+
+    watches: ClassVar[tuple[str, ...]] = ("psi",)
+    kind: Literal["zigzag"] = "zigzag"
+    heading: Radians = Field(gt=0)
+    first: Literal["starboard", "port"] = "starboard"
+    reversals: int | None = Field(default=None, ge=1)
+
+    @property
+    def goal(self) -> str | None:
+        """The end of the manoeuvre: a number of reversals, and the way back."""
+        if self.reversals is None:
+            return None
+        angle = f"{math.degrees(self.heading):.4g} deg"
+        return f"{self.reversals} reversals at {angle} of heading and the way back"
+
+    @property
+    def begins(self) -> float:
+        """The side of the first execute, +1 starboard or -1 port."""
+        return self.side if self.first == "starboard" else -self.side
+
+    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        """Return the overshoots, times and distances; see `indices.zigzag`."""
+        return indices.zigzag(log, self.start, self.begins, self.heading, length)
+
+    def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
+        """Return IMO's limits of the 10/10 and 20/20 zigzag.
+
+        Where there is no rudder the heading alone tells which of them it is.
+        """
+        angle = self.heading if helm.hard_over is None else abs(self.share(helm)) * helm.hard_over
+        asked = [math.degrees(self.heading), math.degrees(angle)]
+        for nominal in (10.0, 20.0):
+            if all(abs(given - nominal) < _NEAR * nominal for given in asked):
+                return indices.zigzag_limits(nominal, length, speed)
+        return {}
+
+    def numbers(self, helm: Helm) -> dict[str, Any]:
+        """Return steer, bounds and sides; a negative steer turns to the other side."""
+        return {
+            "drive": self.drive,
+            "steer": self.share(helm),
+            "start": self.start,
+            "bound": self.heading,
+            "sense": self.side,
+            "first": 1.0 if self.first == "starboard" else -1.0,
+            "most": math.inf if self.reversals is None else float(self.reversals),
+        }
+
+    @classmethod
+    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+        """Return the first side, the present heading and no reversals, [B, 3]."""
+        psi = seen["psi"]
+        return torch.stack((numbers["first"], psi, torch.zeros_like(psi)), dim=-1)
+
+    @classmethod
+    def law(
+        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Reverse the side where the heading has reached its bound."""
+        side, origin, count = memory.unbind(-1)
+        turned = side * numbers["sense"] * (seen["psi"] - origin)
+        reached = turned >= numbers["bound"]
+        side = torch.where(reached, -side, side)
+        steer = torch.where(time >= numbers["start"], side * numbers["steer"], 0.0)
+        return numbers["drive"], steer, torch.stack((side, origin, count + reached.to(side)), -1)
+
+    @classmethod
+    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
+        """Return the rows whose heading is back after their last reversal."""
+        side, origin, count = memory.unbind(-1)
+        back = side * numbers["sense"] * (seen["psi"] - origin) >= 0
+        return (count >= numbers["most"]) & back
+
+
+class ZigzagFamily(Family):
+    """Zigzags drawn at random.
+
+    The heading is one of some, steer and drive are uniform in their ranges, either side comes
+    first.
+
+    Attributes:
+        count: how many manoeuvres.
+        heading: changes of heading to choose from in rad.
+        steer: range of the share of full steer.
+        drive: range of the share of full drive.
+        start: time of the first execute in s.
+    """
+
+    kind: Literal["zigzag"] = "zigzag"
+    heading: tuple[Radians, ...] = Field(min_length=1)
+    steer: Range = (0.25, 1.0)
+    drive: Range = (0.2, 1.0)
+    start: Seconds = 5.0
+
+    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
+        """Draw a manoeuvre with a random generator."""
+        heading = float(random.choice(self.heading))
+        steer, drive = drawn(random, self.steer), drawn(random, self.drive)
+        first: Literal["starboard", "port"] = "starboard" if random.random() < 0.5 else "port"
+        return Zigzag(heading=heading, steer=steer, drive=drive, start=self.start, first=first)
+
+
+class SteadyConfig(Config):
+    """The condition that a turn is steady: for `window` seconds r stays near its running mean.
+
+    Attributes:
+        window: how long it must stay, and time constant of the running mean; a few times what the
+            vessel needs to sail its length.
+        tolerance: how far it may be off, as a share of the largest yaw rate of the manoeuvre so
+            far.
+    """
+
+    window: Seconds = Field(default=10.0, gt=0)
+    tolerance: float = Field(default=0.005, gt=0)
+
+    def numbers(self) -> dict[str, float]:
+        """Return what `steadied` needs to know."""
+        return {"window": self.window, "tolerance": self.tolerance}
+
+
+def steady_at(r: Tensor) -> Tensor:
+    """Return the memory [B, 3] of a steady turn: mean of r, largest |r|, and time near the mean."""
+    return torch.stack((r, r.abs(), torch.zeros_like(r)), dim=-1)
+
+
+def steadied(r: Tensor, numbers: Numbers, memory: Tensor) -> Tensor:
+    """Return the memory [B, 3] of a steady turn one step later, with yaw rate r [B]."""
+    mean, largest, calm = memory.unbind(-1)
+    mean = mean + (numbers["dt"] / numbers["window"]).clamp(max=1.0) * (r - mean)
+    largest = torch.maximum(largest, r.abs())
+    near = (r - mean).abs() <= numbers["tolerance"] * largest
+    return torch.stack((mean, largest, torch.where(near, calm + numbers["dt"], 0.0)), dim=-1)
+
+
+def is_steady(numbers: Numbers, memory: Tensor) -> Tensor:
+    """Return which rows [B] have a steady turn."""
+    return memory[:, 2] >= numbers["window"] - 1e-9
+
+
+def restarted(memory: Tensor, where: Tensor) -> Tensor:
+    """Return the memory of a steady turn with the wait begun anew in rows [B] bool."""
+    return torch.cat((memory[:, :2], memory[:, 2:].masked_fill(where.unsqueeze(-1), 0.0)), dim=-1)
+
+
+class TurningCircle(RudderSteering, ClosedLoop):
+    """Straight ahead until `start`, then the helm held until the heading has changed by `until`.
+
+    IMO asks for 540 deg and full rudder. The memory is the heading at the helm order; 0 before the
+    heading change is reached, then 1, then 2; and that of a steady turn.
+
+    Attributes:
+        until: change of heading.
+        pull_out: the helm then goes amidships until the yaw rate is steady: a vessel that is
+            straight-line stable stops turning.
+        steady: when it is.
+    """
+
+    watches: ClassVar[tuple[str, ...]] = ("psi", "r")
+    kind: Literal["turning_circle"] = "turning_circle"
+    until: Radians = Field(default=3.0 * math.pi, gt=0)
+    pull_out: bool = False
+    steady: SteadyConfig = SteadyConfig()
+
+    @property
+    def goal(self) -> str:
+        """The heading change, and the end of the pull-out."""
+        turned = f"a heading change of {math.degrees(self.until):.4g} deg"
+        return f"{turned} and a steady pull-out" if self.pull_out else turned
+
+    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        """Return the advance, transfer, diameters and the steady turn; see `indices.turning`."""
+        found = indices.turning(log, self.start, self.side, self.until, length)
+        if self.pull_out and "advance" in found:
+            found["pull_out_yaw_rate"] = self.side * float(log["r"][np.isfinite(log["r"])][-1])
+        return found
+
+    def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
+        """Return IMO's limits, which hold for 35 deg of rudder or as much as it goes."""
+        share = abs(self.share(helm))
+        angle = math.degrees(share * (helm.hard_over or 0.0))
+        full = share > 0.999 or angle > _FULL_RUDDER
+        return indices.turning_limits(length) if full else {}
+
+    def numbers(self, helm: Helm) -> dict[str, Any]:
+        """Return steer, sides and bounds."""
+        return {
+            "drive": self.drive,
+            "steer": self.share(helm),
+            "start": self.start,
+            "until": self.until,
+            "side": self.side,
+            "after": 1.0 if self.pull_out else 2.0,
+        } | self.steady.numbers()
+
+    @classmethod
+    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+        """Return the memory [B, 5] at the present heading, in the approach."""
+        psi = seen["psi"]
+        return torch.cat((torch.stack((psi, psi * 0.0), -1), steady_at(seen["r"])), dim=-1)
+
+    @classmethod
+    def law(
+        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Hold the helm until the heading has changed, then amidships until the turn is steady."""
+        origin, phase = memory[:, 0], memory[:, 1]
+        steadiness = steadied(seen["r"], numbers, memory[:, 2:])
+        over = time >= numbers["start"]
+        origin = torch.where(over, origin, seen["psi"])
+        change = numbers["side"] * (seen["psi"] - origin)
+        turned = (phase == 0) & over & (change >= numbers["until"])
+        steadiness = restarted(steadiness, turned)
+        settled = (phase == 1) & is_steady(numbers, steadiness)
+        phase = torch.where(turned, numbers["after"], torch.where(settled, 2.0, phase))
+        steer = torch.where(over & (phase == 0), numbers["steer"], 0.0)
+        return numbers["drive"], steer, torch.cat((torch.stack((origin, phase), -1), steadiness), 1)
+
+    @classmethod
+    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
+        """Return the rows that have turned, and pulled out."""
+        return memory[:, 1] == 2
+
+
+class TurningCircleFamily(Family):
+    """Turning circles drawn at random: steer and drive uniform in their ranges, to either side.
+
+    Attributes:
+        count: how many manoeuvres.
+        steer: range of the share of full steer.
+        drive: range of the share of full drive.
+        start: time of the helm order in s.
+        until: change of heading that ends the manoeuvre in rad.
+    """
+
+    kind: Literal["turning_circle"] = "turning_circle"
+    steer: Range = (0.25, 1.0)
+    drive: Range = (0.2, 1.0)
+    start: Seconds = 5.0
+    until: Radians = Field(default=3.0 * math.pi, gt=0)
+
+    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
+        """Draw a manoeuvre with a random generator."""
+        side = 1.0 if random.random() < 0.5 else -1.0
+        steer, drive = side * drawn(random, self.steer), drawn(random, self.drive)
+        return TurningCircle(steer=steer, drive=drive, start=self.start, until=self.until)
+
+
+class Stopping(ClosedLoop):
+    """Stopping: `drive` until `start`, then `astern` until the surge velocity is zero.
+
+    The steer is zero; there is no memory.
+
+    Attributes:
+        drive: share of full drive of the approach.
+        astern: share of full drive after the order, negative.
+        start: time of the order in s.
+    """
+
+    watches: ClassVar[tuple[str, ...]] = ("u",)
+    kind: Literal["stopping"] = "stopping"
+    drive: float = Field(gt=0, le=1)
+    astern: float = Field(default=-1.0, ge=-1, le=0)
+    start: Seconds = Field(default=5.0, ge=0)
+
+    @property
+    def goal(self) -> str:
+        """The end of the manoeuvre: rest."""
+        return "a surge velocity of zero"
+
+    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        """Return the track reach, head reach, deviation, time; see `indices.stopping`."""
+        return indices.stopping(log, self.start, length)
+
+    def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
+        """Return IMO's limit, which holds for full astern."""
+        return indices.stopping_limits(length) if self.astern <= -0.999 else {}
+
+    def numbers(self, helm: Helm) -> dict[str, Any]:
+        """Return both drives and the time of the order."""
+        return {"drive": self.drive, "astern": self.astern, "start": self.start}
+
+    @classmethod
+    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+        """Return nothing, [B, 0]."""
+        return seen["u"].new_zeros(len(seen["u"]), 0)
+
+    @classmethod
+    def law(
+        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Go astern from the order on."""
+        drive = torch.where(time >= numbers["start"], numbers["astern"], numbers["drive"])
+        return drive, torch.zeros_like(drive), memory
+
+    @classmethod
+    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
+        """Return which rows [B] make no way any more."""
+        return (time > numbers["start"]) & (seen["u"] <= 0)
+
+
+_DOWN = (1.0, 0.6, 0.4, 0.2, 0.1, 0.0, -0.1, -0.2, -0.4, -0.6, -1.0)
+
+
+class Spiral(ClosedLoop):
+    """Dieudonne's spiral: helm angles from one side to the other and back, each until r is steady.
+
+    An unstable vessel shows a loop of yaw rate over angle. The memory is the number of the present
+    angle, and that of a steady turn.
+
+    Attributes:
+        drive: held throughout.
+        steers: shares of full steer in their order; from one side to the other and back where
+            neither these nor `rudders` are given.
+        rudders: the same as rudder angles, for vessels that have one; instead of `steers`.
+        start: of the first; an approach straight ahead before.
+        steady: when the next follows.
+    """
+
+    watches: ClassVar[tuple[str, ...]] = ("r",)
+    kind: Literal["spiral"] = "spiral"
+    drive: float = Field(ge=-1, le=1)
+    steers: tuple[float, ...] = ()
+    rudders: tuple[Radians, ...] = ()
+    start: Seconds = Field(default=5.0, ge=0)
+    steady: SteadyConfig = SteadyConfig()
+
+    @model_validator(mode="after")
+    def _steers_or_rudders(self) -> Spiral:
+        if self.steers and self.rudders:
+            raise ValueError("give steers or rudders, not both")
+        if any(abs(steer) > 1 for steer in self.steers):
+            raise ValueError("steers are shares of full steer from -1 to 1")
+        return self
+
+    @property
+    def angles(self) -> tuple[float, ...]:
+        """Rudder angles in rad, or shares of full steer."""
+        return self.rudders or self.steers or _DOWN + _DOWN[-2::-1]
+
+    @property
+    def goal(self) -> str:
+        """The steady yaw rate at all of the angles."""
+        return f"a steady yaw rate at each of {len(self.angles)} helm angles"
+
+    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        """Return the steady yaw rate of each angle that was finished, and the height of the loop.
+
+        The height is the largest difference of the yaw rates that the angle nearest to zero had;
+        `steers` are shares of full steer (rad where the log has a rudder).
+        """
+        commands = [name for name in log.channels if name.startswith("cmd_")]
+        moved = (np.abs(np.diff(log.stack(commands), axis=0)) > 1e-12).any(axis=1)
+        changes = np.flatnonzero(moved & (log.t[1:] - log.t[0] >= self.start - 1e-9))
+        angles = list(self.angles)
+        # the first change is the order of the first angle, unless that is amidships as the approach
+        # is
+        held = changes if angles[0] == 0 else changes[1:]
+        ends = [*held.tolist(), len(log) - 1][: len(angles)]
+        rates = [float(log["r"][i]) for i in ends]
+        angles = angles[: len(rates)]
+        middle = min(angles, key=abs)
+        amidships = [rate for angle, rate in zip(angles, rates, strict=True) if angle == middle]
+        found: dict[str, Any] = {"steers": angles, "yaw_rates": rates}
+        if len(amidships) > 1:
+            found["loop_height"] = max(amidships) - min(amidships)
+        return found
+
+    def numbers(self, helm: Helm) -> dict[str, Any]:
+        """Return the shares of full steer, zero behind the last, and how many there are."""
+        shares = [rudder_share(a, helm) if self.rudders else a for a in self.angles]
+        return {
+            "drive": self.drive,
+            "start": self.start,
+            "shares": [*shares, 0.0],
+            "count": float(len(shares)),
+        } | self.steady.numbers()
+
+    @classmethod
+    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+        """Return the memory [B, 4] at the first angle."""
+        return torch.cat((torch.zeros_like(seen["r"])[:, None], steady_at(seen["r"])), dim=-1)
+
+    @classmethod
+    def law(
+        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Go to the next angle where the turn is steady."""
+        over = time >= numbers["start"]
+        steadiness = restarted(steadied(seen["r"], numbers, memory[:, 1:]), ~over)
+        settled = is_steady(numbers, steadiness)
+        number = torch.minimum(memory[:, 0] + settled.to(memory), numbers["count"])
+        share = numbers["shares"].gather(1, number.long().unsqueeze(-1))[:, 0]
+        memory = torch.cat((number.unsqueeze(-1), restarted(steadiness, settled)), dim=-1)
+        return numbers["drive"], torch.where(over, share, 0.0), memory
+
+    @classmethod
+    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
+        """Return the rows that have held their last angle."""
+        return memory[:, 0] >= numbers["count"]

@@ -1,0 +1,212 @@
+"""Courses: way-points under an autopilot, and the four corners of document 002."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.control.guidance.line_of_sight import LookAhead
+from residnet.control.guidance.waypoints import WaypointGuidance
+from residnet.control.heading.classical import HeadingPID
+from residnet.control.motion.pid import MotionPIDConfig
+from residnet.control.motion.reference_filter import ReferenceFilterConfig, Waypoint
+from residnet.core.config import Metres, RadiansPerSecond, Seconds
+from residnet.core.errors import UsageError
+from residnet.core.frames import wrap_array
+from residnet.core.layout import HEADING, MOTION, PLANAR, POSE
+from residnet.core.log import Log
+from residnet.dynamics.rollout import Source
+from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, commanded
+
+_POSE = PLANAR.pose
+
+
+class Waypoints(Manoeuvre):
+    """Straight legs between way-points, under line-of-sight guidance.
+
+    The steer is in proportion to heading error and yaw rate.
+
+    Attributes:
+        drive: held throughout.
+        points: way-points (north, east), the first leg begins where the vessel does.
+        acceptance: radius of the circle in which a way-point counts as reached.
+        lookahead: how far before it on its leg the vessel steers for.
+        gain: share of full steer per rad of heading error.
+        rate_gain: share of full steer per rad/s of yaw rate.
+    """
+
+    kind: Literal["waypoints"] = "waypoints"
+    drive: float = Field(gt=0, le=1)
+    points: tuple[tuple[Metres, Metres], ...] = Field(min_length=1)
+    acceptance: Metres = Field(gt=0)
+    lookahead: Metres = Field(gt=0)
+    gain: float = Field(default=1.0, gt=0)
+    rate_gain: Seconds = Field(default=1.0, ge=0)
+
+    def guidance(self, state: tuple[str, ...]) -> WaypointGuidance:
+        """Return the guidance over states with these names."""
+        return WaypointGuidance(self.points, self.acceptance, LookAhead(self.lookahead), state)
+
+    @classmethod
+    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        """Return the closed loop on position and heading; each row has a course of its own."""
+        sources = [WaypointSource(m, helm) for m in manoeuvres if isinstance(m, Waypoints)]
+        return StackedSource(sources, [1] * len(sources))
+
+    @property
+    def goal(self) -> str:
+        """The end of the manoeuvre: the last way-point."""
+        return f"the last of {len(self.points)} way-points"
+
+    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        """Return cross-track errors from the leg that was sailed, and the time of the course."""
+        x = torch.from_numpy(np.nan_to_num(log.stack(_POSE)))
+        guidance = self.guidance(_POSE)
+        s = guidance.initial_state(x[:1])
+        errors: list[float] = []
+        for k in range(len(log)):
+            _, s = guidance(x[k : k + 1], k, s)
+            if bool(guidance.finished(x[k : k + 1], k, s)):
+                break
+            errors.append(float(guidance.leg(x[k : k + 1], s[:, 0].long(), s)[2]))
+        return {
+            "largest_cross_track_error": float(np.abs(errors).max()),
+            "rms_cross_track_error": math.sqrt(np.mean(np.square(errors))),
+            "course_time": float(log.t[min(len(errors), len(log) - 1)] - log.t[0]),
+        }
+
+
+@final
+class WaypointSource(Source):
+    """The source of one way-point course; its memory is the guidance's."""
+
+    def __init__(self, manoeuvre: Waypoints, helm: Helm) -> None:
+        super().__init__()
+        for name in (*_POSE, "r"):
+            helm.column(name)
+        self.guidance = manoeuvre.guidance(helm.state)
+        self.autopilot = HeadingPID(
+            helm.state, kp=manoeuvre.gain, kd=manoeuvre.rate_gain, limit=1.0
+        )
+        self.drive = manoeuvre.drive
+        self.demand = helm.demand
+        self.may_stop = True
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Return the memory [B, 3] of the guidance."""
+        return self.guidance.initial_state(x)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the inputs [B, m] and the memory one step later."""
+        heading, memory = self.guidance(x, k, memory)
+        steer, _ = self.autopilot(x, heading, x[:, :0])
+        command = self.demand(torch.full_like(steer[:, 0], self.drive), steer[:, 0])
+        return commanded(command, w), memory
+
+    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+        """Return which rows [B] have arrived at the last way-point."""
+        return self.guidance.finished(x, k, memory)
+
+
+_H, _D = math.pi / 2, math.pi / 4
+# Table 4.1 prints the twelve twice (correction J12); headings are followed as written (J13)
+SEGMENTS: tuple[Waypoint, ...] = (
+    (0.0, -15.0, -_H), (15.0, -15.0, 0.0), (15.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, -15.0, 0.0),
+    (30.0, -15.0, 2 * _H), (15.0, -15.0, 2 * _H), (15.0, 0.0, 3 * _D), (0.0, 0.0, 3 * _D),
+    (0.0, 0.0, -_D), (0.0, -15.0, -_D), (0.0, 0.0, 0.0),
+)  # fmt: skip
+
+
+class FourCorner(Manoeuvre):
+    """Poses given one after the other through a reference filter, followed by a PID.
+
+    Twelve segments of surge, sway and yaw, alone and together. The vessel must be commanded in all
+    three forces. Source: document 002 section 4.1, Table 4.1.
+
+    Attributes:
+        poses: (north, east, heading); the twelve of the document where absent.
+        interval: between poses; the course lasts so long for each.
+        frequency: of the reference filter in x, y and psi, in rad/s.
+        damping: relative damping of the reference filter in x, y and psi.
+        control: gains of the PID.
+    """
+
+    kind: Literal["four_corner"] = "four_corner"
+    poses: Annotated[tuple[Waypoint, ...], Field(min_length=1)] = SEGMENTS
+    interval: Seconds = Field(default=60.0, gt=0)
+    frequency: tuple[RadiansPerSecond, RadiansPerSecond, RadiansPerSecond] = (0.195, 0.195, 0.415)
+    damping: tuple[float, float, float] = (0.7, 0.7, 0.7)
+    control: MotionPIDConfig
+
+    @property
+    def filter(self) -> ReferenceFilterConfig:
+        """The config of the reference filter."""
+        return ReferenceFilterConfig(
+            waypoints=self.poses,
+            interval=self.interval,
+            frequency=self.frequency,
+            damping=self.damping,
+        )
+
+    def lasts(self, duration: float) -> float:
+        """Return one interval for each pose, or `self.duration` where that is less."""
+        return min(self.filter.duration, self.duration or math.inf)
+
+    @classmethod
+    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        """Return the closed loop on the pose; each row has a course and gains of its own.
+
+        Raises:
+            UsageError: where the vessel has no command for each of the three forces.
+        """
+        step = float(t[1] - t[0])
+        sources = [FourCornerSource(m, helm, step) for m in manoeuvres if isinstance(m, FourCorner)]
+        return StackedSource(sources, [1] * len(sources))
+
+    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        """Return the mean distance from the reference, and mean absolute error of the heading."""
+        reference = self.filter.build(float(log.t[1] - log.t[0]))
+        x = torch.from_numpy(log.stack(_POSE))
+        s = reference.initial_state(x[:1])
+        desired = []
+        for k in range(len(log)):
+            pose, s = reference(x[k : k + 1], k, s)
+            desired.append(pose[0, POSE].numpy())
+        error = x.numpy() - np.stack(desired)
+        return {
+            "mean_position_error": float(np.hypot(*error[:, :HEADING].T).mean()),
+            "mean_heading_error": float(np.abs(wrap_array(error[:, HEADING])).mean()),
+        }
+
+
+@final
+class FourCornerSource(Source):
+    """Reference filter and PID of one course, their memories side by side."""
+
+    def __init__(self, manoeuvre: FourCorner, helm: Helm, step: float) -> None:
+        super().__init__()
+        if helm.forces is None or helm.state[MOTION] != PLANAR.names:
+            raise UsageError(
+                "a four-corner course needs a vessel in surge, sway and yaw that is commanded in"
+                " all three, by forces or azimuth thrusters"
+            )
+        self.forces = helm.forces
+        self.reference = manoeuvre.filter.build(step)
+        self.policy = manoeuvre.control.build(step)
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Return the filter at the vessel's pose, no integral."""
+        return torch.cat((self.reference.initial_state(x), self.policy.initial_state(x)), dim=-1)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the inputs [B, m] and the memory one step later."""
+        n = self.reference.n_state
+        target, guided = self.reference(x, k, memory[:, :n])
+        tau, s = self.policy(x, target, memory[:, n:])
+        return commanded(self.forces(tau), w), torch.cat((guided, s), dim=-1)

@@ -1,0 +1,358 @@
+"""Manoeuvres of demands that are known in advance: steps, levels, random steps, sums of sines.
+
+Source: document 003 section 4.2.2.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from itertools import product
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import AfterValidator, Field, model_validator
+from torch import Tensor
+
+from residnet.core.config import Config, Hertz, Seconds
+from residnet.core.errors import UsageError
+from residnet.dynamics.rollout import Source
+from residnet.manoeuvres.base import (
+    Family,
+    Helm,
+    Manoeuvre,
+    Range,
+    Scheduled,
+    ScheduleSource,
+    drawn,
+)
+
+
+class ConstantInput(Scheduled):
+    """Drive and steer held from the start: from rest to the steady state of a speed or a turn.
+
+    Attributes:
+        drive: share of full drive, -1 to 1.
+        steer: share of full steer, -1 to 1; positive turns to starboard.
+    """
+
+    kind: Literal["constant"] = "constant"
+    drive: float = Field(ge=-1, le=1)
+    steer: float = Field(ge=-1, le=1)
+
+    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Return constant drive and steer [T]."""
+        return torch.full_like(t, self.drive), torch.full_like(t, self.steer)
+
+
+class ConstantFamily(Config):
+    """Every combination of some drives and steers.
+
+    Attributes:
+        drive: shares of full drive, -1 to 1.
+        steer: shares of full steer, -1 to 1.
+    """
+
+    kind: Literal["constant"] = "constant"
+    drive: tuple[float, ...] = Field(min_length=1)
+    steer: tuple[float, ...] = Field(min_length=1)
+
+    def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
+        """Return one manoeuvre per combination; nothing is random."""
+        return [ConstantInput(drive=d, steer=s) for d, s in product(self.drive, self.steer)]
+
+
+class AccelerationDeceleration(Scheduled):
+    """Speed steps straight ahead: drive levels, each held from its time on; the steer is zero.
+
+    Attributes:
+        times: when each level begins in s, ascending.
+        levels: drive from -1 to 1 from that time on.
+    """
+
+    kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
+    times: tuple[Seconds, ...] = Field(min_length=1)
+    levels: tuple[float, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _pairs(self) -> AccelerationDeceleration:
+        if len(self.times) != len(self.levels) or list(self.times) != sorted(self.times):
+            raise ValueError("times and levels need the same number of entries, times ascending")
+        return self
+
+    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the stepped drive [T], zero before the first time; zero steer [T]."""
+        index = torch.searchsorted(torch.tensor(self.times, dtype=t.dtype), t, right=True)
+        return torch.tensor((0.0, *self.levels), dtype=t.dtype)[index], torch.zeros_like(t)
+
+
+class AccelerationDecelerationFamily(Family):
+    """Steps between a high and a low level, drawn at random.
+
+    The high level is lowered by a quarter and by half in turn; all is uniform in its range.
+
+    Attributes:
+        count: how many manoeuvres.
+        high: range of the high level of the drive.
+        low: range of the low level of the drive.
+        hold: range of the time for which a level is held in s.
+    """
+
+    kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
+    high: Range = (0.4, 1.0)
+    low: Range = (0.0, 0.3)
+    hold: tuple[Seconds, Seconds] = (6.0, 12.0)
+
+    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
+        """Draw a manoeuvre with a random generator."""
+        number = np.arange(int(duration / self.hold[0]) + 2)
+        high, low = drawn(random, self.high), drawn(random, self.low)
+        holds = random.uniform(*self.hold, size=number.size)
+        times = np.concatenate(([0.0], np.cumsum(holds)[:-1]))
+        peaks = high * np.array([1.0, 0.75, 0.5])[(number // 2) % 3]
+        levels = np.where(number % 2 == 0, peaks, low)
+        inside = times < duration
+        return AccelerationDeceleration(
+            times=tuple(times[inside].tolist()), levels=tuple(levels[inside].tolist())
+        )
+
+
+_PATTERN = (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)
+
+
+class ThreeTwoOneOne(Scheduled):
+    """The 3-2-1-1 pattern: steering steps of 3, 2, 1 and 1 units to alternating sides.
+
+    It excites a broad band. The steer is zero after it.
+
+    Attributes:
+        drive: share of full drive, -1 to 1.
+        steer: share of full steer, -1 to 1; positive turns to starboard first.
+        start: when the steering begins in s; before, the vessel goes straight ahead.
+        unit: length of the shortest step in s.
+        repeat: whether the pattern is repeated to the end.
+    """
+
+    kind: Literal["three_two_one_one"] = "three_two_one_one"
+    drive: float = Field(ge=-1, le=1)
+    steer: float = Field(ge=-1, le=1)
+    start: Seconds = Field(default=5.0, ge=0)
+    unit: Seconds = Field(gt=0)
+    repeat: bool = True
+
+    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Return constant drive and patterned steer [T]."""
+        # times on the grid must not fall short of their unit by rounding
+        units = torch.floor((t - self.start) / self.unit + 1e-9).long()
+        pattern = torch.tensor(_PATTERN, dtype=t.dtype)
+        steer = self.steer * pattern[units.clamp(min=0) % len(_PATTERN)]
+        active = (units >= 0) & (self.repeat | (units < len(_PATTERN)))
+        return torch.full_like(t, self.drive), torch.where(active, steer, torch.zeros_like(t))
+
+
+class ThreeTwoOneOneFamily(Family):
+    """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated.
+
+    Attributes:
+        count: how many manoeuvres.
+        unit: range of the shortest step in s.
+        steer: range of the share of full steer.
+        drive: range of the share of full drive.
+        start: when the steering begins in s.
+    """
+
+    kind: Literal["three_two_one_one"] = "three_two_one_one"
+    unit: tuple[Seconds, Seconds] = (2.0, 4.0)
+    steer: Range = (0.4, 1.0)
+    drive: Range = (0.1, 0.9)
+    start: Seconds = 5.0
+
+    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
+        """Draw a manoeuvre with a random generator."""
+        unit, steer, drive = (drawn(random, span) for span in (self.unit, self.steer, self.drive))
+        return ThreeTwoOneOne(unit=unit, steer=steer, drive=drive, start=self.start)
+
+
+def _ordered(band: tuple[float, float]) -> tuple[float, float]:
+    if not 0 < band[0] < band[1]:
+        raise ValueError(
+            f"a band goes from a low to a higher frequency above zero, given {band[0]:g} Hz to"
+            f" {band[1]:g} Hz"
+        )
+    return band
+
+
+Band = Annotated[tuple[Hertz, Hertz], AfterValidator(_ordered)]
+"""Lowest and highest frequency."""
+_DRIVE, _STEER, _SWAY = range(3)
+
+
+class Excitation(Scheduled, ABC):
+    """Random demands over a band of frequencies.
+
+    Attributes:
+        drive: mean drive.
+        drive_amplitude: how far the drive goes to either side of it.
+        steer_amplitude: how far the steer goes to either side of zero.
+        sway_amplitude: how far the sway force goes to either side of zero, in shares of the
+            largest; for vessels whose commands are forces.
+        band: frequencies that the demands excite.
+        seed: of everything random.
+        start: when they begin; before, the drive is held and the steer is zero.
+        kind: kind of the manoeuvre.
+    """
+
+    drive: float = Field(ge=-1, le=1)
+    drive_amplitude: float = Field(default=0.0, ge=0, le=2)
+    steer_amplitude: float = Field(default=0.0, ge=0, le=1)
+    sway_amplitude: float = Field(default=0.0, ge=0, le=1)
+    band: Band
+    seed: int = Field(default=0, ge=0)
+    start: Seconds = Field(default=5.0, ge=0)
+
+    @abstractmethod
+    def _wave(self, t: Tensor, which: int) -> Tensor:
+        """Return the wave [T] within +-1 of a demand at times t [T] since the start in s."""
+
+    def _after_start(self, t: Tensor, which: int) -> Tensor:
+        wave = self._wave((t - self.start).clamp(min=0.0), which)
+        return torch.where(t >= self.start - 1e-9, wave, torch.zeros_like(t))
+
+    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Return drive and steer [T], clipped to +-1."""
+        drive = self.drive + self.drive_amplitude * self._after_start(t, _DRIVE)
+        return drive.clamp(-1.0, 1.0), self.steer_amplitude * self._after_start(t, _STEER)
+
+    @classmethod
+    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        """Return the playback of the demands, with the sway forces where there are any.
+
+        Raises:
+            UsageError: where a sway force is asked of a vessel whose commands are no forces.
+        """
+        own = [manoeuvre for manoeuvre in manoeuvres if isinstance(manoeuvre, Excitation)]
+        sway = torch.stack([m.sway_amplitude * m._after_start(t, _SWAY) for m in own])
+        if not bool(sway.any()):
+            return super().source(manoeuvres, helm, t)
+        if helm.side_force is None or "tau_y" not in helm.inputs:
+            raise UsageError(
+                "sway_amplitude: a manoeuvre asks for a sway force, but the vessel's commands are"
+                f" {', '.join(helm.inputs[:2])} and no forces; leave it out"
+            )
+        drive, steer = map(torch.stack, zip(*(m.demands(t) for m in own), strict=True))
+
+        def demand(drive: Tensor, steer: Tensor) -> Tensor:
+            forces = helm.demand(drive, steer)
+            forces[..., helm.inputs.index("tau_y")] += helm.side_force * sway
+            return forces
+
+        return ScheduleSource(drive, steer, demand)
+
+
+class RandomSteps(Excitation):
+    """Drive and steer that jump to random levels.
+
+    Levels are uniform within their amplitudes; each is held for half a period of a random frequency
+    of the band.
+    """
+
+    kind: Literal["random_steps"] = "random_steps"
+
+    def _wave(self, t: Tensor, which: int) -> Tensor:
+        random = np.random.default_rng([self.seed, which])
+        span, times, levels = float(t[-1]), [0.0], [random.uniform(-1.0, 1.0)]
+        while times[-1] <= span:
+            times.append(times[-1] + 0.5 / random.uniform(*self.band))
+            levels.append(random.uniform(-1.0, 1.0))
+        index = torch.searchsorted(torch.tensor(times, dtype=t.dtype), t + 1e-9, right=True) - 1
+        return torch.tensor(levels, dtype=t.dtype)[index]
+
+
+class MultiSine(Excitation):
+    """Sums of sines at frequencies spread evenly in their logarithm over the band.
+
+    Each demand has frequencies of its own. The phases are the ones with the flattest sum of some
+    random draws, so that the amplitude is well used; what is beyond it after ten periods of the
+    lowest frequency is clipped.
+
+    Attributes:
+        tones: frequencies of each of drive and steer.
+    """
+
+    kind: Literal["multi_sine"] = "multi_sine"
+    tones: int = Field(default=8, ge=2, le=200)
+
+    def _wave(self, t: Tensor, which: int) -> Tensor:
+        demands = 3 if self.sway_amplitude else 2
+        frequencies = np.geomspace(*self.band, demands * self.tones)[which % demands :: demands]
+        random = np.random.default_rng([self.seed, which])
+        trial = np.arange(0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0]))
+        angle = 2.0 * math.pi * trial[:, None] * frequencies
+        best, least = np.zeros(self.tones), math.inf
+        for _ in range(20):
+            phases = random.uniform(0.0, 2.0 * math.pi, self.tones)
+            peak = float(np.abs(np.sin(angle + phases).sum(axis=1)).max())
+            if peak < least:
+                best, least = phases, peak
+        turned, begun = (torch.from_numpy(part).to(t.dtype) for part in (frequencies, best))
+        argument = 2.0 * math.pi * t.unsqueeze(-1) * turned + begun
+        return (torch.sin(argument).sum(-1) / least).clamp(-1.0, 1.0)
+
+
+class ExcitationFamily(Family):
+    """Random excitation: everything uniform in its range, the band as given.
+
+    Attributes:
+        count: how many manoeuvres.
+        drive: range of the mean drive.
+        drive_amplitude: range of the drive's amplitude.
+        steer_amplitude: range of the steer's amplitude.
+        sway_amplitude: range of the amplitude of the sway force, in shares of the largest; for
+            vessels whose commands are forces.
+        band: lowest and highest frequency that the demands excite in Hz.
+        start: when they begin in s.
+    """
+
+    drive: Range = (0.3, 0.7)
+    drive_amplitude: Range = (0.0, 0.3)
+    steer_amplitude: Range = (0.2, 1.0)
+    sway_amplitude: Range = (0.0, 0.0)
+    band: Band = (0.02, 0.2)
+    start: Seconds = 5.0
+
+    def _common(self, random: np.random.Generator) -> dict[str, Any]:
+        out: dict[str, Any] = {
+            name: drawn(random, getattr(self, name))
+            for name in ("drive", "drive_amplitude", "steer_amplitude")
+        }
+        out |= {"band": self.band, "seed": int(random.integers(2**31)), "start": self.start}
+        if self.sway_amplitude[1] > 0:
+            out["sway_amplitude"] = drawn(random, self.sway_amplitude)
+        return out
+
+
+class RandomStepsFamily(ExcitationFamily):
+    """Random steps with means and amplitudes uniform in their ranges."""
+
+    kind: Literal["random_steps"] = "random_steps"
+
+    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
+        """Draw a manoeuvre with a random generator."""
+        return RandomSteps.model_validate(self._common(random))
+
+
+class MultiSineFamily(ExcitationFamily):
+    """Multi-sines with means and amplitudes uniform in their ranges.
+
+    Attributes:
+        tones: frequencies of each of drive and steer.
+    """
+
+    kind: Literal["multi_sine"] = "multi_sine"
+    tones: int = Field(default=8, ge=2, le=200)
+
+    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
+        """Draw a manoeuvre with a random generator."""
+        return MultiSine.model_validate(self._common(random) | {"tones": self.tones})
