@@ -27,8 +27,13 @@ STATEMENTS_AND_FUNCTIONS = {
     "heads": (961, 152),
     "identification": (2106, 220),
     "judge": (1887, 204),
+<<<<<<< HEAD
     "manoeuvres": (990, 124),
     "physics": (2023, 258),
+=======
+    "manoeuvres": (896, 136),
+    "physics": (2021, 258),
+>>>>>>> f1cf5a2 (tests: budget of the manoeuvres)
     "regression": (1875, 207),
     "report": (2840, 320),
     "runs": (337, 47),
