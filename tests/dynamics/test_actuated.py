@@ -91,7 +91,10 @@ def test_given_gear_by_hand() -> None:
     path = [a := gear.move(a, w) for _ in range(3)]
     assert [float(p) / DEG for p in path] == pytest.approx([2.5, 4.0, 4.0])
     model = ActuatedDynamics(still(("n", "delta"), 0.5), ("n", "delta"), "start", gear)
-    assert [([*model.gear.state, *model.gear.inputs])[i] for i in model.take] == ["cmd_n", "delta"]
+    assert [([*model.actuators.state, *model.actuators.inputs])[i] for i in model.take] == [
+        "cmd_n",
+        "delta",
+    ]
     with pytest.raises(ConfigError, match="driven by 'tau'"):
         ActuatedDynamics(still(("tau",)), ("tau",), "start", gear)
     for wrong in (

@@ -23,17 +23,10 @@ def test_each_draw_steps_as_the_model_with_its_parameters() -> None:
     many = SampledDynamics(model, "baseline.theta", theta)
     with torch.no_grad():
         after, memory = many.step(x, w, x[:, :0])
-        rates = many.rate(x, signals.prepare(w), torch.zeros(12, 3, dtype=torch.float64))
         for row in range(12):
             alone = copy.deepcopy(model)
             of_kind(alone.baseline, RegressorBaseline).theta.copy_(theta[row % 4])
             torch.testing.assert_close(
                 after[row], alone.step(x[row : row + 1], w[row : row + 1], x[:1, :0])[0][0]
-            )
-            torch.testing.assert_close(
-                rates[row],
-                alone.rate(
-                    x[row : row + 1], signals.prepare(w[row : row + 1]), torch.zeros(1, 3).double()
-                )[0],
             )
     assert memory.shape == (12, 0)

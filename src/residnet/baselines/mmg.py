@@ -183,8 +183,7 @@ class MMGForces(nn.Module):
         columns: Sequence[int],
     ) -> None:
         super().__init__()
-        self.register_buffer("columns", torch.tensor(columns), persistent=False)
-        self.columns: Tensor
+        self.columns = list(columns)
         self.wake_slope, self.still = _WAKE_SLOPE, _STILL
         self.length = float(hull.length)
         self.pressed = 0.5 * hull.density * hull.length * hull.draught
@@ -205,7 +204,8 @@ class MMGForces(nn.Module):
             Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr, N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,
             t_P, w_P0, C_2p, C_2n, t_R, a_H, x_H, gamma_p, gamma_n, l_R, epsilon, kappa,
         ) = theta.unbind(-1)  # fmt: skip
-        u, v, r, n, delta = z.index_select(-1, self.columns).unbind(-1)
+        chosen = [z[..., c] for c in self.columns]
+        u, v, r, n, delta = chosen[0], chosen[1], chosen[2], chosen[3], chosen[4]
         speed = torch.sqrt(u * u + v * v + self.still)
         a, b = v / speed, r * self.length / speed
         # hull

@@ -9,16 +9,15 @@ from typing import Literal, final
 import torch
 from torch import Tensor, nn
 
+from residnet.core import layout
 from residnet.core.config import Config, Quantity
 from residnet.core.errors import ConfigError
-from residnet.core.layout import actuators, motion
 from residnet.core.names import CHANNEL_UNITS, STATE, nearest
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.physics.plant import Plant
+from residnet.physics.plant import ROLLING, Plant
 
-_HULL = {*STATE, "phi", "p"}
 _RATES = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
 
 
@@ -45,12 +44,12 @@ class Actuators(nn.Module, ABC):
 
     @abstractmethod
     def approach(self, rows: int) -> Tensor:
-        """Return the state [rows, 6 + k] of hull and gear that trials start from, float64."""
+        """Return the state [rows, 6 + k] of hull and actuators that trials start from, float64."""
 
 
 @final
 class PlantActuators(Actuators):
-    """A gear made of a plant's actuators, whatever their kind.
+    """A plant's actuators, whatever their kind.
 
     The plant itself moves them, and what its hull would do is thrown away.
     """
@@ -59,7 +58,7 @@ class PlantActuators(Actuators):
         super().__init__()
         self.plant = plant
         self.inputs, self.commands = plant.inputs, plant.commands
-        self.columns = [i for i, name in enumerate(plant.state) if name not in _HULL]
+        self.columns = [i for i, name in enumerate(plant.state) if name not in ROLLING.names]
         self.state = tuple(plant.state[i] for i in self.columns)
         self.dynamics = TracedPlantDynamics(plant, dt, substeps) if self.columns else None
 
@@ -103,10 +102,33 @@ class InputShare(Config):
     limit: float | str | None = None
     rate: float | str | None = None
 
+    def numbers(self, name: str) -> list[float]:
+        """Return drive, steer, centre, limit and rate of the input `name` in SI.
+
+        Raises:
+            ConfigError: where a value has a wrong unit, or nothing moves the input.
+        """
+        unit = CHANNEL_UNITS.get(name, "-")
+        value, rate = Quantity(unit), Quantity(_RATES[unit]) if unit in _RATES else None
+        fastest = float("inf")
+        try:
+            drive, steer, centre = map(value.convert, (self.drive, self.steer, self.centre))
+            limit = abs(drive) + abs(steer) if self.limit is None else value.convert(self.limit)
+            if self.rate is not None:
+                fastest = float(self.rate) if rate is None else rate.convert(self.rate)
+        except ValueError as error:
+            raise ConfigError(f"inputs.{name}: {error}") from None
+        if limit <= 0 or fastest <= 0:
+            raise ConfigError(
+                f"inputs.{name}: limit and rate must be above zero, and a share given of drive or"
+                f" steer; {limit:g}, {fastest:g}"
+            )
+        return [drive, steer, centre, limit, fastest]
+
 
 @final
 class GivenActuators(Actuators):
-    """A gear whose inputs follow the demands within limits and rates.
+    """Inputs that follow the demands within limits and rates.
 
     Args:
         shares: by the name of the model's input; its command is that name after `cmd_`.
@@ -122,10 +144,10 @@ class GivenActuators(Actuators):
     ) -> None:
         super().__init__()
         self.inputs, self.commands = (*map(commanded, shares), *exogenous), len(shares)
-        rows = [_numbers(name, share) for name, share in shares.items()]
-        self.drive, self.steer, self.centre, self.limit, self.rate = torch.tensor(
-            rows, dtype=torch.float64
-        ).unbind(-1)
+        rows = [share.numbers(name) for name, share in shares.items()]
+        table = torch.tensor(rows, dtype=torch.float64)
+        self.shares = table[:, :2].T.contiguous()
+        self.centre, self.limit, self.rate = table[:, 2:].unbind(-1)
         self.limited = [i for i, row in enumerate(rows) if row[4] != float("inf")]
         # what can jump to its command needs no state
         self.state = tuple(list(shares)[i] for i in self.limited)
@@ -133,9 +155,7 @@ class GivenActuators(Actuators):
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the commands [..., c], within their limits."""
-        both = drive.unsqueeze(-1) * self.drive.to(drive.dtype) + steer.unsqueeze(
-            -1
-        ) * self.steer.to(drive.dtype)
+        both = torch.stack((drive, steer), dim=-1) @ self.shares.to(drive.dtype)
         limit = self.limit.to(drive.dtype)
         return self.centre.to(drive.dtype) + torch.minimum(torch.maximum(both, -limit), limit)
 
@@ -155,47 +175,25 @@ def commanded(name: str) -> str:
     return name if name.startswith("cmd_") else f"cmd_{name}"
 
 
-def _numbers(name: str, share: InputShare) -> list[float]:
-    unit = CHANNEL_UNITS.get(name, "-")
-    value, rate = Quantity(unit), Quantity(_RATES[unit]) if unit in _RATES else None
-    try:
-        drive, steer, centre = (
-            value.convert(given) for given in (share.drive, share.steer, share.centre)
-        )
-        limit = abs(drive) + abs(steer) if share.limit is None else value.convert(share.limit)
-        if share.rate is None:
-            fastest = float("inf")
-        else:
-            fastest = rate.convert(share.rate) if rate is not None else float(share.rate)
-    except ValueError as error:
-        raise ConfigError(f"inputs.{name}: {error}") from None
-    if limit <= 0 or fastest <= 0:
-        raise ConfigError(
-            f"inputs.{name}: limit and rate must be above zero, and a share given of drive or"
-            f" steer; {limit:g}, {fastest:g}"
-        )
-    return [drive, steer, centre, limit, fastest]
-
-
 @final
 class ActuatedDynamics(Dynamics):
-    """A learned model behind actuators, with states x [B, 6 + k] and the gear's inputs w [B, m].
+    """A learned model behind actuators, with states x [B, 6 + k] and their inputs w [B, m].
 
-    The state is x, y, psi, u, v, r, then the states of the gear.
+    The state is x, y, psi, u, v, r, then the states of the actuators.
 
-    Each input of the model is a state of the gear where it has one of that name, else an input of
-    the gear, else the command of that name (`cmd_delta` for `delta`: a rudder that stands at its
-    command at once has no state). A model that was fitted on inputs averaged over each step (`hold:
-    mean`) is given the mean of the values at the step's ends, as in its fit.
+    Each input of the model is a state of the actuators where they have one of that name, else one
+    of their inputs, else the command of that name (`cmd_delta` for `delta`: a rudder that stands at
+    its command at once has no state). A model that was fitted on inputs averaged over each step
+    (`hold: mean`) is given the mean of the values at the step's ends, as in its fit.
 
     Args:
         model: the learned model.
         columns: names of the model's inputs, `spec.signals.columns`.
         hold: of the model's inputs, `spec.hold`.
-        gear: with the step of the model.
+        actuators: with the step of the model.
 
     Raises:
-        ConfigError: where the gear has nothing for an input of the model.
+        ConfigError: where the actuators have nothing for an input of the model.
     """
 
     def __init__(
@@ -203,15 +201,14 @@ class ActuatedDynamics(Dynamics):
         model: HybridDynamics,
         columns: tuple[str, ...],
         hold: Literal["start", "mean"],
-        gear: Actuators,
+        actuators: Actuators,
     ) -> None:
         super().__init__(model.dt, model.integrator)
-        self.model = model
-        self.gear = gear
+        self.model, self.actuators = model, actuators
         self.n_state = model.n_state
-        self.state = (*STATE, *gear.state)
+        self.state = (*STATE, *actuators.state)
         self.mean = hold == "mean"
-        names = [*gear.state, *gear.inputs]
+        names = [*actuators.state, *actuators.inputs]
         self.take: list[int] = []
         for name in columns:
             found = next((given for given in (name, commanded(name)) if given in names), None)
@@ -226,18 +223,12 @@ class ActuatedDynamics(Dynamics):
         """Return the memory [batch, n_state] without a past."""
         return self.model.initial_state(batch)
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, 6 + k] of the model at a stage; the gear moves once per step."""
-        return torch.cat(
-            (self.model.rate(motion(x), p, rho), torch.zeros_like(actuators(x))), dim=-1
-        )
-
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state and the memory one step later."""
-        a = actuators(x)
-        moved = self.gear.move(a, w)
+        a = layout.actuators(x)
+        moved = self.actuators.move(a, w)
         given = torch.cat((a, w), dim=-1)[:, self.take]
         if self.mean:
             given = 0.5 * (given + torch.cat((moved, w), dim=-1)[:, self.take])
-        y, s = self.model.step(motion(x), given, s)
+        y, s = self.model.step(layout.motion(x), given, s)
         return torch.cat((y, moved), dim=-1), s

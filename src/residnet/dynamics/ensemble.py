@@ -36,7 +36,7 @@ class MeanBaseline(Baseline):
 
     def parameter_count(self) -> list[float]:
         """Return the parameters of each axis, those of all members together."""
-        return _summed([member.parameter_count() for member in self.members])  # type: ignore[operator]
+        return _parameters(self.members)
 
 
 @final
@@ -49,44 +49,43 @@ class MeanHead(ResidualHead):
         self.widths = [member.n_state for member in members]
         self.n_state = sum(self.widths)
 
-    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] at channels z [B, nz] and the memory for the next step."""
-        total = zero_acceleration(z)
+    def _each(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the members' residuals [K, B, 3] and their memories side by side."""
+        residuals: list[Tensor] = []
         memory: list[Tensor] = []
         begin = 0
         for i, member in enumerate(self.members):
             rho, after = member(z, s[..., begin : begin + self.widths[i]])
-            total = total + rho
+            residuals.append(rho)
             memory.append(after)
             begin += self.widths[i]
-        return total / len(self.members), torch.cat(memory, dim=-1)
+        return torch.stack(residuals), torch.cat(memory, dim=-1)
+
+    def _sequences(self, z: Tensor) -> Tensor:
+        """Return the members' residuals [K, B, T, 3] along channels [B, T, nz]."""
+        residuals: list[Tensor] = []
+        for member in self.members:
+            residuals.append(member.sequence(z))  # type: ignore[operator]
+        return torch.stack(residuals)
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the residual [B, 3] at channels z [B, nz] and the memory for the next step."""
+        residuals, memory = self._each(z, s)
+        return residuals.mean(dim=0), memory
 
     def with_spread(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return mean and standard deviation of the members' residuals [B, 3], and the memory."""
-        told: list[Tensor] = []
-        memory: list[Tensor] = []
-        begin = 0
-        for i, member in enumerate(self.members):
-            rho, after = member(z, s[..., begin : begin + self.widths[i]])
-            told.append(rho)
-            memory.append(after)
-            begin += self.widths[i]
-        mean, deviation = _agreement(torch.stack(told))
-        return mean, deviation, torch.cat(memory, dim=-1)
-
-    def sequence_with_spread(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation of the members' residuals [B, T, 3] along z."""
-        told: list[Tensor] = []
-        for member in self.members:
-            told.append(member.sequence(z))  # type: ignore[operator]
-        return _agreement(torch.stack(told))
+        residuals, memory = self._each(z, s)
+        mean, deviation = _agreement(residuals)
+        return mean, deviation, memory
 
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, 3] along channels [B, T, nz], from an empty memory."""
-        total = zero_acceleration(z)
-        for member in self.members:
-            total = total + member.sequence(z)  # type: ignore[operator]
-        return total / len(self.members)
+        return self._sequences(z).mean(dim=0)
+
+    def sequence_with_spread(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation of the members' residuals [B, T, 3] along z."""
+        return _agreement(self._sequences(z))
 
     def warms_by_steps(self) -> bool:
         """Return whether all members do."""
@@ -101,33 +100,32 @@ class MeanHead(ResidualHead):
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [n_state], that of all members side by side."""
-        ranges = [member.memory_range() for member in self.members]  # type: ignore[operator]
-        return torch.cat([low for low, _ in ranges]), torch.cat([high for _, high in ranges])
+        low, high = zip(*(member.memory_range() for member in self.members), strict=True)  # type: ignore[operator]
+        return torch.cat(low), torch.cat(high)
 
     def parameter_count(self) -> list[float]:
         """Return the parameters of each axis, those of all members together."""
-        return _summed([member.parameter_count() for member in self.members])  # type: ignore[operator]
+        return _parameters(self.members)
 
 
-def _agreement(told: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation [..., 3] of what members tell [K, ..., 3]."""
-    mean = told.mean(dim=0)
+def _agreement(residuals: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation [..., 3] of members' residuals [K, ..., 3]."""
+    mean = residuals.mean(dim=0)
     # the root has no slope at zero
-    return mean, torch.sqrt((told - mean).square().mean(dim=0) + 1e-18)
+    return mean, torch.sqrt((residuals - mean).square().mean(dim=0) + 1e-18)
 
 
-def _summed(counts: Sequence[Sequence[float]]) -> list[float]:
+def _parameters(members: nn.ModuleList) -> list[float]:
+    counts = [member.parameter_count() for member in members]  # type: ignore[operator]
     return [sum(axis) for axis in zip(*counts, strict=True)]
 
 
 def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
     """Return the mean of models with the same signals, step and integrator."""
     first = members[0]
-    baseline, head = (
-        MeanBaseline([member.head.effective_baseline(member.baseline) for member in members]),
-        MeanHead([member.head for member in members]),
-    )
-    return HybridDynamics(first.signals, baseline, head, first.dt, first.integrator)
+    baselines = [member.head.effective_baseline(member.baseline) for member in members]
+    head = MeanHead([member.head for member in members])
+    return HybridDynamics(first.signals, MeanBaseline(baselines), head, first.dt, first.integrator)
 
 
 @final
@@ -145,44 +143,34 @@ class SampledDynamics(Dynamics):
 
     def __init__(self, dynamics: Dynamics, name: str, theta: Tensor) -> None:
         super().__init__(dynamics.dt, dynamics.integrator)
-        self.dynamics = dynamics
-        self.name = name
-        self.theta = theta
+        self.stepped = _Stepped(dynamics)
+        self.name, self.theta = name, theta
         self.n_state = dynamics.n_state
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [M * D, nx] at a stage."""
-        return self._each("rate", x, p, rho)[0]
-
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step later."""
-        after, memory = self._each("step", x, w, s)
-        return after, memory
+        """Return the state and the memory one step later, each draw with its own parameters."""
+        draws, parameter = self.theta.shape[0], f"dynamics.{self.name}"
 
-    def _each(self, method: str, *given: Tensor) -> tuple[Tensor, ...]:
-        """What a method of the model returns with each draw's parameters for its own rows."""
-        called, draws = _Method(self.dynamics, method), self.theta.shape[0]
+        def one(theta: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
+            after: tuple[Tensor, Tensor] = torch.func.functional_call(
+                self.stepped, {parameter: theta}, rows
+            )
+            return after
 
-        def one(theta: Tensor, *rows: Tensor) -> tuple[Tensor, ...]:
-            out = torch.func.functional_call(called, {f"dynamics.{self.name}": theta}, rows)
-            return out if isinstance(out, tuple) else (out,)
-
-        split = [part.reshape(part.shape[0] // draws, draws, part.shape[-1]) for part in given]
-        out: tuple[Tensor, ...] = torch.vmap(one, in_dims=(0, *(1 for _ in given)), out_dims=1)(
-            self.theta, *split
-        )
-        return tuple(part.reshape(given[0].shape[0], part.shape[-1]) for part in out)
+        split = [part.reshape(-1, draws, part.shape[-1]) for part in (x, w)]
+        split.append(s.reshape(x.shape[0] // draws, draws, s.shape[-1]))
+        after, memory = torch.vmap(one, in_dims=(0, 1, 1, 1), out_dims=1)(self.theta, *split)
+        return after.reshape(x.shape), memory.reshape(s.shape)
 
 
 @final
-class _Method(torch.nn.Module):
-    """A method of a model as the forward of a module, as `functional_call` wants it."""
+class _Stepped(nn.Module):
+    """The step of a model as the forward of a module, as `functional_call` wants it."""
 
-    def __init__(self, dynamics: Dynamics, method: str) -> None:
+    def __init__(self, dynamics: Dynamics) -> None:
         super().__init__()
         self.dynamics = dynamics
-        self.method = method
 
-    def forward(self, *given: Tensor) -> object:
-        """Return what the method returns."""
-        return getattr(self.dynamics, self.method)(*given)
+    def forward(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state and the memory one step later."""
+        return self.dynamics.step(x, w, s)

@@ -35,11 +35,12 @@ class GatedHead(ResidualHead):
     Args:
         inner: the head, fitted.
         channels: number of channels nz.
+        holds: whether the inner head sees channels beyond the range at its edge.
     """
 
-    def __init__(self, inner: ResidualHead, channels: int) -> None:
+    def __init__(self, inner: ResidualHead, channels: int, *, holds: bool = False) -> None:
         super().__init__()
-        self.inner = inner
+        self.inner, self.holds = inner, holds
         self.n_state = inner.n_state
         self.tiny = 1e-18
         for name, count, value in (
@@ -56,10 +57,17 @@ class GatedHead(ResidualHead):
         self.fade: Tensor
         self.agreed: Tensor
 
+    def held(self, z: Tensor) -> Tensor:
+        """Return channels z [..., nz], at the edges of their range where they left it."""
+        return torch.minimum(torch.maximum(z, self.low.to(z.dtype)), self.high.to(z.dtype))
+
+    def seen(self, z: Tensor) -> Tensor:
+        """Return the channels [..., nz] that the inner head sees."""
+        return self.held(z) if self.holds else z
+
     def distance(self, z: Tensor) -> Tensor:
         """Return the squared distance [..., 1] of channels z [..., nz] from their range."""
-        low, high, reach = self.low.to(z.dtype), self.high.to(z.dtype), self.reach.to(z.dtype)
-        beyond = (z - torch.minimum(torch.maximum(z, low), high)) / reach
+        beyond = (z - self.held(z)) / self.reach.to(z.dtype)
         return beyond.square().sum(dim=-1, keepdim=True)
 
     def kept(self, z: Tensor, rho: Tensor, spread: Tensor) -> Tensor:
@@ -77,12 +85,12 @@ class GatedHead(ResidualHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the residual [B, 3] at channels z [B, nz] and the memory for the next step."""
-        rho, spread, s = self.inner.with_spread(z, s)
+        rho, spread, s = self.inner.with_spread(self.seen(z), s)
         return self.kept(z, rho, spread), s
 
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, 3] along channels [B, T, nz], from an empty memory."""
-        rho, spread = self.inner.sequence_with_spread(z)
+        rho, spread = self.inner.sequence_with_spread(self.seen(z))
         return self.kept(z, rho, spread)
 
     def warms_by_steps(self) -> bool:
@@ -91,7 +99,7 @@ class GatedHead(ResidualHead):
 
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
-        return self.inner.warmup(z)
+        return self.inner.warmup(self.seen(z))
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [n_state], the inner head's."""
@@ -139,12 +147,15 @@ class GatedHead(ResidualHead):
             high: upper edges [nz].
             fade: distance at which half is left of each axis [3], in half widths of the box.
         """
-        out = GatedHead(_HeldHead(self.inner, low, high), len(low))
-        out.agreed.copy_(self.agreed)
-        out.low.copy_(low)
-        out.high.copy_(high)
-        out.reach.copy_(self._reach(low, high))
-        out.fade.copy_(fade)
+        out = GatedHead(copy.deepcopy(self.inner), len(low), holds=True)
+        for name, value in (
+            ("low", low),
+            ("high", high),
+            ("reach", self._reach(low, high)),
+            ("fade", fade),
+            ("agreed", self.agreed),
+        ):
+            out.get_buffer(name).copy_(value)
         return out
 
     def _reach(self, low: Tensor, high: Tensor) -> Tensor:
@@ -192,47 +203,6 @@ class GatedHead(ResidualHead):
         last = torch.where(worth, torch.arange(len(candidates))[:, None], 0).amax(dim=0)
         self.fade.copy_(fades.flatten()[farther][last])
         return {f"{fade:g}": left[i].tolist() for i, fade in enumerate(candidates)}
-
-
-@final
-class _HeldHead(ResidualHead):
-    """A head whose channels are held at the edges of a box.
-
-    Args:
-        inner: the head.
-        low: lower edges [nz].
-        high: upper edges [nz].
-    """
-
-    def __init__(self, inner: ResidualHead, low: Tensor, high: Tensor) -> None:
-        super().__init__()
-        self.inner = copy.deepcopy(inner)
-        self.n_state = inner.n_state
-        self.register_buffer("low", low.clone())
-        self.register_buffer("high", high.clone())
-        self.low: Tensor
-        self.high: Tensor
-
-    def held(self, z: Tensor) -> Tensor:
-        """Return channels z [..., nz] held at the edges."""
-        return torch.minimum(torch.maximum(z, self.low.to(z.dtype)), self.high.to(z.dtype))
-
-    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inner head's residual [B, 3] at the held channels, and its memory."""
-        rho, _, s = self.with_spread(z, s)
-        return rho, s
-
-    def with_spread(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what the inner head does at the held channels."""
-        return self.inner.with_spread(self.held(z), s)
-
-    def warms_by_steps(self) -> bool:
-        """Return what the inner head says."""
-        return self.inner.warms_by_steps()
-
-    def warmup(self, z: Tensor) -> Tensor:
-        """Return the memory [B, n_state] that past channels [B, T, nz], held, leave."""
-        return self.inner.warmup(self.held(z))
 
 
 def _quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:

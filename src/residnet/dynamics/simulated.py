@@ -85,10 +85,6 @@ class TracedPlantDynamics(Dynamics):
             self.recorded: Any = torch.jit.freeze(recorded, preserved_attrs=["step"])
         self.plant = plant
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, nx] of the plant with what a step holds."""
-        return self.plant.held_rate(x, p)
-
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step of the log; the memory passes through."""
         after: tuple[Tensor, Tensor] = self.recorded.step(x, w, s)
@@ -122,26 +118,15 @@ class NomotoDynamics(Dynamics):
         system[0, 2] = 1.0
         system[1:-1, 1:-1] = plant.a
         system[1:-1, -1] = plant.b
-        self.register_buffer(
-            "to_middle",
-            torch.linalg.matrix_exp(0.5 * dt * system)[:-1].T.contiguous(),
-            persistent=False,
-        )
-        self.register_buffer(
-            "to_end", torch.linalg.matrix_exp(dt * system)[:-1].T.contiguous(), persistent=False
-        )
-        self.register_buffer(
-            "simpson",
-            torch.tensor([1.0, 4.0, 1.0], dtype=torch.float64) * dt / 6.0,
-            persistent=False,
-        )
+        for name, value in (
+            ("to_middle", torch.linalg.matrix_exp(0.5 * dt * system)[:-1].T.contiguous()),
+            ("to_end", torch.linalg.matrix_exp(dt * system)[:-1].T.contiguous()),
+            ("simpson", torch.tensor([1.0, 4.0, 1.0], dtype=torch.float64) * dt / 6.0),
+        ):
+            self.register_buffer(name, value, persistent=False)
         self.to_middle: Tensor
         self.to_end: Tensor
         self.simpson: Tensor
-
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, nx] of the plant; steps do not need it."""
-        return self.plant.rate(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step; the memory passes through."""
@@ -191,10 +176,6 @@ class InAmbientCurrent(Dynamics):
         places[0, state.index("x")] = places[1, state.index("y")] = 1.0
         self.register_buffer("places", places, persistent=False)
         self.places: Tensor
-
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot of the model, through the water."""
-        return self.model.rate(x, p, rho)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state and the memory one step later."""

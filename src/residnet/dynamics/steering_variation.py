@@ -144,10 +144,6 @@ class VariedModel(Dynamics):
         """Return the model itself, without a past, [batch, 3 + k]."""
         return torch.tensor([1.0, 1.0] + [0.0] * (self.n_state - 2)).expand(batch, -1)
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, 6] of the model at a stage, not varied; steps do not need it."""
-        return self._of(x).rate(motion(x), p, rho)
-
     def _of(self, x: Tensor) -> HybridDynamics:
         return self.models[1 if x.dtype == torch.float64 else 0]
 
@@ -186,10 +182,6 @@ class PushedSteering(Dynamics):
         super().__init__(inner.dt, inner.integrator)
         self.inner = inner
         self.n_state, self.inputs = inner.n_state, inputs
-
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return the derivative of the vessel's state; steps do not need it."""
-        return self.inner.rate(x, p, rho)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step and the memory, whose bias is the constant one."""

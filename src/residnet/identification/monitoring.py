@@ -173,10 +173,6 @@ class ChangedDynamics(Dynamics):
         self.gain = each([[1.0 + change.gain.get(i, 0.0) for i in span] for change in changes])
         self.offset = each([[change.offset.get(i, 0.0) for i in span] for change in changes])
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return the rate of the unchanged model; the change acts on whole steps."""
-        return self.model.rate(x, p, rho)
-
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return state and memory one step later, with the changed acceleration."""
         w = w * self.gain + self.offset

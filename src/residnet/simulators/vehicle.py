@@ -109,10 +109,6 @@ class _Guarded(Dynamics):
         self.guarded = guarded
         self.n_state = guarded.n_state
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, 6] of the model at a stage."""
-        return self.guarded.model.rate(x, p, rho)
-
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return state and memory one step later."""
         after, s, _ = self.guarded.flagged_step(x, w, s)

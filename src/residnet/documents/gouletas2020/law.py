@@ -218,10 +218,6 @@ class NominalSteering(Dynamics):
         self.register_buffer("nominal", vessel.memory(nominal), persistent=False)
         self.nominal: Tensor
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return the derivative of the vessel's state; steps do not need it."""
-        return self.inner.rate(x, p, rho)
-
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state [B, nx] after a step."""
         return self.inner.step(x, w, self.nominal.to(x.dtype).expand(x.shape[0], -1))[0], s
