@@ -36,7 +36,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "tasks": (2974, 255),
     "testing": (484, 33),
     "training": (1344, 150),
-    "": (428, 50),
+    "": (405, 49),
 }
 
 

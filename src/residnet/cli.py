@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -47,6 +46,9 @@ def _common(
     ] = False,
 ) -> None:
     """Options of all commands."""
+    # small products are thirty times slower where several libraries fight for the cores
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 
 
 class Recipe(StrEnum):
@@ -104,22 +106,17 @@ def run(
     from residnet.core.processes import spread
     from residnet.tasks.registry import config_file, load_task
 
-    limit_threads()
     task = load_task(config, overrides or [])
-    log = RunLog(task.place(out)) if verbose else None
-    with ExitStack() as stack:
-        if log is not None:
-            stack.enter_context(log.until_the_end())
-        kept = None if log is None else log.line
-        stack.enter_context(drawn_progress(quiet=quiet or as_json, kept=kept))
-        stack.enter_context(spread(workers))
+    log = RunLog(task.place(out), wanted=verbose)
+    drawn = drawn_progress(quiet=quiet or as_json, kept=log.line)
+    with log.until_the_end(), drawn, spread(workers):
         finished = task.run(
             source=config_file(config),
             overrides=overrides or [],
             out=out,
             resume=resume,
             overwrite=overwrite,
-            opened=None if log is None else log.open,
+            opened=log.open,
         )
     if as_json:
         place = {"folder": str(finished.folder.path), "report": str(finished.folder.report)}
@@ -159,14 +156,10 @@ def new(
     """
     from residnet.tasks.drafting import new_config
 
-    limit_threads()
     with drawn_progress(quiet=quiet):
-        ask = asked() if not defaults else None
-        file = out or Path("my_boat.yaml")
-        standard = recipe is not None
-        lines = new_config(logs, file, ask, overwrite=overwrite, standard=standard)
-    for line in lines:
-        print(line)
+        ask, file = None if defaults else asked(), out or Path("my_boat.yaml")
+        lines = new_config(logs, file, ask, overwrite=overwrite, standard=recipe is not None)
+    print("\n".join(lines))
 
 
 @app.command()
@@ -182,11 +175,9 @@ def demo(
     """Write realistic logs of a simulated boat to try things on, as csv and MCAP."""
     from residnet.tasks.demo import write_demo
 
-    limit_threads()
     with drawn_progress(quiet=quiet):
         lines = write_demo(folder, overwrite=overwrite)
-    for line in lines:
-        print(line)
+    print("\n".join(lines))
 
 
 @app.command()
@@ -198,7 +189,6 @@ def check(
     """Validate a config and everything that it names, without running it."""
     from residnet.tasks.registry import load_task
 
-    limit_threads()
     with drawn_progress(quiet=quiet):
         task = load_task(config, overrides or [])
         task.check()
@@ -234,7 +224,6 @@ def inspect(
     from residnet.core.files import require_file_place
     from residnet.tasks.inspection import inspect_logs
 
-    limit_threads()
     if file is not None:
         require_file_place(file)
     with drawn_progress(quiet=quiet):
@@ -270,7 +259,6 @@ def evaluate(
     from residnet.core.files import require_room
     from residnet.tasks.registry import finished_task
 
-    limit_threads()
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "evaluate")
         require_room(out or folder)
@@ -312,7 +300,6 @@ def monitor(
     from residnet.core.files import require_file_place, whole
     from residnet.tasks.registry import finished_task
 
-    limit_threads()
     if file is not None:
         require_file_place(file)
     settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
@@ -355,7 +342,6 @@ def plan_trial(
     from residnet.core.files import require_room
     from residnet.tasks.registry import finished_task
 
-    limit_threads()
     if out is not None:
         require_room(out)
     limits = {"time": time, "area": area, "speed": speed, "rudder": rudder, "count": count}
@@ -394,7 +380,6 @@ def export(
     from residnet.core.files import require_file_place
     from residnet.tasks.registry import finished_task
 
-    limit_threads()
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "export")
         require_file_place(out or run.exports / model)
@@ -424,7 +409,6 @@ def ardupilot(
     from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
     from residnet.simulators.vehicle import vehicle
 
-    limit_threads()
     boat = vehicle(source, model=model, dt=0.0025)
     end = ArduPilotBackEnd(boat, servos(boat, servo or ()), port)
     print(f"{boat.name} listens at UDP port {end.port}; Ctrl-C ends it", flush=True)
@@ -438,7 +422,6 @@ def report(folder: RunPath, quiet: Quiet = False) -> None:
     """Write the figures and the report of a finished run again."""
     from residnet.tasks.registry import report_run
 
-    limit_threads()
     with drawn_progress(quiet=quiet):
         page = report_run(folder)
     print(page)
@@ -457,7 +440,6 @@ def compare(
     """Set finished fits side by side: errors on common logs, paired intervals, configs."""
     from residnet.tasks.compare import compare_runs
 
-    limit_threads()
     with drawn_progress(quiet=quiet):
         text, page = compare_runs(folders, out)
     print(text)
@@ -509,13 +491,6 @@ def show(finished: Finished) -> None:
         print(f"exported: {file}")
     if finished.folder.report.is_file():
         print(f"report: {finished.folder.report}")
-
-
-def limit_threads() -> None:
-    """Compute with one thread, unless the environment says otherwise."""
-    # small products are thirty times slower where several libraries fight for the cores
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
 
 
 def main() -> None:

@@ -131,11 +131,12 @@ class RunLog:
 
     Args:
         folder: that the run will have; a run that ends before it stands has its log beside it.
+        wanted: keep the lines; else nothing is written.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, wanted: bool = True) -> None:
         self._beside = folder.with_name(f"{folder.name}.log.txt")
-        self._held: list[str] = []
+        self._wanted, self._held = wanted, ""
         self._file: Path | None = None
 
     def line(self, text: str) -> None:
@@ -144,9 +145,8 @@ class RunLog:
 
     def open(self, folder: Path) -> None:
         """Write into a folder from now on, behind what an interrupted run left there."""
-        self._file, held = folder / "log.txt", self._held
-        self._held = []
-        self._add("".join(held))
+        self._file = folder / "log.txt"
+        self._add("")
 
     @contextmanager
     def until_the_end(self) -> Iterator[None]:
@@ -154,15 +154,15 @@ class RunLog:
         try:
             yield
         except BaseException as error:
-            self._add("".join(traceback.format_exception(error)))
-            if self._file is None:
+            if self._file is None and self._wanted:
                 self._beside.parent.mkdir(parents=True, exist_ok=True)
-                self._beside.write_text("".join(self._held), encoding="utf-8")
+                self._file = self._beside
+            self._add("".join(traceback.format_exception(error)))
             raise
 
     def _add(self, text: str) -> None:
-        if self._file is None:
-            self._held.append(text)
-            return
-        with self._file.open("a", encoding="utf-8", errors="backslashreplace") as stream:
-            stream.write(text)
+        self._held += text
+        if self._file is not None and self._wanted:
+            with self._file.open("a", encoding="utf-8", errors="backslashreplace") as stream:
+                stream.write(self._held)
+            self._held = ""

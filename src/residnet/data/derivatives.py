@@ -108,13 +108,19 @@ class SavitzkyGolay(Derivative):
 
     def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
         """See `Derivative.piece`."""
-        from scipy.signal import savgol_filter
-
-        smooth, rate = (
-            savgol_filter(values, self.samples(step), self.order, deriv=k, delta=step, axis=0)
-            for k in (0, 1)
-        )
-        return smooth, rate
+        # as scipy.signal.savgol_filter, whose import takes longer than most checks of a config
+        size, half = self.samples(step), self.samples(step) // 2
+        powers = np.vander(np.linspace(-1.0, 1.0, size), self.order + 1, increasing=True)
+        fit, slopes = np.linalg.pinv(powers), np.zeros_like(powers)
+        slopes[:, 1:] = powers[:, :-1] * np.arange(1, self.order + 1) / (half * step)
+        first, last = fit @ values[:size], fit @ values[-size:]
+        out = []
+        for rows in (powers, slopes):
+            weights = rows[half] @ fit
+            inner = [np.correlate(column, weights, "valid") for column in values.T]
+            ends = rows[:half] @ first, rows[half + 1 :] @ last
+            out.append(np.concatenate((ends[0], np.stack(inner, axis=1), ends[1])))
+        return out[0], out[1]
 
 
 @final

@@ -14,6 +14,8 @@ from typing import Any, ClassVar, Literal, Protocol, TypeAlias
 
 from residnet.report.format import fixed
 
+EXPORTS = "exports.json"
+"""File of a run folder that says what came of each export."""
 Mark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 
 

@@ -14,13 +14,21 @@ from markupsafe import Markup, escape
 from residnet.core.config import load_mapping
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json, whole
-from residnet.report.blocks import Block, Bullets, Cell, Code, Facts, Section, bad_where, table_of
+from residnet.report.blocks import (
+    EXPORTS,
+    Block,
+    Bullets,
+    Cell,
+    Code,
+    Facts,
+    Section,
+    bad_where,
+    table_of,
+)
 from residnet.report.browser import Drawn, draw
 from residnet.report.figure import Figure
 
 _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
-EXPORTS = "exports.json"
-"""File of a run folder that says what came of each export."""
 _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
 
 

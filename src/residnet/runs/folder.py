@@ -19,8 +19,6 @@ SUMMARY = "residnet.summary/1"
 
 LOG = "log.txt"
 """File that holds the progress of a run, where that is kept."""
-EXPORTS = "exports.json"
-"""File that says what came of each export."""
 CHECKSUMS = "checksums.json"
 _RESULTS = {".json", ".yaml", ".parquet", ".safetensors"}
 _ELSEWHERE = {"figures", "exports", "tensorboard", "checkpoints"}
