@@ -22,8 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
 
-from planted import FAULTS, SHIPS, Fault, Ship, clean
-from planted_channels import CHANNEL_FAULTS, HARMLESS, Undecidable, anywhere
+from planted import FAULTS, SHIPS, Fault, Ship, Undecidable, clean
 from random_vessels import KINDS, random_logs, ship_of
 
 from residnet.core.errors import ResidnetError
@@ -109,9 +108,7 @@ def _named(fault: Fault, host: Host, logs: list[Log], verbose: bool) -> bool:
     loud = [
         f
         for f in said
-        if f.level != "note"
-        or fault.name in HARMLESS
-        or f.action == "the config masks these samples"
+        if f.level != "note" or fault.harmless or f.action == "the config masks these samples"
     ]
     named = any(f.code in fault.codes for f in loud)
     if not named or verbose:
@@ -140,11 +137,7 @@ def main() -> None:
     names = list(dict.fromkeys(host.ship.name for host in hosts))
     table: dict[tuple[str, str], list[bool]] = {}
     checked, loud = 0, 0
-    faults = [
-        f
-        for f in (*map(anywhere, FAULTS), *CHANNEL_FAULTS)
-        if not given.faults or f.name in given.faults
-    ]
+    faults = [f for f in FAULTS if not given.faults or f.name in given.faults]
     for number, host in enumerate(hosts):
         if not given.faults:
             for log, text in zip(host.logs, alarms(host), strict=True):

@@ -238,7 +238,7 @@ def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray) -> dict[str, Cause
         # of causes that explain the same, as lags of all channels but one and of that one do, the
         # first counts
         gain = {n: left(chosen) - left([*chosen, n]) - price[n] for n in others}
-        gain = {n: round(value / energy, 9) for n, value in gain.items()}
+        gain = {n: round(value / max(energy, 1e-300), 9) for n, value in gain.items()}
         best = max(others, key=lambda name: gain[name], default="")
         if not best or gain[best] <= 0.0:
             break
