@@ -28,7 +28,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "identification": (2102, 220),
     "judge": (1887, 204),
     "manoeuvres": (896, 136),
-    "physics": (2023, 258),
+    "physics": (1993, 251),
     "regression": (1875, 207),
     "report": (2839, 320),
     "runs": (337, 47),

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from golden_tables import table, tensor
+from golden_tables import over_its_length, table, tensor
 from scipy.signal import square
 from staged_plant import StagedPlantDynamics
 from torch import Tensor
@@ -130,11 +130,11 @@ def recorded(frame: pd.DataFrame, plant: HullPlant) -> Tensor:
 
 
 @cache
-def flown(folder: Path, vessel: str) -> dict[str, np.ndarray]:
+def flown(folder: Path, vessel: str, seconds: float) -> dict[str, np.ndarray]:
     """States [T+1, 6] at the steps of every file of one vessel, flown side by side."""
     files = [path for path in sorted(folder.glob("*.csv.gz")) if case_of(path)[0] == vessel]
     plant = plant_of(files[0]).in_calm_water()
-    t = DT * np.arange(round(END / DT))
+    t = DT * np.arange(round(min(END, seconds) / DT))
     # the last stage sees the input just before the next step (golden/README.md)
     stages = (t, t + DT / 2, t + DT - 1e-12)
     w = torch.from_numpy(
@@ -152,7 +152,7 @@ def test_inputs_from_the_name(golden_file: Path) -> None:
     frame, plant = table(golden_file), plant_of(golden_file)
     found = torch.from_numpy(commands(golden_file)(frame["t"].to_numpy()))
     if isinstance(plant.actuators, WaterJets):
-        found[:, 0] = found[:, 0].clamp(0.0, plant.actuators.n_max)
+        found[:, 0] = found[:, 0].clamp(0.0, plant.actuators.config.motor.n_max)
     # times in the file are rounded sums; an input that jumps there may be seen before or after
     away = (found - recorded(frame, plant)).abs() > 1e-9 * recorded(frame, plant).abs().amax(
         0
@@ -169,10 +169,11 @@ def test_forces_of_the_commands(golden_file: Path) -> None:
     size = tau.abs().numpy()
     if isinstance(plant.actuators, WaterJets):
         u, n = nu[:, 0].abs(), command[:, 0].abs()
-        (a, b, c), (d, e, f) = (
-            [abs(p) for p in part] for part in (plant.actuators.a, plant.actuators.c)
+        config = plant.actuators.config
+        (a, b, c), (d, e, f, whole) = (
+            [abs(p.value) for _, p in part] for part in (config.speed, config.revolutions)
         )
-        largest = 2 * (a + u * (b + u * c)) * (d + n * (e + n * f))
+        largest = 2 * (a + u * (b + u * c)) * (d + n * (e + n * f)) / whole
         across = largest * torch.sin(command[:, 1]).abs()
         size = torch.stack((largest, across, 3.82 * across), dim=-1).numpy()
     truth = frame[["tau_x", "tau_y", "tau_z"]].to_numpy()
@@ -184,7 +185,7 @@ def test_right_hand_side_row_by_row(golden_file: Path) -> None:
     frame, plant = table(golden_file), plant_of(golden_file)
     nu, tau = tensor(frame, "u", "v", "r"), tensor(frame, "tau_x", "tau_y", "tau_z")
     hull = plant.hull
-    parts = hull.terms(nu).abs() @ hull.coefficients.abs() + (tau * hull.gain).abs()
+    parts = (hull.terms(nu).abs() @ hull.coefficients.abs() + tau.abs()) @ hull.inverse.T
     truth = frame[["du", "dv", "dr"]].to_numpy()
     assert (
         np.abs(hull(nu, tau).numpy() - truth) <= 1e-12 * np.maximum(parts.numpy(), np.abs(truth))
@@ -200,15 +201,17 @@ def test_right_hand_side_row_by_row(golden_file: Path) -> None:
     )
 
 
-def test_trajectory(golden_file: Path) -> None:
+@over_its_length
+def test_trajectory(golden_file: Path, seconds: float) -> None:
     """Each channel to 1e-6 of its range; where inputs jump within steps, velocities to 3e-2."""
     frame = table(golden_file)
+    frame = frame[frame["t"] <= seconds]
     rows = np.rint(frame["t"].to_numpy() / DT).astype(int)
     np.testing.assert_array_equal(rows, EVERY * np.arange(len(frame)))
     found = dict(
         zip(
             ("x", "y", "psi", "u", "v", "r"),
-            flown(golden_file.parent, case_of(golden_file)[0])[golden_file.name][rows].T,
+            flown(golden_file.parent, case_of(golden_file)[0], seconds)[golden_file.name][rows].T,
             strict=True,
         )
     )

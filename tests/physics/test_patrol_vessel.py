@@ -163,7 +163,7 @@ def test_a_foil_beyond_stall_lifts_no_more(name: str) -> None:
         torch.full_like(delta, 0.5),
         torch.full_like(delta, THRUST),
     )
-    lift, drag = rudders.foil(delta, u, v, thrust)
+    lift, drag = rudders.config.foil(delta, u, v, thrust)
     torch.testing.assert_close(lift, -lift.flip(0), rtol=1e-12, atol=1e-9)
     torch.testing.assert_close(drag, drag.flip(0), rtol=1e-12, atol=1e-9)
     stalled = delta > np.radians(23)

@@ -149,9 +149,8 @@ class AbkowitzConfig(VesselFile):
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
         """
-        wind = self.wind.build() if self.wind is not None else None
         start = {"u": self.speed, "n": self.shaft.n_0 if self.shaft is not None else 0.0}
-        return HullPlant(self.hull(), SeriesForces(self), wind, start)
+        return HullPlant(self.hull(), SeriesForces(self), self.wind, start)
 
     def hull(self) -> Hull:
         """Build the inertia in SI, with the rigid body's Coriolis force where the series lacks it.

@@ -6,6 +6,7 @@ Waves follow document 004, eqs. (5.30)-(5.34).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import Annotated, Literal, final
 
 import numpy as np
@@ -18,19 +19,6 @@ from residnet.physics.parameters import Density, SquareMetres
 
 WIND_INPUTS = ("wind_speed", "wind_dir")
 """True wind as inputs of a plant: speed [m/s] and where it comes FROM [rad], earth-fixed."""
-
-
-class WindLoads(nn.Module, ABC):
-    """Forces of the air on a vessel, without dynamics of its own."""
-
-    @abstractmethod
-    def forward(self, along: Tensor, across: Tensor) -> Tensor:
-        """Return X, Y [N], K, N [N m], stacked [..., 4], in a relative wind.
-
-        Args:
-            u: velocity of the air relative to the vessel along body x [...] in m/s.
-            v: the same along body y [...] in m/s.
-        """
 
 
 class WindLoadConfig(Config, ABC):
@@ -56,10 +44,16 @@ class WindLoadConfig(Config, ABC):
     source: str = Field(min_length=1)
 
     @abstractmethod
-    def build(self) -> WindLoads:
-        """Build the module that computes the wind forces."""
+    def loads(self, along: Tensor, across: Tensor) -> Tensor:
+        """Return X, Y [N], K, N [N m], stacked [..., 4], in a relative wind.
+
+        Args:
+            along: velocity of the air relative to the vessel along body x [...] in m/s.
+            across: the same along body y [...] in m/s.
+        """
 
 
+@final
 class SymmetricWindConfig(WindLoadConfig):
     """Wind coefficients of ships that are nearly symmetric fore and aft.
 
@@ -77,35 +71,17 @@ class SymmetricWindConfig(WindLoadConfig):
     c_y: float = Field(ge=0, le=2)
     c_n: float = Field(ge=0, le=1)
 
-    def build(self) -> SymmetricWind:
-        """Build the module that computes the wind forces."""
-        return SymmetricWind(self)
+    def loads(self, along: Tensor, across: Tensor) -> Tensor:
+        """Return the forces [..., 4], in components: no angle, and smooth in a calm."""
+        front, side = 0.5 * self.density * self.frontal_area, 0.5 * self.density * self.lateral_area
+        speed = torch.sqrt(along * along + across * across + 1e-12)
+        y = side * self.c_y * across * speed
+        n = -2.0 * side * self.length * self.c_n * along * across
+        x = front * self.c_x * along * speed
+        return torch.stack((x, y, self.centre_height * y, n), dim=-1)
 
 
 @final
-class SymmetricWind(WindLoads):
-    """The three coefficients, written in the components of the relative air velocity.
-
-    This needs no angle and is smooth in a calm.
-    """
-
-    def __init__(self, config: SymmetricWindConfig) -> None:
-        super().__init__()
-        dynamic = 0.5 * config.density
-        self.x = dynamic * config.frontal_area * config.c_x
-        self.y = dynamic * config.lateral_area * config.c_y
-        self.n = -2.0 * dynamic * config.lateral_area * config.length * config.c_n
-        self.height = config.centre_height
-
-    def forward(self, along: Tensor, across: Tensor) -> Tensor:
-        """Return the forces [..., 4]."""
-        speed = torch.sqrt(along * along + across * across + 1e-12)
-        side = self.y * across * speed
-        return torch.stack(
-            (self.x * along * speed, side, self.height * side, self.n * along * across), dim=-1
-        )
-
-
 class TabulatedWindConfig(WindLoadConfig):
     """Wind coefficients at angles of the relative wind, as wind tunnels give them.
 
@@ -151,52 +127,30 @@ class TabulatedWindConfig(WindLoadConfig):
             )
         return self
 
-    def build(self) -> TabulatedWind:
-        """Build the module that computes the wind forces."""
-        return TabulatedWind(self)
+    @cached_property
+    def forces_by_angle(self) -> tuple[Tensor, Tensor]:
+        """Return angles [A] and forces X, Y, N per squared speed [A, 3], float64."""
+        sizes = [self.frontal_area, self.lateral_area, self.lateral_area * self.length]
+        values = torch.tensor([self.C_X, self.C_Y, self.C_N], dtype=torch.float64).T
+        areas = torch.tensor(sizes, dtype=torch.float64)
+        angle = torch.tensor(self.angle, dtype=torch.float64)
+        return angle, values * areas * (0.5 * self.density)
 
-
-@final
-class TabulatedWind(WindLoads):
-    """Coefficients by linear interpolation over the angle of the relative wind."""
-
-    def __init__(self, config: TabulatedWindConfig) -> None:
-        super().__init__()
-        dynamic = 0.5 * config.density
-        areas = torch.tensor(
-            [config.frontal_area, config.lateral_area, config.lateral_area * config.length],
-            dtype=torch.float64,
-        )
-        values = (
-            torch.tensor([config.C_X, config.C_Y, config.C_N], dtype=torch.float64).T
-            * areas
-            * dynamic
-        )
-        self.register_buffer(
-            "angle", torch.tensor(config.angle, dtype=torch.float64), persistent=False
-        )
-        self.register_buffer("values", values, persistent=False)
-        self.height = config.centre_height
-        self.angle: Tensor
-        self.values: Tensor
-
-    def forward(self, along: Tensor, across: Tensor) -> Tensor:
-        """Return the forces [..., 4]."""
+    def loads(self, along: Tensor, across: Tensor) -> Tensor:
+        """Return the forces [..., 4], linear between the angles."""
+        turn, table = (part.to(along.dtype) for part in self.forces_by_angle)
         square = along * along + across * across
-        calm = square < 1e-12
         # the angle of a calm is any; a fixed one keeps the gradient finite
-        ahead = torch.where(calm, torch.ones_like(along), -along)
+        ahead = torch.where(square < 1e-12, torch.ones_like(along), -along)
         angle = torch.atan2(-across, ahead)
-        turn = self.angle.to(angle.dtype)
         upper = torch.searchsorted(turn, angle.abs().detach().contiguous(), right=True).clamp(
             1, turn.shape[0] - 1
         )
         share = ((angle.abs() - turn[upper - 1]) / (turn[upper] - turn[upper - 1])).unsqueeze(-1)
-        table = self.values.to(angle.dtype)
         force = (table[upper - 1] * (1.0 - share) + table[upper] * share) * square.unsqueeze(-1)
         side = torch.where(angle < 0, -torch.ones_like(angle), torch.ones_like(angle))
         y = side * force[..., 1]
-        return torch.stack((force[..., 0], y, self.height * y, side * force[..., 2]), dim=-1)
+        return torch.stack((force[..., 0], y, self.centre_height * y, side * force[..., 2]), dim=-1)
 
 
 WindLoadsConfig = Annotated[SymmetricWindConfig | TabulatedWindConfig, Field(discriminator="kind")]

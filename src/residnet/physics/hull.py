@@ -153,8 +153,7 @@ class HullVessel(VesselFile, ABC):
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
         """
-        wind = self.wind.build() if self.wind is not None else None
-        return HullPlant(self.hull(), self.actuators.build(), wind, self.start())
+        return HullPlant(self.hull(), self.actuators.build(), self.wind, self.start())
 
 
 class HullConfig(HullVessel, ABC):

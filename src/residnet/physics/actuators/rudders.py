@@ -147,51 +147,40 @@ class RudderPropeller(Actuators):
             rudder.follow(rudder.limit, rudder.rate, "delta"),
             propeller.follow(propeller.n_max, propeller.n_rate, "n"),
         )
+        self.config = config
         self.curve = ThrustCurve([propeller.forward], [propeller.reverse])
-        self.delta_max, self.n_max, self.x = rudder.limit, propeller.n_max, rudder.x
-        self.lift = (
-            0.5
-            * config.density
-            * rudder.area
-            * 6.13
-            * rudder.aspect_ratio
-            / (rudder.aspect_ratio + 2.25)
-        )
-        self.race = (
-            rudder.race_share * 2.0 / (config.density * 0.25 * torch.pi * propeller.diameter**2)
-        )
-        self.straightening = rudder.straightening
-        self.loss = propeller.advance_loss
-        self.thrust_factor = 1.0 - propeller.thrust_deduction
+        slope = 6.13 * rudder.aspect_ratio / (rudder.aspect_ratio + 2.25)
+        self.lift = 0.5 * config.density * rudder.area * slope
+        disc = 0.25 * math.pi * propeller.diameter**2
+        self.race = rudder.race_share * 2.0 / (config.density * disc)
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the rudder angle from steer and revolutions from drive, as shares of their limits.
 
         Steer to starboard is positive.
         """
-        return torch.stack(
-            (steer.clamp(-1.0, 1.0) * self.delta_max, drive.clamp(-1.0, 1.0) * self.n_max), dim=-1
-        )
+        angle = steer.clamp(-1.0, 1.0) * self.config.rudder.limit
+        return torch.stack((angle, drive.clamp(-1.0, 1.0) * self.config.propeller.n_max), dim=-1)
 
     def thrust(self, n: Tensor, u: Tensor) -> Tensor:
         """Return the thrust [N] of the propeller at n [1/s] and speed through the water u [m/s]."""
-        thrust: Tensor = self.curve(n) - self.loss * n.abs() * u.clamp(min=0.0)
+        loss = self.config.propeller.advance_loss
+        thrust: Tensor = self.curve(n) - loss * n.abs() * u.clamp(min=0.0)
         return thrust
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """Return tau [..., 3] in N, N, N m."""
-        position = self.positions(a, command)
+        rudder, position = self.config.rudder, self.positions(a, command)
         delta, u = position[..., 0], nu[..., 0]
         thrust = self.thrust(position[..., 1], u)
         square = u * u.abs() + self.race * thrust.clamp(min=0.0)
-        across = self.straightening * (nu[..., 1] + self.x * nu[..., 2])
+        across = rudder.straightening * (nu[..., 1] + rudder.x * nu[..., 2])
         # the offset keeps the gradient finite at rest
         inflow = torch.sqrt(square.abs() + 1e-8)
         normal = self.lift * (square * torch.sin(delta) + inflow * across * torch.cos(delta))
         side = -normal * torch.cos(delta)
-        return torch.stack(
-            (self.thrust_factor * thrust - normal * torch.sin(delta), side, self.x * side), dim=-1
-        )
+        ahead = (1.0 - self.config.propeller.thrust_deduction) * thrust
+        return torch.stack((ahead - normal * torch.sin(delta), side, rudder.x * side), dim=-1)
 
 
 class SternRuddersConfig(SteeringGearConfig, ActuatorConfig, ABC):
@@ -208,24 +197,6 @@ class SternRuddersConfig(SteeringGearConfig, ActuatorConfig, ABC):
     z: Metres
     thrust: Newtons = Field(gt=0)
 
-
-class SternRudders(Actuators, ABC):
-    """The forces tau [..., 4] along x, y and about x, z of rudders and propellers at the stern.
-
-    Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state where the rudder has a
-    rate.
-
-    delta > 0 turns to starboard: Y = -L, K = z L, N = -x L, X = T - D (document 004 eqs.
-    (5.26)-(5.29), signs as in corrections G9, G10).
-    """
-
-    commands = ("cmd_delta", "cmd_thrust")
-
-    def __init__(self, config: SternRuddersConfig) -> None:
-        super().__init__(config.follow(config.limit, config.rate, "delta"))
-        self.delta_max, self.thrust_max = config.limit, config.thrust
-        self.x, self.z = config.x, config.z
-
     @abstractmethod
     def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
         """Return the lift and drag [...] in N of all rudders.
@@ -238,32 +209,17 @@ class SternRudders(Actuators, ABC):
         """
 
     @final
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return rudder angle and thrust [..., 2] for steer and drive, shares of their limits.
-
-        There is no thrust astern.
-        """
-        return torch.stack(
-            (steer.clamp(-1.0, 1.0) * self.delta_max, drive.clamp(0.0, 1.0) * self.thrust_max),
-            dim=-1,
-        )
-
-    @final
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [..., 4] in N, N, N m, N m."""
-        delta = self.positions(a, command)[..., 0]
-        thrust = command[..., 1].clamp(0.0, self.thrust_max)
-        lift, drag = self.foil(delta, nu[..., 0], nu[..., 1], thrust)
-        return torch.stack((thrust - drag, -lift, self.z * lift, -self.x * lift), dim=-1)
-
-    @final
-    def followed(self, command: Tensor) -> Tensor:
-        """Return the rudder's command [..., 1]; thrust acts at once."""
-        return command[..., :1]
+    def build(self) -> SternRudders:
+        """Build the module that turns commands into forces."""
+        return SternRudders(self)
 
 
+@final
 class FoilRuddersConfig(SternRuddersConfig):
-    """Rudders as foils (document 004 eqs. (5.20)-(5.25), corrections G8, G11).
+    """Rudders as foils in the open water's speed, corrected for the propellers' race.
+
+    Document 004 eqs. (5.20)-(5.25), corrections G8, G11. The drag at zero angle belongs to the
+    hull's calm-water resistance.
 
     Attributes:
         rudders: how many rudders share the lift evenly.
@@ -286,41 +242,25 @@ class FoilRuddersConfig(SternRuddersConfig):
     diameter: Metres = Field(gt=0)
     density: Density = Field(gt=0)
 
-    def build(self) -> FoilRudders:
-        """Build the module that turns commands into forces."""
-        return FoilRudders(self)
-
-
-@final
-class FoilRudders(SternRudders):
-    """Rudders as foils in the open water's speed, corrected for the propellers' race.
-
-    The drag at zero angle belongs to the hull's calm-water resistance.
-    """
-
-    def __init__(self, config: FoilRuddersConfig) -> None:
-        super().__init__(config)
-        self.slope, self.stall = config.lift_slope, config.stall
-        self.pressure = 0.5 * config.density * config.area * config.rudders
-        self.induced = 1.0 / (0.9 * math.pi * config.aspect_ratio)
-        disc = 0.25 * math.pi * config.diameter**2
-        # C_Th V^2 per newton of total thrust: each propeller has its share
-        self.loading = 2.0 / (config.propellers * config.density * disc)
-
     def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
         """Return the lift and drag [...] in N."""
+        disc = 0.25 * math.pi * self.diameter**2
+        # C_Th V^2 per newton of total thrust: each propeller has its share
+        loading = 2.0 / (self.propellers * self.density * disc)
         angle = delta.clamp(-self.stall, self.stall)
         square = u * u + v * v
         # 1/sqrt(1 + C_Th); the offset keeps it and its gradient finite at rest
-        share = torch.sqrt((square + 1e-20) / (square + self.loading * thrust + 1e-20))
+        share = torch.sqrt((square + 1e-20) / (square + loading * thrust + 1e-20))
         race = thrust * (1.0 + share)
-        coefficient = self.slope * angle
-        flow = self.pressure * square
+        coefficient = self.lift_slope * angle
+        flow = 0.5 * self.density * self.area * self.rudders * square
+        induced = 1.0 / (0.9 * math.pi * self.aspect_ratio)
         lift = flow * coefficient + race * torch.sin(angle)
-        drag = flow * self.induced * coefficient * coefficient + race * (1.0 - torch.cos(angle))
+        drag = flow * induced * coefficient * coefficient + race * (1.0 - torch.cos(angle))
         return lift, drag
 
 
+@final
 class LinearRuddersConfig(SternRuddersConfig):
     """Rudders whose side force is Y_delta_uu u^2 delta, without drag and race.
 
@@ -333,22 +273,49 @@ class LinearRuddersConfig(SternRuddersConfig):
     kind: Literal["linear_rudders"] = "linear_rudders"
     Y_delta_uu: float = Field(gt=0)
 
-    def build(self) -> LinearRudders:
-        """Build the module that turns commands into forces."""
-        return LinearRudders(self)
+    def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the lift and no drag [...] in N."""
+        return self.Y_delta_uu * u * u * delta, torch.zeros_like(delta)
 
 
 @final
-class LinearRudders(SternRudders):
-    """Rudders whose lift is proportional to u^2 delta."""
+class SternRudders(Actuators):
+    """The forces tau [..., 4] along x, y and about x, z of rudders and propellers at the stern.
 
-    def __init__(self, config: LinearRuddersConfig) -> None:
-        super().__init__(config)
-        self.slope = config.Y_delta_uu
+    Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state where the rudder has a
+    rate.
 
-    def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lift and no drag [...] in N."""
-        return self.slope * u * u * delta, torch.zeros_like(delta)
+    delta > 0 turns to starboard: Y = -L, K = z L, N = -x L, X = T - D (document 004 eqs.
+    (5.26)-(5.29), signs as in corrections G9, G10).
+    """
+
+    commands = ("cmd_delta", "cmd_thrust")
+
+    def __init__(self, config: SternRuddersConfig) -> None:
+        super().__init__(config.follow(config.limit, config.rate, "delta"))
+        self.config = config
+        self.delta_max, self.thrust_max = config.limit, config.thrust
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Return rudder angle and thrust [..., 2] for steer and drive, shares of their limits.
+
+        There is no thrust astern.
+        """
+        angle, thrust = steer.clamp(-1.0, 1.0), drive.clamp(0.0, 1.0)
+        return torch.stack((angle * self.delta_max, thrust * self.thrust_max), dim=-1)
+
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        """Return tau [..., 4] in N, N, N m, N m."""
+        delta = self.positions(a, command)[..., 0]
+        thrust = command[..., 1].clamp(0.0, self.thrust_max)
+        lift, drag = self.config.foil(delta, nu[..., 0], nu[..., 1], thrust)
+        return torch.stack(
+            (thrust - drag, -lift, self.config.z * lift, -self.config.x * lift), dim=-1
+        )
+
+    def followed(self, command: Tensor) -> Tensor:
+        """Return the rudder's command [..., 1]; thrust acts at once."""
+        return command[..., :1]
 
 
 Force = Annotated[Parameter, AfterValidator(of_dimension(1, 1, -2))]
@@ -443,24 +410,17 @@ class WaterJets(Actuators):
             motor.follow(motor.n_max, motor.n_rate, "n"),
             nozzle.follow(nozzle.limit, nozzle.rate, "nozzle"),
         )
-        self.n_max = motor.n_max
-        self.angle = nozzle.limit
-        self.jets = float(config.jets)
-        self.x = config.x
-        speed, revolutions = config.speed, config.revolutions
-        self.a = [p.value for p in (speed.a0, speed.a1, speed.a2)]
-        self.c = [
-            p.value / revolutions.reference.value
-            for p in (revolutions.r0, revolutions.r1, revolutions.r2)
-        ]
+        self.config = config
 
     def thrust(self, n: Tensor, u: Tensor) -> Tensor:
         """Return the thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape.
 
         Source: document 000 eq. (6.16).
         """
-        a, c = self.a, self.c
-        return (a[0] + u * (a[1] + u * a[2])) * (c[0] + n * (c[1] + n * c[2]))
+        a, r = self.config.speed, self.config.revolutions
+        by_speed = a.a0.value + u * (a.a1.value + u * a.a2.value)
+        share = (r.r0.value + n * (r.r1.value + n * r.r2.value)) / r.reference.value
+        return by_speed * share
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the commands [..., 2] for drive and steer.
@@ -468,17 +428,16 @@ class WaterJets(Actuators):
         Drive ahead is the share of the motor's revolutions (jets do not push astern), steer the yaw
         moment's sense.
         """
-        side = self.angle if self.x > 0 else -self.angle
-        return torch.stack(
-            (drive.clamp(0.0, 1.0) * self.n_max, steer.clamp(-1.0, 1.0) * side), dim=-1
-        )
+        limit = self.config.nozzle.limit
+        side = steer.clamp(-1.0, 1.0) * (limit if self.config.x > 0 else -limit)
+        return torch.stack((drive.clamp(0.0, 1.0) * self.config.motor.n_max, side), dim=-1)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """Return tau [..., 3] in N, N, N m (6.12)-(6.14)."""
-        state = self.positions(a, command)
-        total = self.jets * self.thrust(state[..., 0], nu[..., 0])
-        across = total * torch.sin(state[..., 1])
-        return torch.stack((total * torch.cos(state[..., 1]), across, self.x * across), dim=-1)
+        n, angle = self.positions(a, command).unbind(-1)
+        total = self.config.jets * self.thrust(n, nu[..., 0])
+        across = total * torch.sin(angle)
+        return torch.stack((total * torch.cos(angle), across, self.config.x * across), dim=-1)
 
     def followed(self, command: Tensor) -> Tensor:
         """Return the commands [..., 2] without negative revolutions."""
