@@ -12,9 +12,9 @@ import torch
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE
-from residnet.data.module import RowsDataModule, Windows, WindowsDataModule, WindowStage
+from residnet.data.module import RowsDataModule, Windows, WindowsDataModule
 from residnet.data.prepare import Prepared
-from residnet.data.windows import WindowBatches, WindowStore
+from residnet.data.windows import WindowBatches, WindowStage, WindowStore
 
 
 def runs(count: int, random: np.random.Generator, mean: float) -> np.ndarray:

@@ -20,7 +20,7 @@ from residnet.identification.fit import fit
 from residnet.identification.fitter import reach_in_free_runs
 from residnet.identification.prepared import prepare_logs
 from residnet.identification.settings import FitSettings
-from residnet.training.module import Score
+from residnet.training.heads import Score
 
 SETTINGS: dict[str, Any] = {
     **{key: TINY[key] for key in ("prepare", "signals", "baseline", "evaluation")},

@@ -11,7 +11,7 @@ from residnet.heads.zero import ZeroHead
 from residnet.identification.fitter import choose_solution
 from residnet.physics.signals import SignalsConfig
 from residnet.regression.solutions import Solution
-from residnet.training.module import Score
+from residnet.training.heads import Score
 
 
 def model() -> HybridDynamics:

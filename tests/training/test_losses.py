@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads.mlp import MlpConfig, MlpHead
-from residnet.training.losses import one_step_loss, rollout_loss
+from residnet.training.heads import one_step_loss, rollout_loss
 
 A = np.array([[-0.4, 0.1, 0.0], [0.0, -0.9, -0.2], [0.05, 0.1, -0.8]])
 B = np.array([[1.0, 0.0], [0.0, 0.1], [0.0, 1.0]])

@@ -17,10 +17,8 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig
-from residnet.training.config import TrainingConfig
-from residnet.training.machine import MachineConfig
-from residnet.training.module import HeadTraining, Score
-from residnet.training.trainer import train
+from residnet.training.config import MachineConfig, TrainingConfig
+from residnet.training.heads import HeadTraining, Score, train
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
 HEADS = {
@@ -46,7 +44,9 @@ def validated(model: HybridDynamics) -> Score:
     return Score(0, float(sum(p.square().sum() for p in model.head.parameters())))
 
 
-def training(head: Any, dtype: torch.dtype, **settings: Any) -> tuple[HeadTraining, Any]:
+def training(
+    head: Any, dtype: torch.dtype, **settings: Any
+) -> tuple[HeadTraining, WindowStore, Any]:
     logs = trials()
     torch.manual_seed(1)
     model = model_of(LINEAR, head=head.build(NAMES))
@@ -57,13 +57,15 @@ def training(head: Any, dtype: torch.dtype, **settings: Any) -> tuple[HeadTraini
     model.head.calibrate(residual)
     config = TrainingConfig.model_validate({**SETTINGS, **settings})
     store = WindowStore.gather(logs, dtype)
-    module = HeadTraining(model.to(dtype), store, config, SCALES.to(dtype), validated, 0)
-    return module, residual
+    module = HeadTraining(model.to(dtype), config, SCALES.to(dtype), validated, 0)
+    return module, store, residual
 
 
-def losses_of(module: HeadTraining, residual: Any, folder: Path | None = None) -> list[float]:
+def losses_of(
+    module: HeadTraining, store: WindowStore, residual: Any, folder: Path | None = None
+) -> list[float]:
     """Train; returns the loss of each epoch."""
-    model, store, config = module.model, module.store, of_kind(module.settings, TrainingConfig)
+    model, config = module.model, of_kind(module.settings, TrainingConfig)
     notes = train("net", model, residual, store, config, SCALES, validated, 0, folder)
     return [row["loss"] for row in notes["curve"]]
 
@@ -72,17 +74,16 @@ def losses_of(module: HeadTraining, residual: Any, folder: Path | None = None) -
 @pytest.mark.parametrize("force", [False, True])
 def test_no_tensor_of_a_training_step_is_made_without_a_device(name: str, force: bool) -> None:
     """With the default device `meta`, a tensor made without one cannot meet the others."""
-    module, _ = training(HEADS[name], torch.float32)
+    module, store, _ = training(HEADS[name], torch.float32)
     if force:
         module.model.disturbance = DisturbanceConfig().build(module.model.dt)
         module.model.n_state += 7
-    for stage, epochs in ((0, 0), (1, 1)):
+    for epochs in (0, 1):
         module.history = [{}] * epochs
-        sources = module.batches[stage]
-        starts = torch.cat([source.epoch(0, 0) for source in sources], dim=1)[0]
+        windows = next(iter(module.data(store).train_dataloader()))
         with torch.device("meta"):
             module._losses = []
-            module.training_step(starts, 0).backward()
+            module.training_step(windows, 0).backward()
             module.on_train_batch_end(None, None, 0)
         assert len(module._losses) == 1
 
@@ -103,8 +104,10 @@ def test_a_device_that_is_not_there_is_one_line() -> None:
 def test_double_precision_trains_to_the_same_losses() -> None:
     losses = {}
     for precision, dtype in (("32-true", torch.float32), ("64-true", torch.float64)):
-        module, residual = training(HEADS["mlp"], dtype, precision=precision, start_noise=0.0)
-        losses[precision] = losses_of(module, residual)
+        module, store, residual = training(
+            HEADS["mlp"], dtype, precision=precision, start_noise=0.0
+        )
+        losses[precision] = losses_of(module, store, residual)
     assert losses["64-true"] == pytest.approx(losses["32-true"], rel=1e-4)
     # were it single precision too, they would be equal
     assert losses["64-true"] != losses["32-true"]
@@ -114,10 +117,10 @@ def test_double_precision_trains_to_the_same_losses() -> None:
 def test_a_gpu_trains_to_the_same_losses() -> None:
     losses = {}
     for device in ("cpu", "cuda"):
-        module, residual = training(
+        module, store, residual = training(
             HEADS["lstm"], torch.float64, device=device, precision="64-true"
         )
-        losses[device] = losses_of(module, residual)
+        losses[device] = losses_of(module, store, residual)
     assert losses["cuda"] == pytest.approx(losses["cpu"], rel=1e-6)
 
 
@@ -128,7 +131,7 @@ def test_two_processes_train_as_one(robust: float, tmp_path: Path) -> None:
     found = {}
     for processes in (1, 2):
         # one step an epoch, so that the curve holds every loss
-        module, residual = training(
+        module, store, residual = training(
             HEADS["lstm"],
             torch.float64,
             precision="64-true",
@@ -139,6 +142,6 @@ def test_two_processes_train_as_one(robust: float, tmp_path: Path) -> None:
             one_step={**SETTINGS["one_step"], "epochs": 25},
             multi_step=[{**SETTINGS["multi_step"][0], "epochs": 25}],
         )
-        found[processes] = losses_of(module, residual, tmp_path / str(processes))
+        found[processes] = losses_of(module, store, residual, tmp_path / str(processes))
         assert len(found[processes]) == 50
     assert found[2] == pytest.approx(found[1], rel=1e-6)

@@ -21,14 +21,15 @@ from torch import Tensor
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import DataError, FitError
 from residnet.core.samples import Samples
+from residnet.data.module import Windows, WindowsDataModule
 from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig, MlpHead
 from residnet.training.config import TrainingConfig
-from residnet.training.module import HeadTraining, Score, Validate
-from residnet.training.trainer import train
+from residnet.training.heads import HeadTraining, Score, Validate, train
+from residnet.training.trainer import Shown
 
 ONE_STEP = {"epochs": 2, "window": 1.0, "batch": 8}
 HALF_SECOND = {"horizon": 0.5, "epochs": 2, "batch": 8}
@@ -89,12 +90,15 @@ def same(one: dict[str, Tensor], two: dict[str, Tensor]) -> bool:
     return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
 
 
-def untrained(logs: Sequence[Prepared], head: Any = None, **config: Any) -> HeadTraining:
-    """The module, float32, without a trainer."""
+def untrained(
+    logs: Sequence[Prepared], head: Any = None, **config: Any
+) -> tuple[HeadTraining, WindowsDataModule]:
+    """The module, float32, without a trainer, and its windows."""
     model, residual, store = prepared(logs, head)
     model.head.calibrate(residual)
     settings = TrainingConfig.model_validate({"steps": 3, "one_step": ONE_STEP, **config})
-    return HeadTraining(model.float(), store, settings, SCALES.float(), Scripted([1.0]), 0)
+    module = HeadTraining(model.float(), settings, SCALES.float(), Scripted([1.0]), 0)
+    return module, module.data(store)
 
 
 def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
@@ -212,7 +216,7 @@ def at_step(step: int) -> property:
 def test_the_average_is_the_recursion_written_out(
     logs: list[Prepared], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module = untrained(logs, average=0.6)
+    module, _ = untrained(logs, average=0.6)
     assert module.average is not None
     weight = first_weight(module.model)
     expected = weight.detach().double().clone()
@@ -235,7 +239,7 @@ def test_learning_rates_fall_along_a_cosine_in_each_stage(
         {"horizon": 0.5, "epochs": 5, "learning_rate": 0.1, "final": 0.1},
         {"horizon": 0.5, "epochs": 1, "learning_rate": 0.05, "final": 0.5},
     ]
-    module = untrained(
+    module, _ = untrained(
         logs, multi_step=stages, one_step={**ONE_STEP, "epochs": 3, "learning_rate": 0.2}
     )
     optimizer = module.configure_optimizers()
@@ -253,7 +257,7 @@ def test_learning_rates_fall_along_a_cosine_in_each_stage(
 
 
 def test_weight_decay_acts_on_matrices_of_the_head_only(logs: list[Prepared]) -> None:
-    module = untrained(logs, weight_decay=0.3)
+    module, _ = untrained(logs, weight_decay=0.3)
     decayed = {
         id(p): group["weight_decay"]
         for group in module.configure_optimizers().param_groups
@@ -265,23 +269,25 @@ def test_weight_decay_acts_on_matrices_of_the_head_only(logs: list[Prepared]) ->
 
 
 def test_batches_hold_their_share_of_beginnings(logs: list[Prepared]) -> None:
-    module = untrained(logs, beginnings={"share": 0.25, "initial": 0.3}, multi_step=[HALF_SECOND])
+    module, data = untrained(
+        logs, beginnings={"share": 0.25, "initial": 0.3}, multi_step=[HALF_SECOND]
+    )
     for epochs, lead in ((0, 0), (2, 3)):
         module.history = [{}] * epochs
-        batches = torch.stack(list(module.train_dataloader()))
-        assert batches.shape == (3, 8)
-        depth = module.store.depth[batches]
-        assert bool((depth[:, 6:] == lead).all())
-        assert bool((depth[:, :6] != lead).any())
-        assert torch.equal(torch.stack(list(module.train_dataloader())), batches), (
+        anywhere, begun = zip(*data.train_dataloader(), strict=True)
+        assert [len(part.depth) for part in anywhere] == [6, 6, 6]
+        assert all(part.depth.tolist() == [lead, lead] for part in begun)
+        assert any(bool((part.depth != lead).any()) for part in anywhere)
+        again, _ = zip(*data.train_dataloader(), strict=True)
+        assert all(torch.equal(one.y, two.y) for one, two in zip(anywhere, again, strict=True)), (
             "seed and epoch decide alone"
         )
 
 
-def loss_of(module: HeadTraining, starts: Tensor) -> float:
+def loss_of(module: HeadTraining, windows: Sequence[Windows]) -> float:
     module.on_fit_start()
     module.history = [{}] * module.settings.one_step.epochs
-    return float(module.training_step(starts, 0).detach())
+    return float(module.training_step(tuple(windows), 0).detach())
 
 
 def test_rollouts_start_from_the_measured_past(logs: list[Prepared]) -> None:
@@ -289,10 +295,10 @@ def test_rollouts_start_from_the_measured_past(logs: list[Prepared]) -> None:
     beginning.
     """
     lstm = LstmConfig(hidden_size=4)
-    plain = untrained(logs, lstm, history=0.4, multi_step=[{**HALF_SECOND, "batch": 1}])
+    plain, data = untrained(logs, lstm, history=0.4, multi_step=[{**HALF_SECOND, "batch": 1}])
     log, row = logs[1], 30
     start = len(logs[0]) + row
-    begun = untrained(
+    begun, _ = untrained(
         logs,
         lstm,
         history=0.4,
@@ -320,14 +326,14 @@ def test_rollouts_start_from_the_measured_past(logs: list[Prepared]) -> None:
         return total / 5
 
     here = by_hand(row, 4, torch.from_numpy(log.smooth[row]).float())
-    assert loss_of(plain, torch.tensor([start])) == pytest.approx(here, rel=1e-4)
+    anywhere = data.windows(torch.tensor([start]), 6, 4)
+    assert loss_of(plain, [anywhere]) == pytest.approx(here, rel=1e-4)
     at_rest = torch.cat(
         (torch.from_numpy(log.smooth[3, :3]), torch.from_numpy(log.y[:3, 3:].mean(0)))
     ).float()
     there = by_hand(3, 3, at_rest)
-    assert loss_of(begun, torch.tensor([start, len(logs[0]) + 3])) == pytest.approx(
-        (here + there) / 2, rel=1e-4
-    )
+    beginning = data.windows(torch.tensor([len(logs[0]) + 3]), 6, 3)
+    assert loss_of(begun, [anywhere, beginning]) == pytest.approx((here + there) / 2, rel=1e-4)
 
 
 def test_short_logs_need_no_room_for_a_stage_without_epochs(tmp_path: Path) -> None:
@@ -351,3 +357,26 @@ def test_beginnings_shorter_than_a_step_take_one_sample(
         logs, tmp_path, Scripted([1.0]), multi_step=[HALF_SECOND], beginnings={"initial": STEP / 10}
     )
     assert all(math.isfinite(entry["loss"]) for entry in notes["curve"])
+
+
+def test_tensorboard_shows_axes_rate_settings_and_a_free_run(
+    logs: list[Prepared], tmp_path: Path
+) -> None:
+    """A validation that knows its axes and a free run leaves them, with the final score."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    t = torch.arange(4.0)
+
+    def validate(model: HybridDynamics) -> Score:
+        return Score(0, 1.5, {"u": 1.0, "v": 2.0}, Shown(t, {"u": (t, t + 1)}))
+
+    trained(logs, tmp_path, validate, multi_step=[HALF_SECOND])
+    events = EventAccumulator(str(tmp_path / "tensorboard" / "mlp")).Reload()
+    tags = events.Tags()
+    assert {"loss", "validation", "validation_u", "validation_v", "learning_rate"} <= set(
+        tags["scalars"]
+    )
+    assert [round(one.value, 6) for one in events.Scalars("validation_v")] == [2.0] * 4
+    assert events.Scalars("learning_rate")[0].value == pytest.approx(2e-3)
+    assert events.Scalars("best_validation")[-1].value == 1.5
+    assert tags["images"] == ["free run"]

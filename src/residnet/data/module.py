@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple, final
 
 import lightning as L
 import torch
 from torch import Tensor
 
-from residnet.data.windows import WindowBatches, WindowStore
+from residnet.data.windows import WindowStage, WindowStore
 
 
 class EpochDataModule(L.LightningDataModule, ABC):
@@ -103,26 +102,6 @@ class Windows(NamedTuple):
     depth: Tensor
 
 
-@dataclass(frozen=True)
-class WindowStage:
-    """The windows of one stage of a training.
-
-    Attributes:
-        length: samples in a window.
-        batch: windows in a batch.
-        history: samples before a window that come with it; where the stretch is shorter, its first
-            is repeated.
-        begun: how many of the batch begin near the start of a stretch, as a free run does.
-        lead: how many samples after it these begin; their history is as long, and at least one.
-    """
-
-    length: int
-    batch: int
-    history: int = 1
-    begun: int = 0
-    lead: int = 0
-
-
 @final
 class WindowsDataModule(EpochDataModule):
     """Training windows of measured logs, for any module that Lightning trains.
@@ -161,7 +140,7 @@ class WindowsDataModule(EpochDataModule):
         self.store = store
         self.stages = list(stages)
         self._steps, self._stage = steps, stage or (lambda epoch: 0)
-        self._drawn = [self._sources(one) for one in self.stages]
+        self._drawn = [one.sources(store, steps) if one else [] for one in self.stages]
 
     @classmethod
     def of(
@@ -174,16 +153,6 @@ class WindowsDataModule(EpochDataModule):
     def steps(self) -> int:
         """Batches in an epoch."""
         return self._steps
-
-    def _sources(self, stage: WindowStage | None) -> list[WindowBatches]:
-        if stage is None:
-            return []
-        starts = self.store.starts(stage.length)
-        sources = [WindowBatches(starts, stage.batch - stage.begun, self._steps)]
-        if stage.begun:
-            begins = self.store.beginnings(stage.length, stage.lead)
-            sources.append(WindowBatches(begins, stage.begun, self._steps))
-        return sources
 
     def batches(self, epoch: int) -> Iterator[tuple[Windows, ...]]:
         """Yield the batches of an epoch: of each source the windows of this process."""

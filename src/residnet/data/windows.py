@@ -169,3 +169,35 @@ class WindowBatches:
             [torch.randperm(self.starts.numel(), generator=generator) for _ in range(rounds)]
         )[:need]
         return self.starts[order].reshape(self.steps, self.batch)
+
+
+@dataclass(frozen=True)
+class WindowStage:
+    """The windows of one stage of a training.
+
+    Attributes:
+        length: samples in a window.
+        batch: windows in a batch.
+        history: samples before a window that come with it; where the stretch is shorter, its first
+            is repeated.
+        begun: how many of the batch begin near the start of a stretch, as a free run does.
+        lead: how many samples after it these begin; their history is as long, and at least one.
+    """
+
+    length: int
+    batch: int
+    history: int = 1
+    begun: int = 0
+    lead: int = 0
+
+    def sources(self, store: WindowStore, steps: int) -> list[WindowBatches]:
+        """Return where the windows of `steps` batches come from: anywhere, then beginnings.
+
+        Raises:
+            DataError: where no log is long enough.
+        """
+        out = [WindowBatches(store.starts(self.length), self.batch - self.begun, steps)]
+        if self.begun:
+            begins = store.beginnings(self.length, self.lead)
+            out.append(WindowBatches(begins, self.begun, steps))
+        return out

@@ -18,6 +18,8 @@ from residnet.baselines.base import ParametricBaseline
 from residnet.baselines.given import StillConfig
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
+from residnet.core.layout import VELOCITIES
+from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, samples
 from residnet.data.windows import WindowStore
@@ -37,11 +39,10 @@ from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
 from residnet.regression.solutions import Coefficient, Solution
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import free_run_starts, refit
-from residnet.training.stage_windows import stage_windows
 
 if TYPE_CHECKING:
     # its module imports Lightning, which checking a config must not wait for
-    from residnet.training.module import Score
+    from residnet.training.heads import Score
 
 
 def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
@@ -96,7 +97,8 @@ class ValidationScore:
 
     def __call__(self, model: HybridDynamics) -> Score:
         """Return the divergences and the mean nrmse of the validation windows, run in float32."""
-        from residnet.training.module import Score
+        from residnet.training.heads import Score
+        from residnet.training.trainer import Shown
 
         candidate = Candidate("validated", "head", model)
         predictions = free_run(
@@ -104,7 +106,14 @@ class ValidationScore:
         )
         errors = window_errors(FreeRun("", "", self.windows, predictions), "validated", self.logs)
         diverged = sum(prediction.diverged for prediction in predictions["validated"])
-        return Score(diverged, float((errors["rmse"].mean(0) / self.scales).mean()))
+        axes = errors["rmse"].mean(0) / self.scales
+        window, states = self.windows[0], predictions["validated"][0].states
+        measured = self.logs[window.log].y[window.start : window.start + len(states)]
+        pairs = (torch.from_numpy(part[:, VELOCITIES]).T for part in (measured, states))
+        columns = dict(zip(VELOCITY, zip(*pairs, strict=True), strict=True))
+        shown = Shown(self.step * torch.arange(len(states)), columns)
+        named = dict(zip(VELOCITY, axes.tolist(), strict=True))
+        return Score(diverged, float(axes.mean()), named, shown)
 
 
 def choose_solution(
@@ -449,7 +458,7 @@ class Fitter:
     def _train(
         self, name: str, model: HybridDynamics, residual: Samples, seed: int
     ) -> dict[str, Any]:
-        from residnet.training.trainer import train
+        from residnet.training.heads import train
 
         settings = self.settings.training.get(name, TrainingConfig())
         dtype = torch.float64 if settings.double else torch.float32
@@ -460,8 +469,8 @@ class Fitter:
 
     def _validated(self, model: HybridDynamics) -> dict[str, Any]:
         """Notes on a model's free runs over the validation logs."""
-        diverged, error = self.validate(model)
-        return {"validation": error, "validation_diverged": diverged}
+        found = self.validate(model)
+        return {"validation": found.error, "validation_diverged": found.diverged}
 
     def _kept(self, fitted: FittedModel) -> FittedModel:
         """Keep a model and return it as a load gives it back.
@@ -509,5 +518,8 @@ def require_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
             except FitError as error:
                 raise FitError(f"head {name}: {error}") from None
         else:
-            stage_windows(settings.training.get(name, TrainingConfig()), windows, step)
+            training = settings.training.get(name, TrainingConfig())
+            for stage in training.windows(step):
+                if stage is not None:
+                    stage.sources(windows, training.steps)
     return fitter

@@ -1,11 +1,108 @@
-"""How a network head is trained. No Lightning here: `residnet check` must stay quick."""
+"""How networks are trained, and on what machine. Neither Lightning nor torch is imported here."""
 
 from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, model_validator
 
 from residnet.core.config import Config, Seconds
-from residnet.training.machine import MachineConfig
+from residnet.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from residnet.data.windows import WindowStage
+
+
+def falling(rate: float, final: float, epoch: int, epochs: int) -> float:
+    """Return a learning rate that falls along a cosine to a share `final` in the last epoch."""
+    progress = 0.5 * (1 - math.cos(math.pi * epoch / max(epochs - 1, 1)))
+    return rate * (1 - progress * (1 - final))
+
+
+class OneStage(Config):
+    """Settings of a training in one stage, with a learning rate that falls along a cosine.
+
+    Attributes:
+        epochs: at most.
+        learning_rate: of Adam in the first epoch.
+        final: share of it in the last.
+        gradient_clip: largest norm of the gradient.
+        patience: stop when this many validations in a row bring nothing better.
+        validate_every: epochs between validations.
+    """
+
+    epochs: int = Field(default=20, ge=1, le=100_000)
+    learning_rate: float = Field(default=1e-2, gt=0)
+    final: float = Field(default=0.02, gt=0, le=1)
+    gradient_clip: float = Field(default=1.0, gt=0)
+    patience: int = Field(default=1000, ge=1)
+    validate_every: int = Field(default=1, ge=1)
+
+    @property
+    def last_stage(self) -> int:
+        """Number of the only stage, 0."""
+        return 0
+
+    def stage(self, epoch: int) -> tuple[int, int]:
+        """Return stage 0, the only one, and the epoch."""
+        return 0, epoch
+
+    def rate(self, epoch: int) -> float:
+        """Return the learning rate of an epoch."""
+        return falling(self.learning_rate, self.final, epoch, self.epochs)
+
+
+class MachineConfig(Config):
+    """What a training runs on.
+
+    Attributes:
+        device: `cpu`, `cuda`, `cuda:1` for the second GPU, or `auto` for a GPU where there is one.
+            Free runs that validate are run on the CPU whatever it is.
+        precision: of numbers, by Lightning's names: `32-true` or `64-true`. Half precision is not
+            offered: the baseline's accelerations, which a rollout adds up, would be off by a
+            hundredth.
+        processes: that share each batch, each on a device of its own (ddp).
+    """
+
+    device: str = Field(default="cpu", pattern=r"^(auto|cpu|cuda(:\d{1,3})?)$")
+    precision: Literal["32-true", "64-true"] = "32-true"
+    processes: int = Field(default=1, ge=1, le=1_024)
+
+    @property
+    def double(self) -> bool:
+        """Return whether weights and windows are float64."""
+        return self.precision == "64-true"
+
+    def for_lightning(self) -> dict[str, Any]:
+        """Return the arguments of Lightning's trainer.
+
+        Raises:
+            UsageError: where the machine has no such device.
+        """
+        import torch
+
+        found = torch.cuda.device_count()
+        kind, _, number = self.device.partition(":")
+        if kind == "auto":
+            kind = "cuda" if found else "cpu"
+        first = int(number or 0)
+        if kind == "cuda" and first + self.processes > found:
+            raise UsageError(
+                f"device: {self.device} with {self.processes} processes needs"
+                f" {first + self.processes} GPUs, and PyTorch finds {found}; give device: cpu, or"
+                " auto"
+            )
+        devices: int | list[int] = self.processes
+        if kind == "cuda":
+            devices = list(range(first, first + self.processes))
+        return {
+            "accelerator": "gpu" if kind == "cuda" else "cpu",
+            "devices": devices,
+            "precision": self.precision,
+            # stages train different parameters
+            "strategy": "auto" if self.processes == 1 else "ddp_spawn_find_unused_parameters_true",
+        }
 
 
 class OneStep(Config):
@@ -149,3 +246,34 @@ class TrainingConfig(MachineConfig):
                 return number, epoch - begin
             begin += length
         return len(self.multi_step), max(epoch - begin, 0)
+
+    def rate(self, epoch: int) -> float:
+        """Return the learning rate of an epoch."""
+        number, within = self.stage(epoch)
+        stage = self.one_step if number == 0 else self.multi_step[number - 1]
+        return falling(stage.learning_rate, stage.final, within, stage.epochs)
+
+    def windows(self, dt: float) -> list[WindowStage | None]:
+        """Return the windows of each stage at a step of dt seconds; None for one without epochs."""
+        from residnet.data.windows import WindowStage
+
+        def begun(batch: int) -> int:
+            """Windows of a batch that begin with a stretch."""
+            if self.beginnings is None:
+                return 0
+            return min(max(round(self.beginnings.share * batch), 1), batch - 1)
+
+        one, lead = self.one_step, 0
+        if self.beginnings is not None:
+            lead = max(round(self.beginnings.initial / dt), 1)
+        first = WindowStage(round(one.window / dt), one.batch, 0, begun(one.batch))
+        return [first if one.epochs else None] + [
+            WindowStage(
+                round(stage.horizon / dt) + 1,
+                stage.batch,
+                round(self.history / dt),
+                begun(stage.batch),
+                lead,
+            )
+            for stage in self.multi_step
+        ]

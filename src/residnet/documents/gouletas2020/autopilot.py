@@ -18,6 +18,7 @@ from residnet.control.heading.controllers import Steering
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.errors import UsageError
 from residnet.core.progress import say
+from residnet.data.module import RowsDataModule
 from residnet.documents.gouletas2020.law import (
     DocumentConfig,
     NetworkPredictor,
@@ -30,8 +31,7 @@ from residnet.dynamics.rollout import Rollout
 from residnet.report.format import DEG
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
-from residnet.training.epochs import EpochTraining
-from residnet.training.running import run_epochs
+from residnet.training.trainer import EpochTraining, run_epochs
 
 
 class Answers(NamedTuple):
@@ -96,7 +96,6 @@ class PredictorFit(EpochTraining):
 
     Args:
         predictor: what is trained, float64.
-        train: what it is trained on.
         kept: what it is validated on.
         settings: of the training.
         seed: of the batches.
@@ -105,38 +104,26 @@ class PredictorFit(EpochTraining):
     def __init__(
         self,
         predictor: NetworkPredictor,
-        train: Answers,
         kept: Answers,
         settings: PredictorTraining,
         seed: int,
     ) -> None:
         super().__init__(settings, seed)
         self.predictor = predictor
-        self.train_answers, self.kept = train, kept
-
-    def train_dataloader(self) -> range:
-        """Return the numbers of batches; their states are drawn when the epoch begins."""
-        return range(math.ceil(len(self.train_answers.x) / self.settings.batch))
+        self.kept = kept
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return Adam, as in the source."""
         return torch.optim.Adam(self.predictor.parameters(), lr=self.settings.learning_rate)
 
     def on_train_epoch_start(self) -> None:
-        """Seed the epoch, shuffle, and set the learning rate."""
-        self.seed_epoch()
-        self.order = torch.randperm(len(self.train_answers.x)).split(self.settings.batch)
+        """Set the learning rate."""
         for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = self.settings.rate(self.epoch)
 
-    def training_step(self, number: int, batch_index: int) -> Tensor:
-        """Return the mean squared error of one batch of states."""
-        rows = self.order[number]
-        loss = (
-            self._misses(Answers(self.train_answers.x[rows], self.train_answers.change[rows]))
-            .square()
-            .mean()
-        )
+    def training_step(self, rows: tuple[Tensor, Tensor], batch_index: int) -> Tensor:
+        """Return the mean squared error of one batch of states and their changes."""
+        loss = self._misses(Answers(*rows)).square().mean()
         self._losses.append(float(loss.detach()))
         return loss
 
@@ -187,9 +174,9 @@ def train_predictor(
     kept = simulate_answers(vessel, exact, rudder, settings, settings.states // 5, 2 * seed + 1)
     predictor = predictor.double()
     predictor.calibrate(*train)
-    notes = run_epochs(
-        name, PredictorFit(predictor, train, kept, settings, seed), predictor, predictor, folder
-    )
+    fit = PredictorFit(predictor, kept, settings, seed)
+    data = RowsDataModule((train.x, train.change), settings.batch, seed, lambda: fit.epoch)
+    notes = run_epochs(name, fit, data, predictor, predictor, folder)
     with torch.no_grad():
         heading, rate = (
             (predictor.changes(kept.x) - kept.change).square().mean((0, 2)).sqrt().tolist()

@@ -23,7 +23,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.frames import wrap
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.store import Stored
-from residnet.training.one_stage import OneStage
+from residnet.training.config import OneStage
 
 _Units = Annotated[int, Field(ge=1)]
 

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from residnet.control.heading.conditions import SteadinessLimits
 from residnet.core.config import Seconds
-from residnet.training.one_stage import OneStage
+from residnet.training.config import OneStage
 
 
 class PolicyTraining(OneStage):

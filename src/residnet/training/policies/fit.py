@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, final
 
@@ -24,10 +25,10 @@ from residnet.control.heading.policies import HeadingPolicy
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.errors import ExportError
 from residnet.core.progress import say
+from residnet.data.module import EpochDataModule
 from residnet.dynamics.rollout import Rollout
-from residnet.training.epochs import EpochTraining
 from residnet.training.policies.config import PolicyTraining
-from residnet.training.running import run_epochs
+from residnet.training.trainer import EpochTraining, run_epochs
 
 _LATE = 1.0 / 3.0
 """Share of a flight at whose end a quiet one should have come to rest."""
@@ -103,10 +104,6 @@ class PolicyFit(EpochTraining):
         fly = _flying(rollout, self.compiler, loop.given(self._batch(0.0, 2)))
         self._loops[dt] = loop, fly
 
-    def train_dataloader(self) -> range:
-        """Return the numbers of batches; what is in them is drawn when they are used."""
-        return range(self.settings.steps)
-
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return Adam over the policy's parameters."""
         wanted = [p for p in self.policy.parameters() if p.requires_grad]
@@ -141,16 +138,28 @@ class PolicyFit(EpochTraining):
         ]
         return sum(not cost <= _FAR * start for cost in costs)
 
-    def training_step(self, number: int, batch_index: int) -> Tensor:
-        """Return the loss of one batch of heading changes."""
+    def batch(self, number: int) -> HeadingChanges:
+        """Return the heading changes of a batch of the present epoch, drawn anew."""
         settings = self.settings
-        progress = (self.epoch + number / settings.steps) / settings.epochs
+        share = settings.share(self._progress(number))
+        return self._batch(share, settings.batch, round(settings.quiet * settings.batch))
+
+    def _progress(self, number: int) -> float:
+        """Return the share of the training that is done at a batch."""
+        return float((self.epoch + number / self.settings.steps) / self.settings.epochs)
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, number: int) -> Any:
+        """Return the batch as it is: policies are trained on the CPU."""
+        return batch
+
+    def training_step(self, changes: HeadingChanges, number: int) -> Tensor:
+        """Return the loss of one batch of heading changes."""
+        settings, progress = self.settings, self._progress(number)
         cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
         rate = settings.learning_rate * _SLOWER ** self._spoilt(self.history)
         for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = rate * (settings.final + (1.0 - settings.final) * cosine)
         quiet = round(settings.quiet * settings.batch)
-        changes = self._batch(settings.share(progress), settings.batch, quiet)
         loop, fly = self._loops[self.step_size]
         flown = loop.flights(changes, *fly(*loop.given(changes)))
         found = flown.measured(self.conditions)
@@ -251,6 +260,24 @@ class PolicyFit(EpochTraining):
         return self.policy, score
 
 
+@final
+class HeadingChangesData(EpochDataModule):
+    """Heading changes that a policy meets, new ones in every batch."""
+
+    def __init__(self, fit: PolicyFit) -> None:
+        super().__init__(fit.seed, lambda: fit.epoch)
+        self.fit = fit
+
+    @property
+    def steps(self) -> int:
+        """Batches in an epoch."""
+        return int(self.fit.settings.steps)
+
+    def batches(self, epoch: int) -> Iterator[HeadingChanges]:
+        """Yield the batches of an epoch, each drawn when its turn comes."""
+        return (self.fit.batch(number) for number in range(self.steps))
+
+
 def _flying(
     rollout: Rollout, compiler: Compiler | None, given: tuple[Tensor, Tensor, Tensor]
 ) -> Flying:
@@ -291,7 +318,7 @@ def train_policy(
         FitError: where no epoch gave a finite cost.
     """
     fit = PolicyFit(policy.float(), vessel, settings, conditions, seed, compiler)
-    notes = run_epochs(name, fit, policy, policy, folder)
+    notes = run_epochs(name, fit, HeadingChangesData(fit), policy, policy, folder)
     notes |= {"unsteady": fit.best_diverged}
     policy.at(conditions.dt)
     return notes

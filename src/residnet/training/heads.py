@@ -1,0 +1,321 @@
+"""Training of heads: windows of logs, one-step and free-run losses, validation in free run."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.core.layout import POSE, VELOCITIES, velocities
+from residnet.core.samples import Samples
+from residnet.data.module import Windows, WindowsDataModule
+from residnet.data.windows import WindowStore
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import MANY, FreeRun, Rollout, scripted
+from residnet.training.config import TrainingConfig
+from residnet.training.trainer import EpochTraining, Shown, run_epochs
+
+Shared = Callable[[Tensor], Tensor]
+"""A sum over this process's windows to the mean of the sums of all processes."""
+
+
+def alone(value: Tensor) -> Tensor:
+    """Return the mean over one process: the value itself."""
+    return value
+
+
+def one_step_loss(
+    model: HybridDynamics,
+    y: Tensor,
+    w: Tensor,
+    nu_dot: Tensor,
+    good: Tensor,
+    spread: Tensor,
+    shared: Shared = alone,
+) -> Tensor:
+    """Return the mean squared error of accelerations along windows (document 003 eq. (20)).
+
+    In units of the residual's spread.
+
+    Args:
+        model: the hybrid model.
+        y: smoothed states [B, T, 6].
+        w: inputs at the same samples [B, T, m].
+        nu_dot: accelerations [B, T, 3].
+        good: samples that count: acceleration known, memory filled [B, T].
+        spread: of the residual, [3].
+        shared: over the processes of a training, whose mean loss is that of all windows.
+    """
+    error = (nu_dot - model.one_step(model.channels(y, w))) / spread
+    weight = good.to(error.dtype).unsqueeze(-1)
+    return (error.square() * weight).sum() / shared(3.0 * weight.sum()).clamp(min=1.0)
+
+
+def rollout_loss(
+    rollout: FreeRun,
+    x0: Tensor,
+    w: Tensor,
+    s: Tensor,
+    y: Tensor,
+    usable: Tensor,
+    scales: Tensor,
+    robust: float,
+    shared: Shared = alone,
+) -> Tensor:
+    """Return the error of free-run velocities, in units of the metrics' scales.
+
+    The mean square, or the mean over windows of their root mean square.
+
+    Args:
+        rollout: the free run of the model, as `Rollout` gives it.
+        x0: initial states [B, 6].
+        w: inputs [B, T, m].
+        s: initial memory [B, n_state].
+        y: measured states after each step [B, T, 6].
+        usable: measured samples that may be scored [B, T].
+        scales: [3].
+        robust: 0 for the mean square; else windows count by sqrt(mean square + robust^2), as the
+            metrics do, so that few bad ones do not rule.
+        shared: over the processes of a training, whose mean loss is that of all windows.
+    """
+    states, _, _ = rollout(x0, w, s)
+    error = (velocities(states[:, 1:]) - velocities(y)) / scales
+    weight = usable.to(error.dtype).unsqueeze(-1)
+    if robust > 0:
+        square = (error.square() * weight).sum((1, 2)) / (3.0 * weight.sum((1, 2))).clamp(min=1.0)
+        return torch.sqrt(square + robust**2).sum() / shared(torch.ones_like(square).sum())
+    # a rollout that runs away must pull back, not drown the batch
+    square = 2.0 * torch.nn.functional.huber_loss(
+        error, torch.zeros_like(error), reduction="none", delta=5.0
+    )
+    return (square * weight).sum() / shared(3.0 * weight.sum()).clamp(min=1.0)
+
+
+@dataclass(frozen=True, order=True)
+class Score:
+    """How a model does in free runs over the validation logs; the lesser score is the better one.
+
+    The error of windows that diverged says little, so that fewer of them count first.
+
+    Attributes:
+        diverged: number of windows that diverged.
+        error: mean nrmse over u, v, r; a diverged window counts with the error of `zero`.
+        axes: nrmse of each axis by name.
+        shown: one of the free runs.
+    """
+
+    diverged: int
+    error: float
+    axes: dict[str, float] = field(default_factory=dict, compare=False)
+    shown: Shown | None = field(default=None, compare=False)
+
+
+Validate = Callable[[HybridDynamics], Score]
+
+
+@final
+class HeadTraining(EpochTraining):
+    """A training of `model.head` that keeps the weights which validate best in free run."""
+
+    def __init__(
+        self,
+        model: HybridDynamics,
+        config: TrainingConfig,
+        scales: Tensor,
+        validate: Validate,
+        seed: int,
+    ) -> None:
+        super().__init__(config, seed)
+        self.model = model
+        self.average = copy.deepcopy(model).requires_grad_(False) if config.average > 0 else None
+        self.rollout = Rollout(model)
+        self._compiled: FreeRun | None = None
+        self.scales = scales
+        self.validate = validate
+        self.stages = config.windows(model.dt)
+        self.rank, self.world = 0, 1
+
+    def data(self, store: WindowStore) -> WindowsDataModule:
+        """Return the windows of each epoch's stage.
+
+        Raises:
+            DataError: where no log is long enough for a stage.
+        """
+        settings = self.settings
+        return WindowsDataModule(
+            store,
+            self.stages,
+            settings.steps,
+            self.seed,
+            lambda epoch: int(settings.stage(epoch)[0]),
+            lambda: self.epoch,
+        )
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Return AdamW, with weight decay on matrices of the head only."""
+        head = list(self.model.head.parameters())
+        groups = [
+            {"params": [p for p in head if p.ndim > 1], "weight_decay": self.settings.weight_decay},
+            {"params": [p for p in head if p.ndim <= 1], "weight_decay": 0.0},
+        ]
+        return torch.optim.AdamW(groups, lr=1e-3)
+
+    def on_fit_start(self) -> None:
+        """Reset the losses; a model that is trained further is a candidate as it is."""
+        super().on_fit_start()
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            self.rank, self.world = self.global_rank, torch.distributed.get_world_size()
+        self.scales = self.scales.to(self.device)
+        if self.settings.from_baseline and self.epoch == 0:
+            self.validate_start()
+            self.best_diverged = self.diverged
+
+    def on_train_epoch_start(self) -> None:
+        """Seed the epoch and set the stage's learning rate."""
+        self.seed_epoch()
+        self.model.baseline.requires_grad_(False)
+        for group in self.trainer.optimizers[0].param_groups:
+            group["lr"] = self.settings.rate(self.epoch)
+
+    def training_step(self, windows: tuple[Windows, ...], batch_index: int) -> Tensor:
+        """Return the loss of one batch of windows, some of which may begin a stretch."""
+        stage, _ = self.settings.stage(self.epoch)
+        loss = self._one_step(windows) if stage == 0 else self._multi_step(windows, stage)
+        self._losses.append(float(self.shared(loss.detach())))
+        return loss
+
+    def shared(self, value: Tensor) -> Tensor:
+        """Return the mean of a value over the processes of the training."""
+        if self.world == 1:
+            return value
+        total = value.detach().clone()
+        torch.distributed.all_reduce(total)
+        return total / self.world
+
+    def _one_step(self, windows: Sequence[Windows]) -> Tensor:
+        y, w, nu_dot, good, depth = (
+            torch.cat([getattr(part, name) for part in windows])
+            for name in ("smooth", "recorded", "nu_dot", "good", "depth")
+        )
+        washout = torch.full_like(depth, round(self.settings.one_step.washout / self.model.dt))
+        if self.settings.beginnings is not None:
+            washout[depth == 0] = 0
+        samples = torch.arange(y.shape[1], device=y.device)
+        counted = good & (samples >= washout[:, None])
+        spread = self.model.head.residual_std().to(y.dtype)
+        return one_step_loss(self.model, y, w, nu_dot, counted, spread, self.shared)
+
+    def _multi_step(self, windows: Sequence[Windows], stage: int) -> Tensor:
+        begins, memories = [], []
+        for number, part in enumerate(windows):
+            memories.append(self.model.warmup(part.past_y, part.past_w))
+            x0 = part.smooth[:, 0]
+            if number == 1:
+                # at the beginning of a stretch the mean of what is known is all that is known
+                mean = part.past_y[..., VELOCITIES].mean(1)
+                x0 = torch.cat((x0[:, POSE], mean), dim=1)
+            begins.append(x0)
+        x0 = torch.cat(begins)
+        if self.settings.start_noise > 0:
+            drawn = self._drawn(stage).to(x0)
+            noise = self.settings.start_noise * self.scales * drawn
+            x0 = torch.cat((x0[:, POSE], x0[:, VELOCITIES] + noise), dim=1)
+        w, y, usable = (
+            torch.cat([getattr(part, name) for part in windows]) for name in ("w", "y", "usable")
+        )
+        return rollout_loss(
+            self._free_run(),
+            x0,
+            w[:, :-1],
+            torch.cat(memories),
+            y[:, 1:],
+            usable[:, 1:],
+            self.scales,
+            self.settings.robust,
+            self.shared,
+        )
+
+    def _drawn(self, stage: int) -> Tensor:
+        """Return standard normal numbers [B, 3] for the windows of this process.
+
+        They are drawn for the whole batch on the CPU: the same on every device, by any processes.
+        """
+        windows = self.stages[stage]
+        assert windows is not None, "an epoch of a stage without windows"
+        drawn = torch.randn(windows.batch, 3, dtype=self.scales.dtype, device="cpu")
+        sizes = [windows.batch - windows.begun, windows.begun]
+        return torch.cat([part[self.rank :: self.world] for part in drawn.split(sizes)])
+
+    def _free_run(self) -> FreeRun:
+        """Return the free run of the model as the training has it now."""
+        if self._compiled is None:
+            # not before: by now the model is on its device and in training
+            self._compiled = scripted(self.rollout, MANY)
+        return self._compiled
+
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Move the averaged weights."""
+        if self.average is None:
+            return
+        # a short memory at first, or the average would remember the untrained start
+        decay = min(self.settings.average, (1.0 + self.global_step) / (10.0 + self.global_step))
+        for kept, new in zip(self.average.parameters(), self.model.parameters(), strict=True):
+            kept.lerp_(new.detach(), 1.0 - decay)
+
+    def validated(self) -> tuple[nn.Module, float]:
+        """Return the averaged model, where there is one, and its free-run error."""
+        model = self.model if self.average is None else self.average
+        score = self.validate(model)
+        self.diverged, self.axes, self.shown = score.diverged, score.axes, score.shown
+        return model, score.error
+
+
+def train(
+    name: str,
+    model: HybridDynamics,
+    samples: Samples,
+    store: WindowStore,
+    config: TrainingConfig,
+    scales: torch.Tensor,
+    validate: Validate,
+    seed: int,
+    folder: Path | None,
+) -> dict[str, Any]:
+    """Train the head of a model and leave the weights that validated best in it (float32).
+
+    Args:
+        name: of the head.
+        model: with its baseline filled in.
+        samples: training samples whose target is the residual; give the scales.
+        store: training windows, float64 where the training's precision is.
+        config: stages.
+        scales: of the velocities, [3].
+        validate: divergences and free-run error of a model on the validation data.
+        seed: of weights and batches.
+        folder: for checkpoints (`checkpoints/<name>/last.ckpt` is resumed from where it exists) and
+            the TensorBoard log; None for neither.
+
+    Returns:
+        Notes about the training: the curve by epoch, the best score, the number of parameters.
+
+    Raises:
+        FitError: where training never gave a finite free run.
+    """
+    model.head.calibrate(samples)
+    if config.from_baseline:
+        model.head.silence()
+    dtype = torch.float64 if config.double else torch.float32
+    scale = scales.to(dtype)
+    # losses and scores are those of velocities
+    model.positions = False
+    try:
+        module = HeadTraining(model.to(dtype), config, scale, validate, seed)
+        return run_epochs(name, module, module.data(store), model, model.head, folder, config)
+    finally:
+        model.to(torch.float32)
+        model.positions = True
