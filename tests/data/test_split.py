@@ -1,4 +1,4 @@
-"""Splits: files by pattern, and no measurement in two of them."""
+"""Splits by file, folder, stretch and manoeuvre, the division where nobody says, and leaks."""
 
 from __future__ import annotations
 
@@ -13,218 +13,214 @@ from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.data.doctor import inspect_together
-from residnet.data.split import SplitConfig, check_leaks, log_names
+from residnet.data.sources import MeasuredLogs, read_logs
+from residnet.data.split import SplitConfig, check_leaks, divided, log_names
+
+FILES = ("turning/a", "turning/b", "zigzag/c", "zigzag/d", "zigzag/deep/e", "odd [1]")
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    for name in (
-        "turning/a.csv",
-        "turning/b.csv",
-        "zigzag/c.csv",
-        "zigzag/d.csv",
-        "zigzag/deep/e.csv",
-        "odd [1].csv",
-    ):
-        path = tmp_path / name
+    for name in FILES:
+        path = tmp_path / f"{name}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("t\n")
     return tmp_path
 
 
-def resolve(**config: Any) -> dict[str, list[Path]]:
-    return validate(
-        {key: str(value) if isinstance(value, Path) else value for key, value in config.items()},
-        SplitConfig,
-        "test",
-    ).resolve()
+def resolve(root: Path, **config: Any) -> dict[str, list[str]]:
+    found = validate({"root": str(root), **config}, SplitConfig, "test").resolve()
+    return {
+        split: [path.relative_to(root).as_posix() for path in paths]
+        for split, paths in found.items()
+    }
 
 
-def test_patterns(root: Path) -> None:
-    files = resolve(
-        root=root,
+def split_of(train: Any, validation: Any = "zigzag/d.csv", test: Any = "turning/*.csv") -> Any:
+    return {"train": [train], "validation": [validation], "test": [test]}
+
+
+def test_patterns_and_files_of_them(root: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    found = resolve(
+        root,
         train=["zigzag/**/*.csv", "zigzag/c.csv"],
         validation=["turning/b.*"],
         test=["turning/a.csv", "odd [1].csv"],
     )
-    assert {
-        split: [str(path.relative_to(root)) for path in paths] for split, paths in files.items()
-    } == {
+    assert found == {
         "train": ["zigzag/c.csv", "zigzag/d.csv", "zigzag/deep/e.csv"],
         "validation": ["turning/b.csv"],
         "test": ["turning/a.csv", "odd [1].csv"],
     }
-
-
-def test_a_file_of_splits_is_relative_to_its_own_folder_unless_a_root_is_given(
-    root: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
     text = "train: [zigzag/c.csv]\nvalidation: [zigzag/d.csv]\ntest: [turning/*.csv]\n"
-    (root / "split.yaml").write_text(text)
     elsewhere = tmp_path_factory.mktemp("configs") / "split.yaml"
-    elsewhere.write_text(text)
-    inside = resolve(file=root / "split.yaml")
-    assert inside == resolve(file=elsewhere, root=root)
-    assert inside["test"] == [root / "turning/a.csv", root / "turning/b.csv"]
+    for file, given in ((root / "split.yaml", {}), (elsewhere, {"root": str(root)})):
+        file.write_text(text)
+        parts = validate({"file": str(file), **given}, SplitConfig, "test").resolve()
+        assert parts["test"] == [root / "turning/a.csv", root / "turning/b.csv"]
 
 
 @pytest.mark.parametrize(
     ("config", "words"),
     [
         ({"train": ["zigzag/c.csv"], "validation": ["zigzag/d.csv"]}, "no files for test"),
-        (
-            {"train": ["zigzag/c.csv"], "validation": ["zigzag/*.csv"], "test": ["turning/*.csv"]},
-            "stands in train and in validation",
-        ),
-        (
-            {"train": ["zigzag/c.csv"], "validation": ["zigzag/x.csv"], "test": ["turning/*.csv"]},
-            "'zigzag/x.csv' matches no file",
-        ),
-        (
-            {"train": ["zig/c.csv"], "validation": ["zigzag/d.csv"], "test": ["turning/*.csv"]},
-            "there is no folder",
-        ),
-        (
-            {"train": ["turning/c.csv"], "validation": ["zigzag/d.csv"], "test": ["turning/*.csv"]},
-            "'turning/c.csv' matches no file",
-        ),
-        (
-            {"train": ["/zigzag/*.csv"], "validation": ["zigzag/d.csv"], "test": ["turning/*.csv"]},
-            "not a pattern relative to",
-        ),
+        (split_of("zigzag/c.csv", "zigzag/*.csv"), "stands in train and in validation"),
+        (split_of("zigzag/c.csv", "zigzag/x.csv"), "'zigzag/x.csv' matches no file"),
+        (split_of("zig/c.csv"), "there is no folder"),
+        (split_of("turning/c.csv"), "'turning/c.csv' matches no file"),
+        (split_of("/zigzag/*.csv"), "not a pattern relative to"),
         ({"trian": ["zigzag/c.csv"]}, "did you mean 'train'?"),
+        ({"file": "split.yaml", "train": ["a"]}, "either `file` or patterns"),
+        ({"auto": ["."], "train": ["a.parquet"]}, "either `auto`, `file` or patterns"),
+        ({"auto": ["nowhere"]}, "'nowhere' matches no file"),
+        ({"file": "none.yaml"}, "no such file"),
+        ({**split_of("a"), "root": "none"}, "is not a folder"),
+        (split_of({"log": "a", "from": "9 s", "to": "3 s"}), "holds nothing"),
+        (
+            split_of(
+                {"log": "zigzag/c.csv", "to": "40 s"},
+                {"log": "zigzag/c.csv", "from": "30 s", "to": "50 s"},
+            ),
+            "the same stretch of .*c.csv stands in train and in validation",
+        ),
     ],
 )
-def test_faulty_patterns(root: Path, config: dict[str, Any], words: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        resolve(root=root, **config)
-    assert words in str(caught.value)
+def test_faulty_splits(root: Path, config: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        validate({"root": str(root), **config}, SplitConfig, "test").files()
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("train", "rest", "words"),
     [
-        (
-            "train: [zigzag/c.csv]\nvalidation: [zigzag/d.csv]\n",
-            "test: expected a list of at least one",
-        ),
-        (
-            "train: [zigzag/c.csv]\nvalidation: []\ntest: [turning/a.csv]\n",
-            "validation: expected a list",
-        ),
-        (
-            "train: zigzag/c.csv\nvalidation: [zigzag/d.csv]\ntest: [turning/a.csv]\n",
-            "train: expected a list",
-        ),
-        (
-            "train: [zigzag/c.csv]\nvalid: [zigzag/d.csv]\ntest: [turning/a.csv]\n",
-            "unknown split 'valid'",
-        ),
-        (
-            "train: [zigzag/c.csv]\nvalidation: [zigzag/d.csv]\ntest: [zigzag/c.csv]\n",
-            "stands in train and in test",
-        ),
+        ("[zigzag/c.csv]", "", "test: expected a list of at least one"),
+        ("[]", "test: [turning/a.csv]", "train: expected a list"),
+        ("zigzag/c.csv", "test: [turning/a.csv]", "train: expected a list"),
+        ("[3]", "test: [turning/a.csv]", "train: expected a list"),
+        ("[zigzag/c.csv]", "tset: [turning/a.csv]", "unknown split 'tset'"),
+        ("[zigzag/c.csv]", "test: [zigzag/c.csv]", "stands in train and in test"),
     ],
 )
-def test_faulty_files_of_splits(root: Path, text: str, words: str) -> None:
-    (root / "split.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=r"split\.yaml") as caught:
-        resolve(file=root / "split.yaml")
-    assert words in str(caught.value)
-
-
-def test_other_faults(root: Path) -> None:
-    with pytest.raises(ConfigError, match="either `file` or patterns"):
-        resolve(file=root / "split.yaml", train=["a"])
-    with pytest.raises(ConfigError, match="no such file"):
-        resolve(file=root / "none.yaml")
-    with pytest.raises(ConfigError, match="is not a folder"):
-        resolve(root=root / "none", train=["a"], validation=["b"], test=["c"])
+def test_faulty_files_of_splits(root: Path, train: str, rest: str, words: str) -> None:
+    (root / "split.yaml").write_text(f"train: {train}\nvalidation: [zigzag/d.csv]\n{rest}\n")
+    with pytest.raises(ConfigError, match=rf"split\.yaml.*{words}"):
+        validate({"file": str(root / "split.yaml")}, SplitConfig, "test").resolve()
 
 
 def test_logs_of_one_name_are_told_apart_by_their_folders(root: Path) -> None:
-    for name in ("zigzag/a.csv", "day_1/run_1/log.csv", "day_2/run_1/log.csv", "day_2/log.csv"):
+    more = ("zigzag/a.csv", "day_1/run_1/log.csv", "day_2/run_1/log.csv", "day_2/log.csv")
+    for name in (*more, "day_2/log.txt"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text("t\n")
-    (root / "day_2/log.txt").write_text("t\n")
-    paths = [path for path in sorted(root.rglob("*.*")) if path.suffix != ".yaml"]
+    paths = sorted(root.rglob("*.*"))
     names = log_names([*paths, paths[0]])
     assert len(set(names.values())) == len(names) == len(paths)
     told = {path.relative_to(root).as_posix(): name for path, name in names.items()}
-    assert told["zigzag/a.csv"] == "zigzag_a"
-    assert told["turning/a.csv"] == "turning_a"
-    assert told["day_1/run_1/log.csv"] == "day_1_run_1_log"
-    assert told["day_2/run_1/log.csv"] == "day_2_run_1_log"
-    assert (told["day_2/log.csv"], told["day_2/log.txt"]) == ("log_csv", "log_txt")
-    # a name that only one log has stays as it is
-    assert told["zigzag/d.csv"] == "d"
-    found = resolve(
-        root=root, train=["zigzag/a.csv"], validation=["zigzag/d.csv"], test=["turning/a.csv"]
+    expected = {
+        **{"zigzag/a.csv": "zigzag_a", "turning/a.csv": "turning_a", "zigzag/d.csv": "d"},
+        **{"day_1/run_1/log.csv": "day_1_run_1_log", "day_2/run_1/log.csv": "day_2_run_1_log"},
+        **{"day_2/log.csv": "log_csv", "day_2/log.txt": "log_txt"},
+    }
+    assert {path: told[path] for path in expected} == expected
+
+
+def saved(folder: Path, *names: str) -> None:
+    """Canonical logs of 60 s that share no row; the first word of a name is the manoeuvre."""
+    for number, name in enumerate(names):
+        log = wavy(seconds=60.0, name=Path(name).name)
+        x = log["x"] + 1000.0 * (number + 1)
+        log = log.replace(channels={**log.channels, "x": x}, manoeuvre=log.name.split("_")[0])
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        log.save(folder / f"{name}.parquet")
+
+
+def splits(root: Path, **split: Any) -> dict[str, list[tuple[str, float, float]]]:
+    """Name, first and last time of every log by split."""
+    settings = {"reader": {"kind": "canonical"}, "split": {"root": str(root), **split}}
+    read = read_logs(validate(settings, MeasuredLogs, "here"))
+    return {
+        name: [(log.name, float(log.t[0]), round(float(log.t[-1]), 6)) for log in logs]
+        for name, logs in read.items()
+    }
+
+
+def test_stretches_folders_and_manoeuvres(tmp_path: Path) -> None:
+    saved(tmp_path, "trip", "a/zigzag_1", "a/turn_1", "b/zigzag_2", "b/turn_2", "c/deep/zigzag_3")
+    trip = {"log": "trip.parquet"}
+    found = splits(
+        tmp_path,
+        train=[trip | {"to": "30 s"}, "a", {"log": "b", "manoeuvre": "turn"}],
+        validation=[trip | {"from": "30 s", "to": "0.75 min"}, {"log": "b", "manoeuvre": "zigzag"}],
+        test=[trip | {"from": 45}, "c"],
     )
-    assert [len(paths) for paths in found.values()] == [1, 1, 1]
+    assert {split: logs[0] for split, logs in found.items()} == {
+        "train": ("trip_0s_30s", 0.0, 29.9),
+        "validation": ("trip_30s_45s", 30.0, 44.9),
+        "test": ("trip_45s_59p9s", 45.0, 59.9),
+    }
+    assert {split: [name for name, _, _ in logs[1:]] for split, logs in found.items()} == {
+        "train": ["turn_1", "zigzag_1", "turn_2"],
+        "validation": ["zigzag_2"],
+        "test": ["zigzag_3"],
+    }
+    whole = {"train": ["a/zigzag_1.parquet"], "validation": ["a/turn_1.parquet"]}
+    with pytest.raises(DataError, match=r"0 samples from 200 s to 59\.9 s; the log runs from 0 s"):
+        splits(tmp_path, **whole, test=[trip | {"from": "200 s"}])
+    with pytest.raises(DataError, match=r"no log of test is of its manoeuvre \(there are trip"):
+        splits(tmp_path, **whole, test=[trip | {"manoeuvre": "spiral"}])
+
+
+def test_residnet_divides_many_logs_and_cuts_few(tmp_path: Path) -> None:
+    saved(tmp_path, *(f"{kind}_{i}" for kind in ("zigzag", "turn") for i in range(5)))
+    found = splits(tmp_path, auto=["."])
+    assert {split: [name for name, _, _ in logs] for split, logs in found.items()} == {
+        "train": ["turn_0", "turn_1", "turn_3", "zigzag_0", "zigzag_1", "zigzag_3"],
+        "validation": ["turn_2", "zigzag_2"],
+        "test": ["turn_4", "zigzag_4"],
+    }
+    log = wavy(seconds=100.0)
+    cut = divided([log.rows(slice(500)).replace(name="copy"), log])
+    assert {split: [one.name for one in logs] for split, logs in cut.items()} == {
+        "train": ["wavy_0s_30s", "wavy_50s_79p9s"],
+        "validation": ["wavy_30s_50s"],
+        "test": ["wavy_79p9s_99p9s"],
+    }
+    together = np.concatenate([one.t for logs in cut.values() for one in logs])
+    assert np.array_equal(np.sort(together), log.t)
 
 
 def copied(log: Log, start: int, stop: int, turns: int = 0) -> Log:
-    channels = {name: values[start:stop].copy() for name, values in log.channels.items()}
-    channels["psi"] = channels["psi"] + 2.0 * np.pi * turns
-    return Log("copy", log.t[start:stop] - log.t[start], channels)
+    part = log.rows(slice(start, stop))
+    channels = {**part.channels, "psi": part["psi"] + 2.0 * np.pi * turns}
+    return part.replace(name="copy", t=part.t - part.t[0], channels=channels)
 
 
-def other(seed: int = 0, size: int = 2000) -> Log:
-    rng = np.random.default_rng(seed)
-    return Log(
-        f"other{seed}",
-        0.1 * np.arange(size),
-        {name: rng.normal(size=size) for name in ("x", "y", "psi", "u", "v", "r", "delta", "n")},
-    )
+def other(seed: int = 0) -> Log:
+    rng, names = np.random.default_rng(seed), ("x", "y", "psi", "u", "v", "r", "delta", "n")
+    channels = {name: rng.normal(size=2000) for name in names}
+    return Log(f"other{seed}", 0.1 * np.arange(2000), channels)
 
 
-def test_a_copied_stretch_is_found_wherever_its_clock_and_heading_start() -> None:
+def test_copies_across_splits_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     log = wavy()
-    logs = {
-        "train": [other(0), log, other(1)],
-        "validation": [other(2)],
-        "test": [copied(log, 700, 1200, turns=-2)],
-    }
-    with pytest.raises(
-        DataError,
-        match=(
-            r"logs wavy \(train\) and copy \(test\) share 500 identical rows, at most 100 are"
-            r" allowed"
-        ),
-    ):
-        check_leaks(logs)
+    copy = copied(log, 700, 1200, turns=-2)
+    logs = {"train": [other(0), log, other(1)], "validation": [other(2)], "test": [copy]}
+    words = r"logs wavy \(train\) and copy \(test\) share 500 identical rows, at most 100 are"
+    for most in (10**9, 600):
+        # of very many rows a sample is compared
+        monkeypatch.setattr("residnet.data.split.LARGE", most)
+        with pytest.raises(DataError, match=words):
+            check_leaks(logs)
+        assert inspect_together([log, copied(log, 700, 1200)]).find("copied_part")
     check_leaks(logs, rows=500)
-    check_leaks({"train": [log, copied(log, 700, 1200)], "test": [other(0)]})
-
-
-def test_a_vessel_at_rest_shares_no_more_than_one_row() -> None:
-    rest = {name: np.zeros(3000) for name in ("x", "y", "psi", "u")}
-    check_leaks(
-        {
-            "train": [Log("a", np.arange(3000.0), rest)],
-            "test": [Log("b", np.arange(3000.0), {**rest, "u": -rest["u"]})],
-        }
-    )
-
-
-def test_missing_values_compare_equal_and_one_split_cannot_leak() -> None:
-    log = wavy()
+    check_leaks({"train": [log, copy, log], "test": [other(0)]})
+    check_leaks({"train": [log, log]})
+    check_leaks({})
+    # a vessel at rest shares no more than one row, and missing values compare equal
+    rest = {name: np.zeros(3000) for name in ("x", "y", "psi")}
+    still = [Log("rest", np.arange(3000.0), {**rest, "u": rest["x"] * sign}) for sign in (1, -1)]
+    check_leaks({"train": still[:1], "test": still[1:]})
     log["u"][100:900] = np.nan
     with pytest.raises(DataError, match="share 800 identical rows"):
         check_leaks({"train": [log], "test": [copied(log, 100, 900)]})
-    check_leaks({"train": [log, log]})
-    check_leaks({})
-
-
-def test_copies_are_found_by_a_sample_of_very_many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    log = wavy()
-    logs = {"train": [log], "test": [copied(log, 700, 1200)]}
-    with pytest.raises(DataError) as exact:
-        check_leaks(logs)
-    monkeypatch.setattr("residnet.data.split.LARGE", 600)
-    with pytest.raises(DataError) as sampled:
-        check_leaks(logs)
-    assert str(sampled.value) == str(exact.value)
-    assert inspect_together([log, copied(log, 700, 1200)]).find("copied_part")

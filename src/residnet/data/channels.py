@@ -83,7 +83,8 @@ def steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
 
     Large is more than `limit` (SI; angles the short way round).
     """
-    values = unwrap(log[channel]) if log.units[channel] == "rad" else log[channel]
+    values = log[channel]
+    values = unwrap(values) if log.units[channel] == "rad" else values
     return np.flatnonzero(np.abs(np.diff(values)) > limit) + 1
 
 

@@ -322,7 +322,8 @@ def _any(log: Log, names: Sequence[str]) -> np.ndarray:
 
 def _each(log: Log, names: Sequence[str], rule: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Return [T] bool: samples that a rule marks in any channel, angles unwrapped."""
-    marked = (rule(unwrap(log[n]) if log.units[n] == "rad" else log[n]) for n in names)
+    channels = {name: log[name] for name in names}
+    marked = (rule(unwrap(v) if log.units[n] == "rad" else v) for n, v in channels.items())
     return np.asarray(np.logical_or.reduce([np.zeros(len(log), dtype=bool), *marked]))
 
 

@@ -326,6 +326,8 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = _COPIED) -> None:
     hashes = [np.unique(sampled_hashes(log, common, one_of)) for _, log in flat]
     owner = np.repeat(np.arange(len(flat)), [h.size for h in hashes])
     _, row = np.unique(np.concatenate(hashes), return_inverse=True)
+    if not row.size:
+        return
     holds = coo_array((np.ones(row.size), (row, owner))).tocsr()
     split_of = np.unique([split for split, _ in flat], return_inverse=True)[1]
     shared = np.where(split_of[:, None] != split_of[None, :], (holds.T @ holds).toarray(), 0.0)
