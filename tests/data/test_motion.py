@@ -11,7 +11,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.align import GridConfig
-from residnet.data.motion import Antenna, MotionConfig, complete_motion
+from residnet.data.motion import Antenna, MotionConfig, complete_motion, smooth_motion
 from residnet.data.prepare import PrepareConfig, prepare
 
 TRUTH = wavy(seconds=120.0)
@@ -69,17 +69,31 @@ def test_velocities_from_position_and_heading(log: Log, config: MotionConfig, mo
     assert set(out.meta["smoothed"]) >= {"u", "v", "r"}
 
 
-def test_an_antenna_that_is_not_told_is_seen_in_the_velocities() -> None:
-    log = measured(antenna=(3.0, -1.0), delay=0.4)
-    assert error(complete_motion(log, MotionConfig()), "v") > 0.2
-
-
 def test_what_is_measured_at_every_sample_stays() -> None:
-    log = measured(every=10, kept=("u", "v", "r"))
-    out = complete_motion(log, MotionConfig())
+    out = complete_motion(measured(every=10, kept=("u", "v", "r")), MotionConfig())
     assert all(np.array_equal(out[name], TRUTH[name]) for name in ("psi", "u", "v", "r"))
     assert error(out, "x") < 1e-3
-    assert complete_motion(TRUTH, MotionConfig()) is TRUTH
+    coarse = TRUTH.replace(channels={n: np.round(v, 2) for n, v in TRUTH.channels.items()})
+    for whole in (TRUTH, coarse):
+        assert complete_motion(whole, MotionConfig()) is whole
+    # an antenna that is not told is seen in the velocities
+    off = measured(antenna=(3.0, -1.0), delay=0.4)
+    assert error(complete_motion(off, MotionConfig()), "v") > 0.2
+    config = validate({"antenna": {"x": "30 cm"}, "delay": "400 ms"}, MotionConfig, "here")
+    assert (config.antenna, config.delay) == (Antenna(x=0.3), 0.4)
+
+
+def test_nine_measured_quantities_become_one_motion() -> None:
+    rates = [np.gradient(TRUTH[name], TRUTH.t) for name in "uvr"]
+    truth = np.stack([*(TRUTH[name] for name in STATE), *rates], axis=1)
+    noise = np.array([0.05, 0.05, 0.01, 0.03, 0.03, 0.005, 0.05, 0.05, 0.01])
+    seen = truth + noise * np.random.default_rng(0).standard_normal(truth.shape)
+    for known in (noise, np.where(np.arange(9) > 5, np.inf, noise)):
+        off = (smooth_motion(seen, known, 0.1) - truth)[100:-100]
+        assert (np.sqrt(np.mean(off**2, axis=0)) < 0.25 * noise).all()
+    seen[3, 4] = np.nan
+    with pytest.raises(DataError, match="column 4 is not finite at sample 3"):
+        smooth_motion(seen, noise, 0.1)
 
 
 @pytest.mark.parametrize("every", [2, 10])
@@ -93,11 +107,6 @@ def test_values_that_a_receiver_repeats_are_made_anew(every: int) -> None:
     assert set(out.meta["smoothed"]) == set(slow)
     assert all(error(out, name) < 0.2 * error(held, name) for name in slow)
     assert all(np.array_equal(out[name], TRUTH[name]) for name in ("psi", "r", "delta"))
-
-
-def test_coarse_values_are_not_taken_for_repeated_ones() -> None:
-    coarse = TRUTH.replace(channels={n: np.round(v, 2) for n, v in TRUTH.channels.items()})
-    assert complete_motion(coarse, MotionConfig()) is coarse
 
 
 def test_a_long_gap_stays_a_gap() -> None:
@@ -126,8 +135,3 @@ def test_without_a_heading_there_is_no_motion() -> None:
     channels["psi"] = np.full(len(TRUTH), np.nan)
     with pytest.raises(DataError, match="1200 positions and 0 headings"):
         complete_motion(Log("lost", TRUTH.t, channels), MotionConfig())
-
-
-def test_the_antenna_from_a_config() -> None:
-    config = validate({"antenna": {"x": "30 cm"}, "delay": "400 ms"}, MotionConfig, "here")
-    assert (config.antenna, config.delay) == (Antenna(x=0.3), 0.4)

@@ -75,76 +75,54 @@ def expected_starts(length: int) -> list[int]:
 
 
 @pytest.mark.parametrize("length", [1, 2, 7, 20])
-def test_windows_start_where_the_loop_says(length: int) -> None:
+def test_windows_start_where_the_loop_says_and_hold_the_logs_samples(length: int) -> None:
     starts = STORE.starts(length)
     assert starts.tolist() == expected_starts(length)
-    for row in starts.tolist():
-        window = ROWS[row : row + length]
-        assert len({(number, LOGS[number].piece[k]) for number, k in window}) == 1, (
-            "a window crosses no break"
-        )
+    names = ("y", "smooth", "nu_dot", "w", "usable", "good")
+    taken = {name: STORE.take(getattr(STORE, name), starts, length) for name in names}
+    for i, row in enumerate(starts.tolist()):
+        number, k = ROWS[row]
+        for name, values in taken.items():
+            own = getattr(LOGS[number], name)[k : k + length]
+            if name in ("y", "smooth"):
+                # positions are counted from the log's start
+                own = own - np.concatenate((LOGS[number].y[0, :2], np.zeros(4)))
+            np.testing.assert_array_equal(values[i].numpy(), own)
 
 
-def test_reach_and_depth_are_those_of_the_stretch() -> None:
+def test_reach_depth_and_beginnings_are_those_of_the_stretch() -> None:
     for row, (number, k) in enumerate(ROWS):
         first, end = stretch(number, k)
         if LOGS[number].piece[k] >= 0:
             assert (int(STORE.depth[row]), int(STORE.reach[row])) == (k - first, end - k)
         else:
             assert int(STORE.reach[row]) == 0
-
-
-@pytest.mark.parametrize("length", [1, 9])
-def test_taken_windows_hold_the_logs_samples(length: int) -> None:
-    starts = STORE.starts(length)[::3]
-    taken = {
-        name: STORE.take(getattr(STORE, name), starts, length)
-        for name in ("y", "smooth", "nu_dot", "w", "usable", "good")
-    }
-    for i, row in enumerate(starts.tolist()):
-        number, k = ROWS[row]
-        log = LOGS[number]
-        for name, values in taken.items():
-            own = getattr(log, name)[k : k + length]
-            if name in ("y", "smooth"):
-                # positions are counted from the log's start
-                own = own - np.concatenate((log.y[0, :2], np.zeros(4)))
-            np.testing.assert_array_equal(values[i].numpy(), own)
-    assert taken["y"].shape == (len(starts), length, 6)
-    assert taken["usable"].shape == (len(starts), length)
+    starts = expected_starts(5)
+    for lead in (0, 1, 4):
+        expected = [row for row in starts if ROWS[row][1] - stretch(*ROWS[row])[0] == lead]
+        assert STORE.beginnings(5, lead).tolist() == expected
+        assert expected
 
 
 def test_history_repeats_the_first_sample_of_a_stretch_that_is_too_short() -> None:
     starts, length, padded = STORE.starts(3), 6, 0
     y, w = STORE.history(starts, length)
-    assert y.shape == (len(starts), length, 6)
     for i, row in enumerate(starts.tolist()):
         number, k = ROWS[row]
         first, _ = stretch(number, k)
         padded += k - first < length
-        for j in range(length):
-            sample = max(k - length + j, first)
-            np.testing.assert_array_equal(y[i, j, 2:].numpy(), LOGS[number].y[sample, 2:])
-            np.testing.assert_array_equal(w[i, j].numpy(), LOGS[number].w[sample])
+        samples = np.maximum(np.arange(k - length, k), first)
+        np.testing.assert_array_equal(y[i, :, 2:].numpy(), LOGS[number].y[samples, 2:])
+        np.testing.assert_array_equal(w[i].numpy(), LOGS[number].w[samples])
     assert 0 < padded < len(starts)
     assert STORE.history(starts, 0)[0].shape == (len(starts), 0, 6)
 
 
-@pytest.mark.parametrize("lead", [0, 1, 4])
-def test_beginnings_lie_so_many_samples_into_their_stretch(lead: int) -> None:
-    expected = [row for row in expected_starts(5) if ROWS[row][1] - stretch(*ROWS[row])[0] == lead]
-    assert STORE.beginnings(5, lead).tolist() == expected
-    assert expected
-
-
-def test_too_long_a_window_is_one_line() -> None:
+def test_too_long_a_window_is_one_line_and_unknown_values_reach_no_tensor() -> None:
     for wanted in (lambda: STORE.starts(500), lambda: STORE.beginnings(5, 300)):
         with pytest.raises(DataError, match="no training log holds a window of") as caught:
             wanted()
         assert "\n" not in str(caught.value)
-
-
-def test_unknown_values_never_reach_a_tensor() -> None:
     assert bool(np.isnan(np.concatenate([log.y for log in LOGS])).any())
     for name in ("y", "smooth", "nu_dot", "w"):
         assert bool(torch.isfinite(getattr(STORE, name)).all())
