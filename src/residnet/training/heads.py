@@ -146,15 +146,18 @@ class HeadTraining(EpochTraining):
         Raises:
             DataError: where no log is long enough for a stage.
         """
-        settings = self.settings
+        # methods, which other processes can be given
         return WindowsDataModule(
-            store,
-            self.stages,
-            settings.steps,
-            self.seed,
-            lambda epoch: int(settings.stage(epoch)[0]),
-            lambda: self.epoch,
+            store, self.stages, self.settings.steps, self.seed, self.stage_of, self.present_epoch
         )
+
+    def stage_of(self, epoch: int) -> int:
+        """Return the number of the stage that an epoch belongs to."""
+        return int(self.settings.stage(epoch)[0])
+
+    def present_epoch(self) -> int:
+        """Return the number of the present epoch."""
+        return self.epoch
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return AdamW, with weight decay on matrices of the head only."""
