@@ -35,7 +35,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "simulators": (360, 44),
     "tasks": (2974, 255),
     "testing": (484, 33),
-    "training": (1343, 155),
+    "training": (1346, 157),
     "": (405, 49),
 }
 
