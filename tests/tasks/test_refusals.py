@@ -71,6 +71,14 @@ def course(folder: Path) -> dict[str, Any]:
     return COURSE
 
 
+def by_recipe(folder: Path) -> dict[str, Any]:
+    """Logs of 30 s without an input; the recipe's trainings follow from their length."""
+    parts = ("baseline", "heads", "training", "prepare", "signals")
+    content = {key: value for key, value in measured(folder).items() if key not in parts}
+    prepare = {**measured(folder)["prepare"], "grid": {"step": 0.1}}
+    return content | {"recipe": "standard", "prepare": prepare, "signals": {"inputs": []}}
+
+
 def of_tiny(content: dict[str, Any]) -> Callable[[Path], dict[str, Any]]:
     def made(folder: Path) -> dict[str, Any]:
         (folder / "tiny.yaml").write_text(yaml.safe_dump(TINY, sort_keys=False))
@@ -82,6 +90,7 @@ def of_tiny(content: dict[str, Any]) -> Callable[[Path], dict[str, Any]]:
 BASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "fit": lambda _: TINY,
     "csv": measured,
+    "recipe": by_recipe,
     "ferry": lambda _: FERRY,
     "trials": lambda _: {"task": "simulate", "name": "trials", "data": TINY["data"]},
     "ship": lambda _: PROGRAMME,
@@ -267,7 +276,7 @@ def test_one_line_before_any_work(
     assert not Path("out").exists(), "nothing is begun"
 
 
-@pytest.mark.parametrize("base", ["fit", "csv", "ship", "study", "course", *TINY_TASKS])
+@pytest.mark.parametrize("base", ["fit", "recipe", "ferry", "ship", "study", "course", *TINY_TASKS])
 def test_what_is_right_passes(
     base: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

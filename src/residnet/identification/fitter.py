@@ -505,6 +505,8 @@ def require_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
             folds of a head, or too short for a refit.
     """
     fitter = Fitter(logs, settings, NoStore())
+    # with the parts of the recipe for these logs, where it is asked for
+    settings = fitter.settings
     step, windows = settings.prepare.grid.step, WindowStore.gather(fitter.train)
     for baseline in settings.all_baselines.values():
         baseline.require_samples(fitter.samples)
