@@ -13,8 +13,6 @@ from kinds import of_kind
 
 from residnet.core.config import load_config, validate
 from residnet.core.errors import ConfigError
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.actuators import RudderPropellerConfig, Thrusters, ThrustersConfig
 from residnet.physics.actuators.rudders import RudderPropeller
 from residnet.physics.hull import FossenConfig
@@ -167,66 +165,6 @@ def test_two_of_them_are_the_differential_thrusters() -> None:
     torch.testing.assert_close(
         unit.demand(drive, steer), twin.demand(drive, steer), rtol=1e-12, atol=1e-12
     )
-
-
-def test_the_example_boat_turns_with_its_rudder_and_mirrors() -> None:
-    plant = load_vessel("example_rudder_boat").build()
-    steer = torch.tensor([0.0, 0.5, -0.5, 1.0], dtype=torch.float64)
-    w = torch.zeros(4, 1200, len(plant.inputs), dtype=torch.float64)
-    w[:, :, : plant.commands] = plant.demand(torch.full_like(steer, 0.8), steer)[:, None]
-    x0 = plant.approach(4)
-    with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, 0.05))(x0, w, x0[:, :0])
-    end = states[:, -1]
-    assert float(end[0, 3]) > 3.0
-    assert float(end[0, 2].abs()) < 1e-12
-    assert float(end[3, 5]) > float(end[1, 5]) > 0.05
-    mirror = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(end[2], end[1] * mirror, rtol=1e-9, atol=1e-10)
-    # a turn costs speed, and the boat drifts outward
-    assert float(end[3, 3]) < float(end[1, 3]) < float(end[0, 3])
-    assert float(end[1, 4]) < 0
-
-
-def test_gradients() -> None:
-    plant = load_vessel("example_rudder_boat").build()
-    x = torch.tensor(
-        [[1.0, -2.0, 0.7, 2.2, -0.3, 0.1, 0.2, 14.0], [0.0, 0.0, 0.1, 3.0, 0.4, -0.05, -0.1, -8.0]],
-        dtype=torch.float64,
-    )
-    w = torch.zeros(2, len(plant.inputs), dtype=torch.float64)
-    w[:, 0], w[:, 1] = torch.tensor([0.21, -0.12]), torch.tensor([14.0, -8.0])
-    w[:, 2:], w[:, -1] = 3.0, 0.5
-    assert torch.autograd.gradcheck(plant.rate, (x.requires_grad_(), w.requires_grad_()))
-    rest = torch.zeros(1, 8, dtype=torch.float64, requires_grad=True)
-    plant.rate(rest, w[:1].detach() * 0).sum().backward()
-    assert bool(torch.isfinite(rest.grad).all())  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("actuators.rudder.x=2.8 m", "less than 0"),
-        ("actuators.rudder.area=0.1 m", r"m\^2"),
-        ("actuators.rudder.limit=35 deg/s", "rad"),
-        (
-            "actuators.propeller.n_max=1600 rpm",
-            r"curve_range -1500 to 1500 rpm does not reach n_max \(\+-1600 rpm\)",
-        ),
-        ("actuators.propeller.curve_range=[-1000 rpm, 1500 rpm]", "does not reach n_max"),
-        ("actuators.propeller.forward=[0, 1]", "forward"),
-        ("actuators.propeller.advance_loss=-1", "advance_loss"),
-        ("actuators.kind=rudder", "rudder_propeller"),
-        ("kind=fosen", "did you mean 'fossen'"),
-        ("added_mass.Y_vdot.value=2500", "not positive definite"),
-    ],
-)
-def test_wrong_boats_are_one_line(override: str, message: str) -> None:
-    from residnet.physics.vessel import VesselConfig
-
-    with pytest.raises(ConfigError, match=message) as caught:
-        load_config(BOAT, [override], VesselConfig).build()
-    assert "\n" not in str(caught.value)
 
 
 def test_wrong_curve_range_of_two_thrusters() -> None:

@@ -1,0 +1,832 @@
+"""Right-hand sides of every kind of vessel against their equations written out, and the figures
+that the documents and their corrections print.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from scipy.signal import TransferFunction, lsim
+from torch import Tensor
+
+from residnet.core.config import load_config
+from residnet.core.errors import ConfigError
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import NomotoDynamics, PlantDynamics, TracedPlantDynamics
+from residnet.physics.abkowitz import AbkowitzConfig
+from residnet.physics.actuators import AzimuthThrusters
+from residnet.physics.actuators.rudders import WaterJets
+from residnet.physics.hull import PHASES, froude_number, phase_of
+from residnet.physics.plant import MassSpringDamperConfig, Plant
+from residnet.physics.vessel import VesselConfig, load_vessel
+from residnet.physics.vessel_file import vessel_files
+
+
+def plant_of(name: str, *overrides: str) -> Plant:
+    return load_config(vessel_files()[name], list(overrides), VesselConfig).build()
+
+
+def rolled(model: Dynamics, x0: Tensor, w: Tensor) -> Tensor:
+    """States [B, T+1, nx] under inputs [B, T, m]."""
+    with torch.no_grad():
+        return Rollout(model)(x0, w, x0[:, :0])[0]
+
+
+def scattered(spread: list[float], count: int = 200, seed: int = 0) -> Tensor:
+    """Numbers away from the kinks at zero."""
+    random = np.random.default_rng(seed)
+    size = random.uniform(0.05, 1.0, (count, len(spread))) * spread
+    return torch.from_numpy(size * random.choice([-1.0, 1.0], size.shape))
+
+
+@pytest.mark.parametrize("name", ["wam_v_cal", "wam_v_vrx", "skewed"])
+def test_matrices_of_a_hull_written_out(name: str) -> None:
+    """M nu_dot + C nu + D nu = tau as document 003 eqs. (5)-(9) and W1, W2 have it."""
+    skewed = (
+        "rigid_body.x_G.value=0.4",
+        "added_mass.Y_rdot.value=-60",
+        "added_mass.N_vdot.value=-90",
+    )
+    vessel = load_config(
+        vessel_files()["wam_v_cal" if name == "skewed" else name],
+        list(skewed) if name == "skewed" else [],
+        VesselConfig,
+    )
+    body, added, damping = vessel.rigid_body, vessel.added_mass, vessel.damping
+    m, arm = body.m.value, body.m.value * body.x_G.value
+    m11, m22 = m - added.X_udot.value, m - added.Y_vdot.value
+    m23, m32 = arm - added.Y_rdot.value, arm - added.N_vdot.value
+    mass = np.array([[m11, 0, 0], [0, m22, m23], [0, m32, body.I_z.value - added.N_rdot.value]])
+    nu, tau = scattered([1.5, 0.6, 0.4]), scattered([300.0] * 3, seed=1)
+    got = vessel.hull()(nu, tau).numpy()
+    for (u, v, r), force, out in zip(nu.numpy(), tau.numpy(), got, strict=True):
+        value = {
+            "u": u, "v": v, "r": r, "u|u|": u * abs(u), "v|v|": v * abs(v), "r|r|": r * abs(r),
+            "|u|v": abs(u) * v,
+        }  # fmt: skip
+        side = m22 * v + 0.5 * (m23 + m32) * r
+        coriolis = np.array([[0, 0, -side], [0, 0, m11 * u], [side, -m11 * u, 0]])
+        rows = (damping.X, damping.Y, damping.N)
+        drag = np.array([sum(p.value * value[t] for t, p in row.items()) for row in rows])
+        residual = mass @ out + coriolis @ [u, v, r] + drag - force
+        assert np.abs(residual).max() < 1e-10 * np.abs(force).max()
+
+
+def test_matrices_of_the_ferry_written_out() -> None:
+    """Document 002 (2.3)-(2.6), (4.1), (4.2) with Table A.1; the half ferry is half of it."""
+    mass = np.array([[2389.657, 0, 0], [0, 2533.911, 62.386], [0, 28.141, 5068.910]])
+    nu, tau = scattered([2.0, 1.5, 0.5]), scattered([300.0] * 3, seed=1)
+    for name, share in (("milliampere", 1.0), ("milliampere_half", 0.5)):
+        hull = plant_of(name).hull
+        got = hull(nu, tau)
+        for (u, v, r), force, out in zip(nu.numpy(), tau.numpy(), got.numpy(), strict=True):
+            c13, c23 = -2533.911 * v - 62.386 * r, 2389.657 * u
+            coriolis = np.array([[0, 0, c13], [0, 0, c23], [-c13, -c23, 0]])
+            damping = np.array([
+                [27.632 + 110.064 * abs(u) + 13.965 * u**2, 0, 0],
+                [
+                    0,
+                    52.947 + 116.486 * abs(v) + 1540.383 * abs(r) + 24.313 * v**2,
+                    -24.732 - 572.141 * abs(v) + 115.457 * abs(r),
+                ],
+                [
+                    0,
+                    -3.524 + 0.832 * abs(v) - 336.827 * abs(r),
+                    122.860 + 121.957 * abs(v) + 874.428 * abs(r),
+                ],
+            ])  # fmt: skip
+            wanted = share * (mass @ out + coriolis @ [u, v, r] + damping @ [u, v, r])
+            np.testing.assert_allclose(wanted, force, atol=1e-10 * np.abs(force).max())
+        torch.testing.assert_close(hull.required(got, nu), tau, rtol=1e-10, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("name", "speed", "pole", "allowed"),
+    [
+        ("milliampere", 0.0, -0.019, 1e-3), ("milliampere", 0.2, 0.0064, 2e-4),
+        ("milliampere", 1.0, 0.135, 3e-3), ("milliampere", 2.0, 0.296, 6e-3),
+        ("odin_forces", 1.0, 0.194, 6e-3), ("odin_forces", 10.0, 0.73, 6e-3),
+    ],
+)  # fmt: skip
+def test_poles_of_sway_and_yaw(name: str, speed: float, pole: float, allowed: float) -> None:
+    """Corrections J6 and H5: unstable above walking pace."""
+    hull = plant_of(name).hull
+    nu = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
+    slope = torch.autograd.functional.jacobian(lambda x: hull(x, torch.zeros_like(x)), nu)
+    largest = float(torch.linalg.eigvals(slope[1:, 1:]).real.max())
+    assert largest == pytest.approx(pole, abs=allowed)
+
+
+def test_speeds_in_the_end() -> None:
+    """Surge balances: W5's 2.19 m/s, a pivot at 25.9 deg/s; H16's 9.96 m/s; document 002's drag."""
+    boat = plant_of("wam_v_cal").in_calm_water()
+    one, none = torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    w = boat.demand(torch.cat((one, none)), torch.cat((none, one)))
+    end = rolled(TracedPlantDynamics(boat, 0.05), boat.approach(2), w[:, None].expand(-1, 1200, -1))
+    assert float(end[0, -1, 3]) == pytest.approx(2.19, abs=0.005)
+    assert np.degrees(float(end[1, -1, 5])) == pytest.approx(25.9, abs=0.05)
+    assert float(end[1, -1, 4]) == pytest.approx(-0.19, abs=0.005)
+    jets = plant_of("odin_jets").in_calm_water()
+    w = torch.tensor([[2000 / 60, 0.0]], dtype=torch.float64)[:, None].expand(1, 1200, 2)
+    assert float(rolled(TracedPlantDynamics(jets, 0.05), jets.approach(1), w)[0, -1, 3]) == (
+        pytest.approx(9.96, abs=0.005)
+    )
+    ferry = plant_of("milliampere", "actuators.response={kind: immediate}").in_calm_water()
+    w = torch.tensor([[200.0, 0.0, 0.0]], dtype=torch.float64)[:, None].expand(1, 3000, 3)
+    u = float(rolled(TracedPlantDynamics(ferry, 0.1), ferry.approach(1), w)[0, -1, 3])
+    assert 27.632 * u + 110.064 * u**2 + 13.965 * u**3 == pytest.approx(200.0, rel=1e-6)
+
+
+def test_force_model_of_odin_written_out() -> None:
+    """(6.6)-(6.8)."""
+    nu, tau = scattered([9.0, 1.5, 0.6]), scattered([4000.0] * 3, seed=1)
+    (u, v, r), (tx, ty, tz) = nu.T.numpy(), tau.T.numpy()
+    wanted = [
+        2.026e-4 * tx + v * r - 0.0101 * u - 0.0492 * abs(u) * u,
+        2.026e-4 * ty - u * r - 0.045 * v - 0.4052 * abs(v) * v,
+        4.78e-5 * tz - 0.0612 * (v + r) - 0.1422 * abs(r) * r,
+    ]
+    got = plant_of("odin_forces").hull(nu, tau).numpy()
+    np.testing.assert_allclose(got, np.stack(wanted, axis=1), rtol=1e-12, atol=1e-13)
+
+
+def jets() -> WaterJets:
+    actuators = plant_of("odin_jets").actuators
+    assert isinstance(actuators, WaterJets)
+    return actuators
+
+
+def test_jet_model_against_the_printed_polynomials() -> None:
+    """Surge by (6.21) with g of (6.20) as H9 corrects it, and the yaw terms of (6.54) as H6 and H7
+    do; both rounded to three digits.
+    """
+    random = np.random.default_rng(0)
+    u, rpm, nozzle = (
+        random.uniform(0, 10, 400),
+        random.uniform(300, 2000, 400),
+        random.uniform(-0.3, 0.3, 400),
+    )
+    plant = plant_of("odin_jets")
+    x = torch.zeros(400, 6, dtype=torch.float64)
+    x[:, 3] = torch.from_numpy(u)
+    w = torch.zeros(400, len(plant.inputs), dtype=torch.float64)
+    w[:, :2] = torch.from_numpy(np.stack([rpm / 60, nozzle], axis=1))
+    rate = plant.rate(x, w).numpy()
+    g = (
+        0.048
+        - 1.0e-3 * rpm
+        + 2.98e-6 * rpm**2
+        - 2.65e-3 * u
+        + 5.554e-5 * u * rpm
+        - 1.65e-7 * u * rpm**2
+    )
+    g += 2.55e-5 * u**2 - 5.31e-7 * u**2 * rpm + 1.58e-9 * u**2 * rpm**2
+    # 0.054 m/s^2 is what correction H11 measured between (6.20) and (6.16)
+    assert np.abs(rate[:, 3] - (g * np.cos(nozzle) - 0.0101 * u - 0.0492 * u**2)).max() < 0.06
+    yaw = (
+        -0.04321
+        + 9.03e-4 * rpm
+        - 2.683e-6 * rpm**2
+        + 2.396e-3 * u
+        - 5.01e-5 * u * rpm
+        + 1.488e-7 * u * rpm**2
+    )
+    yaw += -2.294e-5 * u**2 + 4.79e-7 * u**2 * rpm - 1.425e-9 * u**2 * rpm**2
+    assert np.abs(rate[:, 5] - yaw * np.sin(nozzle)).max() < 5e-3 * np.abs(rate[:, 5]).max()
+
+
+def test_thrust_curve_figures() -> None:
+    """Correction H15: value at rest, roots, where it turns, and the speed at which it is zero."""
+    actuators, zero = jets(), torch.zeros(1, dtype=torch.float64)
+
+    def thrust(rpm: float, u: float = 0.0) -> float:
+        return float(actuators.thrust(zero + rpm / 60, zero + u))
+
+    assert thrust(0) == pytest.approx(118, abs=0.5)
+    assert thrust(168) == pytest.approx(-90, abs=0.5)
+    assert thrust(57.7) > 0 > thrust(57.9)
+    assert thrust(278.6) < 0 < thrust(278.8)
+    speed = 23.1
+    assert thrust(1000, speed - 0.2) > 0 > thrust(1000, speed + 0.2)
+    rpm = torch.arange(0, 2001, dtype=torch.float64)
+    assert int(actuators.thrust(rpm / 60, torch.zeros_like(rpm)).argmin()) == 168
+
+
+def test_jets_saturate_and_turn_to_the_side_that_is_asked_for() -> None:
+    actuators = jets()
+    nu = torch.zeros(2, 3, dtype=torch.float64)
+    beyond = torch.tensor([[50.0, 1.0], [-5.0, -1.0]], dtype=torch.float64)
+    limits = torch.tensor(
+        [[2000 / 60, np.radians(27)], [0.0, -np.radians(27)]], dtype=torch.float64
+    )
+    torch.testing.assert_close(
+        actuators.force(nu[:, :0], beyond, nu), actuators.force(nu[:, :0], limits, nu)
+    )
+    command = actuators.demand(
+        torch.tensor([0.5, 0.5]).double(), torch.tensor([0.3, -0.3]).double()
+    )
+    tau = actuators.force(nu[:, :0], command, nu)
+    assert float(tau[0, 2]) > 0 > float(tau[1, 2])
+    torch.testing.assert_close(tau[:, 2], -3.82 * tau[:, 1])
+
+
+def test_slew_rates_where_they_are_switched_on() -> None:
+    plant = plant_of(
+        "odin_jets", "actuators.motor.n_rate=2000 rpm/s", "actuators.nozzle.rate=1.3464"
+    )
+    assert plant.state[6:] == ("n", "nozzle")
+    x = torch.zeros(1, 8, dtype=torch.float64)
+    w = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
+    w[0, :2] = torch.tensor([2000 / 60, 0.3], dtype=torch.float64)
+    for _ in range(10):
+        x = PlantDynamics(plant, 0.01).step(x, w, x[:, :0])[0]
+    torch.testing.assert_close(x[0, 6:], torch.tensor([200 / 60, 0.13464], dtype=torch.float64))
+
+
+def test_froude_phases() -> None:
+    """Appendix D with the length of correction H17: 0.4 at 4.06 m/s, 1.0 at 10.1 m/s."""
+    vessel = load_vessel("odin_forces")
+    u = torch.tensor([0.0, 4.0, 4.1, 10.1, 10.2, 3.0], dtype=torch.float64)
+    v = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -4.0], dtype=torch.float64)
+    froude = froude_number(u, v, vessel.length.value)
+    assert float(froude[3]) == pytest.approx(1.0, abs=0.005)
+    assert [PHASES[i] for i in phase_of(froude).tolist()] == [
+        "displacement", "displacement", "semi_displacement", "semi_displacement", "planing",
+        "semi_displacement",
+    ]  # fmt: skip
+    assert phase_of(torch.tensor([0.4, 1.0, 1.1])).tolist() == [1, 2, 2]
+    assert phase_of(torch.tensor([1.1]), (0.4, 1.2)).tolist() == [1]
+    with pytest.raises(ValueError, match="length"):
+        froude_number(u, v, 0.0)
+
+
+def test_forces_follow_by_the_thruster_dynamics() -> None:
+    """(4.3): step response of 4 / (s^2 + 3.2 s + 4) by its closed form, and the limits."""
+    plant = plant_of("milliampere")
+    x0 = plant.approach(1)
+    w = torch.zeros(1, 300, len(plant.inputs), dtype=torch.float64)
+    w[..., 0], w[..., 1], w[..., 2] = 100.0, -5000.0, 30.0
+    with torch.no_grad():
+        states, _, _ = Rollout(PlantDynamics(plant, 0.01))(x0, w, x0[:, :0])
+    t = 0.01 * np.arange(301)
+    step = 1 - np.exp(-1.6 * t) * (np.cos(1.2 * t) + 1.6 / 1.2 * np.sin(1.2 * t))
+    np.testing.assert_allclose(states[0, :, 6:9], step[:, None] * [100.0, -995.0, 30.0], atol=1e-5)
+
+
+def azimuth(*overrides: str) -> AzimuthThrusters:
+    actuators = plant_of("milliampere_azimuth", *overrides).actuators
+    assert isinstance(actuators, AzimuthThrusters)
+    return actuators
+
+
+def test_azimuth_thrusters_written_out() -> None:
+    """(5.1), (5.2) in rpm."""
+    rng = np.random.default_rng(0)
+    rpm, angle = rng.uniform(-5200, 5200, (100, 2)), rng.uniform(-3, 3, (100, 2))
+    thrust = (
+        -1.31e-16 * rpm**5
+        - 1.78e-13 * rpm**4
+        + 6.16e-9 * rpm**3
+        + 8.7e-6 * rpm**2
+        + 0.00478 * rpm
+        - 1.07
+    )
+    along, across = np.cos(angle) * thrust, np.sin(angle) * thrust
+    wanted = np.stack([along.sum(1), across.sum(1), 1.8 * (across[:, 0] - across[:, 1])], axis=1)
+    command = torch.from_numpy(np.concatenate([rpm / 60, angle], axis=1))
+    got = azimuth().force(command[:, :0], command, command[:, :3])
+    np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_allocation_makes_the_wanted_forces_with_least_thrust() -> None:
+    thrusters = azimuth()
+    tau = torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3)) * [150, 150, 150])
+    command = thrusters.allocate(tau)
+    torch.testing.assert_close(thrusters.force(tau[:, :0], command, tau), tau, rtol=1e-9, atol=1e-9)
+    thrust, angle = thrusters.thrust(command[:, :2]), command[:, 2:]
+    parts = torch.cat((thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=1).numpy()
+    for want, part in zip(tau.numpy(), parts, strict=True):
+        rows = np.array([[1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1.8, -1.8]])
+        np.testing.assert_allclose(part, np.linalg.lstsq(rows, want, rcond=None)[0], atol=1e-9)
+    # beyond what a thruster can do, each keeps its angle at full thrust
+    far = thrusters.allocate(torch.tensor([[5000.0, 0.0, 0.0]], dtype=torch.float64))
+    torch.testing.assert_close(far, torch.tensor([[87.5, 87.5, 0.0, 0.0]], dtype=torch.float64))
+    nothing = thrusters.force(tau[:1, :0], thrusters.allocate(tau[:1] * 0), tau[:1])
+    torch.testing.assert_close(nothing, tau[:1] * 0, atol=1e-9, rtol=0)
+
+
+def test_mass_spring_damper() -> None:
+    """(5.13) under section 5.3.1's square wave, against SciPy; without force its energy falls."""
+    config = MassSpringDamperConfig()
+    plant = config.build()
+    t = 0.1 * np.arange(500)
+    w = torch.from_numpy(np.where(np.mod(t, 6 * np.pi) < 3 * np.pi, 1.0, -1.0))[None, :, None]
+    x0 = torch.zeros(1, 2, dtype=torch.float64)
+    with torch.no_grad():
+        states, _, _ = Rollout(PlantDynamics(plant, 0.1, substeps=5))(x0, w, x0[:, :0])
+
+    def rate(_: float, y: np.ndarray, force: float) -> list[float]:
+        return [y[1], -1.3 * y[1] + 0.1 * force - 0.5 * y[0]]
+
+    x = np.zeros(2)
+    for k in range(500):
+        force = float(w[0, k, 0])
+        np.testing.assert_allclose(states[0, k], x, atol=1e-7)
+        x = solve_ivp(
+            rate,
+            (0, 0.1),
+            x,
+            args=(force,),
+            rtol=1e-10,
+            atol=1e-12,
+        ).y[:, -1]
+    start = torch.tensor([[1.0, -0.4]], dtype=torch.float64)
+    free, _, _ = Rollout(PlantDynamics(plant, 0.05))(start, w[:, :400] * 0, start[:, :0])
+    energy = 0.5 * config.m.value * free[0, :, 1] ** 2 + 0.5 * config.k.value * free[0, :, 0] ** 2
+    assert bool((energy[1:] < energy[:-1]).all())
+    assert plant.demand(torch.tensor([2.0, -0.5]), torch.zeros(2)).tolist() == [[1.0], [-0.5]]
+    with pytest.raises(ValueError, match="its unit must be kg/s"):
+        MassSpringDamperConfig.model_validate({"d": {"value": 1.0, "unit": "kg", "source": "made"}})
+
+
+THRUST = 1960 * 7.71**2
+
+
+def inputs(plant: Plant, rows: int, delta: float = 0.0, thrust: float = THRUST) -> torch.Tensor:
+    w = torch.zeros(rows, len(plant.inputs), dtype=torch.float64)
+    w[:, 0], w[:, 1] = delta, thrust
+    return w
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """What differs between the sets, as the corrections of document 004 list it."""
+
+    rho: float
+    volume: float
+    gm: float
+    m: float
+    i_x: float
+    i_z: float
+    z_g: float
+    y_vdot: float
+    k_pdot: float
+    n_rdot: float
+
+
+P06 = Numbers(
+    1025, 355.88, 1.0, 1025 * 355.88, 3.4263e6, 3.3818e7, -1.07, -1.9022e6, -0.674e6, -4.3958e7
+)
+SETS = {
+    "patrol_p06": P06,
+    "patrol_p06_linear": P06,
+    "patrol_hyb": Numbers(
+        1025, 355.88, 1.0, 1025 * 355.88, 3.4263e6, 3.3818e7, -1.07, -393e3, -0.674e6, -4.3958e7
+    ),
+    "patrol_mss": Numbers(
+        1014, 357, 1.1, 1014 * 357, 2.3763e6, 4.7934e7, -1.06, -393e3, -0.774e6, -38.7e6
+    ),
+}
+
+
+def navalvessel(c: Numbers, nu: np.ndarray, b: float, tau: np.ndarray) -> np.ndarray:
+    """Accelerations as MSS navalvessel.m forms them, abs(u*b) read as abs(u*v); tau
+    acts beside the hull's own forces.
+    """
+    u, v, p, r = nu
+    au, av, ap, ar = np.abs(nu)
+    m, x_g, z_g, g = c.m, -3.38, c.z_g, 9.81
+    hull = np.array([
+        -1960 * u * au + 0.33 * m * v * r,
+        -11800 * au * v + 131000 * u * r - 3700 * v * av - 794000 * v * ar - 182000 * r * av
+        + 10800 * b * abs(u * v) + 251000 * b * abs(u * r)
+        - 74 * b * u**2,
+        9260 * au * v - 102000 * u * r + 29300 * v * av + 621000 * v * ar + 142000 * r * av
+        - 8400 * b * abs(u * v) - 196000 * b * abs(u * r)
+        - 1180 * b * u**2 - 15500 * au * p - 416000 * p * ap - 500000 * p
+        - 0.325 * c.rho * g * c.volume * b**3 - c.rho * g * c.gm * c.volume * b,
+        -92000 * au * v - 4710000 * au * r - 202e6 * r * ar - 15.6e6 * r * av
+        - 214000 * b * abs(u * v) - 4980000 * b * u * ar - 8000 * b * u * au,
+    ])  # fmt: skip
+    centripetal = m * np.array(
+        [r * v + x_g * r**2 - z_g * p * r, -u * r, z_g * u * r, -x_g * u * r]
+    )
+    mass = np.array([
+        [m + 17400, 0, 0, 0],
+        [0, m - c.y_vdot, -(m * z_g - 296e3), m * x_g + 1.4e6],
+        [0, -(m * z_g + 296e3), c.i_x - c.k_pdot, 0],
+        [0, m * x_g - 538e3, 0, c.i_z - c.n_rdot],
+    ])  # fmt: skip
+    return np.linalg.solve(mass, hull + centripetal + tau)
+
+
+def foil(c: Numbers, u: float, v: float, delta: float, thrust: float) -> np.ndarray:
+    """Forces of thrust and rudders by (5.20)-(5.29) as corrected: two rudders, two propellers with
+    half of the thrust each.
+    """
+    angle = np.clip(delta, -np.radians(23), np.radians(23))
+    lift_coefficient = np.degrees(0.054) * angle
+    drag_coefficient = lift_coefficient**2 / (0.9 * np.pi * 3)
+    square = u**2 + v**2
+    loading = 2 * (thrust / 2) / (c.rho * square * np.pi * 0.8**2)
+    race = 2 * (thrust / 2) * (1 + 1 / np.sqrt(1 + loading))
+    lift = 2 * 0.5 * c.rho * square * 1.5 * lift_coefficient + race * np.sin(angle)
+    drag = 2 * 0.5 * c.rho * square * 1.5 * drag_coefficient + race * (1 - np.cos(angle))
+    return np.array([thrust - drag, -lift, 1.54 * lift, 25.75 * lift])
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_patrol_vessel_written_out(name: str) -> None:
+    plant, c = plant_of(name), SETS[name]
+    states = (
+        scattered([100, 100, 0.3, 2.0, 3.0, 1.0, 0.2, 0.05, 0.3], 100).numpy() + 6.0 * np.eye(9)[4]
+    )
+    thrusts = np.random.default_rng(1).uniform(0, THRUST, len(states))
+    x, w = torch.from_numpy(states), inputs(plant, len(states))
+    w[:, 1] = torch.from_numpy(thrusts)
+    w[:, 2:6] = torch.tensor([3e3, -2e3, 8e3, 5e4], dtype=torch.float64)
+    for row, thrust, got in zip(states, thrusts, plant.rate(x, w).numpy(), strict=True):
+        _, _, phi, psi, u, v, p, r, delta = row
+        angle = np.clip(delta, -np.radians(35), np.radians(35))
+        lift = 7008.8 * u * u * angle
+        linear = np.array([thrust, -lift, 1.54 * lift, 25.75 * lift])
+        tau = linear if name.endswith("linear") else foil(c, u, v, angle, thrust)
+        acceleration = navalvessel(c, row[4:8], phi, tau + np.array([3e3, -2e3, 8e3, 5e4]))
+        pose = [
+            u * np.cos(psi) - v * np.sin(psi) * np.cos(phi),
+            u * np.sin(psi) + v * np.cos(psi) * np.cos(phi),
+            p,
+            r * np.cos(phi),
+        ]
+        np.testing.assert_allclose(got[:4], pose, rtol=1e-12, atol=1e-14)
+        assert np.abs(got[4:8] - acceleration).max() <= 1e-12 * np.abs(acceleration).max()
+        assert got[8] == 0.0
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_a_foil_beyond_stall_lifts_no_more(name: str) -> None:
+    rudders = load_vessel(name).actuators.build()
+    delta = torch.linspace(-0.6, 0.6, 241, dtype=torch.float64)
+    u, v, thrust = (
+        torch.full_like(delta, 7.0),
+        torch.full_like(delta, 0.5),
+        torch.full_like(delta, THRUST),
+    )
+    lift, drag = rudders.config.foil(delta, u, v, thrust)
+    torch.testing.assert_close(lift, -lift.flip(0), rtol=1e-12, atol=1e-9)
+    torch.testing.assert_close(drag, drag.flip(0), rtol=1e-12, atol=1e-9)
+    stalled = delta > np.radians(23)
+    if name.endswith("linear"):
+        torch.testing.assert_close(lift, 7008.8 * 49.0 * delta)
+    else:
+        assert lift[stalled].unique().numel() == 1
+        assert bool((lift[~stalled].diff() >= 0).all())
+
+
+def test_rudders_at_rest() -> None:
+    """Without flow the race alone steers, with half the momentum of a moving vessel; without thrust
+    nothing does, and gradients stay finite.
+    """
+    rudders = load_vessel("patrol_p06").actuators.build()
+    a = torch.full((2, 1), np.radians(10.0), dtype=torch.float64)
+    nu = torch.zeros(2, 4, dtype=torch.float64, requires_grad=True)
+    command = torch.tensor([[0.0, THRUST], [0.0, 0.0]], dtype=torch.float64)
+    tau = rudders.force(a, command, nu)
+    np.testing.assert_allclose(tau[0, 1].item(), -THRUST * np.sin(np.radians(10.0)), rtol=1e-6)
+    assert tau[1].abs().max().item() == 0.0
+    (slope,) = torch.autograd.grad(tau.sum(), nu)
+    assert bool(torch.isfinite(slope).all())
+
+
+def test_heel_and_steady_turns_are_those_of_errata() -> None:
+    """G9: 10 deg of rudder heel 1.25 deg inward at first and 3.34 deg outward in the end; G17, G18:
+    7.00 m/s and 190 m at 5 deg, 124 m at 10 deg.
+    """
+    # the rudder steps
+    plant = load_config(vessel_files()["patrol_p06"], ["actuators.rate=null"], VesselConfig).build()
+    w = torch.cat([inputs(plant, 1, np.radians(angle)) for angle in (5.0, 10.0)])
+    states = rolled(
+        TracedPlantDynamics(plant, 0.05), plant.approach(2), w[:, None].expand(-1, 4000, -1)
+    )
+    phi = np.degrees(states[1, :, 2].numpy())
+    assert phi.max() == pytest.approx(1.25, abs=0.01)
+    assert phi[-1] == pytest.approx(-3.34, abs=0.01)
+    assert np.degrees(float(states[0, -1, 7])) == pytest.approx(2.13, abs=0.01)
+    assert float(states[0, -1, 4]) == pytest.approx(7.00, abs=0.01)
+    speed = torch.linalg.vector_norm(states[:, -1, 4:6], dim=-1)
+    radius = speed / (states[:, -1, 7] * torch.cos(states[:, -1, 2]))
+    assert radius.tolist() == pytest.approx([190, 124], abs=0.7)
+
+
+def test_roll_decays_with_the_period_of_errata() -> None:
+    """From 10 deg: 6.63 s at 7.71 m/s, 6.69 s at rest; document 004, Table 5.2 prints 6.76 s."""
+    plant = plant_of("patrol_p06")
+    x0 = plant.approach(2)
+    x0[1, 4] = 0.0
+    x0[:, 2] = np.radians(10.0)
+    w = torch.cat((inputs(plant, 1), inputs(plant, 1, 0.0, 0.0)))
+    states = rolled(TracedPlantDynamics(plant, 0.01), x0, w[:, None].expand(-1, 3000, -1))
+    for row, period in enumerate((6.63, 6.69)):
+        phi = states[row, :, 2].numpy()
+        at = np.flatnonzero((phi[:-1] > 0) & (phi[1:] <= 0))
+        crossings = 0.01 * (at + phi[at] / (phi[at] - phi[at + 1]))
+        assert np.diff(crossings)[:2].mean() == pytest.approx(period, abs=0.04)
+        assert np.abs(phi[-600:]).max() < 0.5 * phi[0]
+
+
+LENGTH, SERVICE = 160.93, 7.7175
+
+
+def mariner(u: float, v: float, r: float, delta: float) -> np.ndarray:
+    """Accelerations by the published derivatives (times 1e-5); delta positive to port, as there."""
+    speed = np.hypot(u, v)
+    e, v, r = (u - SERVICE) / speed, v / speed, r * LENGTH / speed
+    d = delta
+    x = (
+        -184 * e
+        - 110 * e**2
+        - 215 * e**3
+        - 899 * v**2
+        + 18 * r**2
+        + 798 * r * v
+        - 95 * d**2
+        - 190 * e * d**2
+        + 93 * v * d
+        + 93 * e * v * d
+    )
+    y = (
+        -1160 * v - 499 * r - 8078 * v**3 + 15356 * v**2 * r - 1160 * v * e - 499 * r * e + 278 * d
+        - 90 * d**3
+        + 556 * e * d + 278 * e**2 * d - 4 * v * d**2 + 1190 * v**2 * d - 4 - 8 * e - 4 * e**2
+    )  # fmt: skip
+    n = (
+        -264 * v - 166 * r + 1636 * v**3 - 5483 * v**2 * r - 264 * v * e - 166 * r * e - 139 * d
+        + 45 * d**3
+        - 278 * e * d - 139 * e**2 * d + 13 * v * d**2 - 489 * v**2 * d + 3 + 6 * e + 3 * e**2
+    )  # fmt: skip
+    m11, m22 = 798 + 42.0, 798 + 748.0
+    m23, m32, m33 = 798 * -0.023 + 9.354, 798 * -0.023 - 4.646, 39.2 + 43.8
+    side = np.linalg.solve([[m22, m23], [m32, m33]], [y, n])
+    return np.array([x / m11, side[0], side[1] / LENGTH]) * speed**2 / LENGTH
+
+
+def test_the_mariner_written_out() -> None:
+    plant = load_vessel("mariner").build()
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        nu = np.array([7.0, 0.0, 0.0]) + rng.normal(size=3) * [1.0, 0.8, 0.01]
+        delta = rng.uniform(-0.6, 0.6)
+        x = torch.tensor([[0.0, 0.0, 0.0, *nu, delta]], dtype=torch.float64)
+        w = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
+        w[0, 0] = delta
+        u, v, r = nu
+        np.testing.assert_allclose(
+            plant.rate(x, w)[0, 3:6], mariner(u, v, r, -delta), rtol=1e-10, atol=1e-14
+        )
+
+
+def test_a_turn_of_the_mariner() -> None:
+    """35 deg to starboard from 15 kn, against SciPy on the equations written out; advance and
+    tactical diameter of a few lengths.
+    """
+    plant = load_vessel("mariner").build()
+    steps, dt = 700, 0.5
+    w = torch.zeros(1, steps, len(plant.inputs), dtype=torch.float64)
+    w[:, :, 0] = np.radians(35)
+    x0 = plant.approach(1)
+    assert float(x0[0, 3]) == SERVICE
+    with torch.no_grad():
+        states, _, _ = Rollout(TracedPlantDynamics(plant, dt, substeps=5))(x0, w, x0[:, :0])
+
+    def rate(_: float, s: np.ndarray) -> np.ndarray:
+        c, i = np.cos(s[2]), np.sin(s[2])
+        gear = np.clip(np.radians(35) - s[6], -np.radians(5), np.radians(5))
+        u, v, r, delta = s[3:7]
+        return np.array([c * u - i * v, i * u + c * v, r, *mariner(u, v, r, -delta), gear])
+
+    truth = solve_ivp(rate, (0, steps * dt), x0[0].numpy(), rtol=1e-9, atol=1e-10, max_step=1.0).y[
+        :, -1
+    ]
+    assert (
+        np.abs(states[0, -1, :6].numpy() - truth[:6]) < [0.5, 0.5, 2e-3, 1e-4, 1e-4, 1e-6]
+    ).all()
+    track = states[0]
+    quarter = track[torch.nonzero(track[:, 2] > np.pi / 2)[0, 0]]
+    half = track[torch.nonzero(track[:, 2] > np.pi)[0, 0]]
+    assert 2.5 < float(quarter[0]) / LENGTH < 5.0
+    assert 4.0 < float(half[1]) / LENGTH < 7.0
+
+
+def test_prime_and_si_are_the_same_vessel() -> None:
+    """At the service speed, where the present speed does not scale the series."""
+    prime = load_vessel("mariner")
+    assert isinstance(prime, AbkowitzConfig)
+    force, length, speed = 0.5 * 1025 * LENGTH**2 * SERVICE**2, LENGTH, SERVICE
+    unit = {"du": 1 / speed, "v": 1 / speed, "r": length / speed, "delta": 1.0}
+
+    def scaled(term: str, value: float, size: float) -> float:
+        for factor in term.split():
+            name, _, power = factor.partition("^")
+            size *= unit.get(name, 1.0) ** int(power or 1)
+        return value * size
+
+    rows = {
+        axis: {term: scaled(term, value, size) for term, value in row.items()}
+        for axis, row, size in zip(
+            "XYN", dict(prime.coefficients).values(), (force, force, force * length), strict=True
+        )
+    }
+    kilo, body = 0.5 * 1025 * length**3, prime.mass
+    mass = {
+        "m": body.m * kilo, "I_z": body.I_z * kilo * length**2, "x_G": body.x_G * length,
+        "X_udot": body.X_udot * kilo,
+        "Y_vdot": body.Y_vdot * kilo, "Y_rdot": body.Y_rdot * kilo * length,
+        "N_vdot": body.N_vdot * kilo * length,
+        "N_rdot": body.N_rdot * kilo * length**2,
+    }  # fmt: skip
+    si = AbkowitzConfig.model_validate(
+        prime.model_dump() | {"units": "si", "coefficients": rows, "mass": mass}
+    )
+    a, b = prime.build(), si.build()
+    v = 0.5
+    x = torch.tensor(
+        [[0.0, 0.0, 0.3, np.sqrt(SERVICE**2 - v**2), v, 0.008, -0.2]], dtype=torch.float64
+    )
+    w = torch.zeros(1, len(a.inputs), dtype=torch.float64)
+    w[0, 1:4] = torch.tensor([2e5, -1e5, 3e7])
+    torch.testing.assert_close(a.rate(x, w), b.rate(x, w), rtol=1e-9, atol=1e-12)
+
+
+def test_coriolis_of_the_rigid_body_may_stand_outside_the_series() -> None:
+    """Taking m out of X_vr and Y_r, and m x_G out of N_r and X_rr, and adding C_RB gives the same
+    (at the service speed).
+    """
+    inside = load_vessel("mariner")
+    m, x_g = 798e-5, -0.023
+    changes = {
+        "coefficients.X.v r": 798e-5 - m,
+        "coefficients.X.r^2": 18e-5 - m * x_g,
+        "coefficients.Y.r": -499e-5 + m,
+    }
+    changes |= {
+        "coefficients.Y.du r": -499e-5 + m,
+        "coefficients.N.r": -166e-5 + m * x_g,
+        "coefficients.N.du r": -166e-5 + m * x_g,
+    }
+    outside = load_config(
+        vessel_files()["mariner"],
+        ["coriolis=rigid_body", *(f"{key}={value}" for key, value in changes.items())],
+        AbkowitzConfig,
+    )
+    a, b = inside.build(), outside.build()
+    # at the service speed: the series counts 1 + (U - U0) / U where the body has u / U
+    x = torch.tensor(
+        [[0.0, 0.0, 0.3, np.sqrt(SERVICE**2 - 0.25), 0.5, 0.008, -0.2]], dtype=torch.float64
+    )
+    w = torch.zeros(1, len(a.inputs), dtype=torch.float64)
+    torch.testing.assert_close(a.rate(x, w), b.rate(x, w), rtol=1e-9, atol=1e-14)
+
+
+def test_revolutions_enter_where_the_series_knows_them() -> None:
+    shaft = "shaft={n_0: 1.5, n_max: 2, n_rate: 0.1}"
+    vessel = load_config(
+        vessel_files()["mariner"],
+        [shaft, "coefficients.X.dn=400.0e-5", "coefficients.X.dn^2=50.0e-5"],
+        AbkowitzConfig,
+    )
+    plant = vessel.build()
+    assert plant.inputs[:2] == ("cmd_delta", "cmd_n")
+    x = plant.approach(2)
+    assert x[:, 7].tolist() == [1.5, 1.5]
+    x[1, 7] = 1.8
+    w = torch.zeros(2, len(plant.inputs), dtype=torch.float64)
+    rate = plant.rate(x, w)
+    share = 0.3 / 1.5
+    force = (400e-5 * share + 50e-5 * share**2) * SERVICE**2 / LENGTH / (840e-5)
+    assert float(rate[1, 3] - rate[0, 3]) == pytest.approx(force)
+
+
+NOMOTO = ("nomoto_oceanos", "nomoto_mariner_yaw", "nomoto_mariner")
+
+
+def commands(steps: int, dt: float) -> np.ndarray:
+    """Steps of the rudder [T] within 0.2 rad, each of 2 s."""
+    levels = np.random.default_rng(0).uniform(-0.2, 0.2, steps)
+    return levels[(np.arange(steps) * dt // 2).astype(int)]
+
+
+def flown(model: NomotoDynamics | PlantDynamics, rudder: np.ndarray) -> np.ndarray:
+    x0 = model.plant.approach(1)
+    return rolled(model, x0, torch.from_numpy(rudder)[None, :, None])[0].numpy()
+
+
+def transfer_functions(name: str) -> dict[str, TransferFunction]:
+    """v and r over delta as document 004 (5.3), (5.4), (5.7) write them."""
+    c = load_vessel(name)
+    k = c.K.value
+    if name == "nomoto_oceanos":
+        return {"r": TransferFunction([k], [c.T.value, 1.0])}
+    denominator = [c.T1.value * c.T2.value, c.T1.value + c.T2.value, 1.0]
+    out = {"r": TransferFunction([k * c.T3.value, k], denominator)}
+    if name == "nomoto_mariner":
+        out["v"] = TransferFunction([c.K_v.value * c.T_v.value, c.K_v.value], denominator)
+    return out
+
+
+@pytest.mark.parametrize("name", NOMOTO)
+@pytest.mark.parametrize("dt", [0.01, 0.5])
+def test_steps_of_the_rudder_as_the_transfer_functions_say(name: str, dt: float) -> None:
+    plant = plant_of(name, "rudder.rate=null")
+    rudder = commands(400, dt)
+    states = flown(NomotoDynamics(plant, dt), rudder)
+    known = transfer_functions(name)
+    for channel, function in known.items():
+        # lsim holds inputs over a step and is exact in it
+        _, truth, _ = lsim((function.num, function.den), rudder, np.arange(400) * dt, interp=False)
+        np.testing.assert_allclose(
+            states[:-1, plant.state.index(channel)], truth, rtol=0, atol=1e-11 * np.ptp(truth)
+        )
+    if "v" not in known:
+        assert not states[:, 4].any()
+
+
+@pytest.mark.parametrize("name", NOMOTO)
+def test_the_exact_step_against_rk4_and_scipy(name: str) -> None:
+    """Whole states under a rudder with a rate; RK4 and positions by Simpson's rule are of fourth
+    order.
+    """
+    plant = load_config(vessel_files()[name], ["rudder.rate=5 deg/s"], VesselConfig).build()
+    dt, rudder = 0.05, commands(200, 0.05)
+    exact, stepped = (
+        flown(NomotoDynamics(plant, dt), rudder),
+        flown(PlantDynamics(plant, dt), rudder),
+    )
+    spread = np.ptp(exact, axis=0)
+    np.testing.assert_array_equal(exact[:, -1], stepped[:, -1])
+    assert (np.abs(exact - stepped).max(0) <= 1e-7 * spread).all()
+
+    def rate(_: float, y: np.ndarray, w: torch.Tensor, delta: float) -> np.ndarray:
+        return plant.rate(torch.tensor([[*y, delta]]), w)[0, :-1].numpy()
+
+    x = exact[0, :-1]
+    for k in range(200):
+        w, delta = torch.tensor([[rudder[k]]]), exact[k, -1]
+        x = solve_ivp(
+            rate,
+            (0, dt),
+            x,
+            args=(w, delta),
+            method="DOP853",
+            rtol=1e-12,
+            atol=1e-14,
+        ).y[:, -1]
+    np.testing.assert_allclose(exact[-1, 2:-1], x[2:], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(exact[-1, :2], x[:2], rtol=0, atol=1e-7 * np.ptp(exact[:, 0]))
+
+
+def test_a_steady_turn_is_a_circle_of_document_numbers() -> None:
+    """Corrections G18, G20: 5 deg turn at 17.3 deg/s on a radius of 10.57 m."""
+    plant = plant_of("nomoto_oceanos")
+    states = flown(NomotoDynamics(plant, 0.01), np.full(6000, np.radians(5.0)))
+    assert np.degrees(states[-1, 5]) == pytest.approx(17.35, abs=0.01)
+    # where the yaw rate has settled: half a circle apart
+    half = round(np.pi / states[-1, 5] / 0.01)
+    assert np.hypot(*(states[-1, :2] - states[-1 - half, :2])) == pytest.approx(2 * 10.57, abs=0.02)
+    assert states[-1, 3] == 3.2
+
+
+def test_the_linear_mariner_is_the_mariner_about_straight_motion() -> None:
+    """Poles, gains and zeros from derivatives of the Abkowitz series at 15 kn."""
+    series, linear = load_vessel("mariner").build(), load_vessel("nomoto_mariner").build()
+    x = series.approach(1)
+    w = torch.zeros(1, len(series.inputs), dtype=torch.float64)
+    slope = torch.autograd.functional.jacobian(lambda x: series.rate(x, w)[0, 4:6], x)[:, 0]
+    delta = series.state.index("delta")
+    torch.testing.assert_close(linear.a, slope[:, 4:6], rtol=1e-6, atol=0)
+    torch.testing.assert_close(linear.b, slope[:, delta], rtol=1e-6, atol=0)
+
+
+def test_an_unstable_ship_has_both_signs_negative() -> None:
+    plant = load_config(
+        vessel_files()["nomoto_oceanos"], ["K.value=-1", "T.value=-20"], VesselConfig
+    ).build()
+    states = flown(NomotoDynamics(plant, 0.1), np.full(100, 0.1))
+    assert states[-1, 5] == pytest.approx(0.1 * (np.exp(10.0 / 20) - 1), rel=1e-12)
+
+
+def test_an_exact_step_needs_a_rudder_that_is_held() -> None:
+    plant = load_config(
+        vessel_files()["nomoto_oceanos"],
+        ["rudder.response={kind: first_order, time: 1 s}"],
+        VesselConfig,
+    ).build()
+    with pytest.raises(ConfigError, match="an exact step holds the rudder"):
+        NomotoDynamics(plant, 0.1)
+    assert flown(PlantDynamics(plant, 0.1), np.full(30, 0.1))[-1, -1] == pytest.approx(
+        0.1 * (1 - np.exp(-3.0)), rel=1e-5
+    )

@@ -1,0 +1,217 @@
+"""What every vessel file promises, whatever its kind: shapes, units, symmetry, energy, currents,
+and the fast ways to step it against the plain one.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from residnet.core.config import load_config
+from residnet.core.names import CHANNEL_UNITS
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
+from residnet.physics.plant import HullPlant, Plant
+from residnet.physics.vessel import VesselConfig, load_vessel
+from residnet.physics.vessel_file import vessel_files
+
+HULLS = [name for name in vessel_files() if not name.startswith("nomoto")]
+# the forces of a real hull: the published series of the Mariner has Y_0 and N_0
+SYMMETRIC = [name for name in vessel_files() if name != "mariner"]
+ODD = {"y", "psi", "phi", "v", "r", "p", "delta", "nozzle", "tau_y", "tau_n", "force_y", "force_k",
+       "force_n", "current_east", "force_east", "wind_dir", "_yaw_lag"}  # fmt: skip
+
+
+def scene(plant: Plant, rows: int = 4) -> tuple[Tensor, Tensor]:
+    """States and inputs of a vessel under way, all of them different from zero."""
+    random = torch.Generator().manual_seed(0)
+    x = plant.approach(rows)
+    x = x + 0.05 + 0.1 * torch.rand(x.shape, generator=random, dtype=torch.float64)
+    x[:, plant.state.index("u")] += 1.0
+    w = 0.1 + 0.1 * torch.rand(rows, len(plant.inputs), generator=random, dtype=torch.float64)
+    steer = torch.linspace(-0.5, 0.4, rows, dtype=torch.float64)
+    w[:, : plant.commands] = plant.demand(torch.full_like(steer, 0.6), steer)
+    return x, w
+
+
+def mirrored(values: Tensor, names: tuple[str, ...]) -> Tensor:
+    """The same scene in the mirror of the vessel's centre plane."""
+    other = [
+        names.index(name.replace("port", "*").replace("stbd", "port").replace("*", "stbd"))
+        for name in names
+    ]
+    plain = [name.removeprefix("cmd_").removeprefix("_").removeprefix("acting_") for name in names]
+    sign = [
+        -1.0 if p.removesuffix("_rate") in ODD or n in ODD or "alpha" in n else 1.0
+        for p, n in zip(plain, names, strict=True)
+    ]
+    return values[..., other] * torch.tensor(sign, dtype=values.dtype)
+
+
+@pytest.mark.parametrize("name", vessel_files())
+def test_a_vessel_in_a_batch_with_gradients(name: str) -> None:
+    vessel = load_vessel(name)
+    assert vessel.name == name, "a vessel is called as its file"
+    plant = vessel.build()
+    x, w = scene(plant)
+    # at rest, too, slopes stay finite
+    x[3] = 0.0
+    rate = plant.rate(x.requires_grad_(), w.requires_grad_())
+    assert rate.shape == x.shape
+    for slope in torch.autograd.grad(rate.sum(), (x, w), allow_unused=True):
+        assert slope is None or bool(torch.isfinite(slope).all())
+    for row in range(4):
+        one = slice(row, row + 1)
+        torch.testing.assert_close(plant.rate(x[one], w[one])[0], rate[row], rtol=1e-9, atol=1e-12)
+        moved = plant.end_step(x[one], w[one], 0.01)[0]
+        torch.testing.assert_close(moved, plant.end_step(x, w, 0.01)[row])
+    # what a log may hold has a unit; thrusters are named by the vessel file
+    free = ("_", "n_", "alpha_", "cmd_n_", "cmd_alpha_")
+    logged = [n for n in (*plant.state, *plant.inputs[: plant.commands]) if not n.startswith(free)]
+    assert [n for n in logged if n not in CHANNEL_UNITS] == []
+    assert {"x", "y", "psi", "u", "v", "r"} <= set(plant.state)
+
+
+VARIOUS = ("wam_v_cal", "milliampere", "milliampere_azimuth", "odin_jets", "patrol_p06",
+           "patrol_p06_wind", "example_rudder_boat", "mariner", "nomoto_mariner")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VARIOUS)
+def test_gradients_are_those_of_differences(name: str) -> None:
+    plant = load_vessel(name).build()
+    x, w = scene(plant, 2)
+    # in units in which each input moves the vessel alike
+    scale = torch.where(w.abs() > 1.0, w.abs(), torch.ones_like(w))
+    assert torch.autograd.gradcheck(
+        lambda x, w: plant.rate(x, w * scale), (x.requires_grad_(), (w / scale).requires_grad_()),
+        atol=1e-6,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", vessel_files())
+def test_a_vessel_turns_to_starboard_where_it_is_steered(name: str) -> None:
+    """From where trials start, at full drive, to one side and the other, in mirror images."""
+    plant = load_vessel(name).build()
+    x = plant.approach(2)
+    steer = torch.tensor([0.3, -0.3], dtype=torch.float64)
+    w = torch.zeros(2, 200, len(plant.inputs), dtype=torch.float64)
+    w[:, :, : plant.commands] = plant.demand(torch.ones_like(steer), steer)[:, None]
+    with torch.no_grad():
+        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.1))(x, w, x[:, :0])
+    turned = states[:, -1, plant.state.index("psi")]
+    assert float(turned[0]) > 0 > float(turned[1])
+    assert bool((states[:, -1, plant.state.index("u")] > 0).all())
+    if name in SYMMETRIC:
+        other = mirrored(states[1], plant.state)
+        torch.testing.assert_close(other, states[0], rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", SYMMETRIC)
+def test_port_and_starboard_are_mirror_images(name: str) -> None:
+    plant = load_vessel(name).build()
+    x, w = scene(plant)
+    rate = plant.rate(mirrored(x, plant.state), mirrored(w, plant.inputs))
+    torch.testing.assert_close(rate, mirrored(plant.rate(x, w), plant.state), rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", HULLS)
+def test_calm_water_held_forces_and_the_recorded_step_are_the_same_vessel(name: str) -> None:
+    """To rounding, and at another batch size than recorded."""
+    full, calm = load_vessel(name).build(), load_vessel(name).build().in_calm_water()
+    x, w = scene(full, 5)
+    torch.testing.assert_close(full.held_rate(x, full.prepare(x, w)), full.rate(x, w))
+    w[:, full.commands :] = 0.0
+    # a vessel with wind coefficients meets the air that it drives through
+    full.wind = None
+    assert calm.inputs == full.actuators.commands
+    after = PlantDynamics(full, 0.05, substeps=2).step(x, w, x[:, :0])[0]
+    command = w[:, : calm.commands]
+    for model in (PlantDynamics(calm, 0.05, 2), TracedPlantDynamics(calm, 0.05, 2)):
+        torch.testing.assert_close(
+            model.step(x, command, x[:, :0])[0], after, rtol=1e-9, atol=1e-11
+        )
+
+
+@pytest.mark.parametrize("name", HULLS)
+def test_a_current_carries_and_a_force_in_earth_axes_turns(name: str) -> None:
+    """Afloat with the water nothing acts on an upright hull; earth-fixed forces are those turned by
+    hand.
+    """
+    plant = load_vessel(name).build()
+    x, psi = (
+        torch.zeros(7, len(plant.state), dtype=torch.float64),
+        torch.linspace(-3, 3, 7).double(),
+    )
+    column, place = plant.state.index, plant.inputs.index
+    x[:, column("psi")] = psi
+    x[:, column("u")] = 0.4 * torch.cos(psi) - 0.25 * torch.sin(psi)
+    x[:, column("v")] = -0.4 * torch.sin(psi) - 0.25 * torch.cos(psi)
+    w = torch.zeros(7, len(plant.inputs), dtype=torch.float64)
+    w[:, place("current_north")], w[:, place("current_east")] = 0.4, -0.25
+    plant.wind = None
+    # what the series and some actuators do at rest in the water is there without a current too
+    still = plant.rate(x * 0.0, w * 0.0)
+    rate = plant.rate(x, w) - still
+    torch.testing.assert_close(rate[:, :2], torch.tensor([[0.4, -0.25]]).double().expand(7, 2))
+    assert float(rate[:, 2:].abs().max()) < 1e-12
+    turned = w.clone()
+    w[:, place("force_north")], w[:, place("force_east")] = 40.0, -15.0
+    turned[:, place("force_x")] = 40.0 * torch.cos(psi) - 15.0 * torch.sin(psi)
+    turned[:, place("force_y")] = -40.0 * torch.sin(psi) - 15.0 * torch.cos(psi)
+    torch.testing.assert_close(plant.rate(x, w), plant.rate(x, turned), rtol=1e-9, atol=1e-12)
+
+
+def test_a_manoeuvre_in_a_current_is_the_manoeuvre_and_the_drift() -> None:
+    """Galilei: also while the hull turns and its water velocities change with it."""
+    plant = load_vessel("wam_v_cal").build()
+    w = torch.zeros(2, 500, len(plant.inputs), dtype=torch.float64)
+    both = torch.tensor([0.6, 0.3], dtype=torch.float64)
+    w[:, :, :2] = plant.demand(both[0], both[1])
+    w[1, :, 5], w[1, :, 6] = 0.3, 0.2
+    x0 = plant.approach(2)
+    x0[1, 3], x0[1, 4] = 0.3, 0.2
+    with torch.no_grad():
+        states, _, _ = Rollout(PlantDynamics(plant, 0.04))(x0, w, x0[:, :0])
+    drift = states[1, -1, :3] - states[0, -1, :3]
+    wanted = torch.tensor([0.3 * 20, 0.2 * 20, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(drift, wanted, rtol=0, atol=1e-4)
+
+
+_SKEW = ("rigid_body.x_G.value=0.4", "added_mass.Y_rdot.value=-60", "added_mass.N_vdot.value=-60")
+_EVEN = ("added_mass.K_vdot.value=-296000", "added_mass.N_vdot.value=-1.4e6")
+LOSSLESS = {"wam_v_cal": ("damping={}", *_SKEW), "patrol_p06": ("forces={}", *_EVEN)}
+BRAKED = (
+    *_EVEN,
+    "forces={X: {u|u|: {value: -1960, unit: kg/m, source: made}},"
+    " Y: {v|v|: {value: -3700, unit: kg/m, source: made}},"
+    " K: {p: {value: -5e5, unit: kg m^2/s, source: made}},"
+    " N: {r|r|: {value: -2e8, unit: kg m^2, source: made}}}",
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [*LOSSLESS.items(), ("patrol_p06", BRAKED), ("wam_v_vrx", ()), ("milliampere", ())],
+)
+def test_energy_is_kept_without_damping_and_falls_with_it(
+    name: str, overrides: tuple[str, ...]
+) -> None:
+    """Kinetic energy and that of the restoring moment, as if the mass matrix were symmetric."""
+    plant = load_config(vessel_files()[name], list(overrides), VesselConfig).build().in_calm_water()
+    assert isinstance(plant, HullPlant)
+    n, random = plant.n, torch.Generator().manual_seed(3)
+    x0 = torch.zeros(16, len(plant.state), dtype=torch.float64)
+    spread = torch.tensor([1.5, 0.6, 0.4] if n == 3 else [6.0, 1.0, 0.2, 0.05], dtype=torch.float64)
+    x0[:, n : 2 * n] = torch.randn(16, n, generator=random, dtype=torch.float64) * spread
+    w = torch.zeros(16, 300, len(plant.inputs), dtype=torch.float64)
+    with torch.no_grad():
+        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.01))(x0, w, x0[:, :0])
+    nu, mass = states[..., n : 2 * n], 0.5 * (plant.hull.mass + plant.hull.mass.T)
+    energy = 0.5 * torch.einsum("bti,ij,btj->bt", nu, mass, nu)
+    if n == 4:
+        energy = energy + 0.5 * 1025 * 9.81 * 355.88 * states[..., 2] ** 2
+    if overrides == LOSSLESS.get(name):
+        assert float((energy / energy[:, :1] - 1).abs().max()) < 1e-7
+    else:
+        assert bool((energy.diff(dim=1) < 0).all())
