@@ -28,14 +28,9 @@ SCALES = (-1, 0, 1e-9, 1e-3, 0.1, 0.5, 2, 10, 1e3, 1e9, 1e200)
 
 def places(value: Any, at: Keys = ()) -> Iterator[Keys]:
     """Every place below the root."""
-    items = (
-        value.items()
-        if isinstance(value, Mapping)
-        else enumerate(value)
-        if isinstance(value, list)
-        else ()
-    )
-    for key, item in items:
+    named = isinstance(value, Mapping)
+    pairs = value.items() if named else enumerate(value if isinstance(value, list) else ())
+    for key, item in pairs:
         yield (*at, key)
         yield from places(item, (*at, key))
 
@@ -50,158 +45,78 @@ def put(root: Any, keys: Keys, value: Any) -> None:
     at(root, keys[:-1])[keys[-1]] = value
 
 
-def junk(root: Any, rng: random.Random) -> str:
-    keys, value = rng.choice(list(places(root))), rng.choice(JUNK)
-    put(root, keys, copy.deepcopy(value))
-    return f"{_dotted(keys)} = {str(value)[:30]!r}"
+def _scaled(value: Any, rng: random.Random) -> Any:
+    scaled = value * rng.choice(SCALES)
+    return int(scaled) if type(value) is int and abs(scaled) < 1e30 else scaled
 
 
-def scaled(root: Any, rng: random.Random) -> str:
-    numbers = [keys for keys in places(root) if type(at(root, keys)) in (int, float)]
-    if not numbers:
-        return junk(root, rng)
-    keys, factor = rng.choice(numbers), rng.choice(SCALES)
-    value = at(root, keys) * factor
-    if type(at(root, keys)) is int and abs(value) < 1e30:
-        value = int(value)
-    put(root, keys, value)
-    return f"{_dotted(keys)} = {value:g}"
-
-
-def removed(root: Any, rng: random.Random) -> str:
-    keys = rng.choice(list(places(root)))
-    del at(root, keys[:-1])[keys[-1]]
-    return f"without {_dotted(keys)}"
-
-
-def misspelt(root: Any, rng: random.Random) -> str:
-    named = [keys for keys in places(root) if isinstance(keys[-1], str) and keys[-1]]
-    keys = rng.choice(named)
-    parent, key = at(root, keys[:-1]), str(keys[-1])
-    letter = rng.randrange(len(key))
-    parent[rng.choice([key[:letter] + key[letter + 1 :], key + "s", key.upper(), ""])] = parent.pop(
-        key
-    )
-    return f"{_dotted(keys)} misspelt"
-
-
-def exchanged(root: Any, rng: random.Random) -> str:
-    leaves = [keys for keys in places(root) if not isinstance(at(root, keys), dict | list)]
-    one, other = rng.choice(leaves), rng.choice(leaves)
-    first, second = at(root, one), at(root, other)
-    put(root, one, second)
-    put(root, other, first)
-    return f"{_dotted(one)} and {_dotted(other)} exchanged"
-
-
-def transplanted(root: Any, rng: random.Random) -> str:
-    every = list(places(root))
-    one, other = rng.choice(every), rng.choice(every)
-    put(root, other, copy.deepcopy(at(root, one)))
-    return f"{_dotted(one)} copied to {_dotted(other)}"
-
-
-def relisted(root: Any, rng: random.Random) -> str:
-    lists = [keys for keys in places(root) if isinstance(at(root, keys), list) and at(root, keys)]
-    if not lists:
-        return junk(root, rng)
-    keys = rng.choice(lists)
-    items: list[Any] = at(root, keys)
-    put(root, keys, rng.choice([items[1:], items[::-1], items * 2, items * 50, [items]]))
-    return f"{_dotted(keys)} relisted"
-
-
-def renamed_word(root: Any, rng: random.Random) -> str:
-    words = [keys for keys in places(root) if isinstance(at(root, keys), str)]
-    if len(words) < 2:
-        return junk(root, rng)
-    keys = rng.choice(words)
-    value = at(root, rng.choice(words))
-    put(root, keys, value)
-    return f"{_dotted(keys)} = {value[:30]!r}"
-
-
-EDITS = (
-    *(junk, junk, junk, scaled, scaled, scaled, removed, removed, misspelt),
-    *(exchanged, transplanted, relisted, renamed_word),
-)
-
-
-def _dotted(keys: Keys) -> str:
-    return ".".join(str(key)[:40] for key in keys)
+# what a value must be -> what becomes of it, given another value of the kind
+CHANGES: list[tuple[type | tuple[type, ...], Callable[[Any, Any, random.Random], Any]]] = [
+    (object, lambda old, other, rng: rng.choice(JUNK)),
+    ((int, float), lambda old, other, rng: _scaled(old, rng)),
+    (object, lambda old, other, rng: other),
+    (str, lambda old, other, rng: other),
+    (list, lambda old, other, rng: rng.choice([old[1:], old[::-1], old * 2, old * 50, [old]])),
+]
 
 
 def edited(root: Any, rng: random.Random) -> str:
     """Change a tree of plain values in place; returns what was done."""
-    if not list(places(root)):
+    every = list(places(root))
+    if not every:
         return "nothing to edit"
     try:
-        return rng.choice(EDITS)(root, rng)
+        keys, how = rng.choice(every), rng.randrange(10)
+        parent, key = at(root, keys[:-1]), keys[-1]
+        if how < 2:
+            del parent[key]
+        elif how == 2 and isinstance(key, str) and key:
+            letter = rng.randrange(len(key))
+            wrong = [key[:letter] + key[letter + 1 :], key + "s", key.upper(), ""]
+            parent[rng.choice(wrong)] = parent.pop(key)
+        else:
+            kind, change = rng.choice(CHANGES)
+            fit = [k for k in every if isinstance(at(root, k), kind)] or every
+            keys, other = rng.choice(fit), rng.choice(fit)
+            put(root, keys, copy.deepcopy(change(at(root, keys), at(root, other), rng)))
     except (IndexError, KeyError, TypeError, OverflowError):
         # a value has gone into itself or is no number any more
-        return junk(root, rng)
+        put(root, rng.choice(list(places(root))), None)
+    return ".".join(str(key)[:40] for key in keys)
 
 
-def cut(data: bytes, rng: random.Random) -> bytes:
-    return data[: rng.randrange(len(data) + 1)]
-
-
-def peppered(data: bytes, rng: random.Random) -> bytes:
+def _peppered(data: bytes, rng: random.Random) -> bytes:
     for _ in range(rng.randint(1, 4)):
         place = rng.randrange(len(data) + 1)
         data = data[:place] + rng.choice(BYTES) * rng.choice([1, 1, 40]) + data[place:]
     return data
 
 
-def flipped(data: bytes, rng: random.Random) -> bytes:
+def _flipped(data: bytes, rng: random.Random) -> bytes:
     out = bytearray(data)
-    for _ in range(rng.randint(1, 5)):
-        if out:
-            out[rng.randrange(len(out))] ^= 1 << rng.randrange(8)
+    for _ in range(rng.randint(1, 5) if out else 0):
+        out[rng.randrange(len(out))] ^= 1 << rng.randrange(8)
     return bytes(out)
 
 
-def zeroed(data: bytes, rng: random.Random) -> bytes:
-    place = rng.randrange(len(data) + 1)
-    return data[:place] + bytes(rng.randint(1, 500)) + data[place + rng.randint(0, 500) :]
-
-
-def replaced(data: bytes, rng: random.Random) -> bytes:
-    return rng.choice([b"", b"\n", b"{}", b"[]", b"null", b"1", b'"x"', b"PK\x03\x04", bytes(64)])
-
-
+WHOLES = [b"", b"\n", b"{}", b"[]", b"null", b"1", b'"x"', b"PK\x03\x04", bytes(64)]
 BYTE_DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
-    *(cut, peppered, flipped, zeroed, replaced),
+    _peppered,
+    _flipped,
+    lambda data, rng: data[: rng.randrange(len(data) + 1)],
+    lambda data, rng: data[: rng.randrange(len(data) + 1)] + bytes(rng.randint(1, 500)),
+    lambda data, rng: rng.choice(WHOLES),
 )
-
-
-def alias_bomb(text: str, rng: random.Random) -> str:
-    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
-    return "\n".join([*lines, text])
-
-
-def nested(text: str, rng: random.Random) -> str:
-    sign = rng.choice(["[", "{a: ", "- "])
-    return f"{text}\nextra: {sign * rng.choice([500, 20_000])}"
-
-
-def repeated_key(text: str, rng: random.Random) -> str:
-    lines = text.splitlines()
-    line = rng.choice(lines)
-    return "\n".join([*lines, line])
-
-
-def shifted(text: str, rng: random.Random) -> str:
-    lines = text.splitlines()
-    place = rng.randrange(len(lines))
-    lines[place] = rng.choice(["  ", "\t", " "]) + lines[place]
-    return "\n".join(lines)
-
-
+BOMB = "\n".join(
+    ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
+)
 TEXT_DAMAGES: tuple[Callable[[str, random.Random], str], ...] = (
-    *(alias_bomb, nested, repeated_key, shifted, shifted),
-)
+    lambda text, rng: f"{BOMB}\n{text}",
+    lambda text, rng: f"{text}\nextra: {rng.choice(['[', '{a: ']) * rng.choice([500, 20000])}",
+    lambda text, rng: f"{text}\n{rng.choice(text.splitlines())}",
+    lambda text, rng: text.replace("\n", "\n" + rng.choice(["  ", "\t", " "]), rng.randint(1, 3)),
+)  # fmt: skip
 
 
 def mutated_config(config: Mapping[str, Any], rng: random.Random) -> tuple[bytes, str]:
@@ -213,10 +128,8 @@ def mutated_config(config: Mapping[str, Any], rng: random.Random) -> tuple[bytes
         return text.encode("utf-8", "surrogatepass"), ", ".join(told)
     text = yaml.safe_dump(root, sort_keys=False)
     if rng.random() < 0.4:
-        damage = rng.choice(TEXT_DAMAGES)
-        return damage(text, rng).encode(), damage.__name__
-    spoil = rng.choice(BYTE_DAMAGES)
-    return spoil(text.encode(), rng), spoil.__name__
+        return rng.choice(TEXT_DAMAGES)(text, rng).encode(), "text"
+    return rng.choice(BYTE_DAMAGES)(text.encode(), rng), "bytes"
 
 
 def mutated_folder(run: Path, foreign: Sequence[Path], rng: random.Random) -> str:
@@ -227,21 +140,20 @@ def mutated_folder(run: Path, foreign: Sequence[Path], rng: random.Random) -> st
         foreign: other run folders, whose files may take the place of its own.
         rng: draws.
     """
-    files = sorted(path for path in run.rglob("*") if path.is_file())
-    # few large families of files must not hide the rest
-    families = sorted({_family(path, run) for path in files})
-    family = rng.choice(families)
-    path = rng.choice([path for path in files if _family(path, run) == family])
+    families: dict[str, list[Path]] = {}
+    for file in sorted(path for path in run.rglob("*") if path.is_file()):
+        # few large families of files must not hide the rest
+        plain = file.suffix in (".json", ".yaml")
+        families.setdefault(file.name if plain else file.parent.name + file.suffix, []).append(file)
+    path = rng.choice(families[rng.choice(sorted(families))])
     name = path.relative_to(run)
     how = rng.choice(["bytes", "bytes", "edit", "edit", "edit", "gone", "swap", "other"])
     if how == "edit" and path.suffix in (".json", ".yaml"):
-        text = path.read_text()
-        content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
-        told = edited(content, rng)
-        if path.suffix == ".json":
-            path.write_text(json.dumps(content))
-        else:
-            path.write_text(yaml.safe_dump(content, sort_keys=False), errors="surrogatepass")
+        # any JSON is YAML
+        content = yaml.safe_load(path.read_text())
+        told, as_json = edited(content, rng), path.suffix == ".json"
+        text = json.dumps(content) if as_json else yaml.safe_dump(content, sort_keys=False)
+        path.write_text(text, errors="surrogatepass")
         return f"{name}: {told}"
     if how == "edit" and path.suffix == ".parquet":
         return f"{name}: {_edited_table(path, rng)}"
@@ -250,47 +162,29 @@ def mutated_folder(run: Path, foreign: Sequence[Path], rng: random.Random) -> st
         if rng.random() < 0.3:
             path.mkdir()
         return f"{name} is gone"
-    if how == "swap":
-        other = rng.choice([p for p in files if p.suffix == path.suffix])
+    others = {
+        "swap": [p for part in families.values() for p in part if p.suffix == path.suffix],
+        "other": [folder / name for folder in foreign if (folder / name).is_file()],
+    }.get(how)
+    if others:
+        other = rng.choice(others)
         shutil.copy(other, path) if other != path else path.write_bytes(b"")
-        return f"{name} is {other.relative_to(run)}"
-    if how == "other" and foreign:
-        other = rng.choice(foreign) / name
-        if other.is_file():
-            shutil.copy(other, path)
-            return f"{name} is that of {other.parent}"
-    spoil = rng.choice(BYTE_DAMAGES)
-    path.write_bytes(spoil(path.read_bytes(), rng))
-    return f"{name}: {spoil.__name__}"
-
-
-def _family(path: Path, run: Path) -> str:
-    return (
-        path.name
-        if path.suffix in (".json", ".yaml")
-        else "/".join(path.parts[-2:-1]) + (path.suffix)
-    )
+        return f"{name} is {other}"
+    path.write_bytes(rng.choice(BYTE_DAMAGES)(path.read_bytes(), rng))
+    return f"{name}: bytes"
 
 
 def _edited_table(path: Path, rng: random.Random) -> str:
     import pandas as pd
 
     table = pd.read_parquet(path)
-    column = rng.choice(list(table))
-    how = rng.choice(["dropped", "empty", "text", "null", "huge", "rows", "none"])
-    if how == "dropped":
-        table = table.drop(columns=[column])
-    elif how == "empty":
-        table = table.iloc[:0]
-    elif how == "text":
-        table[column] = table[column].astype(str) + "x"
-    elif how == "null":
-        table[column] = None
-    elif how == "huge" and pd.api.types.is_float_dtype(table[column]):
-        table.loc[table.index[0], column] = 1e300
-    elif how == "rows":
-        table = table.sample(frac=0.7, random_state=rng.randrange(1000))
-    else:
-        table = pd.DataFrame({"a": [1]})
-    table.to_parquet(path)
-    return f"{column} {how}"
+    column, how = rng.choice(list(table)), rng.randrange(5)
+    changes: list[Callable[[], pd.DataFrame]] = [
+        lambda: table.drop(columns=[column]),
+        lambda: table.iloc[:0],
+        lambda: table.assign(**{column: table[column].astype(str) + "x"}),
+        lambda: table.assign(**{column: None}),
+        lambda: table.sample(frac=0.7, random_state=rng.randrange(1000)),
+    ]
+    changes[how]().to_parquet(path)
+    return f"{column}, change {how}"
