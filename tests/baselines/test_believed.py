@@ -4,7 +4,6 @@ exported.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -14,8 +13,6 @@ from residnet.baselines.given import BelievedConfig
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.export import exporter
-from residnet.export.vessel import ExportedVessel
 from residnet.physics.plant import HullPlant
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel, vessel_files
@@ -81,23 +78,6 @@ def test_a_stored_model_needs_no_vessel_file(
     assert loaded == spec
     x, w = torch.randn(4, 6, dtype=torch.float64), torch.randn(4, 3, dtype=torch.float64) * 100
     assert torch.equal(after.step(x, w, x[:, :0])[0], before.step(x, w, x[:, :0])[0])
-
-
-def test_export(tmp_path: Path) -> None:
-    spec = believed()
-    file = tmp_path / "m.pt"
-    exporter("torchscript").export(ExportedVessel(spec, spec.build()), file)
-    extra = {"card.json": ""}
-    module = torch.jit.load(str(file), _extra_files=extra)
-    assert json.loads(extra["card.json"])["baseline"]["kind"] == "believed"
-    x, w = torch.tensor([[0.0, 0, 0.3, 1.0, 0.1, 0.05]]), torch.tensor([[200.0, 10, -30]])
-    after = module.step(x, w, module.initial_state(1))[0]
-    torch.testing.assert_close(
-        after.double(),
-        spec.build().step(x.double(), w.double(), x[:, :0].double())[0],
-        rtol=1e-5,
-        atol=1e-6,
-    )
 
 
 def test_forces_made_by_thrusters() -> None:

@@ -11,8 +11,7 @@ import pytest
 import torch
 from kinds import of_kind
 
-from residnet.core.config import load_config, validate
-from residnet.core.errors import ConfigError
+from residnet.core.config import validate
 from residnet.physics.actuators import RudderPropellerConfig, Thrusters, ThrustersConfig
 from residnet.physics.actuators.rudders import RudderPropeller
 from residnet.physics.hull import FossenConfig
@@ -165,14 +164,3 @@ def test_two_of_them_are_the_differential_thrusters() -> None:
     torch.testing.assert_close(
         unit.demand(drive, steer), twin.demand(drive, steer), rtol=1e-12, atol=1e-12
     )
-
-
-def test_wrong_curve_range_of_two_thrusters() -> None:
-    with pytest.raises(ConfigError, match="does not reach n_max"):
-        load_config(
-            vessel_files()["wam_v_cal"],
-            ["actuators.curve_range=[-1500 rpm, 2400 rpm]"],
-            FossenConfig,
-        )
-    with pytest.raises(ConfigError, match="two thrusters are named 'port'"):
-        thrusters(TWIN[0], TWIN[0])

@@ -9,14 +9,11 @@ from itertools import combinations_with_replacement
 import numpy as np
 import pytest
 import torch
-from kinds import of_kind
 from torch import Tensor
 
-from residnet.physics.hull import FossenConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import channel_parity, mirrored_channels, term_parity, wrong_parity
 from residnet.physics.terms import TermLibrary
-from residnet.physics.vessel import load_vessel
 
 NAMES = ("u", "v", "r", "delta", "n", "tau_x", "tau_y", "tau_n", "wind_u", "wind_v", "wind_mag")
 # what a mirror at the vessel's centre plane does to each, from the definition of the channels
@@ -85,16 +82,6 @@ def test_a_term_is_wrong_where_it_breaks_the_symmetry_of_its_axis(axis: int) -> 
         library(z * torch.tensor(SIGNS, dtype=z.dtype)) - TURNED[axis] * library(z)
     ).abs().amax(0) > 1e-9
     assert [wrong_parity(term, axis, NAMES) for term in terms] == broken.tolist()
-
-
-def test_a_symmetric_hull_has_no_wrong_term() -> None:
-    vessel = of_kind(load_vessel("wam_v_cal"), FossenConfig)
-    for axis, row in enumerate((vessel.damping.X, vessel.damping.Y, vessel.damping.N)):
-        assert row
-        assert not any(wrong_parity(term, axis, ("u", "v", "r")) for term in row)
-    hull, nu = vessel.hull(), random_channels(20, 3)
-    tau = random_channels(20, 3) * torch.tensor([100.0, 50.0, 50.0], dtype=torch.float64)
-    torch.testing.assert_close(hull(nu * TURNED, tau * TURNED), hull(nu, tau) * TURNED)
 
 
 def test_what_nobody_said_is_not_called_wrong() -> None:

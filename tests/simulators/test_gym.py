@@ -10,8 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from residnet.core.errors import UsageError
-from residnet.simulators.gym import Task, VesselEnv, VesselVectorEnv
-from residnet.simulators.tasks import TASKS
+from residnet.simulators.gym import TASKS, Task, VesselEnv, VesselVectorEnv
 from residnet.simulators.vehicle import Vehicle, vehicle
 
 

@@ -96,19 +96,6 @@ class Correction(nn.Module):
 
 
 @final
-class HullForce(nn.Module):
-    """The force [..., 3] that a believed hull says a motion needs."""
-
-    def __init__(self, hull: Hull) -> None:
-        super().__init__()
-        self.hull = hull
-
-    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Return the force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
-        return self.hull.required(nu_dot, nu)
-
-
-@final
 class Corrections(nn.Module):
     """The sum of corrections [..., 3] to a believed force."""
 
@@ -156,9 +143,9 @@ class ForceModel(nn.Module):
             tau = tau + correction(nu_dot, nu)
         return tau
 
-    def parts(self) -> tuple[HullForce, Corrections]:
+    def parts(self) -> tuple[ForceModel, Corrections]:
         """Return the believed hull and the sum of its corrections, as modules of their own."""
-        return HullForce(self.hull), Corrections(self.corrections)
+        return ForceModel(self.hull), Corrections(self.corrections)
 
     def at_heading(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
         """Return tau [..., 3] that the thrusters have to give at heading psi [...] rad.
