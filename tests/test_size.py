@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (794, 117),
     "control": (3232, 352),
     "core": (1268, 183),
-    "data": (7915, 716),
+    "data": (7909, 715),
     "documents": (2544, 272),
     "dynamics": (835, 124),
     "export": (2191, 262),

@@ -320,14 +320,12 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = _COPIED) -> None:
 
     flat = [(split, log) for split, members in logs.items() for log in members]
     common = sorted(set.intersection(*(set(log.channels) for _, log in flat))) if flat else []
-    if len({split for split, _ in flat}) < 2 or not common:
-        return
     one_of = sampling([log for _, log in flat])
-    hashes = [np.unique(sampled_hashes(log, common, one_of)) for _, log in flat]
+    hashes = [np.unique(sampled_hashes(log, common, one_of)) for _, log in flat if common]
+    if len({split for split, _ in flat}) < 2 or not any(h.size for h in hashes):
+        return
     owner = np.repeat(np.arange(len(flat)), [h.size for h in hashes])
     _, row = np.unique(np.concatenate(hashes), return_inverse=True)
-    if not row.size:
-        return
     holds = coo_array((np.ones(row.size), (row, owner))).tocsr()
     split_of = np.unique([split for split, _ in flat], return_inverse=True)[1]
     shared = np.where(split_of[:, None] != split_of[None, :], (holds.T @ holds).toarray(), 0.0)

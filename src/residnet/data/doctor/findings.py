@@ -270,13 +270,13 @@ def summary(inspection: Mapping[str, Any]) -> Summary:
     shown = [f"{code.replace('_', ' ')} ({len(where[code])})" for code in order[:_MOST_KINDS]]
     rest = len(order) - len(shown)
     more = f" and {rest} other kinds" if rest > 1 else " and one other kind" if rest else ""
-    of = f"{misled} of {count} logs hold" if misled else "the logs together hold"
-    of = "the log holds" if count == 1 and misled else of
+    some = "the log holds" if count == 1 else f"{misled} of {count} logs hold"
+    of = some if misled else "the logs together hold"
     tally = f"Data doctor: {of} something that would mislead a fit: {', '.join(shown)}{more}."
     name, first = max(members[order[0]], key=lambda pair: _weight(pair[1]))
     place = "" if name == "together" else f"{name}: "
     action = f"; {first['action']}" if first["action"] else ""
-    effect = first.get("effect")
+    effect = _weight(first)[1]
     size = f" It changes a fit by {100.0 * effect:.0f} %." if effect else ""
     text = f"First fix this: {place}{first['text']}{action}.{size}"
     return Summary(count, misled, {code: len(where[code]) for code in order}, tally, text)

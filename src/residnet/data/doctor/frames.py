@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.log import Log
 from residnet.core.names import POSE, VELOCITY
 from residnet.data.channels import SIGMA_OF_MAD
 from residnet.data.doctor.findings import (
@@ -280,12 +279,11 @@ def course_as_heading(log: Record, found: Check) -> Iterator[Finding]:
             f" {math.degrees(as_course):.1f} deg without the drift of v over u, and to"
             f" {math.degrees(as_heading):.1f} deg with it"
         )
-        yield found(text, {"as_course": as_course, "as_heading": as_heading}, repair=_without_drift)
-
-
-def _without_drift(log: Log) -> Log:
-    drift = np.where(np.abs(log["u"]) > 0.0, np.arctan2(log["v"], log["u"]), 0.0)
-    return with_channels(log, psi=log["psi"] - drift)
+        yield found(
+            text,
+            {"as_course": as_course, "as_heading": as_heading},
+            repair=lambda log: with_channels(log, psi=log["psi"] - np.arctan2(log["v"], log["u"])),
+        )
 
 
 @check("grid", "follows", needs=_ALL)

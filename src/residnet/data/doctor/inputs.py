@@ -57,8 +57,8 @@ def positions_scaled(log: Record, found: Check) -> Iterator[Finding]:
     if float(np.abs(fixes).max()) < 1.0:
         return
     overlap = complex(np.vdot(fixes, place)) / float(np.vdot(fixes, fixes).real)
-    rest = float(np.linalg.norm(place - overlap * fixes))
-    rest /= max(float(np.linalg.norm(place)), 1e-12)
+    size, left = float(np.linalg.norm(place)), float(np.linalg.norm(place - overlap * fixes))
+    rest = left / max(size, 1e-12)
     scale, turn = abs(overlap), float(np.angle(overlap))
     if rest >= 0.2:
         text = f"x, y do not follow {latitude}, {longitude}: {100.0 * rest:.0f} % is left"
