@@ -236,7 +236,8 @@ class Excitation(Scheduled, ABC):
         sway = torch.stack([m.sway_amplitude * m._after_start(t, _SWAY) for m in own])
         if not bool(sway.any()):
             return super().source(manoeuvres, helm, t)
-        if helm.side_force is None or "tau_y" not in helm.inputs:
+        limit = helm.side_force
+        if limit is None or "tau_y" not in helm.inputs:
             raise UsageError(
                 "sway_amplitude: a manoeuvre asks for a sway force, but the vessel's commands are"
                 f" {', '.join(helm.inputs[:2])} and no forces; leave it out"
@@ -245,7 +246,7 @@ class Excitation(Scheduled, ABC):
 
         def demand(drive: Tensor, steer: Tensor) -> Tensor:
             forces = helm.demand(drive, steer)
-            forces[..., helm.inputs.index("tau_y")] += helm.side_force * sway
+            forces[..., helm.inputs.index("tau_y")] += limit * sway
             return forces
 
         return ScheduleSource(drive, steer, demand)
