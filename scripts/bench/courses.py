@@ -19,15 +19,15 @@ import numpy as np
 import torch
 from course_checks import Drawn, draw, faults, sampled
 
-from residnet.control.courses.buoys import BuoyConfig
 from residnet.control.courses.config import (
+    BuoyConfig,
     BuoyCourseConfig,
     PlannedCourse,
     plan_course,
     smallest_turn,
 )
 from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
-from residnet.control.guidance.drift import DriftEstimate
+from residnet.control.guidance.line_of_sight import DriftEstimate
 from residnet.control.heading.classical import HeadingPID
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.vessels import SteeredPlant

@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.core.arrays.heap import keep_freed_memory
+from residnet.core.processes import keep_freed_memory
 from residnet.data.windows import WindowBatches
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from residnet.baselines.steering import LinearSteadyConfig
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
-from residnet.regression.solutions import Coefficient
+from residnet.regression.estimator import Coefficient
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
 # (33), (34) in SI (correction W11), the steering row with B = -A Phi

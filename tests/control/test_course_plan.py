@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from residnet.control.base import ClosedLoop
-from residnet.control.courses.buoys import BuoyConfig
 from residnet.control.courses.config import (
+    BuoyConfig,
     BuoyCourseConfig,
     plan_course,
     report_feasibility,

@@ -8,14 +8,14 @@ import math
 import numpy as np
 import pytest
 
-from residnet.control.courses.buoys import (
+from residnet.control.courses.config import (
     BuoyConfig,
+    dubins_length,
     feasibility,
     overlapping,
     taut_course,
     widened,
 )
-from residnet.control.courses.dubins import dubins_length
 from residnet.core.errors import ConfigError
 
 TABLE_6_3 = [

@@ -14,8 +14,12 @@ from scipy.optimize import brentq
 from residnet.control.base import ClosedLoop, Policy, Reference
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
-from residnet.control.guidance.drift import DriftEstimate
-from residnet.control.guidance.line_of_sight import IntegralLookAhead, LineOfSight, LookAhead
+from residnet.control.guidance.line_of_sight import (
+    DriftEstimate,
+    IntegralLookAhead,
+    LineOfSight,
+    LookAhead,
+)
 from residnet.control.guidance.waypoints import WaypointGuidance
 from residnet.control.heading.classical import HeadingPID
 from residnet.control.heading.vessels import SteeredPlant

@@ -11,8 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from residnet.control.guidance.line_of_sight import LookAhead
-from residnet.control.guidance.waypoints import WaypointGuidance
-from residnet.control.guidance.wheel_over import WheelOver
+from residnet.control.guidance.waypoints import WaypointGuidance, WheelOver
 from residnet.control.heading.turning import Turning
 
 TURNING = Turning(3.47, 3.94, 3.2)

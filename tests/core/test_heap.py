@@ -10,7 +10,7 @@ import pytest
 
 _FAULTS = """
 import resource, sys
-from residnet.core.arrays.heap import keep_freed_memory
+from residnet.core.processes import keep_freed_memory
 if sys.argv[1] == "keep":
     keep_freed_memory()
 def fill():

@@ -15,7 +15,7 @@ from residnet.core.errors import ConfigError
 from residnet.data.readers import ReaderConfig
 from residnet.export import FORMATS, exporter
 from residnet.heads import HeadConfig
-from residnet.heads.plsr import PlsrConfig
+from residnet.heads.linear import PlsrConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.vessel import load_vessel
 from residnet.tasks.registry import catalogue
@@ -75,7 +75,7 @@ def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> N
 @pytest.mark.parametrize(
     ("target", "fault"),
     [
-        ("residnet.heads.plsr:PlsrConfig", "no subclass of residnet.heads.base.HeadKind"),
+        ("residnet.heads.linear:PlsrConfig", "no subclass of residnet.heads.base.HeadKind"),
         ("residnet.heads.base:HeadKind", "HeadKind lacks build"),
         ("residnet_sample.slow_water:SlowWaterConfig", "has no field `kind: Literal['odd']`"),
         ("residnet_sample.slow_water:Nothing", "AttributeError"),

@@ -24,7 +24,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.heads.base import ResidualHead
-from residnet.heads.ridge import RidgeConfig
+from residnet.heads.linear import RidgeConfig
 from residnet.heads.zero import ZeroHead
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import Zigzag

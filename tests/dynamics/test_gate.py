@@ -9,8 +9,8 @@ from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import MeanHead
 from residnet.dynamics.gate import GatedHead
 from residnet.heads.base import ClosedFormHead
+from residnet.heads.linear import RidgeConfig
 from residnet.heads.mlp import MlpConfig
-from residnet.heads.ridge import RidgeConfig
 
 NAMES = ("u", "v", "r", "n")
 

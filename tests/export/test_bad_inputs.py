@@ -13,8 +13,7 @@ from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.vessel import ExportedModel
-from residnet.heads.delay_line import DelayConfig
-from residnet.heads.symbolic import SymbolicConfig, SymbolicHead
+from residnet.heads.symbolic import DelayConfig, SymbolicConfig, SymbolicHead
 from residnet.testing import check_bad_inputs
 from residnet.testing.examples import example_models, example_samples, example_spec
 

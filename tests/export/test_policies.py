@@ -15,7 +15,7 @@ from torch import Tensor
 
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance.course_guidance import CourseGuidance
-from residnet.control.guidance.drift import DriftEstimate
+from residnet.control.guidance.line_of_sight import DriftEstimate
 from residnet.control.heading.controllers import NetworkPolicySpec, ObservedPolicySpec, PtosConfig
 from residnet.control.heading.policies import FIXED, ObservedPolicy
 from residnet.core.errors import ExportError, UsageError

@@ -20,9 +20,8 @@ from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.export.feed_forward import BelievedForce, RequiredForce, ResidualForce
 from residnet.heads.force import ForceHead
+from residnet.heads.linear import PlsrConfig, RidgeConfig
 from residnet.heads.mlp import MlpConfig
-from residnet.heads.plsr import PlsrConfig
-from residnet.heads.ridge import RidgeConfig
 from residnet.heads.symbolic import SymbolicConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.signals import SignalsConfig

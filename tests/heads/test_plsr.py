@@ -14,8 +14,7 @@ from residnet.core.errors import FitError
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisHead
 from residnet.heads.kernel import KernelConfig
-from residnet.heads.plsr import PlsrConfig, PlsrHead
-from residnet.heads.ridge import RidgeConfig
+from residnet.heads.linear import PlsrConfig, PlsrHead, RidgeConfig
 from residnet.regression.shrinkage import pls_path
 
 

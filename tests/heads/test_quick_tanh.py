@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from residnet.heads.quick_tanh import Tanh, quick_tanh
+from residnet.heads.mirror import Tanh, quick_tanh
 
 
 @pytest.mark.parametrize(("dtype", "within"), [(torch.float32, 3e-7), (torch.float64, 1e-15)])

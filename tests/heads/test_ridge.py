@@ -10,7 +10,7 @@ import torch
 from made_samples import NAMES, made
 from sklearn.linear_model import Ridge
 
-from residnet.heads.ridge import RidgeConfig, RidgeHead
+from residnet.heads.linear import RidgeConfig, RidgeHead
 
 
 def fitted(penalties: tuple[float, ...], folds: int = 5) -> tuple[RidgeHead, dict[str, Any]]:

@@ -15,7 +15,7 @@ from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads.ridge import RidgeConfig
+from residnet.heads.linear import RidgeConfig
 from residnet.identification.fit import fit
 from residnet.identification.fitter import reach_in_free_runs
 from residnet.identification.prepared import prepare_logs

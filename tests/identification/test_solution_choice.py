@@ -10,7 +10,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.zero import ZeroHead
 from residnet.identification.fitter import choose_solution
 from residnet.physics.signals import SignalsConfig
-from residnet.regression.solutions import Solution
+from residnet.regression.estimator import Solution
 from residnet.training.heads import Score
 
 

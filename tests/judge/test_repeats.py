@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from made_logs import made
 
+from residnet.judge.goodness import find_pairs, mismatch, repeatability
 from residnet.judge.protocol import Windows
-from residnet.judge.repeats import find_pairs, mismatch, repeatability
 
 STEP = 0.1
 PROTOCOL = Windows(length=10.0, first=5.0)

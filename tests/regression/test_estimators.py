@@ -17,12 +17,11 @@ from sklearn.linear_model import LinearRegression
 from sklearn.linear_model import Ridge as ReferenceRidge
 
 from residnet.core.errors import FitError
-from residnet.regression.estimator import Estimator
+from residnet.regression.estimator import Estimator, Solution
 from residnet.regression.genetic import EquationSearchConfig, EvolutionConfig, GeneticEquations
 from residnet.regression.kernel import KernelRidge, Polynomial, Rbf
 from residnet.regression.least_squares import CentredLeastSquares, ElasticNet, LeastSquares
 from residnet.regression.shrinkage import PLSR, Ridge
-from residnet.regression.solutions import Solution
 from residnet.regression.sparse import SparseRegression
 from residnet.regression.surface import SurfacePLSR
 

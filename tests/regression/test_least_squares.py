@@ -10,8 +10,8 @@ import torch
 from sklearn.linear_model import Ridge
 
 from residnet.core.errors import FitError
+from residnet.regression.estimator import Solution
 from residnet.regression.least_squares import LeastSquares
-from residnet.regression.solutions import Solution
 
 NAMES = ("a", "b", "c")
 

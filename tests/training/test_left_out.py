@@ -14,8 +14,7 @@ from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
 from residnet.training.free_runs.left_out import without_logs
 from residnet.training.offsets import OffsetsConfig
-from residnet.training.refit import refit
-from residnet.training.refit_config import RefitConfig
+from residnet.training.refit import RefitConfig, refit
 
 
 @pytest.mark.long

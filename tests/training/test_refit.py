@@ -38,10 +38,7 @@ from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training import refit as module
 from residnet.training.offsets import Offsets, OffsetsConfig
-from residnet.training.refit import refit
-from residnet.training.refit_config import RefitConfig
-from residnet.training.refit_problem import Problem
-from residnet.training.sensitivities import step_sensitivities
+from residnet.training.refit import Problem, RefitConfig, refit, step_sensitivities
 
 
 def fitted(

@@ -17,8 +17,7 @@ from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.zero import ZeroHead
-from residnet.training.refit import Refitted, refit
-from residnet.training.refit_config import RefitConfig
+from residnet.training.refit import RefitConfig, Refitted, refit
 
 ROWS: dict[Literal["u", "v", "r"], tuple[str, ...]] = {
     "u": ("u", "u|u|", "tau_x"),

@@ -12,7 +12,7 @@ from residnet.core.config import Config
 from residnet.core.derivatives import derivatives_along
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
-from residnet.regression.solutions import Coefficient, Solution
+from residnet.regression.estimator import Coefficient, Solution
 
 
 class Baseline(nn.Module, ABC):

@@ -20,7 +20,7 @@ from residnet.physics.hull import HullConfig, OdinConfig
 from residnet.physics.signals import FORCE_CHANNELS
 from residnet.physics.terms import TermLibrary, parse_term, read_rows
 from residnet.physics.vessel import load_vessel
-from residnet.regression.solutions import Solution
+from residnet.regression.estimator import Solution
 
 Row = dict[str, float]
 

@@ -30,8 +30,8 @@ from residnet.core.errors import FitError
 from residnet.core.names import VELOCITY, nearest
 from residnet.core.samples import Samples
 from residnet.physics.parameters import Density, SquareMetres
+from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.least_squares import descend
-from residnet.regression.solutions import Coefficient, Solution
 
 _WAKE_SLOPE = 2.0
 # keeps the drift angle defined for a ship at rest; (m/s)^2

@@ -22,9 +22,8 @@ from residnet.core.samples import Samples
 from residnet.physics.signals import VelocityBound
 from residnet.physics.symmetry import dissipates, mirrored_terms, wrong_parity
 from residnet.physics.terms import TermLibrary
-from residnet.regression.estimator import chosen, regressors
+from residnet.regression.estimator import Coefficient, Solution, chosen, regressors
 from residnet.regression.least_squares import LeastSquares
-from residnet.regression.solutions import Coefficient, Solution
 
 _BEYOND = 0.5
 """Share of a channel's training range, on either side, in which a bounded model is as fitted."""

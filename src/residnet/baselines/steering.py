@@ -20,8 +20,8 @@ from residnet.core.config import Seconds
 from residnet.core.errors import FitError
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
+from residnet.regression.estimator import Coefficient, Ratio, Solution
 from residnet.regression.least_squares import LeastSquares
-from residnet.regression.solutions import Coefficient, Ratio, Solution
 
 
 class SteeredConfig(IdentifiedConfig, ABC):

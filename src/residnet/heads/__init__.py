@@ -17,8 +17,8 @@ else:
             "residnet.heads",
             "residnet.heads.base:HeadKind",
             {
-                "plsr": "residnet.heads.plsr:PlsrConfig",
-                "ridge": "residnet.heads.ridge:RidgeConfig",
+                "plsr": "residnet.heads.linear:PlsrConfig",
+                "ridge": "residnet.heads.linear:RidgeConfig",
                 "kernel": "residnet.heads.kernel:KernelConfig",
                 "symbolic": "residnet.heads.symbolic:SymbolicConfig",
                 "genetic": "residnet.heads.genetic:GeneticConfig",

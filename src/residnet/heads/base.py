@@ -16,8 +16,8 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import ACCELERATION, nearest
 from residnet.core.samples import Samples
+from residnet.regression.estimator import Solution
 from residnet.regression.shrinkage import CONSTANT
-from residnet.regression.solutions import Solution
 
 _LEAST_STD = 1e-9
 """Least standard deviation of a residual that a network's output is scaled by, SI."""

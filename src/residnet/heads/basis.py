@@ -20,12 +20,12 @@ from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary, polynomial_terms
 from residnet.regression.estimator import (
     Estimator,
+    Solution,
     fold_numbers,
     regressors,
     require_finite,
     usual_folds,
 )
-from residnet.regression.solutions import Solution
 
 
 class BasisConfig(FeatureConfig):

@@ -19,7 +19,7 @@ from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
 from residnet.physics.force_model import FERRY_TERMS, MOTION, accelerating, augmented
 from residnet.physics.signals import FORCE_CHANNELS
-from residnet.regression.solutions import Solution
+from residnet.regression.estimator import Solution
 
 _STEADY = 1e-9
 """Standard deviation of a force in N or N m up to which it never varies."""

@@ -12,9 +12,9 @@ from torch import Tensor
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
+from residnet.regression.estimator import Solution
 from residnet.regression.expressions import ExpressionLibrary, Weights
 from residnet.regression.genetic import EquationSearchConfig, GeneticEquations
-from residnet.regression.solutions import Solution
 from residnet.regression.writing import term
 
 

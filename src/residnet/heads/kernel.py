@@ -17,10 +17,9 @@ from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary
 from residnet.regression.equation_rows import step_of, unbroken_stretches
-from residnet.regression.estimator import fold_numbers, usual_folds
+from residnet.regression.estimator import Solution, fold_numbers, usual_folds
 from residnet.regression.kernel import KernelRidge, Path, Polynomial, Rbf, Recursion
 from residnet.regression.shrinkage import CONSTANT
-from residnet.regression.solutions import Solution
 
 
 class KernelConfig(FeatureConfig):

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
-from residnet.heads.mirror import MirroredHead
-from residnet.heads.quick_tanh import Tanh, quick_tanh
+from residnet.heads.mirror import MirroredHead, Tanh, quick_tanh
 from residnet.physics.signals import VelocityBound
 
 _FARTHEST = 1e3

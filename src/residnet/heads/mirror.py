@@ -1,4 +1,4 @@
-"""Heads that are mirror-symmetric by construction.
+"""Heads that are mirror-symmetric by construction, and the quick tanh that networks share.
 
 What happens to starboard happens, mirrored, to port.
 
@@ -12,12 +12,36 @@ from collections.abc import Sequence
 from typing import final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
 from residnet.heads.base import ResidualHead
 from residnet.physics.symmetry import mirrored_channels
+
+
+def quick_tanh(x: Tensor, many: int = 8_192) -> Tensor:
+    """Return the hyperbolic tangent of x [...], by way of the logistic function where x is large.
+
+    On processors torch computes its sigmoid several times as fast as its tanh. Both ways agree to
+    the rounding of numbers near one. Gradients and traced graphs keep to torch's own, and so do
+    fewer than `many` numbers, for which three operations take longer than one.
+    """
+    traced = False
+    if not torch.jit.is_scripting():  # type: ignore[attr-defined]
+        traced = torch.compiler.is_compiling()
+    if traced or torch.is_grad_enabled() or x.device.type != "cpu" or x.numel() < many:
+        return torch.tanh(x)
+    return (2.0 * x).sigmoid_().mul_(2.0).sub_(1.0)
+
+
+@final
+class Tanh(nn.Module):
+    """The hyperbolic tangent as a layer, without parameters."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the hyperbolic tangent of x [...]."""
+        return quick_tanh(x)
 
 
 @final

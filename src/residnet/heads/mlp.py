@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
-from residnet.heads.mirror import MirroredHead
-from residnet.heads.quick_tanh import Tanh
+from residnet.heads.mirror import MirroredHead, Tanh
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": Tanh,

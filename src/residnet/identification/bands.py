@@ -36,7 +36,7 @@ from residnet.judge.band import (
 from residnet.judge.bands import RunErrors, calibrate, few, run_errors
 from residnet.judge.freerun import Candidate, free_run
 from residnet.judge.protocol import Window
-from residnet.regression.solutions import Solution
+from residnet.regression.estimator import Solution
 from residnet.training.free_runs.left_out import without_logs
 
 

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from residnet.core.arrays import paged
-from residnet.core.arrays.heap import keep_freed_memory
 from residnet.core.errors import DataError, FitError, MissingPackageError
-from residnet.core.processes import free_cores, processes
+from residnet.core.processes import free_cores, keep_freed_memory, processes
 from residnet.core.progress import Progress, listen, listener, report, say
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics

@@ -36,7 +36,7 @@ from residnet.identification.settings import FitSettings, ForceConfig, GateConfi
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.metrics import window_errors
 from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
-from residnet.regression.solutions import Coefficient, Solution
+from residnet.regression.estimator import Coefficient, Solution
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import free_run_starts, refit
 

@@ -30,7 +30,7 @@ from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.training.config import TrainingConfig
 from residnet.training.current import CurrentConfig
-from residnet.training.refit_config import RefitConfig
+from residnet.training.refit import RefitConfig
 
 _RESERVED = ("zero", "baseline", "truth")
 

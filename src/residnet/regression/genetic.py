@@ -24,8 +24,10 @@ from torch import Tensor
 from residnet.core.config import Config
 from residnet.core.errors import FitError, MissingPackageError
 from residnet.regression.estimator import (
+    Coefficient,
     Estimator,
     Regressors,
+    Solution,
     column_names,
     require_data,
     whole,
@@ -41,7 +43,6 @@ from residnet.regression.expressions import (
     TooLargeError,
     tables,
 )
-from residnet.regression.solutions import Coefficient, Solution
 from residnet.regression.sparse import SearchConfig, coefficient_row, everything, find, reduce
 from residnet.regression.writing import equation, symbolic_sum, term, total
 

@@ -18,11 +18,11 @@ from residnet.core.errors import FitError
 from residnet.regression.estimator import (
     Estimator,
     Regressors,
+    Solution,
     fold_numbers,
     require_data,
     whole,
 )
-from residnet.regression.solutions import Solution
 
 _RANK = 1e-12
 """Eigenvalues of the landmarks' kernel below this share of the largest are rounding."""

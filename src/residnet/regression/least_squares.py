@@ -13,15 +13,16 @@ from torch import Tensor
 
 from residnet.core.errors import FitError
 from residnet.regression.estimator import (
+    Coefficient,
     Estimator,
     Regressors,
+    Solution,
     column_names,
     fold_numbers,
     pieces,
     require_data,
     whole,
 )
-from residnet.regression.solutions import Coefficient, Solution
 
 _COLLINEAR = 1e-9
 """Share of the largest singular value below which centred columns count as collinear."""

@@ -18,11 +18,11 @@ from residnet.core.errors import FitError
 from residnet.regression.estimator import (
     Estimator,
     Regressors,
+    Solution,
     fold_numbers,
     pieces,
     require_data,
 )
-from residnet.regression.solutions import Solution
 
 CONSTANT = 1e-9
 """Standard deviation below which, in units of its largest value, a column counts as constant."""

@@ -25,13 +25,14 @@ from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.regression.equation_rows import correlation_time
 from residnet.regression.estimator import (
+    Coefficient,
     Estimator,
     Regressors,
+    Solution,
     column_names,
     require_pairs,
     whole,
 )
-from residnet.regression.solutions import Coefficient, Solution
 
 _DEPENDENT = 1e-12
 """Share of a column's length that must be left beside simpler columns; below it rounding decides.

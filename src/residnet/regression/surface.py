@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.regression.estimator import Estimator, Regressors, fold_numbers, whole
+from residnet.regression.estimator import Estimator, Regressors, Solution, fold_numbers, whole
 from residnet.regression.shrinkage import CONSTANT, FoldMoments, pls_path
-from residnet.regression.solutions import Solution
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
 
 from pydantic import Field
 
-from residnet.core.arrays.heap import keep_freed_memory
 from residnet.core.config import Config, dump_config, load_mapping
 from residnet.core.errors import DataError, ExportError, ResidnetError, UsageError
+from residnet.core.processes import keep_freed_memory
 from residnet.report.blocks import EXPORTS
 from residnet.runs.folder import RunFolder, seal
 from residnet.runs.provenance import Provenance

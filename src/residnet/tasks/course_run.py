@@ -23,10 +23,8 @@ from residnet.control.courses.config import (
 from residnet.control.courses.course_check import Protocol
 from residnet.control.courses.turns import SteadyTurn
 from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
-from residnet.control.guidance.drift import DriftEstimate
-from residnet.control.guidance.line_of_sight import AnyLineOfSight
-from residnet.control.guidance.waypoints import WaypointGuidance
-from residnet.control.guidance.wheel_over import WheelOver
+from residnet.control.guidance.line_of_sight import AnyLineOfSight, DriftEstimate
+from residnet.control.guidance.waypoints import WaypointGuidance, WheelOver
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.policies import HeadingPolicy
 from residnet.control.heading.turning import Turning

@@ -41,9 +41,8 @@ from residnet.identification.prepared import (
     velocity_limit,
 )
 from residnet.judge.band import bands_content
-from residnet.judge.goodness import content
+from residnet.judge.goodness import content, repeatability
 from residnet.judge.metrics import LIMITS_SCHEMA, metrics_content
-from residnet.judge.repeats import repeatability
 from residnet.judge.rollout_files import write_rollouts
 from residnet.judge.soundness import sanity_content
 from residnet.report.run_reader import RunFiles

@@ -14,8 +14,8 @@ from residnet.data.simulated import SimulatedTrials, fly_trials
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.heads.base import ClosedFormHead, FeatureConfig
+from residnet.heads.linear import RidgeConfig
 from residnet.heads.lstm import LstmConfig
-from residnet.heads.ridge import RidgeConfig
 from residnet.physics.signals import SignalsConfig
 
 SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolved()

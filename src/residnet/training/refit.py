@@ -10,22 +10,275 @@ a baseline that holds beliefs about its parameters adds them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, final
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from residnet.baselines.base import ParametricBaseline
+from residnet.baselines.base import Baseline, ParametricBaseline
+from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
-from residnet.core.layout import VELOCITIES, zero_acceleration
+from residnet.core.layout import HEADING, PLANAR, VELOCITIES, YAW_RATE, zero_acceleration
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.training.offsets import Arrow, Offsets, with_spread
-from residnet.training.refit_config import RefitConfig
-from residnet.training.refit_problem import Problem, free_run_starts, problem_of
-from residnet.training.sensitivities import OffsetBaseline, step_sensitivities
+from residnet.training.offsets import Arrow, Offsets, OffsetsConfig, with_spread
+
+# sensitivities have a row for the heading and one for each velocity
+_HEADING_ROW = slice(0, 1)
+_YAW_RATE_ROW = slice(YAW_RATE - HEADING, len(PLANAR.names) - HEADING)
+
+
+@final
+class OffsetBaseline(Baseline):
+    """A baseline with an acceleration of its own for every row of a batch.
+
+    The accelerations grow with the square of the speed, as hull forces do.
+
+    Args:
+        baseline: as it is without.
+        value: accelerations [B, 3] at `speed`; a batch of several times B rows repeats them.
+        axes: a of surge, sway and yaw (0, 1, 2), in which the values may move.
+        speed: in m/s.
+    """
+
+    def __init__(
+        self, baseline: ParametricBaseline, value: Tensor, axes: Sequence[int], speed: float
+    ) -> None:
+        super().__init__()
+        self.baseline = baseline
+        self.value = value
+        self.unit = torch.eye(3, dtype=value.dtype)[:, list(axes)]
+        self.speed = speed
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Return nu_dot [B, 3] at channels z [B, nz], which begin with u and v."""
+        offsets = self.value.repeat(z.shape[0] // self.value.shape[0], 1)
+        nu_dot: Tensor = self.baseline(z) + self.growth(z) * offsets
+        return nu_dot
+
+    def growth(self, z: Tensor) -> Tensor:
+        """Return the square of the speed over that at which the values hold, [B, 1]."""
+        return z[:, :2].square().sum(1, keepdim=True) / self.speed**2
+
+    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
+        """Return the derivatives of nu_dot [D, B, 3] at z [B, nz] along directions [D, B, nz]."""
+        offsets = self.value.repeat(z.shape[0] // self.value.shape[0], 1)
+        growth = 2.0 * (z[:, :2] * ahead[..., :2]).sum(-1, keepdim=True) / self.speed**2
+        return self.baseline.along(z, ahead) + growth * offsets
+
+    def parameter_count(self) -> list[float]:
+        """Return the parameters of each axis; the offsets are no part of the model."""
+        return self.baseline.parameter_count()
+
+    def sensitivity(self, z: Tensor) -> Tensor:
+        """Return the derivative of nu_dot by free parameters and offsets, [B, 3, P + a].
+
+        The parameters are those that the baseline may move; the offsets are the row's own.
+        """
+        return torch.cat(
+            (self.baseline.sensitivity(z), self.growth(z).unsqueeze(-1) * self.unit), dim=2
+        )
+
+
+def step_sensitivities(
+    model: HybridDynamics,
+    baseline: ParametricBaseline | OffsetBaseline,
+    x: Tensor,
+    p: Tensor,
+    s: Tensor,
+) -> Tensor:
+    """Return the sensitivities of (psi, u, v, r) one step later, [B, 4, P].
+
+    They are the exact derivative of `Dynamics.integrate` with the residual at zero, whatever the
+    integrator.
+
+    Args:
+        model: that steps.
+        baseline: its baseline.
+        x: states at the step's start [B, 6].
+        p: prepared inputs, held over the step [B, k].
+        s: sensitivities at the step's start [B, 4, P].
+    """
+    stage_x, stage_s = x, s
+    after, stage_rate = s, s
+    for node, weight in zip(model.nodes, model.weights, strict=True):
+        if node > 0.0:
+            stage_s = torch.add(s, stage_rate, alpha=node * model.dt)
+            residual = zero_acceleration(x)
+            stage_x = x + node * model.dt * model.rate(stage_x, p, residual)
+        z = model.signals(stage_x, p)
+        slopes = baseline.along(z, model.signals.slopes(stage_x, p)).permute(1, 2, 0)
+        nu_dot = torch.baddbmm(baseline.sensitivity(z), slopes, stage_s)
+        stage_rate = torch.cat((stage_s[:, _YAW_RATE_ROW], nu_dot), dim=1)
+        after = torch.add(after, stage_rate, alpha=weight * model.dt)
+    if model.semi_implicit:
+        # the heading moves with the new yaw rate
+        turned = s[:, _HEADING_ROW] + model.dt * after[:, _YAW_RATE_ROW]
+        after = torch.cat((turned, after[:, _HEADING_ROW.stop :]), dim=1)
+    return after
+
+
+_OWN = 1e-8
+"""Weight of a parameter's own start, as a share of the information that the samples would hold if
+all others were known; it says where a parameter stays that the data leave open.
+"""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale);
+    numbers of the free parameters [P]; precision [P, P] about where least squares put them, the
+    part of it that each parameter has for itself, whatever the data say, and that point [P];
+    pull to the mirror symmetry [P, P]; beliefs, mean and precision [P]; which parameters stay at
+    zero [P]; count of independent errors per channel; log of each window [B]; speed at which
+    offsets are what they are said to be.
+    """
+
+    x0: Tensor
+    w: Tensor
+    nu: Tensor
+    weight: Tensor
+    active: Tensor
+    precision: Tensor
+    own: Tensor
+    start: Tensor
+    pull: Tensor
+    believed: Tensor
+    belief: Tensor
+    still: Tensor
+    count: float
+    robust: float
+    log: Tensor
+    speed: float
+
+    def at_rest(self, numbers: Sequence[int]) -> Problem:
+        """Return the problem with further free parameters, by their numbers, that stay at zero."""
+        still = self.still.clone()
+        still[list(numbers)] = True
+        return replace(self, still=still)
+
+    def with_only(self, numbers: Sequence[int]) -> Problem:
+        """Return the problem in which these free parameters stay at zero, and no others."""
+        return replace(self, still=torch.zeros_like(self.still)).at_rest(numbers)
+
+    def over(self, steps: int) -> Problem:
+        """Return the problem whose free runs are so many steps long."""
+        return replace(
+            self, w=self.w[:, :steps], nu=self.nu[:, :steps], weight=self.weight[:, :steps]
+        )
+
+    def share(self, level: Tensor) -> Tensor:
+        """Return half of what one unit of minus the logarithm of a probability costs.
+
+        The cost is `level`.
+
+        With c the mean square error of three channels of so many independent errors each, that
+        logarithm grows by 3 N / 2c for each unit of c, and the cost sqrt(c + robust^2) by 1 / (2
+        cost).
+        """
+        return (level.square() - self.robust**2).clamp(min=1e-12) / (6.0 * self.count * level)
+
+
+def free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> Tensor:
+    """Return the rows at which the free runs of a refit start.
+
+    Args:
+        store: training windows.
+        config: settings.
+        dt: step in s.
+
+    Raises:
+        FitError: where no log is long enough.
+    """
+    steps, every = round(config.horizon / dt), max(round(config.every / dt), 1)
+    starts = store.starts(steps + 1)
+    starts = starts[store.depth[starts] % every == 0]
+    if starts.numel() == 0:
+        raise FitError(
+            f"no training log holds a free run of {config.horizon:g} s for the refit; shorten"
+            " `horizon`"
+        )
+    return starts
+
+
+def problem_of(
+    model: HybridDynamics,
+    baseline: ParametricBaseline,
+    samples: Samples,
+    store: WindowStore,
+    config: RefitConfig,
+    scales: Tensor,
+) -> Problem:
+    """Return the problem that least squares leave to a refit; nothing stays at zero as yet."""
+    steps = round(config.horizon / model.dt)
+    starts = free_run_starts(store, config, model.dt)
+    take = store.take
+    nu = take(store.y, starts + 1, steps)[..., VELOCITIES]
+    usable = take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
+    # r comes from a gyro, which a frozen position does not disturb
+    weight = torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / scales
+    active = baseline.free_indices()
+    covered = (starts[:, None] + torch.arange(1, steps + 1)).unique().numel()
+    believed, belief = baseline.prior()
+    information = baseline.information(samples)
+    own = torch.diag(_OWN * information.diagonal())
+    return Problem(
+        store.y[starts],
+        take(store.w, starts, steps),
+        nu,
+        weight,
+        active,
+        config.prior * information + own,
+        own,
+        baseline.theta.detach().flatten()[active].clone(),
+        config.asymmetric * baseline.asymmetry(samples),
+        believed,
+        belief,
+        torch.zeros(active.numel(), dtype=torch.bool),
+        max(covered * model.dt / config.correlation, 1.0),
+        config.robust,
+        store.log[starts],
+        float(nu[:, :, :2].square().sum(2).mean().sqrt()),
+    )
+
+
+class RefitConfig(Config):
+    """Settings of the Gauss-Newton refit of a baseline's parameters.
+
+    Attributes:
+        horizon: length of the free runs in s.
+        every: time between their starts in s.
+        prior: weight of the least-squares solution, as a share of its own information.
+        asymmetric: shrinks terms that a mirror-symmetric vessel cannot have towards zero; 0 for no
+            such knowledge.
+        robust: windows whose error (in units of the scales) is far above this count by their error
+            and not by its square.
+        correlation: time over which errors of a free run hang together; the logs hold so many
+            independent errors, which says how much beliefs weigh beside them, and how large the
+            standard errors are.
+        offsets: accelerations that each log has for itself (trim, rudder zero, carriage), estimated
+            with the parameters and left out of the model; null where all logs are of exactly the
+            same vessel. The least-squares prior does not know them: give it little weight.
+        iterations: at most.
+    """
+
+    horizon: Seconds = Field(default=20.0, gt=0)
+    every: Seconds = Field(default=10.0, gt=0)
+    prior: float = Field(default=1e-2, ge=0)
+    asymmetric: float = Field(default=0.0, ge=0)
+    robust: float = Field(default=0.05, gt=0)
+    correlation: Seconds = Field(default=10.0, gt=0)
+    offsets: OffsetsConfig | None = None
+    iterations: int = Field(default=10, ge=1, le=10_000)
+
+    def with_prior(self, prior: float) -> RefitConfig:
+        """Return the same settings with one strength of the prior."""
+        return self.model_copy(update={"prior": prior})
+
 
 __all__ = ["Refitted", "free_run_starts", "refit"]
 

@@ -26,9 +26,8 @@ from residnet.identification.planning import (
 )
 from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.signals import SignalsConfig
-from residnet.training.free_runs.covariance import LeftOpen, left_open
-from residnet.training.refit import refit
-from residnet.training.refit_config import RefitConfig
+from residnet.training.free_runs.left_out import LeftOpen, left_open
+from residnet.training.refit import RefitConfig, refit
 
 CONFIG = RefitConfig(horizon=4.0, every=4.0, iterations=3)
 SHARES = {"tau_x": InputShare(drive=1.0), "tau_n": InputShare(steer=0.3)}

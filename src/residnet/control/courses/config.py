@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from residnet.control.courses.buoys import (
-    BuoyConfig,
-    feasibility,
-    overlapping,
-    taut_course,
-    widened,
-)
 from residnet.control.courses.course_check import Asked, Protocol
 from residnet.control.courses.course_plan import Course, CourseRequest, plan
-from residnet.control.courses.dubins import dubins_length
 from residnet.control.courses.outline import Circle
 from residnet.control.courses.turn_table import Turns, arcs, simulated_turns
 from residnet.control.courses.turns import SteadyTurn, TurnMaker, steady_turn, turning_step
@@ -25,6 +20,201 @@ from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError
+
+Side = Literal["starboard", "port"]
+
+
+class BuoyConfig(Config):
+    """A buoy with the side to pass it on and the circle to keep out of.
+
+    Attributes:
+        north: place in m.
+        east: place in m.
+        leave_to: the side of the vessel that it passes on; rounded to starboard, it is left to
+            starboard. Document 004 plots x to the right and y upwards: its "counter-clockwise" is a
+            turn from x towards y, to starboard with x north and y east.
+        radius: of the circle that the vessel must stay outside of.
+    """
+
+    north: Metres
+    east: Metres
+    leave_to: Side
+    radius: Metres
+
+
+class Piece(NamedTuple):
+    """A part of a course: a straight line (`turn` 0) or an arc about a centre.
+
+    An arc turns to starboard (+1) or port (-1).
+
+    Attributes:
+        length: in m.
+        north, east, heading: of its beginning, in m and rad.
+        turn: see above.
+        radius: of an arc in m.
+    """
+
+    length: float
+    north: float
+    east: float
+    heading: float
+    turn: int
+    radius: float
+
+
+class Feasibility(NamedTuple):
+    """The radius of a buoy's circle beside the smallest that a vessel can turn with, in m."""
+
+    buoy: int
+    radius: float
+    smallest: float
+
+    @property
+    def possible(self) -> bool:
+        """Whether the circle is no tighter than the vessel turns."""
+        return self.radius >= self.smallest
+
+
+def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[Feasibility]:
+    """Return each buoy's radius beside the vessel's smallest turning radius in m.
+
+    Both printed courses ask for less than the vessel can do (correction G18).
+    """
+    return [Feasibility(number + 1, buoy.radius, smallest) for number, buoy in enumerate(buoys)]
+
+
+def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
+    """Return the buoys with radii that the vessel can follow."""
+    return [buoy.model_copy(update={"radius": max(buoy.radius, smallest)}) for buoy in buoys]
+
+
+def taut_course(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> list[Piece]:
+    """Return the taut course from a point round the buoys in their order, to the last one's circle.
+
+    It consists of tangents and arcs in turn, as a rope would lie that is laid round every buoy on
+    its side.
+
+    Raises:
+        ConfigError: where the start lies in the first circle, or circles overlap so that no tangent
+            joins them.
+    """
+    if not buoys:
+        raise ConfigError("a course needs at least one buoy")
+    return _tangents(start, list(enumerate(buoys, start=1)))
+
+
+def overlapping(buoys: Sequence[BuoyConfig]) -> list[tuple[int, int]]:
+    """Return the numbers of following buoys that no course passes between, though it has to.
+
+    Their circles overlap, and they are left to different sides.
+    """
+    return [
+        (number, number + 1)
+        for number, (one, two) in enumerate(itertools.pairwise(buoys), start=1)
+        if one.leave_to != two.leave_to
+        and math.hypot(two.north - one.north, two.east - one.east) < one.radius + two.radius
+    ]
+
+
+def _tangents(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]]) -> list[Piece]:
+    """Return the course that touches every circle of numbered buoys."""
+    signs = [1 if buoy.leave_to == "starboard" else -1 for _, buoy in buoys]
+    lines: list[tuple[float, float, float, float]] = []
+    north, east, radius, sign = start[0], start[1], 0.0, 0
+    for (number, buoy), side in zip(buoys, signs, strict=True):
+        along, across = buoy.north - north, buoy.east - east
+        # the tangent from circle 0 to circle 1: the centres' line in its own frame is (length, s1
+        # r1 - s0 r0)
+        offset = side * buoy.radius - sign * radius
+        square = along**2 + across**2 - offset**2
+        if square <= 0:
+            raise ConfigError(
+                f"buoy {number}: its circle of {buoy.radius:.4g} m overlaps what comes before it:"
+                " no tangent joins them"
+            )
+        heading = math.atan2(across, along) - math.atan2(offset, math.sqrt(square))
+        begin = (
+            north + sign * radius * math.sin(heading),
+            east - sign * radius * math.cos(heading),
+        )
+        lines.append((*begin, heading, math.sqrt(square)))
+        north, east, radius, sign = buoy.north, buoy.east, buoy.radius, side
+    pieces: list[Piece] = []
+    for number, (line_north, line_east, heading, length) in enumerate(lines):
+        if number > 0:
+            before, side = lines[number - 1], signs[number - 1]
+            turned = (side * (heading - before[2])) % (2.0 * math.pi)
+            end = (
+                before[0] + before[3] * math.cos(before[2]),
+                before[1] + before[3] * math.sin(before[2]),
+            )
+            pieces.append(
+                Piece(
+                    turned * buoys[number - 1][1].radius,
+                    *end,
+                    before[2],
+                    side,
+                    buoys[number - 1][1].radius,
+                )
+            )
+        pieces.append(Piece(length, line_north, line_east, heading, 0, 0.0))
+    return pieces
+
+
+_TURN = 2.0 * math.pi
+
+
+def _arc(side: float, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the angle turned from one heading to another, side +1 to starboard and -1 to port."""
+    # a full turn that is none but for rounding
+    turned = (side * (end - begin)) % _TURN
+    return np.where(turned > _TURN - 1e-9, 0.0, turned)
+
+
+def _centre(pose: np.ndarray, side: float, radius: float) -> np.ndarray:
+    return pose[..., :2] + side * radius * np.stack(
+        (-np.sin(pose[..., 2]), np.cos(pose[..., 2])), axis=-1
+    )
+
+
+def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarray:
+    """Return the length [...] in m of the shortest path between poses of bounded curvature.
+
+    The path is two arcs and their common tangent, or three arcs (L. E. Dubins 1957). Poses [..., 3]
+    = (north, east, heading) broadcast; turns have a radius of at least `radius`.
+    """
+    start, end = np.broadcast_arrays(np.asarray(start, dtype=float), np.asarray(end, dtype=float))
+    h0, h1 = start[..., 2], end[..., 2]
+    best = np.full(h0.shape, np.inf)
+    for side in (1.0, -1.0):
+        centre = _centre(start, side, radius)
+        line = _centre(end, side, radius) - centre
+        distance, bearing = (
+            np.hypot(line[..., 0], line[..., 1]),
+            np.arctan2(line[..., 1], line[..., 0]),
+        )
+        best = np.minimum(
+            best, radius * (_arc(side, h0, bearing) + _arc(side, bearing, h1)) + distance
+        )
+        # three arcs, the middle one about either point that is two radii from both centres
+        lean = np.arccos(np.clip(distance / (4.0 * radius), 0.0, 1.0))
+        for hand in (1.0, -1.0):
+            out = bearing + hand * lean
+            back = bearing + math.pi - hand * lean
+            first, second = out + side * 0.5 * math.pi, back + side * 0.5 * math.pi
+            turned = _arc(side, h0, first) + _arc(-side, first, second) + _arc(side, second, h1)
+            best = np.where(distance <= 4.0 * radius, np.minimum(best, radius * turned), best)
+        line = _centre(end, -side, radius) - centre
+        distance, bearing = (
+            np.hypot(line[..., 0], line[..., 1]),
+            np.arctan2(line[..., 1], line[..., 0]),
+        )
+        straight = np.sqrt(np.maximum(distance**2 - 4.0 * radius**2, 0.0))
+        heading = bearing + side * np.arctan2(2.0 * radius, straight)
+        total = radius * (_arc(side, h0, heading) + _arc(-side, heading, h1)) + straight
+        best = np.where(distance >= 2.0 * radius, np.minimum(best, total), best)
+    return best
+
 
 _STEP = math.log(1.12)
 """Between the radii of the turns that a plan uses, logarithmic."""

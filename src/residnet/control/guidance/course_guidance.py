@@ -12,7 +12,7 @@ from torch import Tensor
 
 from residnet.control.base import Policy, Reference
 from residnet.control.courses.course_plan import Course
-from residnet.control.guidance.drift import DriftEstimate
+from residnet.control.guidance.line_of_sight import DriftEstimate
 from residnet.core.errors import ConfigError
 
 _LEAST = 0.3

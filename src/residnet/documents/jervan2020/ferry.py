@@ -72,8 +72,8 @@ from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.export.torchscript import TorchScriptExporter
 from residnet.heads.zero import ZeroHead
+from residnet.judge.courses import Tracking, mse, tracking
 from residnet.judge.still_fits import StillFitsConfig, Verdict, still_fits
-from residnet.judge.tracking import Tracking, mse, tracking
 from residnet.manoeuvres import FamilyConfig
 from residnet.manoeuvres.closed_loop import ZigzagFamily
 from residnet.physics.actuators import ForceActuators

@@ -26,7 +26,7 @@ from residnet.core.frames import to_body
 from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.documents.cells import notes_text
-from residnet.judge.tracking import mse
+from residnet.judge.courses import mse
 from residnet.physics.force_model import (
     FERRY_TERMS,
     MOTION,

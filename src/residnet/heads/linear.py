@@ -1,4 +1,4 @@
-"""Ridge regression over basis functions (document 001 section 2.2, correction M4)."""
+"""Ridge regression (document 001 section 2.2, correction M4) and PLSR over basis functions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,48 @@ from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
 from residnet.heads.force import in_space
 from residnet.regression.estimator import Estimator
-from residnet.regression.shrinkage import Ridge
+from residnet.regression.shrinkage import PLSR, Ridge
+
+
+class PlsrConfig(BasisConfig):
+    """A PLSR of the three residuals together.
+
+    Attributes:
+        order: number of latent variables; None chooses it as `choose` says. One-step errors are
+            summed over the axes, each in units of its variance.
+        max_order: highest number of latent variables that is tried.
+    """
+
+    kind: Literal["plsr"] = "plsr"
+    order: int | None = Field(default=None, ge=1)
+    max_order: int = Field(default=40, ge=1)
+
+    def build(self, names: Sequence[str]) -> ClosedFormHead:
+        """Return the module for channels `names`."""
+        return in_space(
+            self,
+            names,
+            lambda settings, channels: PlsrHead(self.model_validate(settings), channels),
+        )
+
+
+@final
+class PlsrHead(BasisHead):
+    """A head of basis functions with coefficients by PLSR."""
+
+    def __init__(self, config: PlsrConfig, names: Sequence[str]) -> None:
+        super().__init__(config, names)
+        self.order = config.order
+        self.max_order = config.max_order
+
+    def estimator(self, folds: int | None) -> Estimator:
+        """Return PLSR of all axes, other orders on offer where free runs choose."""
+        return PLSR(
+            self.order,
+            max_order=self.max_order,
+            folds=folds,
+            alternatives=self.by_free_run and self.order is None,
+        )
 
 
 class RidgeConfig(BasisConfig):
