@@ -1,4 +1,4 @@
-"""Goodness of fit of one-step predictions (document 000, appendix E), and how far repeats differ."""
+"""Goodness of fit of one-step predictions (document 000, appendix E); how far repeats differ."""
 
 from __future__ import annotations
 
