@@ -72,6 +72,26 @@ def test_zones_unix_times_and_plain_seconds() -> None:
         parse_texts(np.array(["2025-13-11 09:15:45"], dtype=object))
 
 
+@pytest.mark.parametrize(
+    ("form", "ahead"),
+    [
+        ("2025-04-11T09:15:{}.{}Z", 0),
+        ("2025-04-11 09:15:{},{}+02:00", 2),
+        ("11.04.2025 9:15:{}:{}", 0),
+        ("2025 / 04 / 11 9:15:{}.{} am", 0),
+        ("2025年4月11日 9時15分{}.{}秒", 0),
+    ],
+)
+def test_dates_whose_seconds_repeat_over_rows(form: str, ahead: int) -> None:
+    tenths = np.arange(0, 300, 7)
+    texts = np.array([form.format(f"{n // 10:02d}", n % 10) for n in tenths], dtype=object)
+    start = np.datetime64("2025-04-11T09:15:00", "ns").astype(np.int64)
+    expected = start - ahead * 3600 * 10**9 + tenths * 10**8
+    np.testing.assert_array_equal(parse_texts(texts, dates=True).ns, expected)
+    with pytest.raises(DataError, match="row 3 is no date or time"):
+        parse_texts(np.array([*texts[:2], texts[0] + ".5"], dtype=object), dates=True)
+
+
 # clocks
 
 

@@ -57,6 +57,9 @@ _CLOCK = (
 _FORM = (
     rf"^\s*(?:{_DATE}(?:[T ,_;]+|$))?(?:{_CLOCK})?\s*(?P<zone>Z|UTC|GMT|[+-]\d{{2}}:?\d{{2}})?\s*$"
 )
+# the fraction of h:mm:ss, and what stands before and after it
+_HOUR_TO_SECOND = r"(?:.*[^\d:])?\d\d?:\d\d?:\d\d?"
+_FRACTION = rf"^(?P<before>{_HOUR_TO_SECOND})[.,:](?P<fraction>\d+)(?P<after>(?:[^\d.,:].*)?)$"
 _NUMBER = r"^\s*(?P<whole>[-+]?\d+)(?:\.(?P<fraction>\d+))?\s*$"
 
 
@@ -129,18 +132,22 @@ def unix_unit(values: np.ndarray) -> str | None:
 
 
 def _parts(cells: pd.Series) -> pd.DataFrame:
-    """Return the parts of dates and times; pandas' own `extract` takes twice the time."""
+    """Return the parts of dates and times; what stands beside the fraction repeats over rows."""
     import pandas as pd
+    import pyarrow as pa
+    from pyarrow import compute
 
-    form = re.compile(_FORM)
-    none = (None,) * form.groups
-    rows = [found.groups() if found else none for found in map(form.match, cells.tolist())]
-    columns = zip(*rows, strict=True) if rows else [()] * form.groups
-    texts = {
-        name: pd.Series(list(column), dtype=object)
-        for name, column in zip(form.groupindex, columns, strict=True)
-    }
-    return pd.DataFrame(texts).set_axis(cells.index)
+    form, texts = re.compile(_FORM), pa.array(cells.tolist(), pa.string())
+    before, fraction, after = compute.extract_regex(texts, _FRACTION).flatten()
+    rest = compute.coalesce(compute.binary_join_element_wise(before, after, ""), texts)
+    rest = rest.dictionary_encode()
+    found = [form.match(text) for text in rest.dictionary.to_pylist()]
+    rows = [one.groups() if one else (None,) * form.groups for one in found]
+    table = pd.DataFrame(rows, columns=list(form.groupindex), dtype=object)
+    table = table.take(rest.indices.to_numpy()).set_axis(cells.index)
+    cut = pd.Series(fraction.to_numpy(zero_copy_only=False), index=cells.index)
+    table["fraction"] = cut.where(cut.notna(), table["fraction"])
+    return table
 
 
 def looks_dated(texts: pd.Series) -> bool:
