@@ -64,17 +64,35 @@ def _told(work: Callable[..., object], files: Sequence[Path]) -> dict[str, Any]:
     return dict(yaml.safe_load(text)["data"]["reader"])
 
 
-def test_one_map_from_every_door(files: list[Path], logs: list[Log]) -> None:
-    from_new = residnet.draft(files).config["data"]["reader"]
+def _doors(files: Sequence[Path]) -> dict[str, dict[str, Any]]:
     shown = inspect_logs(files, None).text.partition("paste into a config:\n")[2]
-    read = {
+    return {
+        "new": residnet.draft(files).config["data"]["reader"],
         "inspect": yaml.safe_load(shown)["data"]["reader"],
         "read_logs": _told(lambda f, hear: residnet.read_logs(f, progress=hear), files),
         "fit": _told(lambda f, hear: residnet.prepare(f, ["delta", "n"], progress=hear), files),
     }
-    for door, found in read.items():
-        assert found == from_new, door
+
+
+def test_one_map_from_every_door(files: list[Path], logs: list[Log]) -> None:
+    found = _doors(files)
+    for door, reader in found.items():
+        assert reader == found["new"], door
     for log, truth in zip(residnet.read_logs(files), logs, strict=True):
         for name in ("x", "y", "u", "v", "r", "delta", "n"):
             size = float(np.abs(truth[name]).max()) + 1e-3
             np.testing.assert_allclose(log[name], truth[name], atol=1e-6 * size, err_msg=name)
+
+
+def test_every_door_keeps_roll(logs: list[Log], tmp_path: Path) -> None:
+    files = foreign_tables.write(logs, tmp_path / "logs", STYLES["English with units"])
+    for file in files:
+        table = pd.read_csv(file)
+        time = table.iloc[:, 0].to_numpy()
+        rolled = {"phi [deg]": 5.0 * np.sin(time), "p [deg/s]": 5.0 * np.cos(time)}
+        table.assign(**rolled).to_csv(file, index=False)
+    found = _doors(files)
+    for door, reader in found.items():
+        assert reader == found["new"], door
+        units = {name: reader["channels"][name]["unit"] for name in ("phi", "p")}
+        assert units == {"phi": "deg", "p": "deg/s"}, door

@@ -222,7 +222,7 @@ class _Read:
             for name in inputs
         }
         if channels := self.reader.get("channels"):
-            state = [*POSE, *VELOCITY, *WIND_INPUTS]
+            state = [*POSE, *VELOCITY, "phi", "p", *WIND_INPUTS]
             state += [] if "x" in channels else ["latitude", "longitude"]
             state += [] if "psi" in channels else QUATERNION
             self.reader["channels"] = {
