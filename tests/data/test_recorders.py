@@ -14,6 +14,7 @@ import written_recorders
 from written_logs import EPOCH, outcome, trial
 from written_recorders import ORIGIN
 
+import residnet
 from residnet.core.config import validate
 from residnet.core.errors import DataError
 from residnet.core.log import Log
@@ -69,6 +70,20 @@ def test_a_loggers_own_times_come_first_where_every_line_has_one(tmp_path: Path)
     assert "estimated_times" not in codes(got)
     np.testing.assert_allclose(got["psi"], log["psi"], atol=1e-5)
     np.testing.assert_allclose(got["x"] - got["x"][0], log["x"] - log["x"][0], atol=2e-3)
+
+
+@pytest.mark.parametrize("write", [written_recorders.nmea, written_recorders.ulog])
+def test_no_other_frame_is_tried_where_the_format_fixes_it(
+    write: Callable[[Log, Path], Path], tmp_path: Path
+) -> None:
+    log = trial(60.0)
+    way = np.cumsum((log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])) * 0.1
+    # north and east exchanged: motion and pose disagree, and other frames would fit
+    path = write(log.replace(channels={**log.channels, "x": way.imag, "y": way.real}), tmp_path)
+    (got,) = residnet.read_logs([path])
+    for name in ("psi", "u", "v", "r"):
+        np.testing.assert_allclose(got[name], log[name], atol=1e-5, err_msg=name)
+    assert "standard_messages" not in residnet.draft(path).config["data"]["reader"]
 
 
 def test_past_midnight(tmp_path: Path) -> None:

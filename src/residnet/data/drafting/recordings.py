@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from residnet.data.drafting.words import MOTION, input_channel, state_channel, w
 from residnet.data.readers.clocks import align_clocks
 from residnet.data.readers.compose import heading_part, position_part
 from residnet.data.readers.detect import AutoConfig
-from residnet.data.readers.messages import standard_plan
+from residnet.data.readers.messages import in_ned, standard_plan
 from residnet.data.readers.quantities import (
     Angle,
     FieldMap,
@@ -66,7 +66,8 @@ def draft_recordings(
     """Return the settings of a reader of recordings of one format, and those that were loaded.
 
     Standard messages map themselves. Where position, heading and velocities do not fit together by
-    them, or the pose comes rarely, other topics and frames are tried. Inputs are found by names.
+    them, or the pose comes rarely, other topics and frames are tried, unless the format fixes its
+    frames. Inputs are found by names.
 
     Args:
         paths: files and folders.
@@ -89,15 +90,19 @@ def draft_recordings(
     plan = standard_plan(some[0], Plan())
     whole = log is not None and {"x", "y", "psi"} <= set(log.channels)
     sources = _standard(some[0], log, plan)
+    posed = [source.topic for source in (plan.position, plan.heading) if source is not None]
+    settled = any(in_ned(some[0][topic]) for topic in posed)
     if by_name := _named_fields(some, marks):
         sources = by_name
     elif log is None or not whole or not _sound(log, marks):
-        found = _fitting(some[0], marks, _COHERENT if whole else 0.0)
+        found = None
+        if not (whole and settled):
+            found = _fitting(some[0], marks, _COHERENT if whole else 0.0)
         if found is None and whole:
             text = "position, heading and velocities fit together badly: check the frames"
             marks.guess(READER, text)
         sources = found or sources
-    elif sources.step > _SLOW:
+    elif sources.step > _SLOW and not settled:
         others = Marks()
         found = _fitting(some[0], others, _COHERENT)
         # the same pose again would lose the velocities that stand beside it
@@ -270,22 +275,24 @@ def _positions(recording: Recording) -> Iterator[PositionConfig]:
             continue
         if all(float(np.nanstd(series[name])) > 0.05 for name in pair):
             yield Local(topic=series.name, north=pair[0], east=pair[1])
-            yield Local(topic=series.name, north=pair[1], east=pair[0])
+            if not in_ned(series):
+                yield Local(topic=series.name, north=pair[1], east=pair[0])
 
 
 def _headings(recording: Recording) -> Iterator[HeadingConfig]:
     for series in _measured(recording):
+        frames: tuple[Literal["ned", "enu"], ...] = ("ned",) if in_ned(series) else ("ned", "enu")
         for whole in [field[:-2] for field in series.fields if field.endswith((".w", "_w"))]:
             if all(series.has(f"{whole}.{axis}") for axis in "xyz") and series[f"{whole}.w"].any():
-                yield Quaternion(topic=series.name, field=whole, frame="ned")
-                yield Quaternion(topic=series.name, field=whole, frame="enu")
+                for frame in frames:
+                    yield Quaternion(topic=series.name, field=whole, frame=frame)
         for field in series.fields:
             if state_channel(words_of(field)) == "psi" and np.isfinite(series[field]).any():
                 largest = float(np.nanmax(np.abs(series[field])))
                 unit = "deg" if largest > 7.0 else "rad"
                 if 0.0 < largest <= 400.0:
-                    yield Angle(topic=series.name, field=field, unit=unit, frame="ned")
-                    yield Angle(topic=series.name, field=field, unit=unit, frame="enu")
+                    for frame in frames:
+                        yield Angle(topic=series.name, field=field, unit=unit, frame=frame)
 
 
 def _velocities(recording: Recording) -> Iterator[tuple[Series, str, str]]:

@@ -292,6 +292,11 @@ MESSAGES = (
 """In the order in which they are asked: the one that says most first."""
 
 
+def in_ned(series: Series) -> bool:
+    """Return whether a series holds messages whose format fixes their frames as NED."""
+    return any(m.conversion == _NED and m.fits(series) for m in MESSAGES)
+
+
 def standard_plan(recording: Recording, declared: Plan) -> Plan:
     """Return the declared plan with what standard messages add to it."""
     plan, conversions, remarks = declared, [], []
