@@ -9,10 +9,9 @@ import pytest
 from printed_times import EPOCH, printed
 
 from residnet.core.errors import DataError, UsageError
-from residnet.data.readers.clocks import align_clocks
 from residnet.data.readers.recording import Recording, Series
 from residnet.data.readers.times import parse_numbers, parse_texts
-from residnet.data.readers.traffic import traffic
+from residnet.data.readers.topics import align_clocks, traffic
 
 RNG = np.random.default_rng(7)
 

@@ -19,7 +19,6 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import mark_folders, named
 from residnet.data.drafting.units import thrown, unit_by_size
 from residnet.data.drafting.words import MOTION, input_channel, state_channel, words_of
-from residnet.data.readers.clocks import align_clocks
 from residnet.data.readers.compose import heading_part, position_part
 from residnet.data.readers.detect import AutoConfig
 from residnet.data.readers.messages import in_ned, standard_plan
@@ -34,6 +33,7 @@ from residnet.data.readers.quantities import (
     Quaternion,
 )
 from residnet.data.readers.recording import EVERYTHING, Recording, Series
+from residnet.data.readers.topics import align_clocks
 
 # how well position, heading and velocities of a recording that is taken as it is fit together, of 1
 _COHERENT = 0.7

@@ -13,6 +13,7 @@ import numpy as np
 
 from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
+from residnet.core.files import sha256
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import report
@@ -147,14 +148,8 @@ def require_values(path: Path, channel: str, column: str, values: np.ndarray) ->
 
 def digest(files: Sequence[Path]) -> str:
     """Return the SHA-256 of one file's bytes, or of the digests of several in order, as hex."""
-    if len(files) == 1:
-        return _file_digest(files[0])
-    return hashlib.sha256("".join(_file_digest(file) for file in files).encode()).hexdigest()
-
-
-def _file_digest(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    sums = [sha256(file) for file in files]
+    return sums[0] if len(sums) == 1 else hashlib.sha256("".join(sums).encode()).hexdigest()
 
 
 def files_of(path: Path) -> list[Path]:

@@ -20,7 +20,6 @@ from residnet.core.names import CHANNEL_UNITS, to_si
 from residnet.data.channels import without_fills
 from residnet.data.derivatives import SavitzkyGolay
 from residnet.data.readers.base import LogReader, digest, require_samples, unwrap
-from residnet.data.readers.clocks import align_clocks
 from residnet.data.readers.frames import (
     at_centre,
     body_velocity,
@@ -57,7 +56,7 @@ from residnet.data.readers.recording import (
     remark,
     same_topic,
 )
-from residnet.data.readers.traffic import agreement, traffic
+from residnet.data.readers.topics import agreement, align_clocks, traffic
 
 _STATE = ("x", "y", "psi", "u", "v", "r", "p", "phi")
 _MOVING = {*_STATE, "north_rate", "east_rate"}

@@ -10,7 +10,6 @@ from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.data.readers.base import LogReader, require_file
 from residnet.data.readers.canonical import CanonicalConfig
-from residnet.data.readers.clocks import align_clocks
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.formats.ardupilot import ArduPilotConfig
 from residnet.data.readers.formats.nmea import NmeaConfig
@@ -19,6 +18,7 @@ from residnet.data.readers.formats.topic_folder import TopicFolderConfig
 from residnet.data.readers.formats.trees import Hdf5Config, MatConfig
 from residnet.data.readers.formats.ulog import UlogConfig
 from residnet.data.readers.recording import EVERYTHING, Recording, Wanted
+from residnet.data.readers.topics import align_clocks
 
 TABLES = (".csv", ".tsv", ".txt", ".dat", ".xlsx", ".parquet", ".jsonl", ".ndjson")
 """Endings of tables, which do not say what their columns are."""
