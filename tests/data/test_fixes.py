@@ -18,8 +18,8 @@ from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.angles import degrees_of
 from residnet.data.readers.tables import CsvConfig
+from residnet.data.readers.written import degrees_of
 from residnet.tasks.drafting import drafted
 
 pytest.importorskip("pyproj")

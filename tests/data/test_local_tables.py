@@ -14,7 +14,7 @@ from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.units import known_unit, to_si
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.times import date_order, looks_dated, parse_texts
+from residnet.data.readers.written import date_order, looks_dated, parse_texts
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from printed_times import EPOCH, printed
 
 from residnet.core.errors import DataError, UsageError
 from residnet.data.readers.recording import Recording, Series
-from residnet.data.readers.times import parse_numbers, parse_texts
 from residnet.data.readers.topics import align_clocks, traffic
+from residnet.data.readers.written import parse_numbers, parse_texts
 
 RNG = np.random.default_rng(7)
 

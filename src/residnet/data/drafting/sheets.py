@@ -18,11 +18,19 @@ from residnet.data.drafting.channels import CHANNELS
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.units import written_unit
 from residnet.data.drafting.words import plain, state_channel, words_of
-from residnet.data.readers.angles import Form, LetterO, degrees_of, side_signs
 from residnet.data.readers.base import require_file
 from residnet.data.readers.tables import excel_sheet, json_rows, parquet_rows, sheet_names
 from residnet.data.readers.texts import first_rows
-from residnet.data.readers.times import date_order, looks_dated, parse_texts, unix_unit
+from residnet.data.readers.written import (
+    Form,
+    LetterO,
+    date_order,
+    degrees_of,
+    looks_dated,
+    parse_texts,
+    side_signs,
+    unix_unit,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

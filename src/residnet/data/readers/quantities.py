@@ -14,9 +14,9 @@ from residnet.core.config import Config, Metres, Radians, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import known_unit, si_unit, to_si
-from residnet.data.readers.angles import Form, LetterO
 from residnet.data.readers.base import unwrap
 from residnet.data.readers.recording import Remark
+from residnet.data.readers.written import Form, LetterO
 
 Frame = Literal["as_measured", "ned", "enu", "body_fsd", "body_fpu"]
 

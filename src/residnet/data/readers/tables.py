@@ -24,7 +24,6 @@ from residnet.core.log import Log
 from residnet.core.names import nearest, shown
 from residnet.core.units import known_unit, to_si
 from residnet.data.channels import beyond_belief, fills, largest
-from residnet.data.readers.angles import degrees_of, side_signs
 from residnet.data.readers.base import (
     Advance,
     LogReader,
@@ -42,7 +41,7 @@ from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
 from residnet.data.readers.quantities import QUATERNION, ChannelMap, factor
 from residnet.data.readers.recording import Remark, remark
 from residnet.data.readers.texts import found_header, numbered, positions, read_csv
-from residnet.data.readers.times import Order, parse_texts, zone_of
+from residnet.data.readers.written import Order, degrees_of, parse_texts, side_signs, zone_of
 
 if TYPE_CHECKING:
     import pandas as pd

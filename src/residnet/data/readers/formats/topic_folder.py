@@ -24,7 +24,7 @@ from residnet.data.readers.recording import (
     key_of,
     remark,
 )
-from residnet.data.readers.times import Stamps, parse_numbers, parse_texts, whole_second
+from residnet.data.readers.written import Stamps, parse_numbers, parse_texts, whole_second
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,7 +16,7 @@ from residnet.data.readers.base import missing_package, require_file
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.quantities import factor
 from residnet.data.readers.recording import EVERYTHING, Recording, Remark, Series, Wanted, remark
-from residnet.data.readers.times import Stamps, parse_numbers, parse_texts, whole_second
+from residnet.data.readers.written import Stamps, parse_numbers, parse_texts, whole_second
 
 if TYPE_CHECKING:
     import h5py

@@ -1,4 +1,4 @@
-"""Times as people, programs and recorders write them: numbers, dates, times of day."""
+"""Times and angles as people, programs and recorders write them."""
 
 from __future__ import annotations
 
@@ -61,6 +61,23 @@ _FORM = (
 _HOUR_TO_SECOND = r"(?:.*[^\d:])?\d\d?:\d\d?:\d\d?"
 _FRACTION = rf"^(?P<before>{_HOUR_TO_SECOND})[.,:](?P<fraction>\d+)(?P<after>(?:[^\d.,:].*)?)$"
 _NUMBER = r"^\s*(?P<whole>[-+]?\d+)(?:\.(?P<fraction>\d+))?\s*$"
+Form = Literal["number", "ddmm"]
+"""How a number stands for an angle: as degrees, or as degrees and minutes in one."""
+LetterO = Literal["east", "west"]
+"""What O stands for: Ost and Oost, or Oeste, Ouest and Ovest."""
+_DECIMAL = r"\d+(?:[.,]\d+)?"
+_ANGLE = (
+    r"^\s*(?P<lead>[NSEWOnsewo])?\s*(?P<sign>[-+−])?\s*"
+    rf"(?P<degrees>{_DECIMAL})\s*(?:°|º|˚|deg\.?|d)?"
+    rf"(?:(?:(?<=[°º˚d.g])\s*|\s+|\s*[:\-]\s*)(?P<minutes>{_DECIMAL})\s*(?:''|['′’´:m]|min\.?)?"
+    rf"(?:(?:(?<=['′’´:mn.])\s*|\s+)(?P<seconds>{_DECIMAL})\s*(?:\"|″|”|''|′′|’’|sec\.?)?)?)?"
+    r"[\s,]*(?P<tail>[NSEWOnsewo])?\s*$"
+)
+_SIDES = {"n": 1.0, "e": 1.0, "s": -1.0, "w": -1.0}
+_OF = {"latitude": "ns", "longitude": "ew"}
+_READ = (
+    "; forms that are read are 59.90535, 59°54.321'N, 59 54 19.3 N and, with `form: ddmm`, 5954.321"
+)
 
 
 @dataclass(frozen=True)
@@ -199,8 +216,7 @@ def parse_texts(
     """
     import pandas as pd
 
-    column = pd.Series(np.asarray(texts, dtype=object), dtype="string").str.strip()
-    known = (column.notna() & (column != "")).to_numpy(dtype=bool)
+    column, known = _filled(pd.Series(np.asarray(texts, dtype=object)))
     cells = column[known] if dates else column.fillna("")
     if not len(cells):
         return Stamps(np.zeros(len(column), dtype=np.int64), False, known)
@@ -212,12 +228,18 @@ def parse_texts(
     return Stamps(ns, stamps.absolute, known, stamps.remarks)
 
 
-def _require(cells: pd.Series, bad: np.ndarray, what: str) -> None:
+def _filled(cells: pd.Series) -> tuple[pd.Series, np.ndarray]:
+    """Return the cells without blanks around them, and [T] which of them are not empty."""
+    column = cells.astype("string").str.strip()
+    return column, (column.notna() & (column != "")).to_numpy(dtype=bool)
+
+
+def _require(cells: pd.Series, bad: np.ndarray, what: str, do: str = "") -> None:
     if bad.any():
         at = int(np.argmax(bad))
         raise DataError(
             f"'{shown(str(cells.iloc[at]))}' in row {int(cells.index[at]) + 1} is no {what}"
-            f" ({int(bad.sum())} such cells)"
+            f" ({int(bad.sum())} such cells){do}"
         )
 
 
@@ -346,3 +368,88 @@ def _fractions(column: pd.Series, whole: np.ndarray) -> tuple[np.ndarray, tuple[
     figures = {"backwards_as_printed": back[0], "backwards_repaired": back[1]}
     found = remark("note", "unpadded_fraction", text, repaired=changed, **figures)
     return unpadded, (found,)
+
+
+def degrees_of(
+    cells: pd.Series, name: str, form: Form = "number", letter_o: LetterO | None = None
+) -> np.ndarray:
+    """Return angles [T] in degrees from cells such as `59°54.321'N`, `59 54 19.3 N` or `-59.9`.
+
+    NaN stands for empty cells.
+
+    Args:
+        cells: of one column.
+        name: of the channel: a latitude has no east.
+        form: of a number that stands alone.
+        letter_o: what O stands for; None refuses it.
+
+    Raises:
+        DataError: naming the first cell that is no such angle.
+    """
+    import pandas as pd
+
+    what = name if name in _OF else "angle"
+    if pd.api.types.is_numeric_dtype(cells):
+        values = cells.to_numpy(dtype=np.float64, na_value=np.nan)
+        angles = from_form(values, form)
+        _require(cells, np.isnan(angles) & ~np.isnan(values), what, _READ)
+        return angles
+    column, known = _filled(cells)
+    parts = column[known].str.extract(_ANGLE)
+    degrees, minutes, seconds = (
+        pd.to_numeric(parts[part].str.replace(",", "."), errors="coerce").to_numpy(
+            dtype=np.float64, na_value=np.nan
+        )
+        for part in ("degrees", "minutes", "seconds")
+    )
+    alone = np.isnan(minutes)
+    degrees = np.where(alone, from_form(degrees, form), degrees)
+    # a fraction has nothing below it; sixty is what a printer may have rounded to
+    wrong = np.isnan(degrees) | (~alone & ((degrees % 1 > 0) | (minutes > 60.0)))
+    wrong |= ~np.isnan(seconds) & ((minutes % 1 > 0) | (seconds > 60.0))
+    lead, tail = (parts[part].str.lower() for part in ("lead", "tail"))
+    side = lead.fillna(tail)
+    turned = parts["sign"].fillna("+").isin(["-", "−"]).to_numpy()
+    signs = side_signs(side, name, letter_o)
+    wrong |= (lead.notna() & tail.notna()).to_numpy() | (turned & (signs > 0) & side.notna())
+    _require(column[known], wrong, what, _READ)
+    out = np.full(len(cells), np.nan)
+    size = degrees + np.nan_to_num(minutes) / 60.0 + np.nan_to_num(seconds) / 3600.0
+    out[known] = np.where(turned, -1.0, signs) * size
+    return out
+
+
+def from_form(values: np.ndarray, form: Form) -> np.ndarray:
+    """Return degrees [T] from numbers of a form; NaN where the minutes are more than sixty."""
+    if form == "number":
+        return values
+    size = np.abs(values)
+    whole, minutes = np.floor(size / 100.0), size % 100.0
+    with np.errstate(invalid="ignore"):
+        out: np.ndarray = np.where(minutes <= 60.0, np.sign(values), np.nan)
+    out *= whole + minutes / 60.0
+    return out
+
+
+def side_signs(sides: pd.Series, name: str, letter_o: LetterO | None = None) -> np.ndarray:
+    """Return 1 or -1 [T] for the letters of hemispheres; 1 where there is none.
+
+    Raises:
+        DataError: where a letter is none of this channel's.
+    """
+    letters = sides.astype("string").str.strip().str.lower()
+    letters = letters.mask(letters == "")
+    if letter_o is not None and name == "longitude":
+        letters = letters.replace("o", letter_o[0])
+    allowed = _OF.get(name, "nsew")
+    wrong = (letters.notna() & ~letters.isin([*allowed])).to_numpy(dtype=bool)
+    if wrong.any():
+        first = shown(str(sides.iloc[int(np.argmax(wrong))]), 20)
+        either = (
+            "; O is east to some and west to others: set letter_o" if first.upper() == "O" else ""
+        )
+        raise DataError(
+            f"'{first}' is no hemisphere of {name}; {' or '.join(allowed.upper())} was"
+            f" expected{either}"
+        )
+    return letters.map(_SIDES).fillna(1.0).to_numpy(dtype=np.float64)
