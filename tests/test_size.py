@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (793, 117),
     "control": (3197, 352),
     "core": (1267, 183),
-    "data": (7908, 715),
+    "data": (7885, 715),
     "documents": (2544, 272),
     "dynamics": (835, 124),
     "export": (2191, 262),

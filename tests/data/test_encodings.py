@@ -14,8 +14,8 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import format_of, recording_for
-from residnet.data.readers.encoding import encoding_of
 from residnet.data.readers.formats.topic_folder import TopicFolderConfig
+from residnet.data.readers.texts import encoding_of
 
 T = np.arange(0.0, 30.0, 0.1)
 NORTH = 2.0 * T

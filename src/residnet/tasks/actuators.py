@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 from residnet.core.config import Config, ExistingPath
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, to_si
-from residnet.data.readers.encoding import as_utf8
+from residnet.data.readers.texts import as_utf8
 from residnet.physics.actuators.identify import (
     Estimate,
     StepAnswer,

@@ -13,7 +13,7 @@ from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.doctor.findings import Check, Finding, Level, check, share_of
 from residnet.data.doctor.statistics import Record
-from residnet.data.readers.encoding import as_utf8
+from residnet.data.readers.texts import as_utf8
 from residnet.data.readers.written import parse_numbers, parse_texts
 
 if TYPE_CHECKING:

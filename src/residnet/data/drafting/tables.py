@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from residnet.core.errors import DataError, ResidnetError, UsageError
-from residnet.core.names import CHANNEL_UNITS
+from residnet.core.names import CHANNEL_UNITS, shown
+from residnet.core.units import known_unit, to_si
 from residnet.data.drafting.channels import (
     CHANNELS,
     READER,
@@ -19,17 +24,34 @@ from residnet.data.drafting.channels import (
 )
 from residnet.data.drafting.physics import Raw
 from residnet.data.drafting.questions import Marks
-from residnet.data.drafting.sheets import (
-    Clock,
-    Sheet,
-    clock_of,
-    peek,
-    refuse_written_positions,
-    with_degrees,
+from residnet.data.drafting.units import other_dimension, written_unit
+from residnet.data.drafting.words import input_channel, plain, state_channel, words_of
+from residnet.data.readers.base import require_file
+from residnet.data.readers.tables import excel_sheet, json_rows, parquet_rows, sheet_names
+from residnet.data.readers.texts import first_rows
+from residnet.data.readers.written import (
+    Form,
+    LetterO,
+    date_order,
+    degrees_of,
+    looks_dated,
+    parse_texts,
+    side_signs,
+    unix_unit,
 )
-from residnet.data.drafting.units import other_dimension
-from residnet.data.drafting.words import input_channel, state_channel, words_of
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+_ROWS = 20_000
+_BRACKETS = re.compile(r"[\[(]")
+_DAY = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
+_FORMS: tuple[Form, ...] = ("number", "ddmm")
+_LARGEST = {"latitude": 90.0, "longitude": 180.0}
+_SIDES = {"latitude": {"N", "S"}, "longitude": {"E", "W", "O"}}
+_GERMANIC = re.compile(r"breite|l(?:ae|a)nge|breedte|lengte|zeit|tijd|kurs|koers|ruder|roer")
+Settings = Mapping[str, Mapping[str, Any]]
+"""Column -> what its entry in a channel map says beside column and unit."""
 _LOOKED_AT = 24
 """Tables whose values are looked at; of the others only the header is."""
 
@@ -191,3 +213,299 @@ def _unused(sheet: Sheet, names: Mapping[str, str], clock: Clock, marks: Marks) 
         marks.note(CHANNELS, f"columns of text: {', '.join(list(sheet.texts.keys() - used)[:12])}")
     if sheet.empty:
         marks.note(CHANNELS, f"empty columns: {', '.join(sheet.empty[:12])}")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The first rows of one table.
+
+    Attributes:
+        path: of the file.
+        about: settings of its reader beside time and channels: kind, delimiter, decimal.
+        header: names of all columns.
+        numbers: values [T] of the columns that hold numbers.
+        texts: columns that hold text, dates among them.
+        empty: columns that hold nothing.
+        columns: what the file calls a column, where its name here has a unit that stands below.
+    """
+
+    path: Path
+    about: dict[str, Any]
+    header: tuple[str, ...]
+    numbers: dict[str, np.ndarray]
+    texts: dict[str, pd.Series]
+    empty: tuple[str, ...]
+    columns: dict[str, str]
+
+    def column(self, name: str) -> str:
+        """Return what the file calls a column."""
+        return self.columns.get(name, name)
+
+
+def peek(path: Path, rows: int = _ROWS) -> Sheet:
+    """Return the first rows of a table, 20,000 where `rows` does not say otherwise.
+
+    Raises:
+        UsageError: where there is no file.
+        DataError: where it is empty or no table.
+    """
+    import pandas as pd
+
+    require_file(path)
+    if path.suffix.lower() == ".parquet":
+        table, about = parquet_rows(path, rows), {"kind": "parquet"}
+    elif path.suffix.lower() == ".xlsx":
+        table, about = _excel(path, rows)
+    elif path.suffix.lower() in (".jsonl", ".ndjson"):
+        table, about = json_rows(path, rows), {"kind": "json_lines"}
+    else:
+        table, about = first_rows(path, rows)
+    columns = _described(table)
+    table.columns = pd.Index(list(columns))
+    if table.empty:
+        raise DataError(f"{path}: holds a header and no rows; leave it out")
+    numbers: dict[str, np.ndarray] = {}
+    texts: dict[str, pd.Series] = {}
+    empty = []
+    for i, name in enumerate(table.columns):
+        column = table.iloc[:, i]
+        if column.isna().all():
+            empty.append(name)
+            continue
+        values = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
+        spoilt = np.isnan(values).sum() > column.isna().sum()
+        if spoilt or column.dtype == bool or pd.api.types.is_datetime64_any_dtype(column):
+            texts[name] = column
+        else:
+            numbers[name] = values
+    renamed = {name: column for name, column in columns.items() if name != column}
+    return Sheet(path, about, tuple(table.columns), numbers, texts, tuple(empty), renamed)
+
+
+def _described(table: pd.DataFrame) -> dict[str, str]:
+    """Return the names of columns with the units that stand beneath them -> their names alone."""
+    names = [str(name).strip() for name in table.columns]
+    rows = [[_unit_in(cell) for cell in row] for row in table.attrs.get("between", [])]
+    units = max(rows, key=lambda row: sum(map(bool, row)), default=[])
+    units = units if 2 * sum(map(bool, units)) >= len([name for name in names if name]) else []
+    told = [*units, *[""] * len(names)]
+    return {
+        f"{name} [{unit}]" if unit and not _BRACKETS.search(name) else name: name
+        for name, unit in zip(names, told, strict=False)
+    }
+
+
+def _unit_in(cell: str) -> str:
+    """Return the unit that a cell beneath a name holds; empty where it holds none."""
+    unit = cell.strip(" []()")
+    try:
+        known_unit(unit)
+    except UsageError:
+        return ""
+    return unit
+
+
+def _excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Return the first sheet with two columns of numbers, else the first, and its settings."""
+    names = sheet_names(path)
+    tables = ((name, excel_sheet(path, name, rows)) for name in names)
+    for number, (name, table) in enumerate(tables):
+        if len(table.select_dtypes("number").columns) > 1:
+            return table, {"kind": "excel", **({"sheet": name} if number else {})}
+    return excel_sheet(path, None, rows), {"kind": "excel"}
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The time of a table.
+
+    Attributes:
+        settings: `time` of a table's reader.
+        seconds: times [T] of the first rows.
+        guess: what is not sure about it; empty where all is.
+        columns: that it takes.
+    """
+
+    settings: dict[str, Any]
+    seconds: np.ndarray
+    guess: str
+    columns: tuple[str, ...]
+
+
+def clock_of(sheet: Sheet) -> Clock:
+    """Return the time of a table.
+
+    Raises:
+        DataError: where no column holds any.
+    """
+    named = [name for name in sheet.header if words_of(name).has("time")]
+    dated = {name: cells for name, cells in sheet.texts.items() if looks_dated(cells)}
+    if dated:
+        return _dated(sheet, dated)
+    rising = [
+        name
+        for name, values in sheet.numbers.items()
+        if values.size > 1
+        and bool((np.diff(values[np.isfinite(values)]) > 0.0).all())
+        # pandas writes the number of each row under no name
+        and not name.startswith("Unnamed: ")
+    ]
+    called = [name for name in named if name in sheet.numbers]
+    # one that is called time and does not increase is refused where it is read; a counter is none
+    others = [name for name in rising if words_of(name).lacks("index")] if not called else []
+    chosen = next((name for name in rising if name in named), next(iter([*called, *others]), None))
+    if chosen is None:
+        if not named:
+            raise DataError(
+                f"{sheet.path}: no column is called time or increases as time does; name it in a"
+                " channel map (--config)"
+            )
+        raise DataError(f"{sheet.path}: column '{named[0]}' holds no times that can be read")
+    values = sheet.numbers[chosen]
+    unit = written_unit(chosen, "s")
+    guess = ""
+    if unit is None:
+        unit, guess = _time_unit(values)
+    if chosen not in named:
+        guess = f"no column is called time; this one increases as time does. {guess}".strip()
+    return Clock({"column": chosen, "unit": unit}, values * to_si(unit), guess, (chosen,))
+
+
+def _dated(sheet: Sheet, dated: dict[str, pd.Series]) -> Clock:
+    """Return the time from one column of dates with times, or from two."""
+
+    def hold(name: str, pattern: str) -> bool:
+        return bool(dated[name].dropna().astype("string").str.contains(pattern).all())
+
+    clocks = [name for name in dated if hold(name, ":|時")]
+    days = [name for name in dated if name not in clocks]
+    if not clocks:
+        raise DataError(f"{sheet.path}: column '{days[0]}' holds dates without a time of day")
+    whole = [name for name in clocks if hold(name, _DAY)]
+    column = (whole or clocks)[0]
+    settings: dict[str, Any] = {"column": column, "unit": "date"}
+    texts, guess = dated[column], ""
+    if not whole and days:
+        settings["date"] = days[0]
+        texts = dated[days[0]].astype("string") + " " + texts.astype("string")
+    order = date_order(texts)
+    if order is None and (whole or days):
+        order = "dmy"
+        guess = "day and month of the dates can be told apart nowhere in the first rows"
+    settings |= {"order": order} if order in ("dmy", "mdy") else {}
+    stamps = parse_texts(texts, dates=True)
+    return Clock(settings, stamps.since(int(stamps.ns[0])), guess, (column, *days[: not whole]))
+
+
+def _time_unit(values: np.ndarray) -> tuple[str, str]:
+    """Return the unit of times without one, and why it is a guess."""
+    known = values[np.isfinite(values)]
+    step, size = float(np.median(np.diff(known))), float(np.median(np.abs(known)))
+    if unix := unix_unit(known):
+        return unix, f"times of this size are Unix time in {unix}"
+    if step < 1e-3 and (2e4 < size < 7e4 or 6.5e5 < size < 8e5):
+        return "day", "times of this size are days as Excel and MATLAB count them"
+    for unit, longest in (("s", 5.0), ("ms", 5e3), ("us", 5e6)):
+        if step <= longest:
+            return unit, f"the header has no unit; steps of {step:g} would be {unit}"
+    return "ns", f"the header has no unit; steps of {step:g} would be ns"
+
+
+def with_degrees(sheet: Sheet, marks: Marks) -> tuple[Sheet, Settings]:
+    """Return a sheet with its positions as numbers of degrees, and how their columns are read.
+
+    Columns that hold nothing that can be read so stay what they are.
+    """
+    import pandas as pd
+
+    columns: dict[str, str] = {}
+    for column in sheet.header:
+        channel = state_channel(words_of(column))
+        if channel in _LARGEST and column not in sheet.empty:
+            columns.setdefault(channel, column)
+    if len(columns) < 2:
+        return sheet, {}
+    cells = {
+        name: pd.Series(sheet.numbers[column]) if column in sheet.numbers else sheet.texts[column]
+        for name, column in columns.items()
+    }
+    sides = {name: _side(sheet, name) for name in columns}
+    letter_o, why = _letter_o(sheet, sides["longitude"] or columns["longitude"])
+    for form in _FORMS:
+        try:
+            degrees = {name: degrees_of(cells[name], name, form, letter_o) for name in columns}
+        except DataError:
+            continue
+        largest = {name: np.abs(v[np.isfinite(v)]).max(initial=0) for name, v in degrees.items()}
+        if all(largest[name] <= _LARGEST[name] for name in columns):
+            break
+    else:
+        return sheet, {}
+    settings: dict[str, dict[str, Any]] = {column: {} for column in columns.values()}
+    if form == "ddmm":
+        for entry in settings.values():
+            entry["form"] = form
+        text = "numbers beyond 90 are taken as degrees and minutes in one, 5954.321 for 59° 54.321'"
+        marks.guess((*CHANNELS, "latitude"), text)
+    for name, side in sides.items():
+        if side is not None:
+            settings[columns[name]]["hemisphere"] = sheet.column(side)
+            degrees[name] = degrees[name] * side_signs(sheet.texts[side], name, letter_o)
+    if letter_o is not None:
+        settings[columns["longitude"]]["letter_o"] = letter_o
+        marks.guess((*CHANNELS, "longitude"), why)
+    read = {**sheet.numbers, **{columns[name]: values for name, values in degrees.items()}}
+    used = {*columns.values(), *sides.values()}
+    return (
+        dataclasses.replace(
+            sheet,
+            numbers={name: read[name] for name in sheet.header if name in read},
+            texts={name: cells for name, cells in sheet.texts.items() if name not in used},
+        ),
+        settings,
+    )
+
+
+def _letter_o(sheet: Sheet, column: str) -> tuple[LetterO | None, str]:
+    """Return what O means as a hemisphere, and why; None where no longitude has it.
+
+    Beside W it is the east, and beside E the west. Alone it is as the names of columns have it:
+    the east in German and Dutch, the west in Spanish, French, Italian and Portuguese.
+    """
+    cells = sheet.texts.get(column)
+    if cells is None:
+        return None, ""
+    ends = cells.dropna().astype("string").str.upper().str.extract(r"^\s*([EOW])?.*?([EOW])?\s*$")
+    found = {str(letter) for end in ends for letter in ends[end].dropna().unique()}
+    if "O" not in found:
+        return None, ""
+    if len(found) > 1:
+        return ("east" if "W" in found else "west"), f"O stands beside {min(found - {'O'})}"
+    german = any(_GERMANIC.search(plain(name)) for name in sheet.header)
+    means: LetterO = "east" if german else "west"
+    return means, f"the letter O is taken as {means}, by the language of the columns' names"
+
+
+def _side(sheet: Sheet, name: str) -> str | None:
+    """Return the column that holds the letters of a channel's hemispheres; None for none."""
+    for column, cells in sheet.texts.items():
+        letters = set(cells.dropna().astype("string").str.strip().str.upper()) - {""}
+        if letters and letters <= _SIDES[name]:
+            return column
+    return None
+
+
+def refuse_written_positions(sheet: Sheet, names: Mapping[str, str]) -> None:
+    """Refuse positions that cannot be read where there are no others.
+
+    Raises:
+        DataError: naming the column and its first cell.
+    """
+    found = [name for name in sheet.texts if state_channel(words_of(name)) in _LARGEST]
+    if found and "x" not in names and not set(_LARGEST) <= set(names):
+        cell = sheet.texts[found[0]].dropna().iloc[0]
+        raise DataError(
+            f"{sheet.path}: column '{found[0]}' holds '{shown(str(cell))}', which is no latitude or"
+            " longitude beside its other column; forms that are read are 59.90535, 59°54.321'N,"
+            " 59 54 19.3 N and 5954.321"
+        )

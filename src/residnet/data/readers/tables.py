@@ -36,11 +36,10 @@ from residnet.data.readers.base import (
     require_values,
     unwrap,
 )
-from residnet.data.readers.encoding import as_utf8
 from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
 from residnet.data.readers.quantities import QUATERNION, ChannelMap, factor
 from residnet.data.readers.recording import Remark, remark
-from residnet.data.readers.texts import found_header, numbered, positions, read_csv
+from residnet.data.readers.texts import as_utf8, found_header, numbered, positions, read_csv
 from residnet.data.readers.written import Order, degrees_of, parse_texts, side_signs, zone_of
 
 if TYPE_CHECKING:

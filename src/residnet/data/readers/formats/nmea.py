@@ -14,8 +14,8 @@ from residnet.core.errors import DataError
 from residnet.core.stretches import stretch_bounds
 from residnet.data.readers.base import missing_package, progress, require_file
 from residnet.data.readers.compose import RecordingConfig
-from residnet.data.readers.encoding import as_utf8, encoding_of_head
 from residnet.data.readers.recording import EVERYTHING, Recording, Remark, Series, Wanted, remark
+from residnet.data.readers.texts import as_utf8, encoding_of_head
 from residnet.data.readers.written import Stamps, parse_texts, whole_second
 
 _SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2,4},[\x20-\x7e]*)")

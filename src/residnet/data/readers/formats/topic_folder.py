@@ -14,7 +14,6 @@ from residnet.core.names import shown
 from residnet.data.drafting.words import state_channel, words_of
 from residnet.data.readers.base import LARGE, progress, require_file, total_size
 from residnet.data.readers.compose import RecordingConfig
-from residnet.data.readers.encoding import as_utf8, encoding_of_head
 from residnet.data.readers.recording import (
     EVERYTHING,
     Recording,
@@ -24,6 +23,7 @@ from residnet.data.readers.recording import (
     key_of,
     remark,
 )
+from residnet.data.readers.texts import as_utf8, encoding_of_head
 from residnet.data.readers.written import Stamps, parse_numbers, parse_texts, whole_second
 
 if TYPE_CHECKING:
