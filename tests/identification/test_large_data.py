@@ -34,6 +34,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paged, "PIECE", 130)
 
 
+@pytest.mark.long
 def test_a_fit_from_disk_is_the_fit_from_memory(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted: dict[str, Any] = {
         key: TINY[key] for key in ("prepare", "signals", "baseline", "evaluation")

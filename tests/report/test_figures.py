@@ -185,6 +185,7 @@ def test_outlines_and_steps() -> None:
     assert joined([])[0].size == 0
 
 
+@pytest.mark.long
 def test_cases_on_a_page_hold_their_curves_to_a_part_in_sixty_thousand() -> None:
     figure = every_kind()
     drawn = draw([figure])
@@ -353,6 +354,7 @@ def test_trials_of_a_sweep_over_their_keys() -> None:
     assert counts["best tenth"] + counts["better half"] + counts["worse half"] == len(trials)
 
 
+@pytest.mark.long
 @needs_browser
 def test_a_browser_draws_every_panel_of_a_fit_and_the_controls_work(run: Path) -> None:
     page = write_fit_page(RunFiles(run))

@@ -315,6 +315,7 @@ def test_accelerations_of_logs_stand_log_by_log(run: Path) -> None:
     assert 'class="weak">0.00030' not in text
 
 
+@pytest.mark.long
 def test_the_file_stands_alone_and_loads_nothing(run: Path) -> None:
     residuals().to_parquet(run / "residuals.parquet")
     path = write_fit_report(run)

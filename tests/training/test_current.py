@@ -107,6 +107,7 @@ def test_wind_is_that_of_the_frame() -> None:
     assert float((after[:, :2] - before[:, :2]).abs().max()) > 0.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
 def test_currents_and_coefficients_come_back(seed: int) -> None:
     """Noise of 3 cm/s and 0.2 deg/s: currents to a centimetre per second, as their standard errors

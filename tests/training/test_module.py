@@ -101,6 +101,7 @@ def untrained(
     return module, module.data(store)
 
 
+@pytest.mark.long
 def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
     logs = trials(noise=0.002, window=0.5)
     baseline = free_run_error(prepared(logs)[0])

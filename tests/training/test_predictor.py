@@ -71,6 +71,7 @@ def test_a_linear_network_finds_nomotos_affine_map(tmp_path: Path) -> None:
     assert (tmp_path / "tensorboard" / "mlp").is_dir()
 
 
+@pytest.mark.long
 def test_the_trained_law_steers_as_the_exact_one(tmp_path: Path) -> None:
     """The same law (6.4) with the network and with the simulated vessel, 30 deg: both settle, at
     the same time within 5 %.
