@@ -27,7 +27,7 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.units import other_dimension, written_unit
 from residnet.data.drafting.words import input_channel, plain, state_channel, words_of
 from residnet.data.readers.base import require_file
-from residnet.data.readers.tables import excel_sheet, json_rows, parquet_rows, sheet_names
+from residnet.data.readers.tables import TABLES, excel_sheet, json_rows, parquet_rows, sheet_names
 from residnet.data.readers.texts import first_rows
 from residnet.data.readers.written import (
     Form,
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _ROWS = 20_000
+_FIRST_ROWS = {"parquet": parquet_rows, "json_lines": json_rows}
 _BRACKETS = re.compile(r"[\[(]")
 _DAY = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
 _FORMS: tuple[Form, ...] = ("number", "ddmm")
@@ -252,14 +253,11 @@ def peek(path: Path, rows: int = _ROWS) -> Sheet:
     import pandas as pd
 
     require_file(path)
-    if path.suffix.lower() == ".parquet":
-        table, about = parquet_rows(path, rows), {"kind": "parquet"}
-    elif path.suffix.lower() == ".xlsx":
-        table, about = _excel(path, rows)
-    elif path.suffix.lower() in (".jsonl", ".ndjson"):
-        table, about = json_rows(path, rows), {"kind": "json_lines"}
+    kind = TABLES.get(path.suffix.lower(), "csv")
+    if kind in _FIRST_ROWS:
+        table, about = _FIRST_ROWS[kind](path, rows), {"kind": kind}
     else:
-        table, about = first_rows(path, rows)
+        table, about = _excel(path, rows) if kind == "excel" else first_rows(path, rows)
     columns = _described(table)
     table.columns = pd.Index(list(columns))
     if table.empty:

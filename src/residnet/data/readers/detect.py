@@ -18,10 +18,9 @@ from residnet.data.readers.formats.topic_folder import TopicFolderConfig
 from residnet.data.readers.formats.trees import Hdf5Config, MatConfig
 from residnet.data.readers.formats.ulog import UlogConfig
 from residnet.data.readers.recording import EVERYTHING, Recording, Wanted
+from residnet.data.readers.tables import TABLES
 from residnet.data.readers.topics import align_clocks
 
-TABLES = (".csv", ".tsv", ".txt", ".dat", ".xlsx", ".parquet", ".jsonl", ".ndjson")
-"""Endings of tables, which do not say what their columns are."""
 # in the order in which they are asked: content that cannot be mistaken first, endings last
 _RECORDINGS: tuple[type[RecordingConfig], ...] = (
     RosbagConfig,

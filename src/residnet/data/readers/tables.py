@@ -47,6 +47,13 @@ if TYPE_CHECKING:
 
 DATE = "date"
 """Stands for a unit where a column holds dates."""
+TABLES = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), "csv"),
+    ".xlsx": "excel",
+    ".parquet": "parquet",
+    **dict.fromkeys((".jsonl", ".ndjson"), "json_lines"),
+}
+"""Ending of a table -> its kind of reader; a table does not say what its columns are."""
 FIX = ("latitude", "longitude")
 _SEARCHED = 60
 """Rows of a sheet among which names are looked for."""
@@ -547,12 +554,13 @@ def json_rows(path: Path, rows: int) -> pd.DataFrame:
 
 def column_names(path: Path) -> tuple[str, ...]:
     """Return what tells tables of the same columns: their names, or the first line of a text."""
-    if path.suffix.lower() == ".parquet":
+    kind = TABLES.get(path.suffix.lower(), "csv")
+    if kind == "parquet":
         import pyarrow.parquet as pq
 
         with _readable(path, "not a readable Parquet file"):
             return tuple(pq.read_schema(path).names)
-    if path.suffix.lower() in (".xlsx", ".jsonl", ".ndjson"):
+    if kind != "csv":
         return ()
     with path.open("rb") as stream:
         return (stream.readline(1 << 16).decode(errors="replace").strip(),)
