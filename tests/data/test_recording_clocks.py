@@ -87,8 +87,9 @@ def test_dates_whose_seconds_repeat_over_rows(form: str, ahead: int) -> None:
     start = np.datetime64("2025-04-11T09:15:00", "ns").astype(np.int64)
     expected = start - ahead * 3600 * 10**9 + tenths * 10**8
     np.testing.assert_array_equal(parse_texts(texts, dates=True).ns, expected)
-    with pytest.raises(DataError, match="row 3 is no date or time"):
-        parse_texts(np.array([*texts[:2], texts[0] + ".5"], dtype=object), dates=True)
+    for end in (".5", " :20"):
+        with pytest.raises(DataError, match="row 3 is no date or time"):
+            parse_texts(np.array([*texts[:2], texts[0] + end], dtype=object), dates=True)
 
 
 # clocks

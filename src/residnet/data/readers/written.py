@@ -57,9 +57,11 @@ _CLOCK = (
 _FORM = (
     rf"^\s*(?:{_DATE}(?:[T ,_;]+|$))?(?:{_CLOCK})?\s*(?P<zone>Z|UTC|GMT|[+-]\d{{2}}:?\d{{2}})?\s*$"
 )
-# the fraction of h:mm:ss, and what stands before and after it
-_HOUR_TO_SECOND = r"(?:.*[^\d:])?\d\d?:\d\d?:\d\d?"
-_FRACTION = rf"^(?P<before>{_HOUR_TO_SECOND})[.,:](?P<fraction>\d+)(?P<after>(?:[^\d.,:].*)?)$"
+# the second and its fraction of h:mm:ss, and what stands before and after them
+_SECOND = (
+    r"^(?P<before>(?:.*[\d日][T ,_;]+)?\d\d?:\d\d?):(?P<second>\d\d?)(?:[.,:](?P<fraction>\d+))?"
+    r"(?P<after>\s*(?:[^\s\d.,:分秒'].*)?)$"
+)
 _NUMBER = r"^\s*(?P<whole>[-+]?\d+)(?:\.(?P<fraction>\d+))?\s*$"
 Form = Literal["number", "ddmm"]
 """How a number stands for an angle: as degrees, or as degrees and minutes in one."""
@@ -149,21 +151,22 @@ def unix_unit(values: np.ndarray) -> str | None:
 
 
 def _parts(cells: pd.Series) -> pd.DataFrame:
-    """Return the parts of dates and times; what stands beside the fraction repeats over rows."""
+    """Return the parts of dates and times; what stands beside the seconds repeats over rows."""
     import pandas as pd
     import pyarrow as pa
     from pyarrow import compute
 
     form, texts = re.compile(_FORM), pa.array(cells.tolist(), pa.string())
-    before, fraction, after = compute.extract_regex(texts, _FRACTION).flatten()
+    before, *seconds, after = compute.extract_regex(texts, _SECOND).flatten()
     rest = compute.coalesce(compute.binary_join_element_wise(before, after, ""), texts)
     rest = rest.dictionary_encode()
     found = [form.match(text) for text in rest.dictionary.to_pylist()]
     rows = [one.groups() if one else (None,) * form.groups for one in found]
     table = pd.DataFrame(rows, columns=list(form.groupindex), dtype=object)
     table = table.take(rest.indices.to_numpy()).set_axis(cells.index)
-    cut = pd.Series(fraction.to_numpy(zero_copy_only=False), index=cells.index)
-    table["fraction"] = cut.where(cut.notna(), table["fraction"])
+    for name, digits in zip(("second", "fraction"), seconds, strict=True):
+        cut = pd.Series(digits.to_numpy(zero_copy_only=False), index=cells.index)
+        table[name] = cut.where(cut.notna() & (cut != ""), table[name])
     return table
 
 
