@@ -26,7 +26,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "export": (2191, 262),
     "heads": (932, 152),
     "identification": (2111, 219),
-    "judge": (1878, 204),
+    "judge": (1866, 207),
     "manoeuvres": (897, 136),
     "physics": (1987, 249),
     "regression": (1864, 207),

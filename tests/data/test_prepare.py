@@ -9,8 +9,7 @@ from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.prepare import PrepareConfig, Prepared, prepare, samples
 from residnet.data.windows import WindowStore
-from residnet.judge.freerun import FreeRun, Prediction
-from residnet.judge.metrics import window_errors
+from residnet.judge.freerun import Errors, Prediction
 from residnet.judge.protocol import Windows
 from residnet.physics.signals import SignalsConfig
 
@@ -100,5 +99,5 @@ def test_masked_outliers_reach_neither_fits_nor_scores_nor_the_start_of_a_window
         )
         for w in windows
     ]
-    errors = window_errors(FreeRun("T10", "train", windows, {"truth": perfect}), "truth", [found])
-    np.testing.assert_allclose(errors["rmse"], 0.0, atol=1e-12)
+    errors = Errors.of(windows, perfect, [found])
+    np.testing.assert_allclose(errors.rmse, 0.0, atol=1e-12)

@@ -13,7 +13,7 @@ from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.zero import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
-from residnet.judge.metrics import kinematics, limits, nrmse_of_windows, window_errors
+from residnet.judge.metrics import Judged
 from residnet.judge.protocol import Window
 from residnet.physics.signals import SignalsConfig
 
@@ -42,7 +42,7 @@ def straight(speed: float, count: int = 21, drift: float = 0.0, turned: float = 
 def test_consistency_by_hand() -> None:
     logs = [made(straight(1.0, drift=0.3, turned=0.02), STEP), made(straight(2.0, drift=0.4), STEP)]
     windows = [Window(0, 0, 21, 0, np.zeros(3)), Window(1, 0, 21, 0, np.zeros(3))]
-    found = kinematics(FreeRun("T2", "test", windows), logs, STEP)
+    found = Judged(FreeRun("T2", "test", windows), [], logs, SCALES).kinematics(STEP)
     # after 2 s the position is off by 0.6 m and 0.8 m, the heading by 0.02 rad and nothing
     assert found["windows"] == 2
     assert found["position_mean"] == pytest.approx(0.7)
@@ -79,7 +79,7 @@ def nine(wind: list[float] | None = None) -> tuple[FreeRun, list[Prepared]]:
 
 def test_bands_are_thirds_of_the_windows() -> None:
     run, logs = nine(wind=[3.0, 1.0, 2.0] * 3)
-    found = limits(run, [candidate("a", "b"), candidate("b")], logs, SCALES, STEP)["bands"]
+    found = Judged(run, [candidate("a", "b"), candidate("b")], logs, SCALES).bands()
     assert [(band["by"], band["low"], band["high"], band["windows"]) for band in found] == [
         ("speed", 1.0, 3.0, 3),
         ("speed", 4.0, 6.0, 3),
@@ -104,28 +104,25 @@ def test_bands_are_thirds_of_the_windows() -> None:
 
 def test_bands_without_windows_enough_or_without_wind_are_left_out() -> None:
     run, logs = nine()
-    assert {band["by"] for band in limits(run, [candidate("a")], logs, SCALES, STEP)["bands"]} == {
-        "speed"
-    }
+    assert {band["by"] for band in Judged(run, [candidate("a")], logs, SCALES).bands()} == {"speed"}
     few = FreeRun("T2", "test", run.windows[:8], {"a": run.predictions["a"][:8]})
     # 8 windows: thirds of 3, 2 and 3
-    assert [band["low"] for band in limits(few, [candidate("a")], logs, SCALES, STEP)["bands"]] == [
+    assert [band["low"] for band in Judged(few, [candidate("a")], logs, SCALES).bands()] == [
         1.0,
         6.0,
     ]
     # one speed: no breakdown at all
     still = [made(straight(1.0), STEP) for _ in range(9)]
-    assert limits(run, [candidate("a")], still, SCALES, STEP)["bands"] == []
+    assert Judged(run, [candidate("a")], still, SCALES).bands() == []
 
 
 def test_worst_windows_are_named() -> None:
     run, logs = nine()
-    found = limits(run, [candidate("a")], logs, SCALES, STEP)["worst"]["a"]
+    found = Judged(run, [candidate("a")], logs, SCALES).limits(STEP)["worst"]["a"]
     assert [entry["log"] for entry in found] == ["log8", "log7", "log6"]
-    errors = window_errors(run, "a", logs)
-    assert [entry["nrmse"] for entry in found] == pytest.approx(
-        nrmse_of_windows(errors, SCALES)[[8, 7, 6]].tolist()
-    )
+    # u alone is off, by 0.09, 0.08 and 0.07 m/s
+    worst = [0.01 * k / 0.5 / 3 for k in (9, 8, 7)]
+    assert [entry["nrmse"] for entry in found] == pytest.approx(worst)
     assert found[0]["t"] == pytest.approx(3.0)
     assert found[0]["rmse"]["u"] == pytest.approx(0.09)
     assert found[0]["manoeuvre"] == "zigzag"

@@ -11,8 +11,8 @@ from made_logs import made, random_states
 from residnet.baselines.given import StillConfig
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.zero import ZeroHead
-from residnet.judge.freerun import Candidate, FreeRun, Prediction
-from residnet.judge.metrics import find, rows, window_errors
+from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction
+from residnet.judge.metrics import Judged, find
 from residnet.judge.protocol import Window
 from residnet.physics.signals import SignalsConfig
 
@@ -39,17 +39,19 @@ def test_by_hand() -> None:
     predicted[-1, :3] = [3.0, -4.0, -0.5]
     log = made(y, 0.1, usable=np.array([True, True, True, False]))
     run = FreeRun("T1", "test", [window(0, 0, 4)], {"mine": [Prediction(predicted, False)]})
-    errors = window_errors(run, "mine", [log])
+    errors = Errors.of(run.windows, run.predictions["mine"], [log])
     # u and v over the three usable samples, r over all four
     np.testing.assert_allclose(
-        errors["rmse"], [[np.sqrt(0.25 / 3), np.sqrt(0.02 / 3), np.sqrt(0.03 / 4)]]
+        errors.rmse, [[np.sqrt(0.25 / 3), np.sqrt(0.02 / 3), np.sqrt(0.03 / 4)]]
     )
-    np.testing.assert_allclose(errors["mae"], [[0.7 / 3, 0.2 / 3, 0.3 / 4]])
-    assert errors["position_error_end"].tolist() == [5.0]
-    assert errors["heading_error_end"].tolist() == [0.5]
-    assert errors["samples"].tolist() == [3]
+    np.testing.assert_allclose(errors.mae, [[0.7 / 3, 0.2 / 3, 0.3 / 4]])
+    assert errors.position_end.tolist() == [5.0]
+    assert errors.heading_end.tolist() == [0.5]
+    assert errors.samples.tolist() == [3]
     (row,) = [
-        r for r in rows(run, [candidate("mine")], [log], SCALES, {}) if r["manoeuvre"] == "all"
+        r
+        for r in Judged(run, [candidate("mine")], [log], SCALES).rows({})
+        if r["manoeuvre"] == "all"
     ]
     nrmse = np.array([np.sqrt(0.25 / 3) / 0.5, np.sqrt(0.02 / 3) / 0.25, np.sqrt(0.03 / 4) / 0.1])
     assert [row["nrmse"][c] for c in "uvr"] == pytest.approx(nrmse.tolist())
@@ -77,12 +79,8 @@ def made_run(seed: int = 0) -> tuple[FreeRun, list]:
 
 def test_rows_equal_a_loop_over_windows() -> None:
     run, logs = made_run()
-    table = rows(
-        run,
-        [candidate("a"), candidate("b")],
-        logs,
-        SCALES,
-        {"manoeuvring": ["zigzag", "turning"], "absent": ["3211"]},
+    table = Judged(run, [candidate("a"), candidate("b")], logs, SCALES).rows(
+        {"manoeuvring": ["zigzag", "turning"], "absent": ["3211"]}
     )
     assert {row["manoeuvre"] for row in table} == {
         "all",
@@ -121,7 +119,7 @@ def test_rows_equal_a_loop_over_windows() -> None:
 
 def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
     run, logs = made_run()
-    row = find(rows(run, [candidate("a")], logs, SCALES, {}), model="a")
+    row = find(Judged(run, [candidate("a")], logs, SCALES).rows({}), model="a")
     # four logs of three windows: whole logs are too few, runs of two and one make eight
     assert row["ci95_blocks"] == {"of": "windows", "count": 8}
     for c in "uvr":
@@ -131,7 +129,7 @@ def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
     assert low < row["nrmse"]["mean"] < high
     alone = FreeRun("T3", "test", run.windows[:1], {"a": run.predictions["a"][:1]})
     (single,) = [
-        r for r in rows(alone, [candidate("a")], logs, SCALES, {}) if r["manoeuvre"] == "all"
+        r for r in Judged(alone, [candidate("a")], logs, SCALES).rows({}) if r["manoeuvre"] == "all"
     ]
     assert single["rmse_ci95"] == {"u": None, "v": None, "r": None}
     assert single["nrmse_mean_ci95"] is single["ci95_blocks"] is None
@@ -140,10 +138,11 @@ def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
 def test_differences_are_paired_by_window_and_kind() -> None:
     run, logs = made_run()
     errors = {
-        name: (window_errors(run, name, logs)["rmse"] / [0.5, 0.25, 0.1]).mean(1) for name in "ab"
+        name: (Errors.of(run.windows, run.predictions[name], logs).rmse / [0.5, 0.25, 0.1]).mean(1)
+        for name in "ab"
     }
     compared = replace(candidate("a"), reference="b")
-    table = rows(run, [compared, candidate("b")], logs, SCALES, {})
+    table = Judged(run, [compared, candidate("b")], logs, SCALES).rows({})
     for row in table:
         chosen = [row["manoeuvre"] in ("all", logs[w.log].log.manoeuvre) for w in run.windows]
         if row["model"] == "b":
@@ -163,7 +162,7 @@ def test_differences_are_paired_by_window_and_kind() -> None:
         )
         # only all kinds together make blocks enough
         assert (found["ci95"] is None) == (row["manoeuvre"] != "all")
-    lost = rows(run, [replace(compared, reference="absent")], logs, SCALES, {})
+    lost = Judged(run, [replace(compared, reference="absent")], logs, SCALES).rows({})
     assert {row["difference"] for row in lost} == {None}
 
 
@@ -175,13 +174,13 @@ def test_perfect_predictions_have_no_error() -> None:
         run.windows,
         {"a": [Prediction(logs[w.log].y[w.start : w.stop], False) for w in run.windows]},
     )
-    row = find(rows(exact, [candidate("a")], logs, SCALES, {}), model="a")
+    row = find(Judged(exact, [candidate("a")], logs, SCALES).rows({}), model="a")
     assert row["nrmse"]["mean"] == row["position_error_end"] == row["heading_error_end"] == 0.0
 
 
 def test_find_wants_exactly_one() -> None:
     run, logs = made_run()
-    table = rows(run, [candidate("a"), candidate("b")], logs, SCALES, {})
+    table = Judged(run, [candidate("a"), candidate("b")], logs, SCALES).rows({})
     assert find(table, model="b", split="test", protocol="T3", manoeuvre="zigzag")["windows"] == 6
     with pytest.raises(KeyError, match="0 rows"):
         find(table, model="c")

@@ -11,7 +11,7 @@ from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.zero import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
-from residnet.judge.metrics import compared, nrmse_of_windows, outside, trust, window_errors
+from residnet.judge.metrics import Judged
 from residnet.judge.protocol import Windows
 from residnet.judge.selection import blocks_of, shares
 from residnet.physics.signals import SignalsConfig
@@ -71,7 +71,7 @@ def run(logs: list[Prepared]) -> FreeRun:
 def test_the_horizon_ends_where_errors_are_no_longer_smaller(
     run: FreeRun, logs: list[Prepared]
 ) -> None:
-    entries = trust(run, CANDIDATES, logs, SCALES, STEP)["mlp"]["horizons"]
+    entries = Judged(run, CANDIDATES, logs, SCALES).trust(STEP)["mlp"]["horizons"]
     assert [entry["windows"] for entry in entries] == [12] * 8
     better = [entry["high"] for entry in entries if entry["difference"]["nrmse_mean"] < 0]
     assert max(better) == pytest.approx(12.5, abs=1.3)
@@ -79,7 +79,7 @@ def test_the_horizon_ends_where_errors_are_no_longer_smaller(
 
 
 def test_speeds_are_bands_of_at_least_five_windows(run: FreeRun, logs: list[Prepared]) -> None:
-    entries = trust(run, CANDIDATES, logs, SCALES, STEP)["baseline"]["speeds"]
+    entries = Judged(run, CANDIDATES, logs, SCALES).trust(STEP)["baseline"]["speeds"]
     assert [round(entry["low"], 1) for entry in entries] == [0.6, 1.5]
     assert all(entry["difference"]["nrmse_mean"] < 0 for entry in entries)
 
@@ -87,20 +87,20 @@ def test_speeds_are_bands_of_at_least_five_windows(run: FreeRun, logs: list[Prep
 def test_every_model_is_compared_with_zero_and_the_first_baseline(
     run: FreeRun, logs: list[Prepared]
 ) -> None:
-    errors = {name: window_errors(run, name, logs) for name in run.predictions}
-    found = compared(run, CANDIDATES, SCALES, errors)
+    judged = Judged(run, CANDIDATES, logs, SCALES)
+    found = judged.compared()
     assert set(found["mlp"]) == {"zero", "baseline"}
     assert set(found["baseline"]) == {"zero"}
     apart = found["baseline"]["zero"]["nrmse_mean"]
-    expected = nrmse_of_windows(errors["baseline"], SCALES) - nrmse_of_windows(
-        errors["zero"], SCALES
-    )
+    # u alone is off, by 0.09 and 0.1 m/s, and the more the later the log
+    expected = np.array([(1.0 + 0.01 * w.log) * -0.01 / 0.5 / 3 for w in run.windows])
+    assert judged.nrmse["zero"][0] == pytest.approx(0.1 / 0.5 / 3)
     assert apart == pytest.approx(expected.mean())
 
 
 def test_samples_outside_the_training_range_are_counted(run: FreeRun, logs: list[Prepared]) -> None:
     # one of six logs is faster than 2 m/s
-    found = outside(run, CANDIDATES, logs)
+    found = Judged(run, CANDIDATES, logs, SCALES).outside()
     assert found["share"] == pytest.approx(1 / 6)
     assert found["channels"] == {"u": pytest.approx(1 / 6)}
 
@@ -116,5 +116,5 @@ def test_shares_of_blocks_sum_to_the_mean_error(
     assert (found.of, len(found.weights)) == (of, blocks)
     assert found.weights.sum() == pytest.approx(1.0)
     own = shares(part, "mlp", logs, SCALES, labels, blocks)
-    expected = nrmse_of_windows(window_errors(part, "mlp", logs), SCALES).mean()
+    expected = Judged(part, [CANDIDATES[2]], logs, SCALES).nrmse["mlp"].mean()
     assert own.sum() == pytest.approx(expected)

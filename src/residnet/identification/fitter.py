@@ -33,8 +33,7 @@ from residnet.identification.models import FitStore, FittedModel, NoStore
 from residnet.identification.prepared import PreparedSplits, velocity_limit
 from residnet.identification.recipe import Facts
 from residnet.identification.settings import FitSettings, ForceConfig, GateConfig
-from residnet.judge.freerun import Candidate, FreeRun, free_run
-from residnet.judge.metrics import window_errors
+from residnet.judge.freerun import Candidate, Errors, free_run
 from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.training.config import TrainingConfig
@@ -104,9 +103,9 @@ class ValidationScore:
         predictions = free_run(
             [candidate], self.windows, self.logs, self.step, self.limit, dtype=torch.float32
         )
-        errors = window_errors(FreeRun("", "", self.windows, predictions), "validated", self.logs)
+        errors = Errors.of(self.windows, predictions["validated"], self.logs)
         diverged = sum(prediction.diverged for prediction in predictions["validated"])
-        axes = errors["rmse"].mean(0) / self.scales
+        axes = errors.rmse.mean(0) / self.scales
         window, states = self.windows[0], predictions["validated"][0].states
         measured = self.logs[window.log].y[window.start : window.start + len(states)]
         pairs = (torch.from_numpy(part[:, VELOCITIES]).T for part in (measured, states))

@@ -26,7 +26,7 @@ from residnet.identification.settings import FitSettings
 from residnet.judge.band import Bands
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.goodness import OneStep, table
-from residnet.judge.metrics import limits, metrics_table, rows
+from residnet.judge.metrics import Judged, metrics_table
 from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
 from residnet.judge.selection import (
     Contender,
@@ -133,8 +133,9 @@ def evaluate_splits(
         begin, out, logs = end, found[split], splits[split]
         run = FreeRun(name, split, windows, own)
         out.runs.append(run)
-        out.rows.extend(rows(run, models, logs, scales, config.groups))
-        out.limits[name] = limits(run, models, logs, scales, step)
+        judged = Judged(run, models, logs, scales)
+        out.rows.extend(judged.rows(config.groups))
+        out.limits[name] = judged.limits(step)
     return found
 
 

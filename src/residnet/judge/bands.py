@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any
@@ -54,10 +54,13 @@ class RunErrors:
 
 
 def run_errors(
-    windows: Sequence[Window], predictions: Sequence[Prediction], logs: Sequence[Prepared]
+    windows: Sequence[Window],
+    predictions: Sequence[Prediction],
+    logs: Sequence[Prepared],
+    found: Errors | None = None,
 ) -> list[RunErrors]:
     """Return the errors of one model's free runs over W windows, their first samples left out."""
-    found = Errors.of(windows, predictions, logs)
+    found = Errors.of(windows, predictions, logs) if found is None else found
     channels = np.column_stack(
         (
             np.abs(found.error[:, VELOCITIES]),
@@ -122,7 +125,10 @@ class BandCounts:
 
 
 def count_bands(
-    run: FreeRun, candidates: Sequence[Candidate], logs: Sequence[Prepared]
+    run: FreeRun,
+    candidates: Sequence[Candidate],
+    logs: Sequence[Prepared],
+    found: Mapping[str, Errors],
 ) -> dict[str, BandCounts]:
     """Return how the bands fared over the windows of one protocol, by model.
 
@@ -130,24 +136,24 @@ def count_bands(
         run: free runs of all models.
         candidates: the models; those without a band under this protocol are left out.
         logs: that the windows belong to.
+        found: errors by model.
     """
     fitted = [c.name for c in candidates if c.kind in _FITTED]
     spreads = _spreads(run, fitted) if len(fitted) > 1 else None
     return {
-        candidate.name: _counted(run, candidate.name, logs, candidate.bands[run.protocol], spreads)
-        for candidate in candidates
-        if run.protocol in candidate.bands
+        one.name: _counted(
+            run_errors(run.windows, run.predictions[one.name], logs, found[one.name]),
+            one.bands[run.protocol],
+            spreads,
+        )
+        for one in candidates
+        if run.protocol in one.bands
     }
 
 
 def _counted(
-    run: FreeRun,
-    model: str,
-    logs: Sequence[Prepared],
-    band: Band,
-    spreads: Sequence[np.ndarray] | None,
+    runs: Sequence[RunErrors], band: Band, spreads: Sequence[np.ndarray] | None
 ) -> BandCounts:
-    runs = run_errors(run.windows, run.predictions[model], logs)
     errors = [own.error for own in runs]
     widths = [band.half_widths(own.states) for own in runs]
     largest = worst(errors, widths)

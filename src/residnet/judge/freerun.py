@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from residnet.core.layout import POSE, VELOCITIES
+from residnet.core.layout import HEADING, POSE, POSITION, VELOCITIES
 from residnet.core.names import STATE, VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
@@ -142,6 +142,26 @@ class Errors:
     def rmse(self) -> np.ndarray:
         """Root mean square errors of u, v and r of each window [W, 3]."""
         return np.asarray(np.sqrt(self.mean(self.velocities**2)))
+
+    @property
+    def mae(self) -> np.ndarray:
+        """Mean absolute errors of u, v and r of each window [W, 3]."""
+        return self.mean(np.abs(self.velocities))
+
+    @property
+    def position_end(self) -> np.ndarray:
+        """Distance from the measured position at the end of each window [W]."""
+        return np.asarray(np.hypot(*self.error[self.begins + self.counts - 1][:, POSITION].T))
+
+    @property
+    def heading_end(self) -> np.ndarray:
+        """Absolute error of the heading at the end of each window [W]."""
+        return np.asarray(np.abs(self.error[self.begins + self.counts - 1, HEADING]))
+
+    @property
+    def samples(self) -> np.ndarray:
+        """Usable samples of each window [W]."""
+        return np.asarray(np.add.reduceat(self.usable.astype(int), self.begins))
 
 
 def free_run(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from residnet.core.layout import HEADING, POSE, VELOCITIES
+from residnet.core.layout import POSE, VELOCITIES
 from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.judge.bands import count_bands
@@ -154,132 +154,314 @@ def difference(
 
 
 SCHEMA = "residnet.metrics/1"
+LIMITS_SCHEMA = "residnet.limits/1"
+ZERO = "zero"
+_PARTS = 8
+_WORST = 3
+_BANDS = 3
+_OF_A_BAND = 5
+"""Windows that a band of speeds has where there are so many: fewer logs have no interval."""
+_LEAST = 3
+_WIND = "wind_speed"
 
 
-def window_errors(run: FreeRun, model: str, logs: Sequence[Prepared]) -> dict[str, np.ndarray]:
-    """Return the errors of one model by window.
-
-    rmse and mae [W, 3] of (u, v, r), position_error_end and heading_error_end [W], samples [W].
-    """
-    found = Errors.of(run.windows, run.predictions[model], logs)
-    last = found.error[found.begins + found.counts - 1]
-    return {
-        "rmse": found.rmse,
-        "mae": found.mean(np.abs(found.velocities)),
-        "position_error_end": np.hypot(last[:, 0], last[:, 1]),
-        "heading_error_end": np.abs(last[:, HEADING]),
-        "samples": np.add.reduceat(found.usable.astype(int), found.begins),
-    }
-
-
-def rows(
-    run: FreeRun,
-    candidates: Sequence[Candidate],
-    logs: Sequence[Prepared],
-    scales: Mapping[str, float],
-    groups: Mapping[str, Sequence[str]],
-) -> list[dict[str, Any]]:
-    """Return the rows of metrics.json for one protocol and split.
-
-    Every model, over all windows, every kind of manoeuvre and every named group of kinds.
-
-    `difference` compares a model with its reference (`Candidate.reference`) over the same windows;
-    None where it has none. Models with a band have its coverage and interval score, too.
+class Judged:
+    """The errors of all models over the W windows of one protocol, and what is read off them.
 
     Args:
         run: free runs of all models.
         candidates: the models.
         logs: that the windows belong to.
-        scales: what nrmse divides by.
-        groups: named sets of kinds of manoeuvre.
+        scales: of u, v, r, which nrmse divides by.
     """
-    kinds = [logs[window.log].log.manoeuvre for window in run.windows]
-    subsets = (
-        {"all": sorted(set(kinds))}
-        | {kind: [kind] for kind in sorted(set(kinds))}
-        | {name: list(members) for name, members in groups.items()}
-    )
-    errors = {candidate.name: window_errors(run, candidate.name, logs) for candidate in candidates}
-    banded = count_bands(run, candidates, logs)
-    out = []
-    for candidate in candidates:
-        diverged = np.array([prediction.diverged for prediction in run.predictions[candidate.name]])
-        for name, members in subsets.items():
-            chosen = np.array([kind in members for kind in kinds])
-            if chosen.any():
-                row: dict[str, Any] = {
-                    "model": candidate.name,
-                    "kind": candidate.kind,
-                    "split": run.split,
-                    "protocol": run.protocol,
+
+    def __init__(
+        self,
+        run: FreeRun,
+        candidates: Sequence[Candidate],
+        logs: Sequence[Prepared],
+        scales: Mapping[str, float],
+    ) -> None:
+        self.run, self.candidates, self.logs = run, candidates, logs
+        self.scale = np.array([scales[name] for name in VELOCITY])
+        self.parts = [(logs[w.log], slice(w.start, w.stop)) for w in run.windows]
+        self.numbers = np.array([window.log for window in run.windows])
+        self.found = {
+            one.name: Errors.of(run.windows, run.predictions[one.name], logs) for one in candidates
+        }
+        self.nrmse = {
+            name: np.asarray((found.rmse / self.scale).mean(1))
+            for name, found in self.found.items()
+        }
+
+    def difference(
+        self,
+        name: str,
+        other: str | None,
+        chosen: np.ndarray,
+        values: Mapping[str, np.ndarray] | None = None,
+    ) -> dict[str, Any] | None:
+        """Return the paired difference of two models over chosen windows [W] bool.
+
+        None where the other is not among the models. `values` [W] by model stand for the nrmse.
+        """
+        values = self.nrmse if values is None else values
+        if other is None or other not in values:
+            return None
+        drawn = blocks(self.numbers[chosen])
+        return difference(values[name][chosen], values[other][chosen], other, drawn)
+
+    def rows(self, groups: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:
+        """Return the rows of metrics.json.
+
+        Every model, over all windows, every kind of manoeuvre and every named group of kinds.
+        `difference` compares a model with its reference (`Candidate.reference`); None where it has
+        none. Models with a band have its coverage and interval score, too.
+        """
+        kinds = [log.log.manoeuvre for log, _ in self.parts]
+        subsets: dict[str, Sequence[str]] = {"all": kinds}
+        subsets |= {kind: [kind] for kind in sorted(set(kinds))} | dict(groups)
+        banded = count_bands(self.run, self.candidates, self.logs, self.found)
+        out = []
+        for one in self.candidates:
+            for name, members in subsets.items():
+                chosen = np.isin(kinds, list(members))
+                if not chosen.any():
+                    continue
+                labels = {
+                    "model": one.name,
+                    "kind": one.kind,
+                    "split": self.run.split,
+                    "protocol": self.run.protocol,
                     "manoeuvre": name,
                 }
-                part = {key: values[chosen] for key, values in errors[candidate.name].items()}
-                drawn = blocks(
-                    [window.log for window, taken in zip(run.windows, chosen, strict=True) if taken]
-                )
-                row |= _summary(part, int(diverged[chosen].sum()), scales, drawn)
-                row["difference"] = against(errors, candidate, scales, chosen, drawn)
-                if candidate.name in banded:
-                    row |= banded[candidate.name].row(chosen)
-                out.append(row)
-    return out
+                row = labels | self._summary(one.name, chosen)
+                row["difference"] = self.difference(one.name, one.reference, chosen)
+                out.append(row | (banded[one.name].row(chosen) if one.name in banded else {}))
+        return out
+
+    def _summary(self, name: str, chosen: np.ndarray) -> dict[str, Any]:
+        found, drawn = self.found[name], blocks(self.numbers[chosen])
+        by_window = np.column_stack((found.rmse, self.nrmse[name]))[chosen]
+        rmse, mae = by_window[:, :3].mean(0), found.mae[chosen].mean(0)
+        nrmse = rmse / self.scale
+        spread = intervals(by_window, drawn)
+        samples = found.samples[chosen]
+
+        def named(values: np.ndarray) -> dict[str, float]:
+            return dict(zip(VELOCITY, values.tolist(), strict=True))
+
+        return {
+            "windows": len(samples),
+            "n": int(samples.sum()),
+            "diverged": sum(
+                one.diverged
+                for one, taken in zip(self.run.predictions[name], chosen, strict=True)
+                if taken
+            ),
+            "rmse": named(rmse),
+            "mae": named(mae),
+            "nrmse": named(nrmse) | {"mean": float(nrmse.mean())},
+            "rmse_ci95": dict(zip(VELOCITY, spread, strict=False)),
+            "nrmse_mean_ci95": spread[3],
+            "ci95_blocks": drawn.row() if drawn is not None else None,
+            "position_error_end": float(found.position_end[chosen].mean()),
+            "heading_error_end": float(found.heading_end[chosen].mean()),
+        }
+
+    def limits(self, step: float) -> dict[str, Any]:
+        """Return the part of limits.json for one protocol and split; `step` of the grid in s."""
+        return {
+            "kinematics": self.kinematics(step),
+            "bands": self.bands(),
+            "worst": {name: self.worst(name) for name in self.found},
+            "compared": self.compared(),
+            "outside": self.outside(),
+            "trust": self.trust(step),
+        }
+
+    def kinematics(self, step: float) -> dict[str, float]:
+        """Return how far integrated measured velocities end from the measured pose.
+
+        They are integrated over each window from its measured pose, as predictions are.
+
+        Returns:
+            windows; position_mean, position_rms in m and heading_mean, heading_rms in rad at the
+            ends of windows. A model that predicted the measured velocities exactly would have
+            these errors.
+        """
+        measured = [log.y[part] for log, part in self.parts]
+        ends = [integrate(y[0, POSE], y[:, VELOCITIES], step)[-1] - y[-1, POSE] for y in measured]
+        error = np.array(ends)
+        position, heading = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
+        out: dict[str, float] = {"windows": len(error)}
+        for name, values in (("position", position), ("heading", heading)):
+            out[f"{name}_mean"] = float(values.mean())
+            out[f"{name}_rms"] = float(np.sqrt(np.mean(values**2)))
+        return out
+
+    def _speeds(self) -> np.ndarray:
+        return np.array(
+            [np.hypot(*log.y[part, VELOCITIES][:, :2].T).mean() for log, part in self.parts]
+        )
+
+    def bands(self) -> list[dict[str, Any]]:
+        """Return errors by thirds of the windows in mean speed and in mean true wind speed.
+
+        The wind only where every log has it. A band of fewer than three windows is left out, and
+        so is a quantity of which one band remains. Each entry: `by` (speed or wind), `low` and
+        `high` in m/s (extremes of the windows' means), `windows`, and by model `nrmse_mean` and
+        `difference` as in metrics.json.
+        """
+        quantities = {"speed": self._speeds()}
+        if all(_WIND in log.log.channels for log, _ in self.parts):
+            winds = [log.log[_WIND][part].mean() for log, part in self.parts]
+            quantities["wind"] = np.array(winds)
+        out = []
+        for quantity, values in quantities.items():
+            if not np.isfinite(values).all():
+                continue
+            thirds = [part for part in _equal_parts(values, _BANDS) if part.sum() >= _LEAST]
+            out += [
+                {
+                    "by": quantity,
+                    "low": float(values[chosen].min()),
+                    "high": float(values[chosen].max()),
+                    "windows": int(chosen.sum()),
+                    "models": {
+                        one.name: {
+                            "nrmse_mean": float(self.nrmse[one.name][chosen].mean()),
+                            "difference": self.difference(one.name, one.reference, chosen),
+                        }
+                        for one in self.candidates
+                    },
+                }
+                for chosen in (thirds if len(thirds) > 1 else ())
+            ]
+        return out
+
+    def worst(self, name: str) -> list[dict[str, Any]]:
+        """Return the three windows with the largest nrmse of a model.
+
+        Each with log, manoeuvre, t (start, the log's clock, s), nrmse, rmse, position_error_end.
+        """
+        found, nrmse = self.found[name], self.nrmse[name]
+        return [
+            {
+                "log": self.parts[i][0].log.name,
+                "manoeuvre": self.parts[i][0].log.manoeuvre,
+                "t": float(self.parts[i][0].log.t[self.run.windows[i].start]),
+                "nrmse": float(nrmse[i]),
+                "rmse": dict(zip(VELOCITY, found.rmse[i].tolist(), strict=True)),
+                "position_error_end": float(found.position_end[i]),
+            }
+            for i in np.argsort(-nrmse, kind="stable")[:_WORST].tolist()
+        ]
+
+    def compared(self) -> dict[str, dict[str, Any]]:
+        """Return by model its paired differences to `zero` and to the first baseline."""
+        everywhere = np.ones(len(self.numbers), dtype=bool)
+        others = [ZERO] if ZERO in self.found else []
+        others += [one.name for one in self.candidates if one.kind == "baseline"][:1]
+        return {
+            name: {
+                other: self.difference(name, other, everywhere) for other in others if other != name
+            }
+            for name in self.found
+        }
+
+    def outside(self) -> dict[str, Any]:
+        """Return how much of the windows lies outside the range of the training data.
+
+        Returns:
+            `share` of the usable samples with a velocity or an input outside its range, and
+            `channels`: the share of each channel that is; empty where no model says its ranges.
+        """
+        ranges = next((one.ranges for one in self.candidates if one.ranges), {})
+        if not ranges:
+            return {}
+        values = np.concatenate(
+            [
+                np.concatenate((log.y[part, VELOCITIES], log.w[part]), axis=1)[log.usable[part]]
+                for log, part in self.parts
+            ]
+        )
+        low, high = np.array(list(ranges.values())).T
+        beyond = (values < low) | (values > high)
+        shares = dict(zip(ranges, beyond.mean(0).tolist(), strict=True))
+        return {
+            "share": float(beyond.any(1).mean()),
+            "channels": {name: share for name, share in shares.items() if share > 0},
+        }
+
+    def trust(self, step: float) -> dict[str, dict[str, Any]]:
+        """Return by model at which horizons and speeds its errors are smaller than `zero`'s.
+
+        Returns:
+            By model `horizons` and `speeds`, each a list of entries with `low` and `high` (s after
+            the start, or m/s), `windows`, and `difference` to `zero` as in metrics.json. Horizons
+            are eighths of the longest window, speeds up to three equal parts of the windows by
+            mean speed. Parts of fewer than three windows are left out.
+        """
+        if ZERO not in self.found:
+            return {}
+        longest = int(self.found[ZERO].counts.max())
+        edges = np.unique(np.linspace(1, longest, _PARTS + 1).round().astype(int))
+        by_part = {name: self._by_part(found, edges) for name, found in self.found.items()}
+        whole = {name: np.nanmean(values, axis=1) for name, values in by_part.items()}
+        speeds = self._speeds()
+        count = min(max(len(speeds) // _OF_A_BAND, 1), _BANDS)
+        bands = [part for part in _equal_parts(speeds, count) if part.any()]
+
+        def entry(
+            name: str, values: Mapping[str, np.ndarray], there: np.ndarray, low: float, high: float
+        ) -> list[dict[str, Any]]:
+            if there.sum() < min(_LEAST, len(there)):
+                return []
+            apart = self.difference(name, ZERO, there, values)
+            return [{"low": low, "high": high, "windows": int(there.sum()), "difference": apart}]
+
+        out = {}
+        for name in self.found:
+            horizons, by_speed = [], []
+            for part, (begin, end) in enumerate(pairwise(edges.tolist())):
+                own = {key: values[:, part] for key, values in by_part.items()}
+                there = np.isfinite(own[name])
+                horizons += entry(name, own, there, begin * step, end * step)
+            for there in bands:
+                ends = float(speeds[there].min()), float(speeds[there].max())
+                by_speed += entry(name, whole, there, *ends)
+            if name != ZERO:
+                out[name] = {"horizons": horizons, "speeds": by_speed}
+        return out
+
+    def _by_part(self, found: Errors, edges: np.ndarray) -> np.ndarray:
+        """Normalised root mean square errors by window and part of its time, [W, parts]; NaN where
+        a window does not reach so far or has no usable sample there.
+        """
+        parts, windows = len(edges) - 1, len(found.counts)
+        part = np.searchsorted(edges, found.place, side="right") - 1
+        there = (part >= 0) & (part < parts)
+        bins = (np.repeat(np.arange(windows), found.counts) * parts + part)[there]
+
+        def sums(values: np.ndarray) -> np.ndarray:
+            columns = [np.bincount(bins, column[there], windows * parts) for column in values.T]
+            return np.stack(columns, axis=1)
+
+        count = sums(found.scored.astype(float))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out = (np.sqrt(sums(found.velocities**2) / count) / self.scale).mean(1)
+        out[count[:, 0] == 0] = np.nan
+        out = out.reshape(-1, parts)
+        out[edges[1:] > found.counts[:, None]] = np.nan
+        return np.asarray(out)
 
 
-def nrmse_of_windows(errors: Mapping[str, np.ndarray], scales: Mapping[str, float]) -> np.ndarray:
-    """Return the mean over u, v, r of rmse / scale for each window, [W]."""
-    return np.asarray((errors["rmse"] / np.array([scales[name] for name in VELOCITY])).mean(1))
-
-
-def against(
-    errors: Mapping[str, Mapping[str, np.ndarray]],
-    candidate: Candidate,
-    scales: Mapping[str, float],
-    chosen: np.ndarray,
-    drawn: Blocks | None,
-) -> dict[str, Any] | None:
-    """Return the paired difference of a model to its reference over chosen windows [W] bool.
-
-    None where it has none among the models.
-    """
-    if candidate.reference is None or candidate.reference not in errors:
-        return None
-    own, other = (
-        nrmse_of_windows(errors[name], scales)[chosen]
-        for name in (candidate.name, candidate.reference)
-    )
-    return difference(own, other, candidate.reference, drawn)
-
-
-def _summary(
-    errors: Mapping[str, np.ndarray],
-    diverged: int,
-    scales: Mapping[str, float],
-    drawn: Blocks | None,
-) -> dict[str, Any]:
-    divisor = np.array([scales[name] for name in VELOCITY])
-    rmse, mae = errors["rmse"].mean(0), errors["mae"].mean(0)
-    nrmse = rmse / divisor
-    spread = intervals(
-        np.concatenate((errors["rmse"], nrmse_of_windows(errors, scales)[:, None]), axis=1), drawn
-    )
-
-    def named(values: np.ndarray) -> dict[str, float]:
-        return {name: float(value) for name, value in zip(VELOCITY, values, strict=True)}
-
-    return {
-        "windows": int(errors["samples"].size),
-        "n": int(errors["samples"].sum()),
-        "diverged": diverged,
-        "rmse": named(rmse),
-        "mae": named(mae),
-        "nrmse": named(nrmse) | {"mean": float(nrmse.mean())},
-        "rmse_ci95": {name: spread[i] for i, name in enumerate(VELOCITY)},
-        "nrmse_mean_ci95": spread[3],
-        "ci95_blocks": drawn.row() if drawn is not None else None,
-        "position_error_end": float(errors["position_error_end"].mean()),
-        "heading_error_end": float(errors["heading_error_end"].mean()),
-    }
+def _equal_parts(values: np.ndarray, count: int) -> list[np.ndarray]:
+    """[W] bool of each of so many equal parts, lowest first; equal values stay together."""
+    edges = np.quantile(values, np.arange(1, count) / count)
+    place = np.searchsorted(edges, values, side="left")
+    return [place == part for part in range(count)]
 
 
 def find(table: Sequence[Mapping[str, Any]], **wanted: str) -> Mapping[str, Any]:
@@ -289,316 +471,6 @@ def find(table: Sequence[Mapping[str, Any]], **wanted: str) -> Mapping[str, Any]
     if len(found) != 1:
         raise KeyError(f"{len(found)} rows with {keys}")
     return found[0]
-
-
-ZERO = "zero"
-_PARTS = 8
-_MOST_BANDS = 3
-_OF_A_BAND = 5
-"""Windows that a band of speeds has where there are so many: fewer logs have no interval."""
-_LEAST = 3
-
-
-def compared(
-    run: FreeRun,
-    candidates: Sequence[Candidate],
-    scales: Mapping[str, float],
-    errors: Mapping[str, Mapping[str, np.ndarray]],
-) -> dict[str, dict[str, Any]]:
-    """Return each model's paired differences to `zero` and to the first baseline.
-
-    Args:
-        run: free runs of one protocol.
-        candidates: the models.
-        scales: of u, v, r.
-        errors: of each model by window, see `residnet.judge.metrics.window_errors`.
-
-    Returns:
-        By model, then by the name of what it is compared with: a difference as in metrics.json.
-    """
-    drawn = blocks([window.log for window in run.windows])
-    by_window = {
-        candidate.name: nrmse_of_windows(errors[candidate.name], scales) for candidate in candidates
-    }
-    others = [ZERO] if ZERO in by_window else []
-    others += [candidate.name for candidate in candidates if candidate.kind == "baseline"][:1]
-    return {
-        name: {
-            other: difference(own, by_window[other], other, drawn)
-            for other in others
-            if other != name
-        }
-        for name, own in by_window.items()
-    }
-
-
-def outside(
-    run: FreeRun, candidates: Sequence[Candidate], logs: Sequence[Prepared]
-) -> dict[str, Any]:
-    """Return how much of the windows lies outside the range of the training data.
-
-    Returns:
-        `share` of the usable samples with a velocity or an input outside its range, and `channels`:
-        the share of each channel that is; empty where no model says its ranges.
-    """
-    ranges = next((candidate.ranges for candidate in candidates if candidate.ranges), {})
-    if not ranges:
-        return {}
-    rows = [(logs[window.log], slice(window.start, window.stop)) for window in run.windows]
-    values = np.concatenate(
-        [
-            np.concatenate((log.y[part, VELOCITIES], log.w[part]), axis=1)[log.usable[part]]
-            for log, part in rows
-        ]
-    )
-    low, high = np.array(list(ranges.values())).T
-    beyond = (values < low) | (values > high)
-    shares = beyond.mean(0)
-    return {
-        "share": float(beyond.any(1).mean()),
-        "channels": {
-            name: float(share) for name, share in zip(ranges, shares, strict=True) if share > 0
-        },
-    }
-
-
-def trust(
-    run: FreeRun,
-    candidates: Sequence[Candidate],
-    logs: Sequence[Prepared],
-    scales: Mapping[str, float],
-    step: float,
-) -> dict[str, dict[str, Any]]:
-    """Return by model at which horizons and speeds its errors are smaller than those of `zero`.
-
-    Returns:
-        By model `horizons` and `speeds`, each a list of entries with `low` and `high` (s after the
-        start, or m/s), `windows`, and `difference` to `zero` as in metrics.json. Horizons are
-        eighths of the longest window, speeds up to three equal parts of the windows by mean speed.
-        Parts of fewer than three windows are left out.
-    """
-    if ZERO not in run.predictions:
-        return {}
-    scale = np.array([scales[name] for name in VELOCITY])
-    longest = max(window.stop - window.start for window in run.windows)
-    edges = np.unique(np.linspace(1, longest, _PARTS + 1).round().astype(int))
-    speeds = np.array(
-        [
-            np.hypot(*logs[w.log].y[w.start : w.stop, VELOCITIES][:, :2].T).mean()
-            for w in run.windows
-        ]
-    )
-    numbers = np.array([window.log for window in run.windows])
-    by_part = {
-        candidate.name: _by_part(run, candidate.name, logs, scale, edges)
-        for candidate in candidates
-    }
-    whole = {name: np.nanmean(values, axis=1) for name, values in by_part.items()}
-    out = {}
-    for candidate in candidates:
-        if candidate.name == ZERO:
-            continue
-        own, zero = by_part[candidate.name], by_part[ZERO]
-        horizons = []
-        for part, (begin, end) in enumerate(pairwise(edges.tolist())):
-            there = np.isfinite(own[:, part])
-            entry = _entry(own[:, part], zero[:, part], numbers, there)
-            horizons += [{"low": begin * step, "high": end * step, **e} for e in entry]
-        bands = []
-        for there in _bands(speeds):
-            entry = _entry(whole[candidate.name], whole[ZERO], numbers, there)
-            low, high = float(speeds[there].min()), float(speeds[there].max())
-            bands += [{"low": low, "high": high, **e} for e in entry]
-        out[candidate.name] = {"horizons": horizons, "speeds": bands}
-    return out
-
-
-def _entry(
-    own: np.ndarray, zero: np.ndarray, numbers: np.ndarray, there: np.ndarray
-) -> list[dict[str, Any]]:
-    """The difference over the windows that are there [W] bool; empty where there are too few."""
-    if there.sum() < min(_LEAST, len(there)):
-        return []
-    drawn = blocks(numbers[there])
-    return [
-        {
-            "windows": int(there.sum()),
-            "difference": difference(own[there], zero[there], ZERO, drawn),
-        }
-    ]
-
-
-def _by_part(
-    run: FreeRun, model: str, logs: Sequence[Prepared], scale: np.ndarray, edges: np.ndarray
-) -> np.ndarray:
-    """Normalised root mean square errors by window and part of its time, [W, parts]; NaN where a
-    window does not reach so far or has no usable sample there.
-    """
-    found, parts = Errors.of(run.windows, run.predictions[model], logs), len(edges) - 1
-    part = np.searchsorted(edges, found.place, side="right") - 1
-    there = (part >= 0) & (part < parts)
-    bins = (np.repeat(np.arange(len(run.windows)), found.counts) * parts + part)[there]
-
-    def sums(values: np.ndarray) -> np.ndarray:
-        size = len(run.windows) * parts
-        return np.stack([np.bincount(bins, column[there], size) for column in values.T], axis=1)
-
-    count = sums(found.scored.astype(float))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        out = (np.sqrt(sums(found.velocities**2) / count) / scale).mean(1)
-    out[count[:, 0] == 0] = np.nan
-    out = out.reshape(-1, parts)
-    out[edges[1:] > found.counts[:, None]] = np.nan
-    return np.asarray(out)
-
-
-def _bands(values: np.ndarray) -> list[np.ndarray]:
-    """[W] bool of each band that has a window, lowest first; equal values stay together."""
-    count = min(max(len(values) // _OF_A_BAND, 1), _MOST_BANDS)
-    edges = np.quantile(values, np.arange(1, count) / count)
-    place = np.searchsorted(edges, values, side="left")
-    return [place == band for band in range(count) if (place == band).any()]
-
-
-LIMITS_SCHEMA = "residnet.limits/1"
-_WORST = 3
-_BANDS = 3
-_LEAST_WINDOWS = 3
-_WIND = "wind_speed"
-
-
-def limits(
-    run: FreeRun,
-    candidates: Sequence[Candidate],
-    logs: Sequence[Prepared],
-    scales: Mapping[str, float],
-    step: float,
-) -> dict[str, Any]:
-    """Return the part of limits.json for one protocol and split.
-
-    It holds `kinematics`, `bands`, `worst`, `compared`, `outside` and `trust`.
-    """
-    errors = {candidate.name: window_errors(run, candidate.name, logs) for candidate in candidates}
-    return {
-        "kinematics": kinematics(run, logs, step),
-        "bands": bands(run, candidates, logs, scales, errors),
-        "worst": {
-            name: worst(run, logs, nrmse_of_windows(part, scales), part)
-            for name, part in errors.items()
-        },
-        "compared": compared(run, candidates, scales, errors),
-        "outside": outside(run, candidates, logs),
-        "trust": trust(run, candidates, logs, scales, step),
-    }
-
-
-def kinematics(run: FreeRun, logs: Sequence[Prepared], step: float) -> dict[str, float]:
-    """Return how far integrated measured velocities end from the measured pose.
-
-    They are integrated over each window from its measured pose, as predictions are.
-
-    Returns:
-        windows; position_mean, position_rms in m and heading_mean, heading_rms in rad at the ends
-        of windows. A model that predicted the measured velocities exactly would have these errors.
-    """
-    apart = []
-    for window in run.windows:
-        y = logs[window.log].y[window.start : window.stop]
-        apart.append(integrate(y[0, POSE], y[:, VELOCITIES], step)[-1] - y[-1, POSE])
-    error = np.array(apart)
-    position, heading = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
-    return {
-        "windows": len(error),
-        "position_mean": float(position.mean()),
-        "position_rms": float(np.sqrt(np.mean(position**2))),
-        "heading_mean": float(heading.mean()),
-        "heading_rms": float(np.sqrt(np.mean(heading**2))),
-    }
-
-
-def bands(
-    run: FreeRun,
-    candidates: Sequence[Candidate],
-    logs: Sequence[Prepared],
-    scales: Mapping[str, float],
-    errors: Mapping[str, Mapping[str, np.ndarray]],
-) -> list[dict[str, Any]]:
-    """Return errors by thirds of the windows in mean speed and in mean true wind speed.
-
-    The wind only where every log has it.
-
-    A band of fewer than three windows is left out, and so is a quantity of which one band remains.
-    Each entry: `by` (speed or wind), `low` and `high` in m/s (extremes of the windows' means),
-    `windows`, and by model `nrmse_mean` and `difference` as in metrics.json.
-    """
-    parts = [(logs[window.log], slice(window.start, window.stop)) for window in run.windows]
-    quantities = {
-        "speed": np.array([np.hypot(log.y[rows, 3], log.y[rows, 4]).mean() for log, rows in parts])
-    }
-    if all(_WIND in log.log.channels for log, _ in parts):
-        quantities["wind"] = np.array([log.log[_WIND][rows].mean() for log, rows in parts])
-    out = []
-    for name, values in quantities.items():
-        if not np.isfinite(values).all():
-            continue
-        thirds = [chosen for chosen in _bands_limits(values) if chosen.sum() >= _LEAST_WINDOWS]
-        for chosen in thirds if len(thirds) > 1 else ():
-            drawn = blocks(
-                [window.log for window, taken in zip(run.windows, chosen, strict=True) if taken]
-            )
-            models = {
-                candidate.name: {
-                    "nrmse_mean": float(
-                        nrmse_of_windows(errors[candidate.name], scales)[chosen].mean()
-                    ),
-                    "difference": against(errors, candidate, scales, chosen, drawn),
-                }
-                for candidate in candidates
-            }
-            low, high = float(values[chosen].min()), float(values[chosen].max())
-            out.append(
-                {
-                    "by": name,
-                    "low": low,
-                    "high": high,
-                    "windows": int(chosen.sum()),
-                    "models": models,
-                }
-            )
-    return out
-
-
-def _bands_limits(values: np.ndarray) -> list[np.ndarray]:
-    """[W] bool of each third, lowest first; equal values stay together."""
-    edges = np.quantile(values, np.arange(1, _BANDS) / _BANDS)
-    place = np.searchsorted(edges, values, side="left")
-    return [place == band for band in range(_BANDS)]
-
-
-def worst(
-    run: FreeRun, logs: Sequence[Prepared], nrmse: np.ndarray, errors: Mapping[str, np.ndarray]
-) -> list[dict[str, Any]]:
-    """Return the three windows with the largest nrmse [W].
-
-    Each with log, manoeuvre, t (start, the log's clock, s), nrmse, rmse and position_error_end.
-    """
-    out = []
-    for i in np.argsort(-nrmse, kind="stable")[:_WORST].tolist():
-        log = logs[run.windows[i].log]
-        rmse = dict(zip(("u", "v", "r"), errors["rmse"][i].tolist(), strict=True))
-        start = float(log.log.t[run.windows[i].start])
-        end = float(errors["position_error_end"][i])
-        out.append(
-            {
-                "log": log.log.name,
-                "manoeuvre": log.log.manoeuvre,
-                "t": start,
-                "nrmse": float(nrmse[i]),
-                "rmse": rmse,
-                "position_error_end": end,
-            }
-        )
-    return out
 
 
 _LABELS = ("model", "kind", "split", "protocol", "manoeuvre", "selected")
