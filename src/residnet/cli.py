@@ -363,7 +363,7 @@ def export(
             metavar="NAME",
             help="Name of the model; 'selected' for the one chosen on validation data.",
         ),
-    ],
+    ] = "selected",
     file_format: Annotated[
         str,
         typer.Option("--format", metavar="FORMAT", help="One of `residnet list formats`."),

@@ -49,6 +49,38 @@ def test_a_mean_over_the_step_ends_with_the_piece(broken: bool) -> None:
         assert log.w[k] == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("step", [0.1, 0.25])
+@pytest.mark.parametrize("kind", ["gaps", "dies", "rare", "nothing", "spikes"])
+def test_a_channel_that_nothing_uses_changes_nothing(kind: str, step: float) -> None:
+    random = np.random.default_rng(1)
+    t = 0.1 * np.arange(400)
+    channels = {name: 0.1 * np.sin(t + k) for k, name in enumerate((*STATE, "n"))}
+    other = random.normal(size=t.size)
+    spoiled = {
+        "gaps": random.random(t.size) < 0.3,
+        "dies": t > 20.0,
+        "rare": np.arange(t.size) % 10 > 0,
+        "nothing": np.ones(t.size, dtype=bool),
+        "spikes": np.zeros(t.size, dtype=bool),
+    }[kind]
+    other[spoiled] = np.nan
+    other[200] = 1e3 if kind == "spikes" else other[200]
+    config = PrepareConfig.model_validate(
+        {
+            "grid": {"step": step},
+            "derivative": {"kind": "savitzky_golay", "window": 1.5, "order": 2},
+            "masks": [{"kind": "spike"}, {"kind": "nan"}],
+        }
+    )
+    alone, beside = (
+        prepare(Log("made", t, content, manoeuvre="made"), "train", ("n",), config)
+        for content in (channels, {**channels, "voltage": other})
+    )
+    assert alone.good.sum() > 100
+    for name in ("y", "smooth", "nu_dot", "w", "piece", "usable", "good"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(beside, name))
+
+
 def test_windows_begin_where_told() -> None:
     logs = [made("start"), made("start", broken=True)]
     store = WindowStore.gather(logs)

@@ -93,6 +93,10 @@ def test_measured_csv_end_to_end(
             assert row["rmse"] == pytest.approx(mine["rmse"], rel=1e-12)
     assert call(monkeypatch, "export", out, "--model", "ridge", "--format", "torchscript") == 0
     assert (out / "exports" / "ridge.pt").is_file()
+    assert call(monkeypatch, "export", out, "--out", tmp_path / "chosen") == 0
+    card = json.loads((tmp_path / "chosen.card.json").read_text())
+    assert card["model"] == content["selected"]
+    assert (tmp_path / "chosen.pt").is_file()
     capsys.readouterr()
     assert call(monkeypatch, "export", out, "--model", "rigde") == 2
     assert "did you mean 'ridge'" in one_line(capsys)

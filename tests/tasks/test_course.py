@@ -187,7 +187,7 @@ def test_a_policy_flies_the_course_and_is_exported(
     assert not bool(arrived)
     assert float(command.abs()) <= math.radians(5.001)
     assert exported.step(start, memory)[2].tolist() == [False]
-    assert call(monkeypatch, "export", "run/autopilot", "--model", "learned", "--format", "c") == 0
+    assert call(monkeypatch, "export", "run/autopilot", "--format", "c") == 0
     assert call(monkeypatch, "export", "run", "--model", "learned_sides", "--format", "c") == 0
     card = json.loads((tmp_path / "run/exports/learned_sides.card.json").read_text())
     assert (card["format"], card["dtype"]) == ("c", "float64")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from pydantic import Field
 
@@ -36,8 +38,14 @@ class GridConfig(Config):
     longest_gap: Seconds | None = Field(default=None, gt=0.0)
 
 
-def align(log: Log, config: GridConfig) -> Log:
+def align(log: Log, config: GridConfig, needed: Collection[str] | None = None) -> Log:
     """Return the log on the grid.
+
+    Args:
+        log: with an increasing clock.
+        config: grid.
+        needed: channels without which a sample is missing; all where None. What nobody uses must
+            cost no sample.
 
     A log that lies on the grid to a thousandth of a step keeps its times and samples exactly. Where
     the grid is coarser than the log by a factor of two or more, every channel that is not held is
@@ -69,8 +77,11 @@ def align(log: Log, config: GridConfig) -> Log:
         )
     grid = log.t[0] + config.step * np.arange(count)
     if count == len(log) and float(np.abs(log.t - grid).max()) <= _ON_GRID * config.step:
-        return _with_gap_mask(log, _incomplete(log.channels))
-    return _resampled(log, config, grid)
+        out = log
+    else:
+        out = _resampled(log, config, grid)
+    names = [name for name in out.channels if needed is None or name in needed]
+    return _with_gap_mask(out, np.isnan(out.stack(names)).any(axis=1))
 
 
 def onto(log: Log, config: GridConfig, times: np.ndarray) -> Log:
@@ -123,9 +134,7 @@ def _resampled(log: Log, config: GridConfig, grid: np.ndarray) -> Log:
             "samples_before": len(log),
         },
     }
-    return _with_gap_mask(
-        log.replace(t=grid, channels=channels, masks=masks, meta=meta), _incomplete(channels)
-    )
+    return log.replace(t=grid, channels=channels, masks=masks, meta=meta)
 
 
 class _Reach:
@@ -217,12 +226,6 @@ def _rewrapped(original: np.ndarray, continuous: np.ndarray, values: np.ndarray)
         return values
     low = 0.0 if np.nanmin(original) >= 0.0 else -np.pi
     return np.remainder(values - low, 2.0 * np.pi) + low
-
-
-def _incomplete(channels: dict[str, np.ndarray]) -> np.ndarray:
-    """Return [T] bool: NaN in any channel."""
-    missing: np.ndarray = np.isnan(np.stack(list(channels.values()))).any(axis=0)
-    return missing
 
 
 def _with_gap_mask(log: Log, missing: np.ndarray) -> Log:

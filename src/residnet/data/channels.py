@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from residnet.core.log import Log
@@ -104,13 +106,19 @@ def spike_cells(log: Log) -> dict[str, np.ndarray]:
     return out
 
 
-def without_spikes(log: Log) -> Log:
+def without_spikes(log: Log, needed: Collection[str] | None = None) -> Log:
     """Return the log with its spikes bridged and marked, the log itself where it has none.
+
+    Only channels that are needed are looked at, all where that is None.
 
     Measured channels are interpolated, others hold their last value. The mask `spike` keeps the
     samples from being learned from or scored.
     """
-    cells = spike_cells(log)
+    cells = {
+        name: bad
+        for name, bad in spike_cells(log).items()
+        if needed is None or name in needed
+    }
     if not cells:
         return log
     channels = dict(log.channels)

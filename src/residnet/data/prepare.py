@@ -114,8 +114,10 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
         DataError: where no sample remains, or a value is none that a vessel can have.
     """
     large = paged.lies_on_disk(log.t)
-    log = without_spikes(_plausible(log, columns))
-    log = align(_masked(log, columns, config), config.grid)
+    # a channel that the model does not use changes nothing
+    needed = {*STATE, *columns}
+    log = without_spikes(_plausible(log, columns), needed)
+    log = align(_masked(log, columns, config), config.grid, needed)
     y, w = log.stack(STATE), log.stack(tuple(columns))
     piece = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), segments(log), -1)
     usable = scored(log) & (piece >= 0)
@@ -166,11 +168,14 @@ def _plausible(log: Log, columns: Sequence[str]) -> Log:
 def _masked(log: Log, columns: Sequence[str], config: PrepareConfig) -> Log:
     """Return the log with its whole motion and the masks of the config."""
     whole = complete_motion(log, config.motion)
-    if whole is log:
-        return apply_masks(fill_sparse(log, tuple(columns), config.grid.held), config.masks)
+    filled = fill_sparse(whole, tuple(columns), config.grid.held)
     # masks look at the samples as recorded: interpolation hides a frozen sensor
-    seen = apply_masks(log.replace(channels={**whole.channels, **log.channels}), config.masks)
-    return fill_sparse(whole.replace(masks=seen.masks), tuple(columns), config.grid.held)
+    recorded = filled if whole is log else whole.replace(channels=whole.channels | log.channels)
+    asked = {*STATE, *columns}
+    asked |= {name for mask in config.masks for name in mask.model_dump().get("channels", ())}
+    seen = {name: values for name, values in recorded.channels.items() if name in asked}
+    masks = apply_masks(recorded.replace(channels=seen), config.masks).masks
+    return filled.replace(masks=masks)
 
 
 def _means(w: np.ndarray, piece: np.ndarray) -> np.ndarray:

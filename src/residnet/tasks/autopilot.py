@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, final
 
@@ -333,9 +333,22 @@ class AutopilotConfig(ComputingTask):
         def again(card: dict[str, Any]) -> Exported:
             return export_as(self, run, card, model)
 
-        if model not in self.policies:
-            raise UsageError(f"{run.path}: no policy '{model}'{nearest(model, self.policies)}")
+        model = named_export(run, model, self.policies)
         return exported_file(run, model, out, file_format, again)
+
+
+def named_export(run: RunFolder, name: str, names: Collection[str]) -> str:
+    """Return the export of that name; `selected` is the only one there is.
+
+    Raises:
+        UsageError: where there is no such export, or `selected` leaves open which.
+    """
+    if name == "selected" and len(names) == 1:
+        return next(iter(names))
+    if name not in names:
+        known = nearest(name, names) or f"; give one with --model: {', '.join(names)}"
+        raise UsageError(f"{run.path}: nothing to export is named '{name}'{known}")
+    return name
 
 
 def exported_file(
@@ -361,10 +374,12 @@ def exported_file(
     file = run.exports / f"{name}.pt"
     if not file.is_file():
         raise UsageError(f"{file}: no such file; the run writes it at its end")
-    if file_format != "torchscript":
-        from residnet.export import exporter
+    from residnet.export import exporter
+    from residnet.export.base import place_of
 
-        chosen, extra = exporter(file_format), {"card.json": ""}
+    chosen, extra = exporter(file_format), {"card.json": ""}
+    out = None if out is None else place_of(out, file, chosen.suffix)
+    if file_format != "torchscript":
         torch.jit.load(str(file), _extra_files=extra)
         out = out or file.with_name(f"{name}{chosen.suffix}")
         chosen.export(again(json.loads(extra["card.json"])), out)

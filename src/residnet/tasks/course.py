@@ -23,14 +23,14 @@ from residnet.core.config import (
     Seconds,
     load_config,
 )
-from residnet.core.errors import ConfigError, UsageError
+from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.dynamics.simulated import check_steps
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, Outcome
-from residnet.tasks.autopilot import AnyController, AutopilotConfig, exported_file
+from residnet.tasks.autopilot import AnyController, AutopilotConfig, exported_file, named_export
 
 if TYPE_CHECKING:
     from residnet.export.base import Exported
@@ -232,8 +232,7 @@ class CourseTaskConfig(ComputingTask):
         from residnet.tasks.course_run import export_as
 
         names = {f"{self.policy}_{protocol}": protocol for protocol in self.protocols}
-        if model not in names:
-            raise UsageError(f"{run.path}: no export '{model}'{nearest(model, names)}")
+        model = named_export(run, model, names)
 
         def again(card: dict[str, Any]) -> Exported:
             return export_as(self, run, card, names[model])

@@ -24,6 +24,7 @@ from residnet.data.simulated import SimulatedTrials
 from residnet.data.split import data_files, log_names
 from residnet.dynamics.store import ModelSpec, load_model, model_names
 from residnet.export import exporter
+from residnet.export.base import place_of
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.fit import fit
 from residnet.identification.identified import (
@@ -242,7 +243,8 @@ def export_model(run: RunFolder, name: str, out: Path | None, file_format: str) 
         raise UsageError(f"{run.path}: no model '{name}'{nearest(name, ['selected', *known])}")
     spec, model = load_model(run.models / chosen)
     rows = [row for row in metrics["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"]
-    file = out or run.exports / f"{chosen}{chosen_format.suffix}"
+    usual = run.exports / f"{chosen}{chosen_format.suffix}"
+    file = place_of(out, usual, chosen_format.suffix)
     chosen_format.export(ExportedVessel(spec, model, rows), file)
     return file
 
