@@ -4,6 +4,6 @@ source "$(dirname "${BASH_SOURCE[0]}")/_venv.sh"
 install_residnet "[dev]"
 export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 if [ $# -eq 0 ]; then
-  set -- -q -n 2 --dist loadgroup -m "not long and not exporters"
+  set -- -q -n 2 --dist loadfile --no-loadscope-reorder -m "not long and not exporters"
 fi
 exec .venv/bin/python -m pytest "$@"

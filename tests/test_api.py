@@ -68,6 +68,7 @@ def test_every_name_is_there_and_documented() -> None:
         _ = residnet.fitt  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_units_are_converted_as_they_are_declared(trials: Path, logs: list[residnet.Log]) -> None:
     flown = write_trials(trials.parent / "again", duration=40.0)
     by_name = {log.name: log for log in logs}
@@ -228,6 +229,7 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(
     assert loaded.notes["validation"] == pytest.approx(models["ridge"].notes["validation"])
 
 
+@pytest.mark.long
 def test_a_simulation_by_function_mapping_and_command_line_is_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -74,6 +74,7 @@ def write_knots(file: Path) -> None:
     np.savetxt(file, np.stack(columns, axis=1), delimiter=",")
 
 
+@pytest.mark.long
 def test_its_parts_pass_the_contracts_and_the_broken_one_is_caught(
     site: Path, tmp_path: Path
 ) -> None:
@@ -108,6 +109,7 @@ def test_its_head_runs_by_name_from_yaml(site: Path, tmp_path: Path) -> None:
     assert "head.readout.weight,0," in (run / "exports" / "slow.csv").read_text()
 
 
+@pytest.mark.long
 def test_a_package_that_is_not_there_is_missed_by_name(tmp_path: Path) -> None:
     """Without the package its kind is unknown, in one line."""
     config = {**TINY, "heads": {"slow": {"kind": "slow_water"}}}

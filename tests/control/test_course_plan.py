@@ -124,6 +124,7 @@ def test_no_part_of_a_plan_is_tighter_than_the_vessel_turns_and_buoys_stay_outsi
     assert planned.course.length <= 1.06 * planned.reference
 
 
+@pytest.mark.long
 def test_a_given_heading_lengthens_the_shortest_course_past_sides(vessel: SteeredPlant) -> None:
     """Along the first leg it changes nothing; away from it the vessel has to come round, pi R and
     more.

@@ -76,6 +76,7 @@ FOLLOWER = TrackKeeping(LAW, VESSEL.state, limit=LIMIT, dt=DT)
 CROSS = [0.8, -1.6, 0.0]
 
 
+@pytest.mark.long
 def test_a_leg_is_kept_at_the_crab_angle_of_the_current() -> None:
     for reference, policy in (
         (legs(IntegralLookAhead(12.0, 0.8, DT)), LAW),

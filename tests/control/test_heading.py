@@ -159,6 +159,7 @@ def test_document_law_takes_the_shorter_way_round() -> None:
     assert command[:, 0].tolist() == pytest.approx([float(command[0, 0])] * 3)
 
 
+@pytest.mark.long
 def test_document_autopilot_creeps_as_errata_says() -> None:
     """With the source's horizon of one step it turns at 0.011 deg/s; with 2 s it arrives."""
     plant = of_kind(load_vessel("nomoto_oceanos").build(), SteeringVessel)

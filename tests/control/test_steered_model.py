@@ -29,6 +29,7 @@ def pair(name: str) -> tuple[SteeredPlant, SteeredModel]:
     return vessel, SteeredModel(model, spec.signals.columns, spec.hold, vessel)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["nomoto_oceanos", "nomoto_oceanos_rate10"])
 def test_a_perfect_model_flies_as_its_vessel(name: str) -> None:
     vessel, learned = pair(name)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from residnet.core.errors import UsageError
-from residnet.core.files import whole
+from residnet.core.files import file_stem, whole
 
 
 def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
@@ -42,3 +42,25 @@ def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path, name: str) -
     with pytest.raises(UsageError, match="cannot be written") as caught, whole(path) as file:
         file.write_text("new")
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "x/../../../NAME",
+        "zigzag 10/10",
+        "..",
+        "",
+        "a\x00b",
+        "C:\\boat",
+        "\udce4",
+        "n" * 400,
+        "船" * 90,
+    ],
+)
+def test_a_name_becomes_one_file_of_one_folder(name: str, tmp_path: Path) -> None:
+    stem = file_stem(name)
+    (tmp_path / f"{stem}.txt").write_text("here")
+    assert [path.name for path in tmp_path.iterdir()] == [f"{stem}.txt"]
+    assert stem != file_stem(f"{name}/") != file_stem(f"{name}:")
+    assert file_stem("Zigzag 10, 20°_ä (2)") == "Zigzag 10, 20°_ä (2)"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import foreign_tables
 import numpy as np
@@ -11,7 +10,6 @@ import pandas as pd
 import pytest
 from foreign_tables import CHANNELS, NAMES, Style
 
-import residnet
 from residnet.core.config import validate
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks, Question
@@ -48,19 +46,9 @@ STYLES = {
 }
 
 
-@pytest.fixture(scope="module")
-def logs() -> list[Log]:
-    """Zigzags and turns of a ship with rudder and propeller."""
-    trials: list[dict[str, Any]] = [
-        {"kind": "zigzag", "drive": 0.8, "steer": 0.5, "heading": "20 deg", "start": 3},
-        {"kind": "turning_circle", "drive": 0.9, "steer": 0.4, "start": 3},
-        {"kind": "zigzag", "drive": 0.6, "steer": -0.4, "heading": "10 deg", "start": 3},
-    ]
-    noise = {"u": 0.02, "v": 0.02, "r": 0.002}
-    flown = residnet.simulate(
-        "example_rudder_boat", trials, duration=90.0, step=0.1, noise=noise, seed=4
-    )
-    return list(flown.logs)
+@pytest.fixture
+def logs(ship_logs: list[Log]) -> list[Log]:
+    return ship_logs
 
 
 @pytest.mark.parametrize("style", STYLES.values(), ids=STYLES.keys())

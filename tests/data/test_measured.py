@@ -111,6 +111,7 @@ def test_the_copied_file_is_caught_and_the_published_split_passes(
         check_leaks({**logs, "test": [*logs["test"], copy]})
 
 
+@pytest.mark.long
 def test_the_doctor_finds_the_known_illnesses(logs: dict[str, list[Log]]) -> None:
     lags, gyro, freezes = [], {}, []
     for log in itertools.chain(*logs.values()):
@@ -141,6 +142,7 @@ def test_the_doctor_finds_the_known_illnesses(logs: dict[str, list[Log]]) -> Non
     assert max(freezes) < 0.06
 
 
+@pytest.mark.long
 @needs_kvlcc2
 def test_tank_data_are_consistent_and_their_mistakes_would_be_seen() -> None:
     columns = {**KVLCC2, "delta": ("delta", "rad"), "n": ("rev", "1/s")}

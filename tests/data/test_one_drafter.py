@@ -28,19 +28,9 @@ STYLES = {
 }
 
 
-@pytest.fixture(scope="module")
-def logs() -> list[Log]:
-    """Zigzags and a turn of a ship with rudder and propeller."""
-    trials: list[dict[str, Any]] = [
-        {"kind": "zigzag", "drive": 0.8, "steer": 0.5, "heading": "20 deg", "start": 3},
-        {"kind": "turning_circle", "drive": 0.9, "steer": 0.4, "start": 3},
-        {"kind": "zigzag", "drive": 0.6, "steer": -0.4, "heading": "10 deg", "start": 3},
-    ]
-    noise = {"u": 0.02, "v": 0.02, "r": 0.002}
-    flown = residnet.simulate(
-        "example_rudder_boat", trials, duration=90.0, step=0.1, noise=noise, seed=4
-    )
-    return list(flown.logs)
+@pytest.fixture
+def logs(ship_logs: list[Log]) -> list[Log]:
+    return ship_logs
 
 
 @pytest.fixture(params=STYLES)

@@ -136,6 +136,7 @@ def test_the_true_wind_stands_in_the_log(windy: str) -> None:
     assert "wind_speed" not in calm.channels
 
 
+@pytest.mark.long
 def test_dead_time_needs_the_plants_own_step(tmp_path: Path) -> None:
     """Found when the config is read; the delay line itself enters no log."""
     text = vessel_files()["example_rudder_boat"].read_text()

@@ -155,6 +155,7 @@ def test_python_is_right(block: Block) -> None:
     assert used <= set(dir(residnet)), f"{block}: residnet has no {used - set(dir(residnet))}"
 
 
+@pytest.mark.long
 def test_the_head_of_contributing_keeps_the_contract(tmp_path: Path) -> None:
     block = next(b for b in BLOCKS if b.page == "CONTRIBUTING.md" and "BrakeConfig" in b.text)
     (tmp_path / "brake.py").write_text(block.text)

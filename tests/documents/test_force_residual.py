@@ -149,6 +149,7 @@ def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
     assert advice in verdict(results)
 
 
+@pytest.mark.long
 def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: Path) -> None:
     """The forces are noise, the believed hull predicts others: regressions beat it, not zero."""
     t, *_ = motion(0, 300.0)
@@ -241,6 +242,7 @@ def test_lag_of_the_thrusters_is_told_by_the_actual_forces(tmp_path: Path) -> No
     assert all(found.forces[axis]["explained_with_lag"] > 0.99 for axis in ("surge", "sway", "yaw"))
 
 
+@pytest.mark.long
 def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0, psi=np.zeros(3000))
     settings = config(

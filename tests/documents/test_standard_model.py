@@ -122,6 +122,7 @@ def test_a_fit_recovers_what_is_determined_and_names_what_is_not() -> None:
     assert found.sums["m - Y_vdot"][0] == pytest.approx(MASS - p["Y_vdot"], rel=1e-6)
 
 
+@pytest.mark.long
 def test_standard_errors_are_those_of_repeated_noise() -> None:
     nu, tau = states(800)
     p = some() | {

@@ -194,6 +194,7 @@ def flights() -> list[tuple[Flight, Flight]]:
     return list(zip(*pair, strict=True))
 
 
+@pytest.mark.long
 def test_a_learned_model_flies_zigzags_by_itself(flights: list[tuple[Flight, Flight]]) -> None:
     for ship, model in flights[:5]:
         truth, mine = (flight.manoeuvre.indices(flight.motion) for flight in (ship, model))

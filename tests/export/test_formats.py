@@ -95,7 +95,13 @@ def test_a_file_keeps_the_contract(name: str, variant: str, tmp_path: Path) -> N
     assert json.loads(held) == json.loads(json.dumps(card))
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    "variant",
+    [
+        name if i % 3 == 0 else pytest.param(name, marks=pytest.mark.long)
+        for i, name in enumerate(VARIANTS)
+    ],
+)
 def test_torchscript_is_the_model(variant: str, tmp_path: Path) -> None:
     """With all its methods, in single precision; the model itself is left alone."""
     made = exported(variant)

@@ -160,6 +160,7 @@ def flown(loaded: Loaded) -> np.ndarray:
     return np.array(track)
 
 
+@pytest.mark.long
 def test_a_course_as_c_is_followed_as_in_python(tmp_path: Path) -> None:
     exported = along()
     card = exporter("c").export(exported, tmp_path / "along.c")

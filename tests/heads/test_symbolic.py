@@ -59,6 +59,7 @@ def found(notes: dict[str, Any], axis: str) -> dict[str, float]:
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", range(3))
 def test_all_six_equations_of_random_multisines(number: int) -> None:
     for logs, names, config, truth in (

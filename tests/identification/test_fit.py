@@ -103,6 +103,7 @@ def test_models_stand_in_order(identified: Identified) -> None:
     assert np.all(identified.limit > 0)
 
 
+@pytest.mark.long
 def test_finished_heads_are_taken_from_the_store(
     identified: Identified,
     settings: FitSettings,

@@ -232,6 +232,7 @@ def test_rudder_angles() -> None:
         TurningCircle(drive=1, rudder=31 * DEG).share(HELM)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("vessel", ["milliampere", "milliampere_azimuth"])
 def test_four_corner_course_of_the_ferry(vessel: str) -> None:
     """Gains from the ferry's own mass; it keeps near the filtered poses and comes back to where it

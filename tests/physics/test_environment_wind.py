@@ -133,6 +133,7 @@ def test_a_plant_feels_the_wind_relative_to_itself() -> None:
     np.testing.assert_allclose(force, [-head, 0, 0], atol=1e-8)
 
 
+@pytest.mark.long
 def test_wind_that_stands_across_drifts_a_vessel_down_wind() -> None:
     """Without thrust it moves the way the air moves."""
     from residnet.dynamics.rollout import Rollout

@@ -503,6 +503,7 @@ def test_rudders_at_rest() -> None:
     assert bool(torch.isfinite(slope).all())
 
 
+@pytest.mark.long
 def test_heel_and_steady_turns_are_those_of_errata() -> None:
     """G9: 10 deg of rudder heel 1.25 deg inward at first and 3.34 deg outward in the end; G17, G18:
     7.00 m/s and 190 m at 5 deg, 124 m at 10 deg.
@@ -590,6 +591,7 @@ def test_the_mariner_written_out() -> None:
         )
 
 
+@pytest.mark.long
 def test_a_turn_of_the_mariner() -> None:
     """35 deg to starboard from 15 kn, against SciPy on the equations written out; advance and
     tactical diameter of a few lengths.

@@ -79,7 +79,10 @@ def test_every_task_has_a_page_whose_sections_hold_something(task: str, tmp_path
 
 
 @pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "task",
+    [task if task == "autopilot" else pytest.param(task, marks=pytest.mark.long) for task in TASKS],
+)
 def test_nothing_is_wider_than_the_window_and_no_word_is_broken(task: str, tmp_path: Path) -> None:
     page = page_of(task, tmp_path / "run")
     for width in (360, 820):

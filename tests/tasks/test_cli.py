@@ -168,6 +168,7 @@ def test_folders_hold_tables_recordings_or_other_logs(tmp_path: Path) -> None:
         log_files([tmp_path / "empty"], folders=True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("error", [DataError("no such wind"), KeyboardInterrupt(), ValueError("x")])
 def test_the_log_of_a_run_that_ends_badly(
     error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -98,6 +98,7 @@ def test_a_vessel_leaves_logs_indices_and_figures(ship: Path) -> None:
     assert "first overshoot" in plain(ship / "report.html")
 
 
+@pytest.mark.long
 def test_a_model_flies_beside_its_vessel_and_alone(
     tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,6 +131,7 @@ def test_a_model_flies_beside_its_vessel_and_alone(
     assert log["cmd_n_port"].max() == pytest.approx(0.8 * 2380 / 60)
 
 
+@pytest.mark.long
 def test_a_manoeuvre_that_never_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

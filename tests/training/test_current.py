@@ -156,6 +156,7 @@ def test_a_start_in_a_wrong_valley_is_left() -> None:
     assert float((found[3] - right[3]).norm()) < 0.1 < float((wrong[3] - right[3]).norm())
 
 
+@pytest.mark.long
 def test_calm_water_has_no_current() -> None:
     logs, _ = sailed()
     signals = SIGNALS.build()

@@ -62,6 +62,7 @@ def smoothed() -> list[Prepared]:
     return trials(window=3.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("terms", [QUADRATIC, LINEAR], ids=["quadratic", "linear"])
 def test_free_runs_on_fresh_data_improve_on_biased_least_squares(
     smoothed: list[Prepared], terms: Sequence[str]

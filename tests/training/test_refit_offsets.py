@@ -65,6 +65,7 @@ def score(error: Tensor) -> float:
     return float(error.square().mean().sqrt())
 
 
+@pytest.mark.long
 def test_planted_offsets_are_found_and_no_longer_spoil_the_vessel() -> None:
     offsets = planted(1)
     logs = trials(LOGS, 33.0, seed=1, offsets=offsets)
@@ -83,6 +84,7 @@ def test_planted_offsets_are_found_and_no_longer_spoil_the_vessel() -> None:
     )
 
 
+@pytest.mark.long
 def test_without_offsets_looking_for_them_costs_nothing() -> None:
     logs = trials(LOGS, 33.0, seed=2)
     blind, _, none = refitted(logs, None)

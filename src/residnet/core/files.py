@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -55,6 +56,24 @@ def sha256(path: Path) -> str:
     """Return the hexadecimal SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+_UNSAFE = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]+')
+_LONGEST_NAME = 200
+"""Bytes of a file's name before its suffix; file systems take 255."""
+
+
+def file_stem(name: str) -> str:
+    """Return a log's, a manoeuvre's or a figure's name as that of a file within one folder.
+
+    What no file system takes, or what would lead to another folder, becomes `_`; such names end in
+    a part of their hash, so that two that differ stay apart.
+    """
+    whole_name = _UNSAFE.sub("_", name).lstrip(".").encode("utf-8")
+    safe = whole_name[:_LONGEST_NAME].decode("utf-8", "ignore") or "_"
+    if safe == name:
+        return name
+    return f"{safe}_{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
 
 
 def read_json(path: Path) -> dict[str, Any]:

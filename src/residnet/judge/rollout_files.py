@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from residnet.core.files import whole
+from residnet.core.files import file_stem, whole
 from residnet.core.names import STATE
 from residnet.data.prepare import Prepared
 from residnet.judge.band import Bands
@@ -90,7 +90,7 @@ def write_rollouts(
         w = np.concatenate(given)
         columns |= {f"{INPUT}{name}": w[:, place] for place, name in enumerate(inputs)}
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
-        with whole(folder / f"{log.log.name}.parquet") as file:
+        with whole(folder / f"{file_stem(log.log.name)}.parquet") as file:
             pq.write_table(table, file, compression="zstd")
 
 

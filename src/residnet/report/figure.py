@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
-from residnet.core.files import whole
+from residnet.core.files import file_stem, whole
 from residnet.core.stretches import stretches
 from residnet.report.blocks import Section
 
@@ -272,7 +272,7 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
     from residnet.report.still import save, still
 
     folder.mkdir(parents=True, exist_ok=True)
-    name = name or figure.name
+    name = file_stem(name or figure.name)
     # the sections of a surface belong to the screen, its cases stand side by side
     groups = [figure.cases] if figure.surface else [[case] for case in figure.cases if case.still]
     stills = []

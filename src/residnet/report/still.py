@@ -27,6 +27,8 @@ _DASHES: dict[str, Any] = {
 }
 # Any: matplotlib types the keys as a closed set of literals
 RC: Any = {
+    # names of logs may hold a dollar sign
+    "text.parse_math": False,
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,

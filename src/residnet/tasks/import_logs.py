@@ -10,6 +10,7 @@ from pydantic import Field
 
 from residnet.core.config import ConfigPath
 from residnet.core.errors import ConfigError
+from residnet.core.files import file_stem
 from residnet.core.names import nearest
 from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
@@ -77,7 +78,7 @@ class ImportConfig(Task):
         for number, path in enumerate(paths):
             report("reading recordings", number, len(paths))
             log = reader.read(path).replace(name=names[path])
-            log.save(folder.path / "logs" / f"{log.name}.parquet")
+            log.save(folder.path / "logs" / f"{file_stem(log.name)}.parquet")
             found = findings[log.name] = log.meta.get("findings", [])
             told = [f"{f['level']}: {f['text']}" for f in found if f["level"] != "note"]
             loud += bool(told)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from residnet.core.config import Config, ExistingPath, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError, UsageError
+from residnet.core.files import file_stem
 from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.core.progress import say
 from residnet.data.readers import ReaderConfig
@@ -333,7 +334,7 @@ class SimulateConfig(ComputingTask):
             drawn = zip(self.data.splits(manoeuvres), flown[0][1], strict=True)
             places = [(f"logs/{split}", flight) for split, flight in drawn]
         for place, flight in places:
-            flight.log.save(folder.path / place / f"{flight.log.name}.parquet")
+            flight.log.save(folder.path / place / f"{file_stem(flight.log.name)}.parquet")
         rows = [row for craft, flights in flown for row in index_rows(craft, flights, length)]
         content = index_contents(self.name, length, rows)
         folder.write_json(folder.path / "indices.json", content)
