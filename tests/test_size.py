@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (793, 117),
     "control": (3197, 352),
     "core": (1276, 184),
-    "data": (7890, 714),
+    "data": (8034, 719),
     "documents": (2544, 272),
     "dynamics": (835, 124),
     "export": (2195, 263),

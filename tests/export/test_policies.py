@@ -73,7 +73,9 @@ def along() -> ExportedCoursePolicy:
 KINDS = [heading, network, along]
 
 
-@pytest.mark.parametrize("make", KINDS)
+@pytest.mark.parametrize(
+    "make", [heading, *(pytest.param(make, marks=pytest.mark.long) for make in KINDS[1:])]
+)
 def test_torchscript_answers_as_the_policy_and_is_safe(
     make: Callable[[], ExportedController], tmp_path: Path
 ) -> None:
@@ -171,6 +173,7 @@ def test_a_course_as_c_is_followed_as_in_python(tmp_path: Path) -> None:
     np.testing.assert_allclose(theirs, flown(Eager(exported)), rtol=0, atol=1e-4)
 
 
+@pytest.mark.long
 def test_a_heading_policy_is_written_as_c(tmp_path: Path) -> None:
     """With its queue of pending commands and the memory of its network."""
     for exported in (heading(), network()):

@@ -30,6 +30,22 @@ def geodetic(log: Log) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(latitude), np.asarray(longitude)
 
 
+def moos(log: Log, folder: Path) -> Path:
+    """The pose and the speed of uNav, and a command of pMarinePID at every fifth sample."""
+    heading = np.degrees(log["psi"]) % 360.0
+    speed = np.hypot(log["u"], log["v"])
+    lines = ["%% LOG FILE:   ./trial.alog", f"%% LOGSTART {EPOCH:.2f}", ""]
+    for i, t in enumerate(log.t.tolist()):
+        told = {"NAV_X": log["y"][i], "NAV_Y": log["x"][i], "NAV_HEADING": heading[i]}
+        told["NAV_SPEED"] = speed[i]
+        lines += [f"{t:<14.3f} {name:<14} uNav           {v:.9f}" for name, v in told.items()]
+        lines += [f"{t:<14.3f} DESIRED_RUDDER pMarinePID     {i % 7:.1f}"] * (i % 5 == 0)
+        lines += [f"{t:<14.3f} MODE           pHelmIvP       MODE=DRIVE"] * (i % 9 == 0)
+    path = folder / "trial.alog"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def nmea(log: Log, folder: Path, *, prefix: bool = False) -> Path:
     """RMC, HDT and ROT, in this order at every sample; `prefix` writes the logger's time in front
     of each line.

@@ -28,6 +28,7 @@ else:
                 "mat": "residnet.data.readers.formats.trees:MatConfig",
                 "hdf5": "residnet.data.readers.formats.trees:Hdf5Config",
                 "nmea": "residnet.data.readers.formats.nmea:NmeaConfig",
+                "moos": "residnet.data.readers.formats.moos:MoosConfig",
                 "ulog": "residnet.data.readers.formats.ulog:UlogConfig",
                 "ardupilot": "residnet.data.readers.formats.ardupilot:ArduPilotConfig",
                 "auto": "residnet.data.readers.detect:AutoConfig",

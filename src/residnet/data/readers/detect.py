@@ -12,6 +12,7 @@ from residnet.data.readers.base import LogReader, require_file
 from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.formats.ardupilot import ArduPilotConfig
+from residnet.data.readers.formats.moos import MoosConfig
 from residnet.data.readers.formats.nmea import NmeaConfig
 from residnet.data.readers.formats.rosbag import RosbagConfig
 from residnet.data.readers.formats.topic_folder import TopicFolderConfig
@@ -27,6 +28,7 @@ _RECORDINGS: tuple[type[RecordingConfig], ...] = (
     TopicFolderConfig,
     UlogConfig,
     ArduPilotConfig,
+    MoosConfig,
     NmeaConfig,
     MatConfig,
     Hdf5Config,

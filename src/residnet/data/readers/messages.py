@@ -141,6 +141,14 @@ def _joints(s: Series) -> Plan:
     return Plan(channels)
 
 
+def _moos(s: Series) -> Plan:
+    place = None
+    if s.has("NAV_X") and s.has("NAV_Y"):
+        place = Local(topic=s.name, north="NAV_Y", east="NAV_X")
+    heading = Angle(topic=s.name, field="NAV_HEADING", unit="deg") if s.has("NAV_HEADING") else None
+    return Plan({}, place, heading)
+
+
 def _named(s: Series) -> list[str]:
     known = (name for name in s.fields if name in CHANNEL_UNITS and name != "t")
     return [name for name in known if s[name].size and not np.isnan(s[name]).all()]
@@ -279,6 +287,7 @@ MESSAGES = (
         ("VTG",),
         lambda s: Plan({}, None, None, _over_ground(s, "true_track", "spd_over_grnd_kts", "kn")),
     ),
+    Message("MoosNavigation", ("Variables",), _moos),
     Message("NmeaHeading", ("HDT",), lambda s: Plan({}, None, _angle(s, "heading"))),
     Message("NmeaRateOfTurn", ("ROT",), lambda s: Plan(_maps(s, "deg/s", {"r": "rate_of_turn"}))),
     Message(

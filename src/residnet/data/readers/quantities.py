@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -103,7 +104,65 @@ class Conversion(Config):
         turn, ahead = _FRAMES[self.frame][name] if self.frame != "as_measured" else _SAME
         gain = turn * self.sign * to_si(self.unit, CHANNEL_UNITS.get(name)) * self.scale
         values = gain * (raw - self.offset) + ahead
-        return unwrap(values) if name == "psi" else values
+        return true_headings(values) if name == "psi" else values
+
+
+_EVEN = 0.2
+"""Share by which the steps of an interpolation may differ, whose ends are rounded."""
+_SWEPT = 10.0
+"""Times that a step of such an interpolation exceeds the steps of an ordinary turn."""
+
+
+def true_headings(psi: np.ndarray) -> np.ndarray:
+    """Return headings [T] in rad, unwrapped; NaN where the recorder made them up.
+
+    A recorder that resamples by straight lines goes from 359 to 1 deg by way of 180. Such samples
+    lie in a run of even steps from one edge of the circle to the other, far larger than the steps
+    before and behind it: a vessel gathers and loses its rate of turn.
+    """
+    out = unwrap(psi)
+    known = np.flatnonzero(np.isfinite(psi))
+    wrapped = np.remainder(psi[known], 2.0 * np.pi)
+    step = np.diff(wrapped)
+    size = np.abs(np.where(np.abs(step) > np.pi, 2.0 * np.pi - np.abs(step), step))
+    if step.size < 3 or not size.any():
+        return out
+    swept = np.abs(step) > max(_SWEPT * float(np.median(size)), np.radians(5.0))
+    sense = np.sign(step) * swept
+    bounds = np.flatnonzero(np.diff(np.concatenate(([0.0], sense, [0.0]))))
+    usual = np.where(swept, np.median(size), size)
+    made = np.zeros(known.size, dtype=bool)
+    for begin, end in itertools.pairwise(bounds):
+        part = step[begin:end]
+        if part.size < 2 or not sense[begin]:
+            continue
+        # the steps into and out of the interpolation may be cut short
+        slope = np.abs(part).max()
+        even = np.abs(part[1:-1]) >= (1.0 - _EVEN) * slope
+        beside = np.append(usual[max(begin - 2, 0) : begin], usual[end : end + 2]).max(initial=0.0)
+        across = 2.0 * np.pi - abs(part.sum()) < slope + 2.0 * beside
+        sudden = slope > _SWEPT * beside
+        if even.all() and across and sudden:
+            made[begin + 1 : end] = True
+    if not made.any():
+        return out
+    # where two follow each other, the sample between them lies on neither end
+    made[1:-1] |= made[:-2] & made[2:]
+    kept = known[~made]
+    out[known[made]] = np.nan
+    out[kept] = np.unwrap(psi[kept])
+    return out
+
+
+def told_headings(raw: np.ndarray, psi: np.ndarray) -> str:
+    """Return how many headings a recorder made up between 359 and 1 deg; empty for none."""
+    lost = int((np.isfinite(raw) & ~np.isfinite(psi)).sum())
+    return (
+        f"{lost} headings were interpolated by the recorder from 359 to 1 deg by way of 180; they"
+        " are left empty"
+        if lost
+        else ""
+    )
 
 
 class ChannelMap(Conversion):

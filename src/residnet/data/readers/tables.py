@@ -36,8 +36,9 @@ from residnet.data.readers.base import (
     require_values,
     unwrap,
 )
+from residnet.data.readers.clocks import steady_clock
 from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
-from residnet.data.readers.quantities import QUATERNION, ChannelMap, factor
+from residnet.data.readers.quantities import QUATERNION, ChannelMap, factor, told_headings
 from residnet.data.readers.recording import Remark, remark
 from residnet.data.readers.texts import as_utf8, found_header, numbered, positions, read_csv
 from residnet.data.readers.written import Order, degrees_of, parse_texts, side_signs, zone_of
@@ -296,10 +297,16 @@ class TableReader(LogReader):
         ends = np.flatnonzero(measured)[[0, -1]] if measured.any() else np.array([0, -1])
         kept = ends[0] + np.flatnonzero(np.isfinite(t[ends[0] : ends[1] + 1]))
         require_samples(path, kept)
+        tick = None if config.time.unit == DATE else to_si(config.time.unit)
+        recorded = np.stack([values[kept] for values in raw.values()], axis=1)
+        t[kept], said = steady_clock(t[kept], recorded, tick)
+        findings += said
         require_increasing(path, t[kept], lambda i: self._row(int(kept[i]) + above))
         channels = {name: maps[name].convert(name, raw[name][kept]) for name in maps}
         for name, values in channels.items():
             require_values(path, name, maps[name].column, values)
+        if "psi" in channels and (text := told_headings(raw["psi"][kept], channels["psi"])):
+            findings.append(remark("note", "heading_interpolated", text))
         units = {name: entry.si(name) for name, entry in maps.items()}
         findings += _placed(path, channels, units)
         _headed(path, channels, units, maps)

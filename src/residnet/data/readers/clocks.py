@@ -1,0 +1,69 @@
+"""Clocks that go on though their numbers do not: counters that wrap, stamps of whole seconds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from residnet.data.readers.recording import Remark, remark
+
+_BITS = (16, 24, 32, 48)
+"""Widths of the counters that microcontrollers stamp with."""
+_HOUR = 3600.0
+_USUAL_STEPS = 3.0
+"""Usual steps within which the clock has gone on where its counter began anew."""
+
+
+def steady_clock(
+    t: np.ndarray, rows: np.ndarray, tick: float | None = None
+) -> tuple[np.ndarray, list[Remark]]:
+    """Return times [T] in s as the clock went on, and what was mended.
+
+    A counter that passes its largest number begins anew at zero: where a step back is one of its
+    lengths but for a few usual steps, that length is added from there on; so is the hour that a
+    clock on the wall is set back in autumn. Stamps that several rows share are those of a clock
+    coarser than the rows: these are spread over the time to the next stamp, unless they are copies.
+
+    Args:
+        t: as recorded; all finite.
+        rows: what was recorded [T, k].
+        tick: s that the counter counts by; None for a clock of dates.
+    """
+    step = np.diff(t)
+    forward = step[step > 0.0]
+    if not forward.size:
+        return t, []
+    usual, remarks = float(np.median(forward)), []
+    lengths = {"an hour, as in autumn": _HOUR} if tick is None else {}
+    if tick is not None:
+        lengths = {f"2^{bits} of its ticks": 2.0**bits * tick for bits in _BITS}
+    added = np.zeros_like(t)
+    for what, length in lengths.items():
+        on = step + length
+        began = (step < -0.5 * length) & (on > 0.0) & (on < _USUAL_STEPS * usual)
+        if began.any():
+            added[1:] += length * np.cumsum(began)
+            first = float(t[:-1][began][0])
+            text = f"the clock fell back after {first:.6g} s by {what}; it is read as going on"
+            remarks.append(remark("note", "clock_wraps", text, count=float(began.sum())))
+    t = t + added
+    stamps, begins, counts = np.unique(t, return_index=True, return_counts=True)
+    each = int(np.median(counts))
+    if stamps.size < 3 or each < 2 or (np.diff(t) < 0.0).any():
+        return t, remarks
+    shared = np.flatnonzero(np.diff(t) == 0.0)
+    before, after = rows[shared], rows[shared + 1]
+    if ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=1).mean() > 0.5:
+        return t, remarks
+    coarse = float(np.median(np.diff(stamps)))
+    # a last stamp has none after it; a first one may have begun before the recording did
+    gap = np.minimum(np.append(np.diff(stamps), coarse), 2.0 * coarse)
+    share = np.arange(t.size) - np.repeat(begins, counts)
+    whole = np.maximum(counts, each)
+    share[: counts[0]] += whole[0] - counts[0]
+    spread = t + share * np.repeat(gap / whole, counts)
+    text = (
+        f"about {each} rows share each time stamp, which come every {coarse:.4g} s; they are spread"
+        " evenly from one stamp to the next"
+    )
+    remarks.append(remark("note", "coarse_stamps", text, rows=float(each), step=coarse))
+    return spread, remarks
