@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -125,3 +126,10 @@ def test_secrets_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     assert without_secrets(text) == (
         "at ~/x.py\nAPI_TOKEN = ***\npassword: ***\nmqtt://***@host/x\nn: 3\n"
     )
+
+
+@pytest.mark.parametrize("closed", ["1>&-", "2>&-", "1>&- 2>&-"])
+def test_closed_streams_do_not_end_a_command(closed: str, tmp_path: Path) -> None:
+    told = "import sys; from residnet.exits import enter; enter(lambda: sys.stderr.write('x'))"
+    command = f'{sys.executable} -c "{told}" {closed}'
+    assert subprocess.run(command, shell=True, check=False, cwd=tmp_path).returncode == 0

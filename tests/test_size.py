@@ -19,8 +19,8 @@ STATEMENTS_AND_FUNCTIONS = {
     "api": (682, 79),
     "baselines": (793, 117),
     "control": (3197, 352),
-    "core": (1276, 184),
-    "data": (8034, 719),
+    "core": (1304, 185),
+    "data": (8035, 719),
     "documents": (2544, 272),
     "dynamics": (835, 124),
     "export": (2195, 263),
@@ -31,12 +31,12 @@ STATEMENTS_AND_FUNCTIONS = {
     "physics": (1987, 249),
     "regression": (1864, 207),
     "report": (2839, 320),
-    "runs": (337, 47),
+    "runs": (364, 48),
     "simulators": (355, 44),
     "tasks": (2982, 256),
     "testing": (484, 33),
     "training": (1308, 157),
-    "": (405, 49),
+    "": (409, 49),
 }
 
 

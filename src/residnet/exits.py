@@ -83,6 +83,11 @@ def enter(command: Callable[[], object]) -> None:
         SystemExit: with the exit code, where it is not 0.
     """
     signals = _Signals()
+    # a service may start a command with closed streams
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            stream = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 (to the end)
+            setattr(sys, name, stream)
     try:
         with signals.heard():
             command()

@@ -149,3 +149,22 @@ def test_a_write_that_fails_leaves_the_old_file(
         folder.write(folder.report, "new and longer")
     assert folder.report.read_text() == "old"
     assert not list(folder.path.rglob("*.partial"))
+
+
+def test_two_processes_do_not_write_into_one_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("residnet.runs.folder._PATIENCE", 1)
+    with RunFolder(tmp_path / "run").held():
+        RunFolder.create(tmp_path / "run", "a: 1\n")
+        with (
+            pytest.raises(UsageError, match="another run is being written here"),
+            RunFolder(tmp_path / "run").held(),
+        ):
+            pass
+        (tmp_path / "run" / "metrics.json").write_text("{}")
+        RunFolder.create(tmp_path / "run", "a: 1\n", overwrite=True)
+        with pytest.raises(UsageError, match="another run"), RunFolder(tmp_path / "run").held():
+            pass
+    with RunFolder(tmp_path / "run").held():
+        assert (tmp_path / "run" / "resolved.yaml").read_text() == "a: 1\n"

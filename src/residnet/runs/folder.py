@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +34,10 @@ _BEFORE_RESULTS = {
     LOG,
 }
 """Files that a run writes before its first result; a folder of these alone may be used again."""
+
+
+_PATIENCE = 20
+"""Tenths of a second that the workers of a killed run have to end."""
 
 
 class RunFolder:
@@ -103,7 +110,12 @@ class RunFolder:
                 # what is done again must not look finished meanwhile
                 folder.summary.unlink(missing_ok=True)
                 return folder
-            shutil.rmtree(path)
+            for entry in path.iterdir():
+                # the folder itself stays, since it is held
+                if entry.is_dir() and not entry.is_symlink():
+                    shutil.rmtree(entry)
+                else:
+                    entry.unlink()
         path.mkdir(parents=True, exist_ok=True)
         folder.write(folder.resolved, resolved)
         return folder
@@ -126,6 +138,41 @@ class RunFolder:
                 f"{self.path}: was made with another configuration ({self.resolved} differs);"
                 " resume with the same one or give another --out"
             )
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other processes from running into this folder within the context.
+
+        Where the system or its disk knows no locks, nothing is held.
+
+        Raises:
+            UsageError: where another process runs into it.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            import fcntl
+        except ImportError:
+            yield
+            return
+        place = os.open(self.path, os.O_RDONLY)
+        try:
+            for left in range(_PATIENCE, -1, -1):
+                try:
+                    fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if left:
+                        time.sleep(0.1)
+                        continue
+                    raise UsageError(
+                        f"{self.path}: another run is being written here; wait for it, or give"
+                        " another --out"
+                    ) from None
+                except OSError:
+                    break
+            yield
+        finally:
+            os.close(place)
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:

@@ -198,10 +198,11 @@ class Task(Config):
         )
         if resume:
             made_from.require_same_inputs(RunFolder(place))
-        folder = RunFolder.create(place, resolved, resume=resume, overwrite=overwrite)
-        if opened is not None:
-            opened(folder.path)
-        return self.conduct(folder, made_from, self.carry_out, report=report)
+        with RunFolder(place).held():
+            folder = RunFolder.create(place, resolved, resume=resume, overwrite=overwrite)
+            if opened is not None:
+                opened(folder.path)
+            return self.conduct(folder, made_from, self.carry_out, report=report)
 
     @final
     def place(self, out: Path | None) -> Path:

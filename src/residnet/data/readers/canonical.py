@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, final
 
-import numpy as np
-
 from residnet.core.config import Config
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers.base import (
@@ -45,19 +43,14 @@ class CanonicalReader(LogReader):
                 no number.
         """
         require_file(path)
-        try:
-            log = Log.load(path)
-        except KeyError as error:
-            raise DataError(
-                f"{path}: canonical log without {error}; the file is damaged, write it again"
-            ) from error
+        log = Log.load(path)
         for name, unit in log.units.items():
             if unit != CHANNEL_UNITS.get(name, unit):
                 raise UsageError(
                     f"{path}: channel {name} is in [{unit}], a canonical log holds it in"
                     f" [{CHANNEL_UNITS[name]}]; convert it and save again"
                 )
-        t = log.t.astype(np.float64)
+        t = log.t
         require_samples(path, t)
         require_increasing(path, t, lambda i: f"row {i + 1}")
         for name, values in log.channels.items():
