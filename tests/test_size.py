@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (793, 117),
     "control": (3197, 352),
     "core": (1304, 185),
-    "data": (8035, 719),
+    "data": (8052, 720),
     "documents": (2544, 272),
     "dynamics": (835, 124),
     "export": (2195, 263),

@@ -12,6 +12,8 @@ from residnet.data.readers.base import unwrap
 
 # standard deviations of a Gaussian in its median absolute deviation
 SIGMA_OF_MAD = 1.4826
+# share of the spread of a motion below which a sensor of it does not move: no unit is off so far
+STILL = 1e-3
 # reason in `Log.masks`
 SPIKE = "spike"
 # a spike leaves the median of its neighbours by so many times the usual change from sample to

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.names import POSE, VELOCITY
-from residnet.data.channels import SIGMA_OF_MAD
+from residnet.data.channels import SIGMA_OF_MAD, STILL
 from residnet.data.doctor.findings import (
     Check,
     Finding,
@@ -314,6 +314,15 @@ def _follow(
     slow channels correlate at any lag.
     """
     motion = log.of(rates)
+    own, turned = (float(np.nanstd(one)) for one in (motion.measured[name], reference))
+    if name == "r" and turned > 5.0 * motion.noise and own < STILL * turned:
+        return {
+            "text": f"{name} does not move, while {what} does; the gyro is dead or another column",
+            "figures": {"correlation": 0.0, "gain": 0.0, "lag": 0.0},
+            "code": f"follows_{name}",
+            "level": "will mislead",
+            "fix": f"leave {name} out of the channel map: it follows from the heading",
+        }
     match = agreement(reference, motion.measured[name], log.step)
     if match is None or match.spread < least:
         return {}

@@ -10,6 +10,7 @@ import numpy as np
 
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import to_si
+from residnet.data.channels import STILL
 from residnet.data.drafting.physics import (
     FRAMES,
     POSE_FRAMES,
@@ -220,6 +221,7 @@ class Channels:
         if {"x", "y", "psi"} <= set(self._names):
             self._settle_axes()
             self._settle_frame()
+            self._settle_still()
         self._settle_wind()
         return {name: self._entry(name) for name in self._names}
 
@@ -330,6 +332,19 @@ class Channels:
             text = f"position, heading and velocities fit together badly ({score:.2f} of 1)"
             self._marks.guess((*CHANNELS, "psi"), f"{text}: check units and axes")
         self._frame = Frame(False, self._frame.from_east)
+
+    def _settle_still(self) -> None:
+        """Leave out velocities that do not move, while position and heading do."""
+        for name, place in (("u", 1), ("v", 2), ("r", 3)):
+            moved = [motion[place] for motion in self._motions if motion is not None]
+            if name not in self._names or not moved:
+                continue
+            size = to_si(self._unit(name, mark=False), CHANNEL_UNITS[name])
+            own = size * float(np.nanstd(self._values(name)))
+            if own < STILL * float(np.std(np.concatenate(moved))):
+                column = self._names.pop(name)
+                text = f"'{column}' does not move, while position and heading do; left out:"
+                self._marks.note(CHANNELS, f"{text} {name} follows from them")
 
     def _settle_wind(self) -> None:
         """Leave out a wind that turns with the vessel, and a wind without its other half."""

@@ -230,6 +230,17 @@ MESSAGES = (
         _ROS,
         ("twist.linear.x", "twist.angular.z"),
     ),
+    Message(
+        "Pose2D",
+        ("Pose2D", "Pose2DStamped"),
+        lambda s: Plan(
+            {},
+            Local(topic=s.name, north="y", east="x"),
+            Angle(topic=s.name, field="theta", frame="enu"),
+        ),
+        _ROS,
+        ("x", "y", "theta"),
+    ),
     Message("Imu", ("Imu",), _imu, _ROS, ("angular_velocity.z", "linear_acceleration.x")),
     Message(
         "Fix",

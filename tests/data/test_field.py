@@ -1,0 +1,63 @@
+"""Kinds of recordings that were met in the field, each as a small made input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from residnet.core.config import validate
+from residnet.core.log import Log
+from residnet.data.doctor import inspect
+from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.tables import draft_tables
+from residnet.data.readers import ReaderConfig
+from residnet.data.readers.messages import standard_plan
+from residnet.data.readers.quantities import Angle, Local, Plan
+from residnet.data.readers.recording import Recording, Series
+
+
+@pytest.fixture(scope="module")
+def turning() -> Log:
+    """A vessel that turns to and fro, its velocities those of its pose."""
+    t = 0.1 * np.arange(1200)
+    psi, u = 0.8 * np.sin(0.15 * t) + 0.1 * t, 1.5 + 0.3 * np.sin(0.05 * t)
+    x, y = (np.cumsum(0.1 * u * f(psi)) for f in (np.cos, np.sin))
+    noise = np.random.default_rng(2).normal(size=(4, t.size))
+    channels = {"x": x + 0.01 * noise[0], "y": y + 0.01 * noise[1], "psi": psi}
+    channels |= {"u": u + 0.01 * noise[2], "v": 0.01 * noise[3], "r": np.gradient(psi, t)}
+    return Log("turning", t, {**channels, "delta": 0.3 * np.sin(0.15 * t + 1.0)})
+
+
+def test_a_gyro_that_is_dead_is_said_to_be_dead(turning: Log, tmp_path: Path) -> None:
+    dead = 4e-7 + 1e-9 * np.sin(turning.t)
+    log = turning.replace(channels={**turning.channels, "r": dead})
+    told = {one.code: one for one in inspect(log, ["delta"]).findings}["follows_r"]
+    assert "r does not move" in told.text
+    assert "it follows from the heading" in told.action
+    assert "sign" not in told.action
+    told = {one.code: one for one in inspect(turning, ["delta"]).findings}["follows_r"]
+    assert told.level == "note"
+
+    table = {"time [s]": log.t, "north [m]": log["x"], "east [m]": log["y"]}
+    table |= {"heading [deg]": np.degrees(log["psi"]) % 360.0, "surge [m/s]": log["u"]}
+    table |= {"yaw rate [deg/s]": np.degrees(dead), "rudder [deg]": np.degrees(log["delta"])}
+    pd.DataFrame(table).to_csv(tmp_path / "run.csv", index=False)
+    marks = Marks()
+    content = draft_tables([tmp_path / "run.csv"], marks)[0]
+    assert set(content["channels"]) == {"x", "y", "psi", "u", "delta"}
+    assert "r follows from them" in str(vars(marks))
+    read = validate(content, ReaderConfig, "here").build().read(tmp_path / "run.csv")
+    np.testing.assert_allclose(read["psi"], log["psi"], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["geometry_msgs/msg/Pose2D", ""])
+def test_a_pose_in_the_plane_counts_from_east(kind: str) -> None:
+    t = np.arange(10.0)
+    fields = {"x": 2.0 * t, "y": 3.0 * t, "theta": 0.1 * t}
+    series = Series("/boat/pose", kind, fields, t)
+    plan = standard_plan(Recording(Path("run"), {series.name: series}), Plan())
+    assert plan.position == Local(topic="/boat/pose", north="y", east="x")
+    assert plan.heading == Angle(topic="/boat/pose", field="theta", frame="enu")
