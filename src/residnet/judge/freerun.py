@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from residnet.core.frames import wrap_array
 from residnet.core.layout import HEADING, POSE, POSITION, VELOCITIES
 from residnet.core.names import STATE, VELOCITY
 from residnet.data.prepare import Prepared
@@ -90,7 +91,7 @@ class Errors:
     sensor disturbs, over all.
 
     Attributes:
-        error: predicted minus measured x, y, psi, u, v, r [N, 6].
+        error: predicted minus measured x, y, psi, u, v, r [N, 6]; psi within half a turn.
         usable: which samples are [N].
         counts: samples of each window [W].
     """
@@ -106,8 +107,11 @@ class Errors:
         """Return the errors of predictions over windows of logs."""
         rows = [(logs[window.log], slice(window.start, window.stop)) for window in windows]
         pairs = zip(predictions, rows, strict=True)
+        error = np.concatenate([one.states - log.y[part] for one, (log, part) in pairs])
+        # a turn too many is no error of where the vessel points
+        error[:, HEADING] = wrap_array(error[:, HEADING])
         return cls(
-            np.concatenate([prediction.states - log.y[part] for prediction, (log, part) in pairs]),
+            error,
             np.concatenate([log.usable[part] for log, part in rows]),
             np.array([window.stop - window.start for window in windows]),
         )

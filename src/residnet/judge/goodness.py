@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from residnet.core.frames import wrap_array
 from residnet.core.layout import HEADING, POSE, POSITION, RANGE_VELOCITIES, VELOCITIES
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.data.prepare import Prepared
@@ -169,7 +170,8 @@ def _apart(pair: Pair, logs: Sequence[Prepared]) -> list[float]:
     good = first.usable[a] & second.usable[b]
     end_a, end_b = _end(first.y[a]), _end(second.y[b])
     rms = [float(np.sqrt(np.mean(part**2))) for part in (nu[good, 0], nu[good, 1], nu[:, 2])]
-    return [*rms, float(np.hypot(*(end_a - end_b)[POSITION])), float(abs((end_a - end_b)[HEADING]))]
+    apart = end_a - end_b
+    return [*rms, float(np.hypot(*apart[POSITION])), float(abs(wrap_array(apart[HEADING])))]
 
 
 def _end(y: np.ndarray) -> np.ndarray:

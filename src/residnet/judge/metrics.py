@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
+from residnet.core.frames import wrap_array
 from residnet.core.layout import POSE, VELOCITIES
 from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
@@ -293,7 +294,7 @@ class Judged:
         measured = [log.y[part] for log, part in self.parts]
         ends = [integrate(y[0, POSE], y[:, VELOCITIES], step)[-1] - y[-1, POSE] for y in measured]
         error = np.array(ends)
-        position, heading = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
+        position, heading = np.hypot(error[:, 0], error[:, 1]), np.abs(wrap_array(error[:, 2]))
         out: dict[str, float] = {"windows": len(error)}
         for name, values in (("position", position), ("heading", heading)):
             out[f"{name}_mean"] = float(values.mean())
