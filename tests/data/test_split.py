@@ -14,7 +14,7 @@ from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.data.doctor import inspect_together
 from residnet.data.sources import MeasuredLogs, read_logs
-from residnet.data.split import SplitConfig, check_leaks, divided, log_names
+from residnet.data.split import SplitConfig, check_leaks, divided, log_names, without_copies
 
 FILES = ("turning/a", "turning/b", "zigzag/c", "zigzag/d", "zigzag/deep/e", "odd [1]")
 
@@ -224,3 +224,21 @@ def test_copies_across_splits_are_found(monkeypatch: pytest.MonkeyPatch) -> None
     log["u"][100:900] = np.nan
     with pytest.raises(DataError, match="share 800 identical rows"):
         check_leaks({"train": [log], "test": [copied(log, 100, 900)]})
+
+
+def test_rows_between_two_fixes_are_no_copies() -> None:
+    """Commands at 10 Hz, positions at 1 Hz: rows of equal commands alone stand in every log."""
+    t = 0.1 * np.arange(2000)
+    fixed = np.arange(t.size) % 10 == 0
+
+    def sailed(seed: int) -> Log:
+        place = np.random.default_rng(seed).normal(size=t.size).cumsum()
+        return Log(
+            f"run{seed}", t, {"x": np.where(fixed, place, np.nan), "n": np.round(5 + t // 20)}
+        )
+
+    check_leaks({"train": [sailed(1)], "test": [sailed(2)]}, rows=2)
+    copied = sailed(1).replace(name="again")
+    with pytest.raises(DataError, match="share 200 identical rows"):
+        check_leaks({"train": [sailed(1)], "test": [copied]}, rows=2)
+    assert [log.name for log in without_copies([sailed(1), sailed(2), copied])] == ["run1", "run2"]

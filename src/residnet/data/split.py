@@ -19,7 +19,7 @@ from residnet.core.arrays.paged import LARGE, forget, lies_on_disk
 from residnet.core.config import Config, ConfigPath, Seconds, load_mapping, validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
-from residnet.core.names import nearest
+from residnet.core.names import STATE, nearest
 from residnet.data.readers.base import files_of
 from residnet.data.readers.detect import LOG_ENDINGS, format_of
 
@@ -291,10 +291,8 @@ def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
 
 def without_copies(logs: Sequence[Log]) -> list[Log]:
     """Return the logs without those whose rows another one holds; the longest stay."""
-    from residnet.data.split import row_hashes
-
     common = sorted(set.intersection(*(set(log.channels) for log in logs))) if logs else []
-    hashes = [set(row_hashes(log, common).tolist()) if common else set() for log in logs]
+    hashes = [set(measured_hashes(log, common).tolist()) if common else set() for log in logs]
     kept: list[int] = []
     for i in sorted(range(len(logs)), key=lambda i: -len(logs[i])):
         if all(len(hashes[i] & hashes[j]) <= _COPIED for j in kept):
@@ -321,7 +319,8 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = _COPIED) -> None:
     flat = [(split, log) for split, members in logs.items() for log in members]
     common = sorted(set.intersection(*(set(log.channels) for _, log in flat))) if flat else []
     one_of = sampling([log for _, log in flat])
-    hashes = [np.unique(sampled_hashes(log, common, one_of)) for _, log in flat if common]
+    hashes = [measured_hashes(log, common) for _, log in flat if common]
+    hashes = [np.unique(part[part % np.uint64(one_of) == 0]) for part in hashes]
     if len({split for split, _ in flat}) < 2 or not any(h.size for h in hashes):
         return
     owner = np.repeat(np.arange(len(flat)), [h.size for h in hashes])
@@ -333,7 +332,7 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = _COPIED) -> None:
     (split_a, a), (split_b, b) = flat[first], flat[second]
     if not shared[first, second]:
         return
-    same = np.intersect1d(row_hashes(a, common), row_hashes(b, common)).size
+    same = np.intersect1d(measured_hashes(a, common), measured_hashes(b, common)).size
     if same > rows:
         raise DataError(
             f"logs {a.name} ({split_a}) and {b.name} ({split_b}) share {same} identical rows, at"
@@ -358,6 +357,22 @@ def sampled_hashes(log: Log, channels: Sequence[str], one_of: int) -> np.ndarray
     hashes = row_hashes(log, channels)
     forget()
     return np.asarray(hashes[hashes % np.uint64(one_of) == 0])
+
+
+_MOTION = (*STATE, "phi", "p")
+
+
+def measured_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
+    """Return the hashes of the rows that hold half of the motion at least, uint64 [K].
+
+    Where channels come at several rates, a row between two fixes holds commands alone, and tells
+    nothing of the run that it is from.
+    """
+    motion = [name for name in channels if name in _MOTION] or channels
+    measured = np.isfinite(log.stack(tuple(motion))).sum(axis=1)
+    hashes = row_hashes(log, channels)[2 * measured >= measured.max(initial=0)]
+    forget()
+    return np.asarray(hashes)
 
 
 def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
