@@ -130,8 +130,33 @@ def test_a_fit_is_prepared_from_position_and_heading() -> None:
 
 def test_without_a_heading_there_is_no_motion() -> None:
     channels = {name: TRUTH[name] for name in ("x", "y", "delta")}
-    with pytest.raises(UsageError, match="no channel psi; position and heading are needed"):
+    with pytest.raises(UsageError, match="no channel psi, u, v, r; give position and heading, or"):
         complete_motion(Log("lost", TRUTH.t, channels), MotionConfig())
     channels["psi"] = np.full(len(TRUTH), np.nan)
     with pytest.raises(DataError, match="1200 positions and 0 headings"):
         complete_motion(Log("lost", TRUTH.t, channels), MotionConfig())
+
+
+@pytest.mark.parametrize("lacking", [("x", "y", "psi"), ("x", "y"), ("psi",)])
+def test_velocities_without_a_pose_make_one_from_the_origin(lacking: tuple[str, ...]) -> None:
+    channels = {name: values for name, values in TRUTH.channels.items() if name not in lacking}
+    log = complete_motion(TRUTH.replace(channels=channels), MotionConfig())
+    assert log.meta["integrated"] == list(lacking)
+    assert "not of a place" in log.meta["findings"][0]["text"]
+    away = np.exp(1j * (TRUTH["psi"][0] if "psi" in lacking else 0.0))
+    place = (log["x"] + 1j * log["y"] - log["x"][0] - 1j * log["y"][0]) * away
+    true = TRUTH["x"] + 1j * TRUTH["y"] - TRUTH["x"][0] - 1j * TRUTH["y"][0]
+    if lacking != ("psi",):
+        assert np.abs(place - true).max() < 5e-3 * np.abs(true).max()
+    turned = TRUTH["psi"] - (TRUTH["psi"][0] if "psi" in lacking else 0.0)
+    np.testing.assert_allclose(log["psi"], turned, atol=2e-3)
+    for name in ("u", "v", "r"):
+        np.testing.assert_array_equal(log[name], TRUTH[name])
+
+
+def test_a_fit_is_prepared_from_velocities_alone() -> None:
+    channels = {name: TRUTH[name] for name in ("u", "v", "r", "delta")}
+    config = PrepareConfig(grid=GridConfig(step=0.1))
+    prepared = prepare(TRUTH.replace(channels=channels), "train", ("delta",), config)
+    assert prepared.usable.all()
+    np.testing.assert_array_equal(prepared.y[:, 3], TRUTH["u"])

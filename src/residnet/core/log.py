@@ -21,8 +21,9 @@ _PIECE = 500_000
 
 _WORDS: dict[str, type | tuple[type, ...]] = {
     **{"name": str, "manoeuvre": str, "units": dict, "meta": dict},
-    **{"source": str, "sha256": str, "findings": list, "smoothed": list, "spikes": dict},
-    **{"stretch": list, "grid": dict, "vessel": str, "epoch": (int, float), "epoch_ns": int},
+    **{"source": str, "sha256": str, "findings": list, "spikes": dict, "smoothed": list},
+    **{"integrated": list, "stretch": list, "grid": dict, "vessel": str},
+    **{"epoch": (int, float), "epoch_ns": int},
 }
 """What a file says of itself, and of its `meta` what residnet reads."""
 

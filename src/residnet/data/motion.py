@@ -82,9 +82,11 @@ def complete_motion(log: Log, config: MotionConfig) -> Log:
     if not (made or config.moves):
         return log
     if missing := [name for name in POSE if name in lacking]:
+        if set(lacking) <= set(POSE):
+            return _integrated(log, missing)
         raise UsageError(
-            f"log {log.name}: no channel {', '.join(missing)}; position and heading are needed,"
-            " and give the velocities where these were not measured: name their columns"
+            f"log {log.name}: no channel {', '.join(lacking)}; give position and heading, or u, v"
+            " and r: either makes the other where it was not measured; name their columns"
         )
     made |= set(STATE) if config.always else set(POSE) if config.moves else set()
     names = [name for name in STATE if name in made]
@@ -97,6 +99,39 @@ def complete_motion(log: Log, config: MotionConfig) -> Log:
         channels={**log.channels, **{n: smooth[n] if n in made else log[n] for n in STATE}},
         units={**log.units, **{name: CHANNEL_UNITS[name] for name in STATE}},
         meta={**log.meta, "smoothed": names, "findings": findings},
+    )
+
+
+def _integrated(log: Log, missing: Sequence[str]) -> Log:
+    """Return a log of velocities with the pose that they lead to, from the origin on.
+
+    A model of velocities needs no pose. Errors of position and heading are then those of the
+    integrated velocities, and not of a place.
+    """
+    dt = np.diff(log.t, prepend=log.t[:1])
+
+    def integral(rate: np.ndarray) -> np.ndarray:
+        known = np.nan_to_num(rate)
+        return np.asarray(np.cumsum(0.5 * dt * (known + np.concatenate((known[:1], known[:-1])))))
+
+    pose = {"psi": integral(log["r"]) if "psi" in missing else np.asarray(log["psi"])}
+    heading = np.exp(1j * np.nan_to_num(pose["psi"]))
+    ground = heading * (np.nan_to_num(log["u"]) + 1j * np.nan_to_num(log["v"]))
+    pose |= {"x": integral(ground.real), "y": integral(ground.imag)}
+    made = {name: pose[name] for name in missing}
+    text = (
+        f"{', '.join(missing)} were not measured and are integrated from the velocities: errors of"
+        " position and heading are those of integrated velocities, and not of a place"
+    )
+    note = remark("note", "integrated_pose", text, channels=len(missing))
+    return log.replace(
+        channels={**log.channels, **made},
+        units={**log.units, **{name: CHANNEL_UNITS[name] for name in missing}},
+        meta={
+            **log.meta,
+            "integrated": list(missing),
+            "findings": [*log.meta.get("findings", ()), note],
+        },
     )
 
 

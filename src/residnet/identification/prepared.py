@@ -71,10 +71,14 @@ def _tell_spikes(logs: Sequence[Prepared]) -> None:
 
 
 def _tell_smoothed(logs: Sequence[Prepared]) -> None:
-    """Say which channels of how many logs were not measured at every sample."""
-    made = [", ".join(log.log.meta["smoothed"]) for log in logs if "smoothed" in log.log.meta]
-    for names in dict.fromkeys(made):
-        say(f"  {names} of {made.count(names)} logs come from a smoother of the measured motion")
+    """Say which channels of how many logs were made from others, and how."""
+    for key, source in (
+        ("smoothed", "come from a smoother of the measured motion"),
+        ("integrated", "are integrated from the velocities: their errors are those of no place"),
+    ):
+        made = [", ".join(log.log.meta[key]) for log in logs if key in log.log.meta]
+        for names in dict.fromkeys(made):
+            say(f"  {names} of {made.count(names)} logs {source}")
 
 
 def require_length(log: Prepared, settings: FitSettings) -> None:

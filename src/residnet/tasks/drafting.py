@@ -270,6 +270,11 @@ class _Read:
                 " position and heading. Where the antenna stands off the vessel's centre, or its"
                 " positions come late, add prepare.motion: {antenna: {x: ..., y: ...}, delay: ...}."
             )
+        if made := next(iter(self.whole.values())).meta.get("integrated"):
+            lines.append(
+                f"{', '.join(made)} are not measured: they are integrated from the velocities, and"
+                " errors of position and heading are those of integrated velocities."
+            )
         say(f"{len(self.logs)} logs were read, {len(self.left_out)} left out")
         return lines
 

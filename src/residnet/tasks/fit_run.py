@@ -188,6 +188,7 @@ def write_judged(
                 name: float(np.abs(log.y[log.usable, STATE.index(name)]).max())
                 for name in ("u", "v", "r")
             },
+            **({"integrated": made} if (made := log.log.meta.get("integrated")) else {}),
         }
         for split, members in logs.items()
         for log in members

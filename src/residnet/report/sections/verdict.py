@@ -46,11 +46,20 @@ def figures_of_lead(run: RunFiles) -> Section | None:
     return Section(f"Figures of {lead}", [Bullets([minus(text) for text in out if text])])
 
 
+_NO_PLACE = (
+    "The logs hold no {}: judge the model by its velocities, for errors of position and heading are"
+    " those of integrated velocities."
+)
+
+
 def evidence(run: RunFiles, selected: str) -> Evidence:
     """Return what the folder holds that a verdict on its selected model is passed on."""
     protocol, split = run.protocols[0], run.focus
     rows = {model: row for model in run.kinds if (row := run.row(model, split, protocol))}
     inspection = run.json("doctor.json")
+    doctor = summary(inspection).tally if inspection.get("logs") else ""
+    if made := next((log["integrated"] for log in run.quality if log.get("integrated")), None):
+        doctor = f"{_NO_PLACE.format(', '.join(made))} {doctor}".strip()
     return Evidence(
         selected,
         split,
@@ -58,7 +67,7 @@ def evidence(run: RunFiles, selected: str) -> Evidence:
         run.baseline or "",
         run.json("selection.json"),
         (run.limits.get("splits") or {}).get(split, {}).get(protocol, {}),
-        summary(inspection).tally if inspection.get("logs") else "",
+        doctor,
     )
 
 
