@@ -82,11 +82,13 @@ def complete_motion(log: Log, config: MotionConfig) -> Log:
     if not (made or config.moves):
         return log
     if missing := [name for name in POSE if name in lacking]:
-        if set(lacking) <= set(POSE):
+        # a heading from the rate alone would not be that of positions which were measured
+        if {"x", "y"} <= set(lacking) <= set(POSE):
             return _integrated(log, missing)
         raise UsageError(
             f"log {log.name}: no channel {', '.join(lacking)}; give position and heading, or u, v"
-            " and r: either makes the other where it was not measured; name their columns"
+            " and r without a position: either makes the other where it was not measured; name"
+            " their columns"
         )
     made |= set(STATE) if config.always else set(POSE) if config.moves else set()
     names = [name for name in STATE if name in made]
