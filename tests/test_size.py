@@ -16,11 +16,11 @@ import residnet
 
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
-    "api": (682, 79),
+    "api": (683, 79),
     "baselines": (793, 117),
     "control": (3197, 352),
-    "core": (1304, 185),
-    "data": (8074, 723),
+    "core": (1311, 186),
+    "data": (8276, 740),
     "documents": (2544, 272),
     "dynamics": (835, 124),
     "export": (2195, 263),
@@ -33,7 +33,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2843, 320),
     "runs": (364, 48),
     "simulators": (355, 44),
-    "tasks": (2984, 256),
+    "tasks": (2986, 256),
     "testing": (484, 33),
     "training": (1308, 157),
     "": (409, 49),

@@ -131,6 +131,7 @@ READERS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
     "ulog": (written_recorders.ulog, "pyulog"),
     "ardupilot": (written_recorders.ardupilot, "pymavlink"),
     "canonical": (_canonical, ""),
+    "joined": (written_logs.two_files, ""),
     "auto": (written_logs.bag2_mcap, "rosbags"),
 }
 
@@ -145,6 +146,8 @@ def test_reader(kind: str, tmp_path: Path) -> None:
     if kind in ("csv", "parquet", "excel", "json_lines"):
         channels = {name: {"column": name, "unit": CHANNEL_UNITS[name]} for name in log.channels}
         settings = {"time": {"column": "t"}, "channels": channels}
+    if kind == "joined":
+        settings = {"parts": written_logs.PARTS, "shift": {"cmd": 0.0}}
     read = check_reader(
         validate({"kind": kind, **settings}, ReaderConfig, "here"), write(log, tmp_path)
     )

@@ -131,3 +131,9 @@ def test_foreign_parquet(tmp_path: Path, metadata: dict[str, str] | None) -> Non
     pq.write_table(pa.table({"t": [0.0, 1.0]}).replace_schema_metadata(metadata), path)
     with pytest.raises(UsageError, match=f"not a residnet log \\({SCHEMA}\\)"):
         Log.load(path)
+
+
+def test_a_log_is_shown_in_one_line() -> None:
+    log = Log("run 1", 0.1 * np.arange(901), {"u": np.zeros(901), "psi": np.zeros(901)})
+    assert repr(log) == "Log('run 1', unknown, 901 samples over 90.0 s: u [m/s], psi [rad])"
+    assert "0 samples over 0.0 s" in repr(Log("none", np.zeros(0), {}))

@@ -98,8 +98,11 @@ def fragment(text: str) -> Any:
     )
     part = yaml.safe_load(text)
     if place[1] == "data.reader":
-        whole["data"]["reader"]["channels"] |= part["channels"]
-        whole["data"]["reader"]["time"] = part["time"]
+        joined = part["kind"] == "joined"
+        for reader in part["parts"].values() if joined else [part]:
+            whole["data"]["reader"]["channels"] |= reader["channels"]
+            whole["data"]["reader"]["time"] = reader["time"]
+        whole["data"]["reader"] = part if joined else whole["data"]["reader"]
     elif place[1] == "prepare":
         whole["prepare"] |= part
     else:

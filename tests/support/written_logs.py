@@ -17,6 +17,7 @@ from scipy.io import savemat
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
+from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers.detect import reader_for
 
 EPOCH = 1_744_362_945
@@ -39,6 +40,25 @@ def trial(seconds: float = 40.0, step: float = 0.1) -> Log:
         "cmd_stbd": np.where(np.cos(0.6 * t) > 0, 4.0, 1.0),
     }
     return Log("trial", t, channels)
+
+
+PARTS: dict[str, Any] = {
+    word: {
+        "kind": "csv",
+        "time": {"column": "t"},
+        "channels": {name: {"column": name, "unit": CHANNEL_UNITS[name]} for name in names},
+    }
+    for word, names in (("nav", ("x", "y", "psi", "u", "v", "r")), ("cmd", ("cmd_port",)))
+}
+"""Reader of what `two_files` writes."""
+
+
+def two_files(log: Log, folder: Path) -> Path:
+    """The motion in a file and a command in another one beside it; returns that of the motion."""
+    for word, part in PARTS.items():
+        table = pd.DataFrame({"t": log.t, **{name: log[name] for name in part["channels"]}})
+        table.to_csv(folder / f"trial_{word}.csv", index=False)
+    return folder / "trial_nav.csv"
 
 
 def csv(log: Log, folder: Path) -> Path:

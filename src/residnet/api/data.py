@@ -88,7 +88,7 @@ def read_logs(
         raise UsageError("read_logs: give channels or a reader, not both")
     with hearing(progress):
         files = log_files([file for entry in given for file in _matching(entry)], folders=True)
-        names, logs = log_names(files), dict[Path, Log]()
+        logs = dict[Path, Log]()
         settings: Any = None if reader is None else part(reader, "reader")
         if channels is not None:
             settings = {
@@ -101,7 +101,7 @@ def read_logs(
             for draft in read_each(files):
                 for error in draft.left_out.values():
                     raise error
-                if "channels" in draft.reader:
+                if {"channels", "parts"} & set(draft.reader):
                     say(f"{next(iter(draft.logs))}: channel map as guessed, to be checked")
                     content = {"data": {"reader": draft.reader}}
                     for line in commented(content, draft.marks.comments).splitlines():
@@ -109,11 +109,12 @@ def read_logs(
                 logs |= draft.logs
         else:
             chosen = validate(plain(settings), ReaderConfig, "read_logs").build()
-            for number, file in enumerate(files):
+            for number, file in enumerate(chosen.logs_among(files)):
                 report("reading logs", number, len(files))
                 logs[file] = chosen.read(file)
             report("reading logs", len(files), len(files))
-    return [logs[file].replace(name=names[file]) for file in files]
+    names = log_names(logs)
+    return [logs[file].replace(name=names[file]) for file in files if file in logs]
 
 
 def _matching(entry: Any) -> list[Path]:
@@ -303,7 +304,7 @@ def prepare(
         like: data whose settings are taken over; all logs then form the split `external`.
         progress: is told how far the work is.
         settings: further keys of the sections `signals` (exogenous, forces), `prepare` (masks,
-            derivative, trim, hold) and `evaluation` (protocols, selection, scales, groups,
+            derivative, motion, trim, hold) and `evaluation` (protocols, selection, scales, groups,
             divergence) of a config, as YAML has them; without `selection` the first of `protocols`
             chooses between models.
 

@@ -98,6 +98,12 @@ class Log:
     def __len__(self) -> int:
         return int(self.t.size)
 
+    def __repr__(self) -> str:
+        seconds = float(self.t[-1] - self.t[0]) if len(self) else 0.0
+        channels = ", ".join(f"{name} [{self.units[name]}]" for name in self.channels)
+        about = f"{self.manoeuvre}, {len(self)} samples over {seconds:.1f} s"
+        return f"Log({self.name!r}, {about}: {channels})"
+
     def __getitem__(self, name: str) -> np.ndarray:
         """Return the values [T] of one channel.
 
@@ -206,6 +212,11 @@ class Log:
 
         if not path.is_file():
             raise UsageError(f"{path}: no such file")
+        if path.suffix.lower() != ".parquet":
+            raise UsageError(
+                f"{path}: is no log that residnet wrote (.parquet), and only such are read here;"
+                " the task `import` turns others into such logs"
+            )
         try:
             table = pq.read_table(path)
         except (pa.ArrowException, OSError) as error:

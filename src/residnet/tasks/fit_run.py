@@ -313,7 +313,7 @@ def external_logs(
     data = config.data
     own = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
     # a folder may be one log, as a ROS 2 bag is
-    files = log_files(paths, isinstance(own, RecordingConfig))
+    files = own.build().logs_among(log_files(paths, isinstance(own, RecordingConfig)))
     read = [
         (CanonicalConfig() if Log.recognises(path) else own).build().read(path).replace(name=name)
         for path, name in log_names(files).items()

@@ -83,21 +83,24 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
     inputs, masks = (fit.signals.columns, fit.prepare.masks) if fit is not None else (None, ())
     own = None if task is None else getattr(task, "reader", None) or task.data.reader
     files = log_files(paths, own is None or isinstance(own, RecordingConfig))
-    names, read, maps = log_names(files), dict[Path, Log | ResidnetError](), list[str]()
+    read, maps = dict[Path, Log | ResidnetError](), list[str]()
     if own is None:
         for draft in read_each(files):
             read |= {**draft.logs, **draft.left_out}
-            if "channels" in draft.reader:
+            if {"channels", "parts"} & set(draft.reader):
                 drafted = {"data": {"kind": "measured", "reader": draft.reader}}
                 maps += ["channel map as guessed, to check and paste into a config:"]
                 maps += commented(drafted, draft.marks.comments).splitlines()
     else:
         reader = own.build()
-        for file in files:
+        for file in reader.logs_among(files):
             try:
                 read[file] = reader.read(file)
             except DataError as error:
                 read[file] = error
+    # files that only belong to others are no logs
+    files = [file for file in files if file in read]
+    names = log_names(files)
     logs: list[Log] = []
     reports: list[Report] = []
     for number, path in enumerate(files):

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,17 @@ from typing import Any
 from residnet.core.config import validate
 from residnet.core.errors import ResidnetError, UsageError
 from residnet.core.log import Log
+from residnet.core.names import STATE
 from residnet.core.progress import report
-from residnet.data.drafting.channels import CHANNELS
+from residnet.data.drafting.channels import READER
 from residnet.data.drafting.physics import Raw, turns_to
-from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.questions import Key, Marks
 from residnet.data.drafting.recordings import draft_recordings
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import kind_of
+from residnet.data.readers.joined import partners
 from residnet.data.readers.recording import Recording
 from residnet.data.readers.tables import column_names
 from residnet.data.split import log_names, logs_below
@@ -30,6 +32,7 @@ from residnet.data.split import log_names, logs_below
 INPUTS = ("signals", "inputs")
 """Key of a config's inputs."""
 _TABLES = (".csv", ".parquet")
+_FIXES = ("latitude", "longitude", "qw")
 
 
 def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
@@ -105,7 +108,9 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
         )
     kind, read = kinds[paths[0]], DraftedLogs({"kind": "canonical"}, marks)
     loaded: dict[Path, Recording] = {}
-    if kind == "table":
+    if kind == "table" and (trips := partners({path: column_names(path) for path in paths})):
+        read.reader, paths = _draft_joined(trips, marks)
+    elif kind == "table":
         read.reader, read.left_out = draft_tables(paths, marks)
     elif kind != "canonical":
         read.reader, loaded = draft_recordings(paths, marks)
@@ -128,15 +133,39 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
     return read
 
 
+def _draft_joined(
+    trips: Mapping[str, Sequence[Path]], marks: Marks
+) -> tuple[dict[str, Any], list[Path]]:
+    """Return the settings of a reader of files that belong together, and those of the motion."""
+    parts: dict[str, dict[str, Any]] = {}
+    for word, files in trips.items():
+        own = Marks()
+        parts[word] = draft_tables(files, own)[0]
+        place = (*READER, "parts", word)
+        for told, tell in ((own.guesses, marks.guess), (own.notes, marks.note)):
+            for key, text in told:
+                tell((*place, *key[len(READER) :]) if key[: len(READER)] == READER else key, text)
+    known = {word: set(part["channels"]) & {*STATE, *_FIXES} for word, part in parts.items()}
+    order = sorted(parts, key=lambda word: -len(known[word]))
+    text = (
+        f"files whose names differ in {' and '.join(order)} alone are taken as one trip; where both"
+        " have no dates, their clocks are brought together by what the commands explain"
+    )
+    marks.guess((*READER, "parts"), text)
+    return {"kind": "joined", "parts": {word: parts[word] for word in order}}, [*trips[order[0]]]
+
+
 def read_each(paths: Sequence[Path]) -> list[DraftedLogs]:
     """Return logs of any formats, those with the same columns together.
 
     Where none of those alike can be read, all of them are left out.
     """
     alike: dict[tuple[str, ...], list[Path]] = {}
+    tables = {path: column_names(path) for path in paths if kind_of(path) == "table"}
+    joined = bool(partners(tables))
     for path in paths:
         kind = kind_of(path)
-        names = column_names(path) if kind == "table" else ()
+        names = tables[path] if kind == "table" and not joined else ()
         alike.setdefault((kind, *names), []).append(path)
     out = []
     for group in alike.values():
@@ -150,7 +179,7 @@ def read_each(paths: Sequence[Path]) -> list[DraftedLogs]:
 
 def _turn_rudders(read: DraftedLogs) -> None:
     """Turn the sign of rudders whose positive angles turn the vessel to port."""
-    channels = read.reader.get("channels", {})
+    channels, places = _entries(read.reader)
     held = dict.fromkeys(name for log in read.logs.values() for name in log.channels)
     names = [name for name in held if re.match(r"(cmd_)?delta(?!_rate)", name)]
     moving = [moved for log in read.logs.values() if names and (moved := _turning(log))]
@@ -158,7 +187,7 @@ def _turn_rudders(read: DraftedLogs) -> None:
         there = [log for log in moving if name in log.channels]
         logs = [Raw(log.t, {name: log[name]}) for log in there]
         slope, error = turns_to(logs, name, {i: log["r"] for i, log in enumerate(there)})
-        key = (*CHANNELS, name) if name in channels else INPUTS
+        key = places.get(name, INPUTS)
         if abs(slope) < 4.0 * error:
             read.marks.guess(key, f"the logs do not tell to which side {name} turns the vessel")
         elif slope < 0.0 and name in channels:
@@ -172,6 +201,21 @@ def _turn_rudders(read: DraftedLogs) -> None:
         elif slope < 0.0:
             text = f"positive values of {name} turned the vessel to port in the logs"
             read.marks.guess(key, text)
+
+
+def _entries(reader: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, Key]]:
+    """Return channel -> entry of a drafted reader, and channel -> its key in the config."""
+    parts: dict[Key, Mapping[str, Any]] = {
+        (*READER, "parts", word): part for word, part in reader.get("parts", {}).items()
+    }
+    parts = parts or {READER: reader}
+    entries: dict[str, dict[str, Any]] = {}
+    places: dict[str, Key] = {}
+    for place, part in parts.items():
+        for name, entry in part.get("channels", {}).items():
+            entries.setdefault(name, entry)
+            places.setdefault(name, (*place, "channels", name))
+    return entries, places
 
 
 def _turning(log: Log) -> Log | None:

@@ -46,6 +46,9 @@ if TYPE_CHECKING:
 _ROWS = 20_000
 _FIRST_ROWS = {"parquet": parquet_rows, "json_lines": json_rows}
 _BRACKETS = re.compile(r"[\[(]")
+_TURNS = re.compile(r"rpm|rev|1/s|hz|turns|u/?min|umdr|drehz|toeren|tours|giri|varv", re.IGNORECASE)
+_PULSES = (900.0, 2100.0)
+"""Pulses in us that servos and speed controllers take."""
 _DAY = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
 _FORMS: tuple[Form, ...] = ("number", "ddmm")
 _LARGEST = {"latitude": 90.0, "longitude": 180.0}
@@ -88,6 +91,7 @@ def draft_tables(
     attitudes = quaternions(numeric)
     parts = {column for attitude in attitudes for column in attitude.values()}
     names = named([name for name in numeric if name not in parts], marks)
+    names = _pulsed(names, sheets)
     refuse_written_positions(first, names)
     if "psi" not in names:
         names |= levelled(attitudes, [one.numbers for one in sheets])
@@ -184,6 +188,24 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
     order = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
     return {name: names[name] for name in order if name in names}
+
+
+def _pulsed(names: Mapping[str, str], sheets: Sequence[Sheet]) -> dict[str, str]:
+    """Return channel -> column, where pulses to a motor are no revolutions but its throttle.
+
+    Pulses are whole microseconds between 900 and 2,100; revolutions say in their name what they
+    are, or are zero at rest.
+    """
+    out = {}
+    for channel, column in names.items():
+        values = np.concatenate([one.numbers.get(column, np.zeros(0)) for one in sheets])
+        values = values[np.isfinite(values)]
+        if re.match(r"(cmd_)?n(_|$)", channel) and values.size and not _TURNS.search(column):
+            whole = bool((values == np.round(values)).all())
+            if whole and values.min() >= _PULSES[0] and values.max() <= _PULSES[1]:
+                channel = re.sub(r"^(cmd_)?n", "throttle", channel)
+        out[channel] = column
+    return out
 
 
 def _raw(

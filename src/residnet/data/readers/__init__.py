@@ -22,6 +22,7 @@ else:
                 "parquet": "residnet.data.readers.tables:ParquetConfig",
                 "excel": "residnet.data.readers.tables:ExcelConfig",
                 "json_lines": "residnet.data.readers.tables:JsonLinesConfig",
+                "joined": "residnet.data.readers.joined:JoinedConfig",
                 "canonical": "residnet.data.readers.canonical:CanonicalConfig",
                 "csv_topics": "residnet.data.readers.formats.topic_folder:TopicFolderConfig",
                 "rosbag": "residnet.data.readers.formats.rosbag:RosbagConfig",

@@ -27,6 +27,10 @@ LARGE = 300_000_000
 class LogReader(ABC):
     """Reads one file format into the canonical `Log`."""
 
+    def logs_among(self, paths: Sequence[Path]) -> list[Path]:
+        """Return the files that are logs by themselves; others only belong to these."""
+        return list(paths)
+
     @abstractmethod
     def read(self, path: Path) -> Log:
         """Return the log in one file, in SI units, psi unwrapped, time strictly increasing.

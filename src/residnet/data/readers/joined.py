@@ -1,0 +1,286 @@
+"""Several files of one trip, each from a recorder of its own, as one log."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple, final
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from residnet.core.config import Config, Seconds
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+from residnet.core.names import STATE
+from residnet.data.align import GridConfig, onto
+from residnet.data.motion import MotionConfig, complete_motion
+from residnet.data.readers.base import LogReader, digest, require_file
+from residnet.data.readers.recording import Remark, remark
+from residnet.data.readers.tables import (
+    TABLES,
+    CsvConfig,
+    ExcelConfig,
+    JsonLinesConfig,
+    ParquetConfig,
+)
+
+_LEAST = 0.5
+"""Share of the shorter log that two clocks must have in common while their shift is looked for."""
+_COARSE, _FINE = 0.5, 0.05
+"""Steps in s by which the shift is looked for, and then around the best."""
+_SURE = 1.5
+"""How much more of the accelerations any shift far from the best one must leave unexplained."""
+_FAR = 3.0
+"""Time in s from which on a shift is another one."""
+_BLOCK = 2.5
+"""Time in s over which the velocities that are gained are explained: derivatives would be noise."""
+_SAMPLES = 3000
+"""Samples of the motion from which a shift is found."""
+
+TableKind = CsvConfig | ParquetConfig | ExcelConfig | JsonLinesConfig
+
+
+@final
+class JoinedConfig(Config):
+    """Files of one trip whose names differ in one word, such as gnss_1.csv beside motors_1.csv.
+
+    The first part is that of the motion: a log is named by its file and has its clock. What the
+    others hold is brought to this clock, averaged where it comes more often and held where it comes
+    more rarely.
+
+    Attributes:
+        parts: word in the file's name -> reader of such files, that of the motion first.
+        shift: word -> time in s that is added to the clock of that part; parts without one are
+            joined by their dates, and where they have none by the shift with which their channels
+            explain most of the accelerations.
+    """
+
+    kind: Literal["joined"] = "joined"
+    parts: dict[str, TableKind] = Field(min_length=2)
+    shift: dict[str, Seconds] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known(self) -> JoinedConfig:
+        others = list(self.parts)[1:]
+        if wrong := set(self.shift) - set(others):
+            raise ValueError(
+                f"shift: '{min(wrong)}' is no part whose clock can be moved ({', '.join(others)})"
+            )
+        return self
+
+    def build(self) -> JoinedReader:
+        """Build the reader of joined files."""
+        return JoinedReader(self)
+
+
+class Shift(NamedTuple):
+    """The time in s to add to a clock, and what it explains of what the motion alone leaves.
+
+    Attributes:
+        seconds: to add.
+        explained: share of the variance, from 0 to 1.
+        other: the same with the best shift that is far from it.
+    """
+
+    seconds: float
+    explained: float
+    other: float
+
+
+@final
+class JoinedReader(LogReader):
+    """Reads the file of the motion and those beside it."""
+
+    def __init__(self, config: JoinedConfig) -> None:
+        self._config = config
+
+    def logs_among(self, paths: Sequence[Path]) -> list[Path]:
+        """Return the files of the motion."""
+        first, *others = self._config.parts
+        kind = self._config.parts[first].kind
+        return [
+            path
+            for path in paths
+            if first in path.name
+            and not any(word in path.name for word in others)
+            and TABLES.get(path.suffix.lower(), "csv") == kind
+        ]
+
+    def files(self, path: Path) -> dict[str, Path]:
+        """Return word -> file of the trip that a file of the motion is of.
+
+        Raises:
+            DataError: where the name lacks the word of the motion, or a file is missing.
+        """
+        require_file(path)
+        first, *others = self._config.parts
+        before, found, after = path.name.rpartition(first)
+        if not found:
+            raise DataError(
+                f"{path}: its name holds no '{first}'; give the files of the motion, to which"
+                f" those of {', '.join(others)} belong"
+            )
+        out = {first: path}
+        for word in others:
+            beside = path.with_name(f"{before}{word}{after}")
+            if not beside.is_file():
+                raise DataError(f"{path}: {beside.name} is not beside it; leave the trip out")
+            out[word] = beside
+        return out
+
+    def read(self, path: Path) -> Log:
+        """Return the log of one trip; see `LogReader.read`.
+
+        Raises:
+            DataError: where a file of the trip is missing or cannot be read, or their clocks have
+                nothing in common.
+        """
+        files = self.files(path)
+        logs = {word: self._config.parts[word].build().read(file) for word, file in files.items()}
+        first, *others = logs
+        log = logs[first]
+        for word in others:
+            log = self._beside(log, logs[word], word)
+        meta = {**log.meta, "sha256": digest(list(files.values()))}
+        return log.replace(meta=meta)
+
+    def _beside(self, log: Log, other: Log, word: str) -> Log:
+        """Return a log with the channels of another one, on its own clock."""
+        new = {n: values for n, values in other.channels.items() if n not in log.channels}
+        shift, told = self._shift(log, other.replace(channels=new), word)
+        t = other.t + shift
+        step = float(np.median(np.diff(log.t)))
+        both = (log.t >= t[0]) & (log.t <= t[-1])
+        if both.sum() < 2:
+            raise DataError(
+                f"log {log.name}: its clock goes from {log.t[0]:.1f} to {log.t[-1]:.1f} s, that of"
+                f" {word} from {t[0]:.1f} to {t[-1]:.1f} s; give `shift: {{{word}: ...}}`"
+            )
+        held = tuple(new) if float(np.median(np.diff(t))) > step else ()
+        moved = onto(other.replace(t=t, channels=new), GridConfig(step=step, held=held), log.t)
+        findings = [*log.meta.get("findings", ()), *other.meta.get("findings", ()), told]
+        return log.replace(
+            channels={**log.channels, **{name: moved[name] for name in new}},
+            units={**log.units, **{name: other.units[name] for name in new}},
+            meta={**log.meta, "findings": findings},
+        )
+
+    def _shift(self, log: Log, other: Log, word: str) -> tuple[float, Remark]:
+        given = self._config.shift.get(word)
+        if given is not None:
+            return given, remark("note", "joined", f"{word}: its clock is moved by {given:g} s")
+        epochs = [one.meta.get("epoch") for one in (log, other)]
+        if None not in epochs:
+            absolute = (float(epochs[1] or 0) - other.t[0]) - (float(epochs[0] or 0) - log.t[0])
+            return absolute, remark("note", "joined", f"{word}: joined by the dates of both")
+        found = clock_shift(log, other)
+        text = (
+            f"{word}: its clock is moved by {found.seconds:+.2f} s, with which its channels explain"
+            f" {100 * found.explained:.0f} % of what the motion alone leaves of the accelerations"
+            f" ({100 * found.other:.0f} % with any shift {_FAR:g} s from it)"
+        )
+        figures = found._asdict()
+        if 1.0 - found.other < _SURE * (1.0 - found.explained):
+            text += f"; that is not sure, give `shift: {{{word}: ...}}`"
+            return found.seconds, remark("will mislead", "joined", text, **figures)
+        return found.seconds, remark("note", "joined", text, **figures)
+
+
+def clock_shift(log: Log, other: Log) -> Shift:
+    """Return the shift of another log's clock with which its channels explain most accelerations.
+
+    For each shift that leaves half of the shorter log, what u and r gain over blocks of time is
+    fitted by integrals of the velocities, and of each channel, its square and its product with the
+    speed. What counts is the share of what the velocities alone leave of all blocks.
+
+    Args:
+        log: of the motion, measured or by position and heading.
+        other: channels that drive the vessel.
+
+    Raises:
+        DataError: where the log holds no motion.
+    """
+    whole = complete_motion(log, MotionConfig())
+    every = max(1, len(whole) // _SAMPLES)
+    t = whole.t[::every]
+    size = max(4, round(_BLOCK / float(np.median(np.diff(t)))))
+    begin = np.arange(0, len(t) - size, max(1, size // 4))
+
+    def over(columns: np.ndarray) -> np.ndarray:
+        """Return the integrals of columns [T, k] over the blocks [B, k]."""
+        area = 0.5 * np.diff(t)[:, None] * (columns[1:] + columns[:-1])
+        total = np.concatenate((np.zeros((1, columns.shape[1])), np.cumsum(area, axis=0)))
+        return np.asarray(total[begin + size] - total[begin])
+
+    known = {name: np.isfinite(whole[name]) for name in ("u", "r")}
+    u, r = (np.interp(t, whole.t[k], whole[n][k]) for n, k in known.items())
+    gained = np.stack((u[begin + size] - u[begin], r[begin + size] - r[begin]), axis=1)
+    gained /= np.maximum(gained.std(axis=0), 1e-12)
+    own = over(np.stack((np.ones_like(u), u, u * np.abs(u), r, r * np.abs(r), u * r), axis=1))
+    # what the motion explains by itself, which says nothing of the commands
+    rest = gained - own @ np.linalg.lstsq(own, gained, rcond=1e-9)[0]
+    left_alone = (rest**2).sum(axis=1)
+    driving = [values for name, values in other.channels.items() if name not in STATE]
+    least = _LEAST * min(t[-1] - t[0], other.t[-1] - other.t[0])
+
+    def explained(shift: float) -> float:
+        at = t - shift
+        inside = (at[begin] >= other.t[0]) & (at[begin + size] <= other.t[-1])
+        if inside.sum() < 3 * (own.shape[1] + 3 * len(driving)):
+            return 0.0
+        columns = [own[inside]]
+        for values in driving:
+            there = np.isfinite(values)
+            w = np.interp(at, other.t[there], values[there])
+            columns.append(over(np.stack((w, w * np.abs(w), w * u), axis=1))[inside])
+        x, y = np.concatenate(columns, axis=1), gained[inside]
+        x = x / np.maximum(np.abs(x).max(axis=0), 1e-12)
+        left = y - x @ np.linalg.lstsq(x, y, rcond=1e-9)[0]
+        # blocks that the other log does not reach stay as the motion alone leaves them
+        return float((left_alone[inside].sum() - (left**2).sum()) / left_alone.sum())
+
+    low, high = t[0] - other.t[-1] + least, t[-1] - other.t[0] - least
+    coarse = np.arange(low, max(high, low + _COARSE), _COARSE)
+    scores = np.array([explained(shift) for shift in coarse.tolist()])
+    best = float(coarse[scores.argmax()])
+    fine = best + np.arange(-_COARSE, _COARSE + _FINE, _FINE)
+    found = np.array([explained(shift) for shift in fine.tolist()])
+    seconds = float(fine[found.argmax()])
+    far = scores[np.abs(coarse - seconds) > _FAR]
+    return Shift(seconds, float(found.max()), float(far.max(initial=0.0)))
+
+
+def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
+    """Return word -> files, where files come in groups whose names differ in that word alone.
+
+    Empty where they do not: files of one group have the same columns, and every trip one of each.
+
+    Args:
+        paths: file -> its columns.
+    """
+    groups: dict[tuple[str, ...], list[Path]] = {}
+    for path, columns in paths.items():
+        groups.setdefault(columns, []).append(path)
+    members = list(groups.values())
+    if not 2 <= len(members) <= 6 or len({len(group) for group in members}) > 1:
+        return {}
+    words = [_words(group) for group in members]
+    for number, chosen in enumerate(words):
+        others = set().union(*(set(w) for k, w in enumerate(words) if k != number))
+        words[number] = [word for word in chosen if word not in others]
+    if not all(words):
+        return {}
+    named = {own[0]: group for own, group in zip(words, members, strict=True)}
+    trips = [
+        {path.with_name(path.name.replace(word, "\0")) for path in group}
+        for word, group in named.items()
+    ]
+    return named if all(trip == trips[0] for trip in trips) else {}
+
+
+def _words(group: list[Path]) -> list[str]:
+    """Return the words that the names of all files of a group hold, the longest first."""
+    held = [set(re.findall(r"[^\W\d_]+", path.stem)) for path in group]
+    return sorted(set.intersection(*held), key=lambda word: (-len(word), word))
