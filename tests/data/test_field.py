@@ -61,3 +61,14 @@ def test_a_pose_in_the_plane_counts_from_east(kind: str) -> None:
     plan = standard_plan(Recording(Path("run"), {series.name: series}), Plan())
     assert plan.position == Local(topic="/boat/pose", north="y", east="x")
     assert plan.heading == Angle(topic="/boat/pose", field="theta", frame="enu")
+
+
+@pytest.mark.parametrize("name", ["magnetic heading [deg]", "Compass [deg]", "heading_mag [deg]"])
+def test_a_magnetic_heading_is_marked(name: str, turning: Log, tmp_path: Path) -> None:
+    for column, marked in ((name, True), ("heading [deg]", False)):
+        table = {"time [s]": turning.t, "north [m]": turning["x"], "east [m]": turning["y"]}
+        table |= {column: np.degrees(turning["psi"]) % 360.0}
+        pd.DataFrame(table).to_csv(tmp_path / "run.csv", index=False)
+        marks = Marks()
+        assert "psi" in draft_tables([tmp_path / "run.csv"], marks)[0]["channels"]
+        assert any("minus the declination" in text for _, text in marks.guesses) == marked

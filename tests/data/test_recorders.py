@@ -124,6 +124,20 @@ def test_px4(tmp_path: Path) -> None:
     ]
 
 
+def test_ardupilot_of_2014_counts_milliseconds(tmp_path: Path) -> None:
+    log = trial(20.0)
+    got = reader_for(path := written_recorders.ardupilot_2014(log, tmp_path)).read(path)
+    assert {"x", "y", "psi", "r"} <= set(got.channels)
+    middle = (got.t > 2.0) & (got.t < 18.0)
+    for name, most in (("psi", 0.02), ("r", 0.02)):
+        true = np.interp(got.t, log.t, log[name])
+        apart = got[name] - true
+        apart -= 2.0 * np.pi * np.round(np.median(apart) / (2.0 * np.pi)) if name == "psi" else 0.0
+        assert np.abs(apart[middle]).max() < most
+    away = got["x"] - np.interp(got.t, log.t, log["x"])
+    assert np.ptp(away[middle]) < 0.2
+
+
 def test_ardupilot(tmp_path: Path) -> None:
     log = trial(20.0)
     got = reader_for(path := written_recorders.ardupilot(log, tmp_path)).read(path)

@@ -171,6 +171,43 @@ def ardupilot(log: Log, folder: Path) -> Path:
     return path
 
 
+def ardupilot_2014(log: Log, folder: Path) -> Path:
+    """ArduPilot as of 2014: times in ms, that of a fix at its end; no filter, no latitude scale."""
+    formats = [
+        (128, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns", 89),
+        (
+            1,
+            "GPS",
+            "BIHBcLLeeEefI",
+            "Status,TimeMS,Week,NSats,HDop,Lat,Lng,RelAlt,Alt,Spd,GCrs,VZ,T",
+            45,
+        ),
+        (2, "ATT", "Iccf", "TimeMS,DesRoll,Roll,Yaw", 15),
+        (3, "IMU", "Ifff", "TimeMS,GyrX,GyrY,GyrZ", 19),
+    ]
+    body = b""
+    for number, name, kinds, columns, length in formats:
+        body += b"\xa3\x95\x80" + struct.pack(
+            "<BB4s16s64s", number, length, name.encode(), kinds.encode(), columns.encode()
+        )
+    latitude, longitude = geodetic(log)
+    gps = EPOCH - 315_964_800 + 18
+    for i, t in enumerate(log.t.tolist()):
+        at = BOOT // 1000 + round(t * 1e3)
+        if i % 2 == 0:
+            place = (round(latitude[i] * 1e7), round(longitude[i] * 1e7), 0, 0, 0, 0, 0.0, at)
+            ms = (gps % 604_800) * 1000 + round(t * 1e3)
+            body += b"\xa3\x95\x01" + struct.pack(
+                "<BIHBhiiiiIifI", 3, ms, gps // 604_800, 12, 80, *place
+            )
+        yaw = float(np.degrees(log["psi"][i]) % 360)
+        body += b"\xa3\x95\x02" + struct.pack("<Ihhf", at, 0, 0, yaw)
+        body += b"\xa3\x95\x03" + struct.pack("<Ifff", at, 0.0, 0.0, log["r"][i])
+    path = folder / "trial.bin"
+    path.write_bytes(body)
+    return path
+
+
 def _message(kind: str, content: bytes) -> bytes:
     return struct.pack("<HB", len(content), ord(kind)) + content
 

@@ -18,6 +18,8 @@ from residnet.data.readers.base import Advance, missing_package, progress, requi
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.recording import EVERYTHING, Recording, Series, Wanted
 
+_TICKS = {"TimeUS": 1_000, "TimeMS": 1_000_000, "T": 1_000_000}
+"""Field of the time since boot -> its unit in ns."""
 _REPORT_EVERY = 5000
 _DATED = 100_000_000.0
 
@@ -91,18 +93,22 @@ def _collect(
         if count % _REPORT_EVERY == 0:
             advance(reader.percent)
         fields = message.get_fieldnames()
-        if not fields or fields[0] != "TimeUS":
-            continue
         kind, instance = message.get_type(), message.fmt.instance_field
+        # logs of 2014 count milliseconds, which a fix of theirs holds at its end
+        clock = fields[0] if fields else ""
+        clock = "T" if kind == "GPS" and clock not in _TICKS and "T" in fields else clock
+        if clock not in _TICKS:
+            continue
         number = int(getattr(message, instance)) if instance in fields else 0
         name = f"{kind}_{number}" if number else kind
         listed.add(name)
         if not wanted(name):
             continue
         if name not in columns:
-            values = {field: getattr(message, field) for field in fields[1:]}
+            values = {field: getattr(message, field) for field in fields if field != clock}
             numbers = [f for f, v in values.items() if isinstance(v, int | float)]
-            columns[name] = _Columns(kind, [f for f in numbers if wanted.field(name, f)])
+            kept = [field for field in numbers if wanted.field(name, field)]
+            columns[name] = _Columns(kind, kept, clock)
         columns[name].add(message)
 
 
@@ -129,13 +135,13 @@ def _silence() -> Iterator[None]:
 class _Columns:
     """Messages of one kind: time in ns since boot, numbers row by row."""
 
-    def __init__(self, kind: str, names: list[str]) -> None:
-        self._kind, self._names = kind, names
+    def __init__(self, kind: str, names: list[str], clock: str) -> None:
+        self._kind, self._names, self._clock = kind, names, clock
         self.time, self._rows = array("q"), array("d")
 
     def add(self, message: Any) -> None:
         """Append one message to the columns."""
-        self.time.append(int(message.TimeUS) * 1000)
+        self.time.append(int(getattr(message, self._clock)) * _TICKS[self._clock])
         self._rows.extend([getattr(message, name) for name in self._names])
 
     def series(self, name: str, origin: int) -> Series:
