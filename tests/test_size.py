@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (793, 117),
     "control": (3197, 352),
     "core": (1311, 186),
-    "data": (8284, 740),
+    "data": (8288, 741),
     "documents": (2544, 272),
     "dynamics": (835, 124),
     "export": (2195, 263),

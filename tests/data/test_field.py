@@ -72,3 +72,16 @@ def test_a_magnetic_heading_is_marked(name: str, turning: Log, tmp_path: Path) -
         marks = Marks()
         assert "psi" in draft_tables([tmp_path / "run.csv"], marks)[0]["channels"]
         assert any("minus the declination" in text for _, text in marks.guesses) == marked
+
+
+def test_what_a_recording_holds_is_told_where_no_channel_is_found() -> None:
+    t = np.arange(5.0)
+    series = [
+        Series("/chatter", "std_msgs/msg/String", {}, t),
+        Series("tank", "", {"level": t, "volts": t}, t),
+    ]
+    whole = Recording(Path("run"), {one.name: one for one in series})
+    assert whole.contents == "/chatter (String), tank (level, volts)"
+    many = Recording(Path("run"), {f"s{i}": series[0] for i in range(23)})
+    assert many.contents.endswith("s19 (String), and 3 more")
+    assert Recording(Path("run"), {}).contents == "nothing"

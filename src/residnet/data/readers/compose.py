@@ -277,10 +277,9 @@ def _parts(recording: Recording, plan: Plan, longest_gap: float) -> list[Part]:
         if entry["level"] == "fatal":
             raise DataError(f"{recording.path}: {entry['text']}")
     if not parts:
-        held = ", ".join(recording.series) or "nothing"
         raise UsageError(
             f"{recording.path}: no channel to read; name them under `channels`, `position`,"
-            f" `heading` (the recording holds {held})"
+            f" `heading` (the recording holds {recording.contents})"
         )
     return parts
 

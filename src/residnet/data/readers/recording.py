@@ -113,6 +113,10 @@ class Series:
         return dataclasses.replace(self, remarks=(*self.remarks, *remarks))
 
 
+_TOLD = 20
+"""Series of a recording that a message names."""
+
+
 @dataclass(frozen=True)
 class Recording:
     """What one file or folder holds.
@@ -133,6 +137,16 @@ class Recording:
     files: tuple[Path, ...] = ()
     remarks: tuple[Remark, ...] = ()
     listed: tuple[str, ...] = field(default=())
+
+    @property
+    def contents(self) -> str:
+        """What it holds in words: each series with its type, or its fields where it has none."""
+        told = [
+            f"{name} ({one.kind.rsplit('/', 1)[-1] or ', '.join(list(one.fields)[:6])})"
+            for name, one in self.series.items()
+        ]
+        more = len(told) - _TOLD
+        return ", ".join([*told[:_TOLD], *([f"and {more} more"] if more > 0 else [])]) or "nothing"
 
     def __getitem__(self, topic: str | None) -> Series:
         """Return one series; None names the only one. A leading slash may be left out.
