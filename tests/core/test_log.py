@@ -137,3 +137,9 @@ def test_a_log_is_shown_in_one_line() -> None:
     log = Log("run 1", 0.1 * np.arange(901), {"u": np.zeros(901), "psi": np.zeros(901)})
     assert repr(log) == "Log('run 1', unknown, 901 samples over 90.0 s: u [m/s], psi [rad])"
     assert "0 samples over 0.0 s" in repr(Log("none", np.zeros(0), {}))
+
+
+def test_a_log_of_a_model_alone_names_no_vessel(tmp_path: Path) -> None:
+    log = Log("flown", np.arange(3.0), {"u": np.zeros(3)}, meta={"vessel": None, "findings": []})
+    log.save(tmp_path / "flown.parquet")
+    assert Log.load(tmp_path / "flown.parquet").meta["vessel"] is None

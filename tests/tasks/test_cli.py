@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 import written_logs
 import yaml
 from tiny import call
@@ -94,9 +95,9 @@ def test_measured_csv_end_to_end(
     assert call(monkeypatch, "export", out, "--model", "ridge", "--format", "torchscript") == 0
     assert (out / "exports" / "ridge.pt").is_file()
     assert call(monkeypatch, "export", out, "--out", tmp_path / "chosen") == 0
-    card = json.loads((tmp_path / "chosen.card.json").read_text())
-    assert card["model"] == content["selected"]
-    assert (tmp_path / "chosen.pt").is_file()
+    card = {"card.json": ""}
+    torch.jit.load(str(tmp_path / "chosen.pt"), _extra_files=card)
+    assert json.loads(card["card.json"])["model"] == content["selected"]
     capsys.readouterr()
     assert call(monkeypatch, "export", out, "--model", "rigde") == 2
     assert "did you mean 'ridge'" in one_line(capsys)

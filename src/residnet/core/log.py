@@ -22,7 +22,7 @@ _PIECE = 500_000
 _WORDS: dict[str, type | tuple[type, ...]] = {
     **{"name": str, "manoeuvre": str, "units": dict, "meta": dict},
     **{"source": str, "sha256": str, "findings": list, "spikes": dict, "smoothed": list},
-    **{"integrated": list, "stretch": list, "grid": dict, "vessel": str},
+    **{"integrated": list, "stretch": list, "grid": dict},
     **{"epoch": (int, float), "epoch_ns": int},
 }
 """What a file says of itself, and of its `meta` what residnet reads."""
