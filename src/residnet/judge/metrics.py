@@ -243,7 +243,8 @@ class Judged:
 
     def _summary(self, name: str, chosen: np.ndarray) -> dict[str, Any]:
         found, drawn = self.found[name], blocks(self.numbers[chosen])
-        by_window = np.column_stack((found.rmse, self.nrmse[name]))[chosen]
+        ends = (found.position_end, found.heading_end)
+        by_window = np.column_stack((found.rmse, self.nrmse[name], *ends))[chosen]
         rmse, mae = by_window[:, :3].mean(0), found.mae[chosen].mean(0)
         nrmse = rmse / self.scale
         spread = intervals(by_window, drawn)
@@ -266,8 +267,10 @@ class Judged:
             "rmse_ci95": dict(zip(VELOCITY, spread, strict=False)),
             "nrmse_mean_ci95": spread[3],
             "ci95_blocks": drawn.row() if drawn is not None else None,
-            "position_error_end": float(found.position_end[chosen].mean()),
-            "heading_error_end": float(found.heading_end[chosen].mean()),
+            "position_error_end": float(by_window[:, 4].mean()),
+            "position_error_end_ci95": spread[4],
+            "heading_error_end": float(by_window[:, 5].mean()),
+            "heading_error_end_ci95": spread[5],
         }
 
     def limits(self, step: float) -> dict[str, Any]:
