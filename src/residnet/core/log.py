@@ -238,11 +238,7 @@ class Log:
             columns[name] = np.asarray(values, dtype=kind)
         if "t" not in columns:
             raise DataError(f"{path}: canonical log without a column 't'; write the file again")
-        masks = {
-            n.removeprefix("mask:"): c
-            for n, c in columns.items()
-            if n.startswith("mask:")
-        }
+        masks = {n.removeprefix("mask:"): c for n, c in columns.items() if n.startswith("mask:")}
         channels = {n: c for n, c in columns.items() if n != "t" and not n.startswith("mask:")}
         return cls(
             about["name"],

@@ -117,9 +117,7 @@ def without_spikes(log: Log, needed: Collection[str] | None = None) -> Log:
     samples from being learned from or scored.
     """
     cells = {
-        name: bad
-        for name, bad in spike_cells(log).items()
-        if needed is None or name in needed
+        name: bad for name, bad in spike_cells(log).items() if needed is None or name in needed
     }
     if not cells:
         return log
