@@ -243,8 +243,9 @@ class Judged:
 
     def _summary(self, name: str, chosen: np.ndarray) -> dict[str, Any]:
         found, drawn = self.found[name], blocks(self.numbers[chosen])
-        ends = (found.position_end, found.heading_end)
-        by_window = np.column_stack((found.rmse, self.nrmse[name], *ends))[chosen]
+        by_window = np.column_stack(
+            (found.rmse, self.nrmse[name], found.position_end, found.heading_end)
+        )[chosen]
         rmse, mae = by_window[:, :3].mean(0), found.mae[chosen].mean(0)
         nrmse = rmse / self.scale
         spread = intervals(by_window, drawn)
