@@ -374,6 +374,13 @@ def export(
             "--out", metavar="FILE", help="File to write; RUN/exports/<model>.pt where not given."
         ),
     ] = None,
+    anyway: Annotated[
+        bool,
+        typer.Option(
+            "--anyway",
+            help="Write what is worse than doing without it, too; its card says so.",
+        ),
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Export a model of a finished run for controllers, after a parity check."""
@@ -383,7 +390,7 @@ def export(
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "export")
         require_file_place(out or run.exports / model)
-        written = task.export_model(run, model, out, file_format)
+        written = task.export_model(run, model, out, file_format, anyway=anyway)
     print(written)
 
 

@@ -21,11 +21,11 @@ import pytest
 import torch
 from exported_models import HIGH, LOW, VARIANTS, AsTensors, built, spec_of
 
-from residnet.core.errors import ExportError
+from residnet.core.errors import ExportError, WithheldError
 from residnet.dynamics.ensemble import mean_of
 from residnet.export import base, exporter, torchscript, vessel
 from residnet.export.aoti import AotiModel
-from residnet.export.base import Loaded, RoundingError
+from residnet.export.base import Loaded, RoundingError, released
 from residnet.export.c import CompiledModel
 from residnet.export.c_code import STRICT, CFunction, c_files, compile_shared, compiler
 from residnet.export.casadi_function import CasadiModel
@@ -129,6 +129,15 @@ def test_torchscript_is_the_model(variant: str, tmp_path: Path) -> None:
     torch.testing.assert_close(together[:, -1], at, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(last, s, rtol=1e-4, atol=1e-5)
     assert (together.dtype, outside.dtype, outside.shape) == (torch.float32, torch.bool, (3, 30))
+
+
+def test_what_is_worse_than_nothing_is_withheld_or_marked() -> None:
+    with pytest.raises(WithheldError, match=r"model mine is withheld: it drifts; .* --anyway"):
+        released(exported("lstm"), ["it drifts"], anyway=False)
+    assert released(exported("lstm"), ["it drifts"], anyway=True).card()["objections"] == [
+        "it drifts"
+    ]
+    assert released(exported("lstm"), [], anyway=False).card()["objections"] == []
 
 
 def test_the_card_says_what_a_controller_needs() -> None:

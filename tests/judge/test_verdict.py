@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from residnet.judge.verdict import Evidence, diverged_note, verdict
+from residnet.judge.verdict import Evidence, diverged_note, objections, verdict
 
 
 def row(error: float, diverged: int = 0) -> dict[str, Any]:
@@ -60,6 +60,14 @@ def test_a_model_worse_than_zero_says_so_first() -> None:
 
 def test_where_nothing_beats_zero_the_first_sentence_says_so() -> None:
     assert verdict(evidence(selected="zero"))[0].startswith("NOTHING BEATS ZERO")
+
+
+def test_what_is_worse_than_zero_or_the_baseline_is_objected_to() -> None:
+    assert objections(evidence(0.2)) == []
+    assert objections(evidence(0.3)) == ["on test data its NRMSE is 0.3, that of baseline 0.25"]
+    assert len(objections(evidence(0.6))) == 2
+    assert objections(evidence(selected="baseline")) == []
+    assert objections(evidence(selected="unknown")) == []
 
 
 def test_unsound_models_and_divergences_are_named() -> None:

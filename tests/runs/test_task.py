@@ -11,7 +11,7 @@ import pytest
 import torch
 from read_page import plain
 
-from residnet.core.errors import DataError, ExportError, FitError, UsageError
+from residnet.core.errors import DataError, ExportError, FitError, UsageError, WithheldError
 from residnet.report.blocks import Code, Section
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome
@@ -22,7 +22,7 @@ class SampleTask(ComputingTask):
 
     task: Literal["sample"] = "sample"
     seed: int = 7
-    fault: Literal["", "raises", "fails a check", "is not exported"] = ""
+    fault: Literal["", "raises", "fails a check", "is not exported", "is withheld"] = ""
 
     def recorded_seed(self) -> int:
         return self.seed
@@ -45,8 +45,17 @@ class SampleTask(ComputingTask):
             folder.write(folder.exports / "model.txt", "exported")
             return folder.exports / "model.txt"
 
-        first = {"wild": diverging} if self.fault == "is not exported" else {}
-        return Outcome(["It works."], figures, "a table", failure, {**first, "model": model})
+        def worse() -> Path:
+            raise WithheldError("model wild is withheld: worse than zero")
+
+        first = {"is not exported": {"wild": diverging}, "is withheld": {"wild": worse}}
+        return Outcome(
+            ["It works."],
+            figures,
+            "a table",
+            failure,
+            {**first.get(self.fault, {}), "model": model},
+        )
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
@@ -110,6 +119,14 @@ def test_a_result_that_fails_a_check_is_reported_first(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="a flight did not end"):
         SampleTask(name="checked", fault="fails a check").run(out=tmp_path / "run")
     assert RunFolder.open(tmp_path / "run").report.is_file()
+
+
+def test_a_run_that_withholds_a_model_is_complete_and_says_so(tmp_path: Path) -> None:
+    finished = SampleTask(name="worse", fault="is withheld").run(out=tmp_path / "run")
+    assert [file.name for file in finished.exports] == ["model.txt"]
+    said = "Not exported: model wild is withheld: worse than zero."
+    assert finished.folder.read_summary()["verdict"] == ["It works.", said]
+    assert "model wild is withheld" in finished.folder.report.read_text()
 
 
 def test_an_export_that_fails_is_reported_and_the_run_complete(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model
 from residnet.export import exporter
+from residnet.export.base import released
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.models import FittedModel
 from residnet.identification.monitoring import (
@@ -33,6 +34,7 @@ from residnet.identification.monitoring import (
 )
 from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
 from residnet.judge.band import read_bands
+from residnet.judge.verdict import UNSEEN, Evidence, objections
 from residnet.runs.folder import require_sealed, seal
 
 if TYPE_CHECKING:
@@ -258,6 +260,7 @@ def export_model(
     format: str = "torchscript",
     *,
     metrics: Sequence[Mapping[str, Any]] = (),
+    anyway: bool = False,
 ) -> Mapping[str, Any]:
     """Write a model for controllers, after a parity check, and return what its card says.
 
@@ -265,9 +268,12 @@ def export_model(
         model: to export.
         file: to write.
         format: one of `available("formats")`.
-        metrics: rows of metrics.json of this model, for the card.
+        metrics: rows of metrics.json. Those of this model stand in the card; those of `zero` and
+            of a baseline under the same protocol show whether it is worse than they are.
+        anyway: whether a model is wanted that is worse, too; its card says so.
 
     Raises:
+        WithheldError: where it is worse than `zero` or the baseline, but for `anyway`.
         ConfigError: where there is no such format.
         UsageError: where the format cannot hold such a model.
         ExportError: where what was written does not reproduce the model.
@@ -276,8 +282,25 @@ def export_model(
         card = residnet.export_model(models["lstm"], "lstm.pt")
     """
     require(model, Model, "export_model: expected a model")
-    exported = ExportedVessel(model.spec, model.module, list(metrics))
-    return exporter(format).export(exported, path(file, "export_model"))
+    name = model.spec.name
+    chosen_format = exporter(format)
+    own = [row for row in metrics if row.get("model", name) == name]
+    exported = ExportedVessel(model.spec, model.module, own)
+    released(exported, _objections(name, metrics), anyway=anyway)
+    return chosen_format.export(exported, path(file, "export_model"))
+
+
+def _objections(name: str, metrics: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what rows of metrics.json say against a model, on the data that tell most."""
+    whole = [row for row in metrics if row.get("manoeuvre") == "all"]
+    splits = [row["split"] for row in whole if row["model"] == name]
+    if not splits:
+        return []
+    split = next((one for one in UNSEEN if one in splits), splits[0])
+    judged = [row for row in whole if row["split"] == split]
+    rows = {row["model"]: row for row in judged if row["protocol"] == judged[0]["protocol"]}
+    baseline = next((row["model"] for row in judged if row["kind"] == "baseline"), "")
+    return objections(Evidence(name, split, rows, baseline))
 
 
 def require(given: Any, kind: type[Any], expected: str) -> None:

@@ -51,3 +51,10 @@ class FitError(ResidnetError):
 
 class ExportError(ResidnetError):
     """The error of an exported model that does not reproduce the original (exit code 1)."""
+
+
+class WithheldError(ExportError):
+    """The error of a model that is worse than doing without it (exit code 1).
+
+    A run whose own exports meet it is complete.
+    """

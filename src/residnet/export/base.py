@@ -27,14 +27,14 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import nn
 
-from residnet.core.errors import ExportError, UsageError
+from residnet.core.errors import ExportError, UsageError, WithheldError
 
 Numbers = npt.NDArray[Any]
 SINGLE, DOUBLE = 1e-5, 1e-12
@@ -89,6 +89,7 @@ class Exported(ABC):
         flags: those of them that are truth values; they stand last.
         precisions: that are tried, one after the other.
         methods: of `module`, beside `forward`.
+        objections: sentences on what speaks against its use, for the card; see `released`.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Exported(ABC):
     flags: Sequence[str]
     precisions: Sequence[torch.dtype] = (torch.float32, torch.float64)
     methods: Sequence[str] = ()
+    objections: Sequence[str] = ()
 
     def require_numbers(self) -> None:  # noqa: B027 (policies are built from finite numbers)
         """Refuse what holds numbers that are not finite.
@@ -119,8 +121,13 @@ class Exported(ABC):
         """Return a module whose `forward` is the step, without checks of shapes."""
 
     @abstractmethod
+    def contents(self) -> dict[str, Any]:
+        """Return what the card says of this kind of thing."""
+
+    @final
     def card(self) -> dict[str, Any]:
         """Return the card, without format, precision and parity."""
+        return {**self.contents(), "objections": list(self.objections)}
 
     @abstractmethod
     def check(
@@ -169,6 +176,30 @@ class Exporter(ABC):
             UsageError: where the format cannot hold such a thing.
             ExportError: where what was written does not reproduce it.
         """
+
+
+Made = TypeVar("Made", bound=Exported)
+
+
+def released(exported: Made, objections: Sequence[str], *, anyway: bool) -> Made:
+    """Return what may be exported, with all that speaks against it in its card.
+
+    Args:
+        exported: that is to be written.
+        objections: sentences without a full stop on why one should do without it: it is worse than
+            `zero`, than the believed model or than the law that it stands beside.
+        anyway: whether it is wanted all the same.
+
+    Raises:
+        WithheldError: where something speaks against it, and it is not wanted all the same.
+    """
+    exported.objections = tuple(objections)
+    if objections and not anyway:
+        raise WithheldError(
+            f"{exported.what} is withheld: {'; '.join(objections)}; `residnet export --anyway`"
+            " writes it all the same, and its card says so"
+        )
+    return exported
 
 
 def place_of(out: Path | None, usual: Path, suffix: str) -> Path:

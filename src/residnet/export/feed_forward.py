@@ -17,7 +17,7 @@ from residnet.core.errors import ExportError, UsageError
 from residnet.core.layout import PLANAR, RANGE_VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export.base import Exported, Exporter, Loaded
+from residnet.export.base import Exported, Exporter, Loaded, released
 from residnet.export.guard import replaced, widening
 from residnet.export.torchscript import TorchScriptExporter, require_shape, size
 from residnet.export.vessel import ExportedVessel
@@ -258,7 +258,7 @@ class ExportedForce(Exported):
             )
         return {"steps": len(motion), "share_of_range": worst}
 
-    def card(self) -> dict[str, Any]:
+    def contents(self) -> dict[str, Any]:
         """Return what a controller needs to know."""
         guarded = GuardedForce(self.inner, self.ranges)
         accepted = torch.stack((guarded.least, guarded.most), dim=1).tolist()
@@ -308,4 +308,7 @@ class FeedForwardExporter(Exporter):
         if not isinstance(exported, ExportedVessel):
             raise UsageError(f"{exported.what}: a feed-forward is made of a vessel model alone")
         force, ranges = required_force(exported.spec, exported.at(torch.float64))
-        return TorchScriptExporter().export(ExportedForce(exported.name, force, ranges), file)
+        made = released(
+            ExportedForce(exported.name, force, ranges), exported.objections, anyway=True
+        )
+        return TorchScriptExporter().export(made, file)

@@ -329,7 +329,7 @@ class ExportedController(Exported):
         """Return the step without checks of shapes."""
         return _Answer(self.controller(dtype)).eval()
 
-    def card(self) -> dict[str, Any]:
+    def contents(self) -> dict[str, Any]:
         """Return all that a user needs to run the policy, and how good it is."""
         module, policy = self.controller(self.precisions[0]), self.policy
         ranges = zip(module.low.tolist(), module.high.tolist(), strict=True)

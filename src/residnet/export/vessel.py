@@ -220,7 +220,7 @@ class ExportedVessel(Exported):
                     " again"
                 )
 
-    def card(self) -> dict[str, Any]:
+    def contents(self) -> dict[str, Any]:
         """Return all that a user needs to drive the model, and how good it is."""
         spec, band = self.spec, self.spec.band
         units = spec.signals.units()

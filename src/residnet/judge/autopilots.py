@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,19 @@ def distribution(values: Tensor) -> dict[str, float]:
         "p95": float(np.quantile(array, 0.95)),
         "max": float(array.max()),
     }
+
+
+def objections(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what rows of metrics.json say against using a policy rather than a tuned law."""
+    judged = {row["model"]: row for row in rows if row["protocol"] == "conditions"}
+    if model not in judged:
+        return []
+    own = judged[model]["cost"]["mean"]
+    laws = {name: row["cost"]["mean"] for name, row in judged.items() if row["kind"] == "classical"}
+    best = min(laws, key=laws.__getitem__, default=model)
+    if best == model or own <= laws[best]:
+        return []
+    return [f"under its conditions a flight costs {own:.4g} s, with {best} {laws[best]:.4g} s"]
 
 
 def step_row(

@@ -56,6 +56,22 @@ def verdict(evidence: Evidence) -> list[str]:
     return [sentence for sentence in sentences if sentence]
 
 
+def objections(evidence: Evidence) -> list[str]:
+    """Return what speaks against using the model at all, as `residnet.export.base.released` asks.
+
+    A model is to be better than `zero`, and than the model that it was built on.
+    """
+    own = evidence.rows.get(evidence.selected)
+    if own is None:
+        return []
+    return [
+        f"on {evidence.split} data its NRMSE is {_nrmse(own):.3g}, that of {other}"
+        f" {_nrmse(row):.3g}"
+        for other in dict.fromkeys((ZERO, evidence.baseline))
+        if (row := evidence.rows.get(other)) is not None and _nrmse(own) > _nrmse(row)
+    ]
+
+
 def useless(evidence: Evidence) -> bool:
     """Return whether the selected model is `zero`, or no better: then no range is to be trusted."""
     own, zero = evidence.rows.get(evidence.selected), evidence.rows.get(ZERO)

@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
 from pydantic import Field
 
 from residnet.core.config import Config, dump_config, load_mapping
-from residnet.core.errors import DataError, ExportError, ResidnetError, UsageError
+from residnet.core.errors import (
+    DataError,
+    ExportError,
+    ResidnetError,
+    UsageError,
+    WithheldError,
+)
 from residnet.core.processes import keep_freed_memory
 from residnet.report.blocks import EXPORTS
 from residnet.runs.folder import RunFolder, seal
@@ -33,11 +39,11 @@ class Exported(NamedTuple):
 
     Attributes:
         files: that were written.
-        faults: one line for each export that failed.
+        faults: of each export that failed, or was withheld.
     """
 
     files: tuple[Path, ...] = ()
-    faults: tuple[str, ...] = ()
+    faults: tuple[ResidnetError, ...] = ()
 
 
 class MainFigure(NamedTuple):
@@ -68,7 +74,8 @@ class Outcome:
         failure: a line where a result fails a check; the run is complete, and ends as a `DataError`
             with this line.
         exports: what writes each model for controllers once the report stands, by its name; one
-            that fails is reported, and the complete run ends as an `ExportError`.
+            that fails is reported, and the complete run ends as an `ExportError`. One that is
+            withheld is reported alone.
     """
 
     verdict: Sequence[str] = ()
@@ -154,11 +161,22 @@ class Task(Config):
         """
         raise self.lacks_verb(run)
 
-    def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
+    def export_model(
+        self,
+        run: RunFolder,
+        model: str,
+        out: Path | None,
+        file_format: str,
+        *,
+        anyway: bool = False,
+    ) -> Path:
         """Export one model of a finished run for controllers; returns the file.
+
+        With `anyway` a model is written that is worse than doing without it, too.
 
         Raises:
             UsageError: where runs of this task have nothing to export, or there is no such model.
+            WithheldError: where it is worse than doing without it.
             ExportError: where the exported model does not agree with the one that it came from.
         """
         raise self.lacks_verb(run)
@@ -251,8 +269,9 @@ class Task(Config):
         folder.write_summary(self.task, verdict, figures, finished=True)
         if outcome.failure:
             raise DataError(outcome.failure)
-        if exported.faults:
-            raise ExportError(f"{exported.faults[0]}; the run itself is complete: {folder.report}")
+        for fault in exported.faults:
+            if not isinstance(fault, WithheldError):
+                raise ExportError(f"{fault}; the run itself is complete: {folder.report}")
         return Finished(folder, outcome, exported.files)
 
     @classmethod
@@ -325,7 +344,7 @@ def _write_exports(folder: RunFolder, exports: Exports) -> Exported:
         try:
             file = write()
         except ResidnetError as error:
-            faults.append(str(error))
+            faults.append(error)
             rows.append({"model": name, "file": None, "fault": str(error)})
         else:
             files.append(file)

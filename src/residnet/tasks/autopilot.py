@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, final
+from typing import Annotated, Any, ClassVar, Literal, Self, final
 
 import torch
 from pydantic import Field, model_validator
@@ -47,9 +45,6 @@ from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, Outcome
 from residnet.training.policies.config import PolicyTraining
-
-if TYPE_CHECKING:
-    from residnet.export.base import Exported
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]
@@ -320,21 +315,25 @@ class AutopilotConfig(ComputingTask):
         draw(files)
         return sections(files)
 
-    def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
-        """Return the file of a policy, which was exported and checked when the run ended.
-
-        In other formats it is written from the stored policy now.
+    def export_model(
+        self,
+        run: RunFolder,
+        model: str,
+        out: Path | None,
+        file_format: str,
+        *,
+        anyway: bool = False,
+    ) -> Path:
+        """Write a policy of a finished run for controllers; returns the file.
 
         Raises:
-            UsageError: where there is no such policy, or another format is given.
+            UsageError: where there is no such policy or format.
+            WithheldError: where a classical controller costs less, but for `anyway`.
+            ExportError: where the file does not reproduce the policy.
         """
-        from residnet.tasks.autopilot_run import export_as
+        from residnet.tasks.autopilot_run import export_policy
 
-        def again(card: dict[str, Any]) -> Exported:
-            return export_as(self, run, card, model)
-
-        model = named_export(run, model, self.policies)
-        return exported_file(run, model, out, file_format, again)
+        return export_policy(self, run, model, out, file_format, anyway=anyway)
 
 
 def named_export(run: RunFolder, name: str, names: Collection[str]) -> str:
@@ -349,44 +348,6 @@ def named_export(run: RunFolder, name: str, names: Collection[str]) -> str:
         known = nearest(name, names) or f"; give one with --model: {', '.join(names)}"
         raise UsageError(f"{run.path}: nothing to export is named '{name}'{known}")
     return name
-
-
-def exported_file(
-    run: RunFolder,
-    name: str,
-    out: Path | None,
-    file_format: str,
-    again: Callable[[dict[str, Any]], Exported],
-) -> Path:
-    """Return the file of a policy: the TorchScript that its run wrote, or another format of it.
-
-    Args:
-        run: that exported it.
-        name: of the file without its ending.
-        out: where to write; None for beside the TorchScript file.
-        file_format: one of `residnet list formats`.
-        again: returns the policy for the card of the TorchScript file.
-
-    Raises:
-        UsageError: where the run has written no such file.
-        ExportError: where the new file does not reproduce the policy.
-    """
-    file = run.exports / f"{name}.pt"
-    if not file.is_file():
-        raise UsageError(f"{file}: no such file; the run writes it at its end")
-    from residnet.export import exporter
-    from residnet.export.base import place_of
-
-    chosen, extra = exporter(file_format), {"card.json": ""}
-    out = None if out is None else place_of(out, file, chosen.suffix)
-    if file_format != "torchscript":
-        torch.jit.load(str(file), _extra_files=extra)
-        out = out or file.with_name(f"{name}{chosen.suffix}")
-        chosen.export(again(json.loads(extra["card.json"])), out)
-    elif out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, out)
-    return out or file
 
 
 def school_of(config: AutopilotConfig, name: str) -> SteeredPlant | SteeredModel:

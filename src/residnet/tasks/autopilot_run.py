@@ -31,10 +31,10 @@ from residnet.control.heading.vessels import SteeredPlant, fly
 from residnet.core.progress import report, say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.store import rebuilt
-from residnet.export.base import Exported
+from residnet.export import exporter
+from residnet.export.base import place_of, released
 from residnet.export.closed_loop import CompiledLoop
 from residnet.export.policy import ExportedHeading
-from residnet.export.torchscript import TorchScriptExporter
 from residnet.judge.autopilots import (
     QUANTITIES,
     QUIET_FLIGHTS,
@@ -42,6 +42,7 @@ from residnet.judge.autopilots import (
     drawn,
     judged,
     measure,
+    objections,
     random_variations,
     sea_flights,
     sea_row,
@@ -69,6 +70,7 @@ from residnet.tasks.autopilot import (
     AnyController,
     AutopilotConfig,
     JudgedConditions,
+    named_export,
     paced,
     school_of,
     tuned_before,
@@ -141,12 +143,7 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
     return Outcome(
         *_told(config, rows),
         "\n\n".join(table.text() for table in tables),
-        exports={
-            name: partial(
-                _export, config, folder, name, cast("RecurrentPolicy", controllers[name][1]), rows
-            )
-            for name in config.policies
-        },
+        exports={name: partial(export_policy, config, folder, name) for name in config.policies},
     )
 
 
@@ -356,25 +353,43 @@ def _told(
     return sentences, figures
 
 
-def _export(
+def export_policy(
     config: AutopilotConfig,
-    folder: RunFolder,
-    name: str,
-    policy: RecurrentPolicy,
-    rows: list[dict[str, Any]],
+    run: RunFolder,
+    model: str,
+    out: Path | None = None,
+    file_format: str = "torchscript",
+    *,
+    anyway: bool = False,
 ) -> Path:
-    """Export a policy, with its rows of metrics.json in the card; returns the file."""
-    about = {"vessel": config.vessel, "conditions": _stated(config).model_dump(mode="json")}
+    """Write a policy of a run, with its rows of metrics.json in the card; returns the file.
+
+    Args:
+        config: of the run.
+        run: that trained it.
+        model: name of the policy; `selected` is the only one there is.
+        out: file to write; exports/<model> with the format's suffix where not given.
+        file_format: one of `residnet list formats`.
+        anyway: whether a policy is wanted that costs more than a classical controller.
+
+    Raises:
+        UsageError: where there is no such policy.
+        WithheldError: where a classical controller costs less, but for `anyway`.
+        ExportError: where the file does not reproduce the policy.
+    """
+    name, chosen = named_export(run, model, config.policies), exporter(file_format)
+    rows = run.read_metrics()["rows"]
+    flown = paced(config)
+    about = {"vessel": config.vessel, "conditions": _stated(flown).model_dump(mode="json")}
     learned = config.policies[name].learned
     about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
-    metrics = [row for row in rows if row["model"] == name]
-    file = folder.exports / f"{name}.pt"
-    exported = ExportedHeading(name, policy, safe=config.safe, about=about, metrics=metrics)
-    TorchScriptExporter().export(exported, file)
+    exported = ExportedHeading(
+        name,
+        stored_policy(config, run.models, name, flown.test.dt),
+        safe=config.safe,
+        about=about,
+        metrics=[row for row in rows if row["model"] == name],
+    )
+    file = place_of(out, run.exports / f"{name}{chosen.suffix}", chosen.suffix)
+    chosen.export(released(exported, objections(name, rows), anyway=anyway), file)
     return file
-
-
-def export_as(config: AutopilotConfig, run: RunFolder, card: dict[str, Any], name: str) -> Exported:
-    """Return a stored policy at the step, and with the card, of its TorchScript file."""
-    policy = stored_policy(config, run.models, name, card["dt"])
-    return ExportedHeading(name, policy, safe=config.safe, about=card, metrics=card["metrics"])

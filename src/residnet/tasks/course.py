@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, final
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self, final
 
 import numpy as np
 import torch
@@ -23,17 +25,14 @@ from residnet.core.config import (
     Seconds,
     load_config,
 )
-from residnet.core.errors import ConfigError
+from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import nearest
 from residnet.dynamics.simulated import check_steps
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, Outcome
-from residnet.tasks.autopilot import AnyController, AutopilotConfig, exported_file, named_export
-
-if TYPE_CHECKING:
-    from residnet.export.base import Exported
+from residnet.tasks.autopilot import AnyController, AutopilotConfig, named_export
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
@@ -221,20 +220,39 @@ class CourseTaskConfig(ComputingTask):
         draw(files)
         return sections(files)
 
-    def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
+    def export_model(
+        self,
+        run: RunFolder,
+        model: str,
+        out: Path | None,
+        file_format: str,
+        *,
+        anyway: bool = False,
+    ) -> Path:
         """Return the file of a policy with the guidance of a course, named after both.
 
         TorchScript was exported and checked when the run ended; other formats are written now.
 
         Raises:
-            UsageError: where there is no such file, or another format is given.
+            UsageError: where there is no such file or format.
+            ExportError: where the new file does not reproduce the policy.
         """
+        from residnet.export import exporter
+        from residnet.export.base import place_of
         from residnet.tasks.course_run import export_as
 
         names = {f"{self.policy}_{protocol}": protocol for protocol in self.protocols}
         model = named_export(run, model, names)
-
-        def again(card: dict[str, Any]) -> Exported:
-            return export_as(self, run, card, names[model])
-
-        return exported_file(run, model, out, file_format, again)
+        file, chosen = run.exports / f"{model}.pt", exporter(file_format)
+        if not file.is_file():
+            raise UsageError(f"{file}: no such file; the run writes it at its end")
+        written = place_of(out, file.with_name(f"{model}{chosen.suffix}"), chosen.suffix)
+        if file_format != "torchscript":
+            extra = {"card.json": ""}
+            torch.jit.load(str(file), _extra_files=extra)
+            card = json.loads(extra["card.json"])
+            chosen.export(export_as(self, run, card, names[model]), written)
+        elif written != file:
+            written.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, written)
+        return written

@@ -203,14 +203,23 @@ class FitConfig(FitSettings, ComputingTask):
 
         return plan_trials(self, run, model, limits)
 
-    def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
+    def export_model(
+        self,
+        run: RunFolder,
+        model: str,
+        out: Path | None,
+        file_format: str,
+        *,
+        anyway: bool = False,
+    ) -> Path:
         """Export one model, `selected` for the one chosen on validation data; returns the file.
 
         Raises:
+            WithheldError: where the model is worse than zero or the baseline, but for `anyway`.
             ConfigError: where there is no such format.
             UsageError: where there is no such model.
             ExportError: where the exported model does not agree with the one that it came from.
         """
         from residnet.tasks.fit_run import export_model
 
-        return export_model(run, model, out, file_format)
+        return export_model(run, model, out, file_format, anyway=anyway)

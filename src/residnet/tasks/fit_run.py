@@ -24,7 +24,7 @@ from residnet.data.simulated import SimulatedTrials
 from residnet.data.split import data_files, log_names
 from residnet.dynamics.store import ModelSpec, load_model, model_names
 from residnet.export import exporter
-from residnet.export.base import place_of
+from residnet.export.base import place_of, released
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.fit import fit
 from residnet.identification.identified import (
@@ -46,9 +46,10 @@ from residnet.judge.goodness import content, repeatability
 from residnet.judge.metrics import LIMITS_SCHEMA, metrics_content
 from residnet.judge.rollout_files import write_rollouts
 from residnet.judge.soundness import sanity_content
+from residnet.judge.verdict import objections
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import errors_table
-from residnet.report.sections.verdict import verdict
+from residnet.report.sections.verdict import evidence, verdict
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.provenance import Provenance
@@ -223,7 +224,9 @@ def fit_outcome(
     return Outcome(sentences, figures, errors_table(files, split).text(), failure, exports or {})
 
 
-def export_model(run: RunFolder, name: str, out: Path | None, file_format: str) -> Path:
+def export_model(
+    run: RunFolder, name: str, out: Path | None, file_format: str, *, anyway: bool = False
+) -> Path:
     """Export one model of a fit in the format of that name, and return the file.
 
     Args:
@@ -231,10 +234,12 @@ def export_model(run: RunFolder, name: str, out: Path | None, file_format: str) 
         name: of the model; `selected` for the one chosen on validation data.
         out: file to write; exports/<model> with the format's suffix where not given.
         file_format: one of `residnet list formats`.
+        anyway: whether a model is wanted that is worse than doing without it.
 
     Raises:
         ConfigError: where there is no such format.
         UsageError: where there is no such model.
+        WithheldError: where it is worse than doing without it, but for `anyway`.
         ExportError: where the exported model does not agree with the one that it came from.
     """
     chosen_format, metrics = exporter(file_format), run.read_metrics()
@@ -246,7 +251,8 @@ def export_model(run: RunFolder, name: str, out: Path | None, file_format: str) 
     rows = [row for row in metrics["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"]
     usual = run.exports / f"{chosen}{chosen_format.suffix}"
     file = place_of(out, usual, chosen_format.suffix)
-    chosen_format.export(ExportedVessel(spec, model, rows), file)
+    against = objections(evidence(RunFiles(run.path), chosen))
+    chosen_format.export(released(ExportedVessel(spec, model, rows), against, anyway=anyway), file)
     return file
 
 
