@@ -21,7 +21,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "control": (3197, 352),
     "core": (1312, 186),
     "data": (8288, 741),
-    "documents": (2544, 272),
+    "documents": (2414, 223),
     "dynamics": (835, 124),
     "export": (2205, 265),
     "heads": (932, 152),

@@ -23,7 +23,7 @@ from residnet.core.config import load_config
 from residnet.documents.jervan2020.ferry import (
     FerryModelConfig,
     FerryStudyConfig,
-    Study,
+    Flown,
     identify,
     record_of,
     study,
@@ -58,7 +58,7 @@ def believed() -> ForceModel:
     return ForceModel(built.hull)
 
 
-def flown(interval: float, random: torch.Generator, *, turned: bool) -> Study:
+def flown(interval: float, random: torch.Generator, *, turned: bool) -> Flown:
     """Fly the course once with the believed model; `turned`: its waypoints in random order."""
     over = [f"course.interval={interval}", "~crossing"]
     config = load_config(CONFIG, over, FerryStudyConfig)
@@ -71,7 +71,7 @@ def flown(interval: float, random: torch.Generator, *, turned: bool) -> Study:
     return study(config.model_copy(update={"models": {"plain": plain}}))
 
 
-def judge(found: Study, interval: float, random: torch.Generator) -> list[str]:
+def judge(found: Flown, interval: float, random: torch.Generator) -> list[str]:
     """Return a line for each model that a random half identifies."""
     record, base, lines = record_of(found.first, interval, None), believed(), []
     folds = torch.unique(record.fold)
@@ -85,8 +85,8 @@ def judge(found: Study, interval: float, random: torch.Generator) -> list[str]:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "feed_forward.pt"
             ranges = list(zip(low.tolist(), high.tolist(), strict=True))
-            force = RequiredForce(*model.model.parts(), mirrored=True)
-            exported = ExportedForce(name, force, ranges, model.notes.get("lag"))
+            force = RequiredForce(*model.force.parts(), mirrored=True)
+            exported = ExportedForce(name, force, ranges, model.fit.notes.get("lag"))
             TorchScriptExporter().export(exported, file)
             exported = torch.jit.load(str(file))
         far = torch.tensor(REACHES, dtype=torch.float64).repeat_interleave(5000).unsqueeze(-1)

@@ -22,12 +22,9 @@ from residnet.documents.jervan2020.measured import (
     compare_accelerations,
     force_study,
     read_measured,
-    sections,
-    verdict,
-    write_results,
+    written,
 )
 from residnet.physics.force_model import FERRY_TERMS
-from residnet.runs.folder import RunFolder
 
 CONFIG = Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020" / "measured.yaml"
 STEP = 0.1
@@ -118,20 +115,16 @@ def test_what_the_hull_lacks_is_found_and_said(tmp_path: Path) -> None:
     # noise of 2 N is all that is left
     assert all(2.0 < value < 8.0 for value in left)
     coefficients = dict(
-        zip(FERRY_TERMS, found.final["ridge"].fit.coefficients.tolist(), strict=True)
+        zip(FERRY_TERMS, found.models["ridge"].fit.coefficients.tolist(), strict=True)
     )
     assert coefficients["u_dot"][0] == pytest.approx(500, rel=0.05)
     assert coefficients["r_dot"][2] == pytest.approx(400, rel=0.05)
-    results = write_results(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
-    assert "in the mean over the axes: plsr and ridge." in " ".join(verdict(results))
-    titles = [section.title for section in sections(settings, results, tmp_path / "run")]
+    results, figures = written(settings, found)
+    assert "in the mean over the axes: plsr and ridge." in " ".join(settings.verdict(results))
+    titles = [section.title for section in settings.sections(results, tmp_path / "run")]
     assert titles[:2] == ["Data and cross-validation", "Commanded and actual force"]
     assert "Residual of the actual force" in titles
-    assert {path.name for path in (tmp_path / "run" / "figures").glob("*.png")} >= {
-        "scores.png",
-        "forces_one.png",
-        "residual_one.png",
-    }
+    assert {figure.name for figure in figures} >= {"scores", "forces_one", "residual_one"}
 
 
 def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
@@ -143,10 +136,10 @@ def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
     assert [row["model"] for row in found.rows] == ["zero", "believed", "ols", "surface"]
     assert not any(any(better(rows(found)[name], "believed")) for name in ("ols", "surface"))
     assert better(rows(found)["believed"], "zero")[3]
-    results = write_results(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
-    assert "None of the 2 regressions is better" in " ".join(verdict(results))
+    results, _ = written(settings, found)
+    assert "None of the 2 regressions is better" in " ".join(settings.verdict(results))
     advice = "Recommended: the believed model alone in surge, sway and yaw."
-    assert advice in verdict(results)
+    assert advice in settings.verdict(results)
 
 
 @pytest.mark.long
@@ -164,8 +157,8 @@ def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: 
     assert not any(better(ridge, "reference"))
     assert believed["minus_zero"]["ci95"][3][0] > 0
     settings = config(tmp_path)
-    results = write_results(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
-    said = " ".join(verdict(results))
+    results, _ = written(settings, found)
+    said = " ".join(settings.verdict(results))
     assert "worse than no force in surge, sway and yaw" in said
     assert "None of the 1 regressions is better than the better of no force" in said
     assert "Recommended: no force at all in surge, sway and yaw." in said
@@ -253,12 +246,12 @@ def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) ->
         },
     )
     found = force_study(settings)
-    assert list(found.final) == ["ridge"]
-    results = write_results(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
+    assert list(found.models) == ["ridge"]
+    results, _ = written(settings, found)
     assert results["failed"]["earth"].startswith(
         "model earth: a force constant in earth axes does not show"
     )
-    titles = [section.title for section in sections(settings, results, tmp_path / "run")]
+    titles = [section.title for section in settings.sections(results, tmp_path / "run")]
     assert "Not determined by these logs" in titles
 
 

@@ -4,7 +4,6 @@ what is refused.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,13 @@ from residnet.control.motion.anticipation import Derivatives, Lag, course, neede
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, FitError
 from residnet.documents.jervan2020.ferry import (
+    Ferry,
     FerryStudyConfig,
-    Study,
+    Flown,
     identify,
     record_of,
-    sections,
     study,
-    verdict,
-    write_results,
+    written,
 )
 from residnet.documents.jervan2020.residual import (
     constant_force,
@@ -56,7 +54,7 @@ def config(name: str, *overrides: str) -> FerryStudyConfig:
 
 
 @pytest.fixture(scope="module")
-def short() -> Study:
+def short() -> Flown:
     torch.set_num_threads(1)
     return study(config("operation", *SHORT, "~crossing"))
 
@@ -72,28 +70,29 @@ def test_every_table_has_a_valid_config(path: Path) -> None:
     assert load_config(path, [], FerryStudyConfig).task == "ferry_study"
 
 
-def test_the_lag_and_the_missing_half_are_found_and_flown(short: Study) -> None:
+def test_the_lag_and_the_missing_half_are_found_and_flown(short: Flown) -> None:
     model, before, after = (
         short.models["lag_ridge"],
         short.courses["believed"].tracking,
         short.courses["lag_ridge"].tracking,
     )
+    left = model.test_mse(short.record)
     assert model.lag is not None
     assert model.lag.frequency == pytest.approx(2.0, rel=0.01)
     assert model.lag.damping == pytest.approx(0.8, rel=0.01)
     # the command is held for 20 ms: 10 ms on average
     assert model.lag.delay == pytest.approx(0.01, abs=0.01)
-    assert all(own < 0.02 * raw for own, raw in zip(model.test_mse, short.unmodelled, strict=True))
+    assert all(own < 0.02 * raw for own, raw in zip(left, short.unmodelled, strict=True))
     assert after.position_mae < 0.05 * before.position_mae
     assert after.iaew[0] < 0.05 * before.iaew[0]
     motion = short.first.nu_dot, short.first.nu
-    missed = (model.model(*motion) - hull("milliampere_half").required(*motion)).std(0)
+    missed = (model.force(*motion) - hull("milliampere_half").required(*motion)).std(0)
     # over both halves: of a shortened course the second goes beyond what identified
     assert bool((missed < 0.06 * short.first.acting.std(0)).all())
 
 
-def test_a_fitted_model_runs_forward_as_the_true_ferry(short: Study) -> None:
-    equations = forward_equations("milliampere", short.models["lag_ridge"].model, "lag_ridge")
+def test_a_fitted_model_runs_forward_as_the_true_ferry(short: Flown) -> None:
+    equations = forward_equations("milliampere", short.models["lag_ridge"].force, "lag_ridge")
     names = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
     model = BelievedConfig(vessel=equations).build(names)
     # along the half that identified: shortened segments leave the other half outside of what was
@@ -130,7 +129,7 @@ def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
 def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
     near = "course.waypoints=[[0, 0, 0], [2, 0, 0], [2, -1, 0], [2, -1, 20 deg]]"
     flown = config("azimuth", near, "course.interval=5 s")
-    flight = flown.ferry().fly_course(flown.course, [(ForceModel(hull("milliampere")), None)])[0]
+    flight = Ferry(flown).fly(flown.course, [(ForceModel(hull("milliampere")), None)])[0]
     # the logged force is the controller's: feed-forward and feedback, not what the thrusters make
     motion = course(flown.course, flown.loop.step)
     needed = needed_force(ForceModel(hull("milliampere")), motion, None, flown.loop.step)
@@ -167,7 +166,7 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
         alone["believed"].tracking.position_mae
         > 10 * found.courses["believed"].tracking.position_mae
     )
-    upside_down = found.models["case"].model.corrections[0].coefficients
+    upside_down = found.models["case"].force.corrections[0].coefficients
     assert isinstance(upside_down, torch.Tensor)
     upside_down[:3] -= 5000.0 * torch.eye(3)
     wanted = config(
@@ -178,29 +177,29 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
         "models.case={fit: {kind: plsr, order: 1}, fly: true}",
     )
     folder = RunFolder.create(tmp_path / "run", "", resume=False)
-    results = write_results(wanted, found, folder)
+    results, figures = written(wanted, found, folder)
     assert results["models"]["case"]["not_forward"].startswith("model case: its mass matrix")
     assert any(
         sentence.startswith("With lag_ridge as feed-forward, the mean position error in the course")
-        for sentence in verdict(results)
+        for sentence in wanted.verdict(results)
     )
-    titles = [section.title for section in sections(wanted, results, folder.path)]
+    titles = [section.title for section in wanted.sections(results, folder.path)]
     assert "Models that cannot run forward in time" in titles
     assert "Feed-forward without feedback" in titles
     assert {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")} == {
         "lag_ridge_forward.yaml"
     }
-    assert {path.name for path in folder.figures.glob("*.png")} >= {
-        "errors_course.png",
-        "forces_course.png",
-        "errors_feed_forward_alone.png",
+    assert {figure.name for figure in figures} >= {
+        "errors_course",
+        "forces_course",
+        "errors_feed_forward_alone",
     }
-    row = json.loads((tmp_path / "run" / "ferry.json").read_text())["course"]["lag_ridge"]
+    row = results["course"]["lag_ridge"]
     assert row["power"][0] * float(found.first.t[-1]) == pytest.approx(row["energy"][0], rel=0.01)
 
 
-def test_exported_feed_forward_is_the_model(short: Study, tmp_path: Path) -> None:
-    model = short.models["lag_ridge"].model
+def test_exported_feed_forward_is_the_model(short: Flown, tmp_path: Path) -> None:
+    model = short.models["lag_ridge"].force
     force = RequiredForce(*model.parts(), mirrored=False)
     exported = ExportedForce("ferry", force, [(-5.0, 5.0)] * 3 + [(-9.0, 9.0)] * 3)
     exporter("torchscript").export(exported, tmp_path / "f.pt")
@@ -212,7 +211,7 @@ def test_exported_feed_forward_is_the_model(short: Study, tmp_path: Path) -> Non
 
 
 def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
-    short: Study, tmp_path: Path
+    short: Flown, tmp_path: Path
 ) -> None:
     """Far from what identified it, a wild correction commands no more than 1.2 times the hull."""
     record = record_of(short.first, 20.0, None)
@@ -264,7 +263,7 @@ def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
     assert tau[:, 1:].abs().max() < 1e-9
 
 
-def test_one_segment_nan_and_too_few_samples_are_clear_errors(short: Study) -> None:
+def test_one_segment_nan_and_too_few_samples_are_clear_errors(short: Flown) -> None:
     wanted = config("operation").models["lag_ridge"].model_copy(update={"lag": False})
     base = ForceModel(hull("milliampere"))
     record = record_of(short.first, 20.0, None)

@@ -60,9 +60,8 @@ def test_errors_over_the_order_are_those_of_scikit_learn_with_folds_left_out() -
     data = made()
     e, f, *_, std_y = data.standardised
     assert data.test is not None
-    orders = fitted(data, kind="plsr", order=2).orders
-    assert orders is not None
-    assert orders.left_out.shape == orders.test.shape == (6, 3)
+    left_out, test = fitted(data, kind="plsr", order=2).orders.values()
+    assert left_out.shape == test.shape == (6, 3)
     errors = []
     for fold in range(6):
         out = (data.fold == fold).numpy()
@@ -70,12 +69,12 @@ def test_errors_over_the_order_are_those_of_scikit_learn_with_folds_left_out() -
         other.fit(e.numpy()[~out], f.numpy()[~out])
         errors.append((f.numpy()[out] - other.predict(e.numpy()[out])) * std_y.numpy())
     np.testing.assert_allclose(
-        orders.left_out[2].numpy(), np.square(np.concatenate(errors)).mean(0), rtol=1e-6
+        left_out[2].numpy(), np.square(np.concatenate(errors)).mean(0), rtol=1e-6
     )
     x, y = data.test
     model = fitted(data, kind="plsr", order=3)
-    np.testing.assert_allclose(orders.test[2], (y - model.predict(x)).square().mean(0), rtol=1e-6)
-    assert fitted(data, kind="ridge").orders is None
+    np.testing.assert_allclose(test[2], (y - model.predict(x)).square().mean(0), rtol=1e-6)
+    assert not fitted(data, kind="ridge").orders
 
 
 def test_full_order_is_least_squares() -> None:

@@ -13,7 +13,12 @@ import torch
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.vessels import SteeredPlant, fly
 from residnet.documents.gouletas2020.autopilot import simulate_answers, train_predictor
-from residnet.documents.gouletas2020.law import DocumentConfig, NetworkPredictor, PredictorTraining
+from residnet.documents.gouletas2020.law import (
+    DocumentConfig,
+    NetworkPredictor,
+    PredictiveConfig,
+    PredictorTraining,
+)
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
@@ -27,13 +32,10 @@ SETTINGS = PredictorTraining(states=1000, epochs=40, batch=50)
 def trained(
     folder: Path, horizon: float, *, linear: bool, hidden: tuple[int, ...] = (20,)
 ) -> tuple[NetworkPredictor, dict[str, float]]:
-    law = DocumentConfig(horizon=horizon)
+    config = PredictiveConfig(horizon=horizon, hidden=hidden, linear=linear, training=SETTINGS)
     torch.manual_seed(0)
-    network = NetworkPredictor(VESSEL.state, candidates=41, hidden=hidden, linear=linear)
-    angles = law.law(network, STEERING).rudder
-    return network, train_predictor(
-        "mlp", network, VESSEL, law.predictor(STEERING), angles, SETTINGS, 0, folder
-    )
+    network = config.spec(STEERING).build()
+    return network, train_predictor("mlp", network, config, STEERING, 0, folder)
 
 
 def test_answers_are_nomotos_closed_form() -> None:
@@ -42,7 +44,7 @@ def test_answers_are_nomotos_closed_form() -> None:
     """
     law, horizon = DocumentConfig(horizon=2.0), 2.0
     angles = torch.linspace(-LIMIT, LIMIT, 41, dtype=torch.float64)
-    x, change = simulate_answers(VESSEL, law.predictor(STEERING), angles, SETTINGS, 50, 3)
+    x, change = simulate_answers(VESSEL, law.exact(STEERING), angles, SETTINGS, 50, 3)
     start, steady = x[:, VESSEL.column("r"), None], GAIN * angles[None, :]
     decay = 1 - math.exp(-horizon / TIME)
     torch.testing.assert_close(change[:, 1], (steady - start) * decay, rtol=1e-4, atol=1e-7)

@@ -17,8 +17,9 @@ import numpy as np
 from residnet.core.errors import UsageError
 from residnet.core.files import whole
 from residnet.documents import published
+from residnet.documents.study import histories
 from residnet.judge.goodness import block_interval
-from residnet.report.blocks import Block, Cell, Section, Table, Text
+from residnet.report.blocks import Block, Cell, Column, Section, Text, table_of
 from residnet.report.figure import (
     BLUE,
     MEASURED,
@@ -52,7 +53,8 @@ _NAMES = {
     "zero": "velocities held",
 }
 _SHOWN = {"baseline": ORANGE, "rbf_joint": BLUE, "p2_joint": VERMILLION}
-_AXES = (("u", "m/s", 1.0), ("v", "m/s", 1.0), ("r", "deg/s", DEG))
+_AXES = {"u": ("u m/s", 1.0, 4), "v": ("v m/s", 1.0, 4), "r": ("r deg/s", DEG, 3)}
+"""Title, factor from SI and decimals of each velocity."""
 
 
 def sections(files: RunFiles) -> list[Section]:
@@ -80,22 +82,75 @@ def sections(files: RunFiles) -> list[Section]:
     content = {"schema": "residnet.moreno2019/1", "rows": rows, "pairs": pairs}
     with whole(files.path / "study.json") as file:
         file.write_text(json.dumps(content, indent=1) + "\n")
-    figures = [_record(records["test"]), *curves(files.fit("rbf_joint"))]
+    printed = published("moreno2019")
+    for row in rows:
+        row["name"] = _NAMES[row["model"]]
+        row["published"] = printed["rmse"].get(row["model"], {}).get(row["split"])
+        row["of"] = f"{row['diverged']} of {row['records']}"
+    others = [
+        {"name": model, "split": split, "published": numbers, "of": ""}
+        for model, splits in printed["others"].items()
+        for split, numbers in splits.items()
+    ]
+    errors = table_of(
+        [*rows, *others],
+        [
+            ("model", "name"),
+            ("split", "split"),
+            *(
+                _column(title, axis, factor, decimals)
+                for axis, (title, factor, decimals) in enumerate(_AXES.values())
+            ),
+            ("diverged", lambda row: Cell(row["of"])),
+        ],
+        caption="Root mean square errors in free runs over whole records, with 95 % intervals by"
+        " moving blocks of the squared errors. Published figures are those of the document's own"
+        " ship and records.",
+    )
+    changes = table_of(
+        pairs,
+        [
+            ("model", lambda row: _NAMES[row["model"]].partition(",")[0]),
+            ("split", "split"),
+            *(_column(f"{name} %", i, 100.0, 0) for i, name in enumerate(_AXES)),
+        ],
+        caption="Change of the mean square error from outputs tuned each for itself to outputs"
+        " tuned together, paired sample by sample, with 95 % intervals. Negative: together is"
+        " better.",
+    )
     folder = files.path / "figures" / "moreno2019"
-    blocks: list[Block] = [_errors_table(rows), _pairs_table(pairs)]
-    blocks += [write_figure(folder, figure) for figure in figures]
-    blocks.append(
+    figures = [_record(records["test"]), *curves(files.fit("rbf_joint"))]
+    blocks: list[Block] = [
+        errors,
+        changes,
+        *(write_figure(folder, figure) for figure in figures),
         Text(
             [
                 "The equations that the document prints, in their likeliest reading; Delta is the"
                 " voltage of its motor, so that they cannot be evaluated on another ship:",
-                *published("moreno2019")["equations"],
+                *printed["equations"],
             ]
-        )
-    )
+        ),
+    ]
     if _OPTIONAL not in names:
         blocks.insert(0, Text(f"Not run: {_NAMES[_OPTIONAL]}, which needs the extra gp."))
     return [Section("Document 001 (Moreno-Salinas et al. 2019)", blocks)]
+
+
+def _column(title: str, axis: int, factor: float, decimals: int) -> Column:
+    """Return a column of a velocity, with its interval and the published value in small print."""
+    name = list(_AXES)[axis]
+
+    def cell(row: Mapping[str, Any]) -> Cell:
+        notes = []
+        if row.get(f"{name}_ci95"):
+            notes.append(" to ".join(fixed(factor * end, decimals) for end in row[f"{name}_ci95"]))
+        if row.get("published"):
+            notes.append(f"published {fixed(factor * row['published'][axis], decimals)}")
+        text = fixed(factor * row[name], decimals) if name in row else ""
+        return Cell(text, "; ".join(notes))
+
+    return title, cell
 
 
 def _squares(model: str, records: Sequence[StoredWindow], axis: int) -> list[np.ndarray]:
@@ -118,7 +173,7 @@ def _row(model: str, split: str, records: Sequence[StoredWindow]) -> dict[str, A
         "records": len(records),
         "diverged": sum(record.diverged[model] for record in records),
     }
-    for axis, (name, _, _) in enumerate(_AXES):
+    for axis, name in enumerate(_AXES):
         found = block_interval(_squares(model, records, axis))
         ends = (max(found.low, 0.0), found.high)
         row[name] = math.sqrt(found.mean)
@@ -133,7 +188,7 @@ def _pair(model: str, other: str, split: str, records: Sequence[StoredWindow]) -
     negative where the first model is better.
     """
     row: dict[str, Any] = {"model": model, "to": other, "split": split}
-    for axis, (name, _, _) in enumerate(_AXES):
+    for axis, name in enumerate(_AXES):
         squares, reference = _squares(model, records, axis), _squares(other, records, axis)
         found = block_interval([a - b for a, b in zip(squares, reference, strict=True)])
         level = float(np.concatenate(reference).mean())
@@ -143,79 +198,20 @@ def _pair(model: str, other: str, split: str, records: Sequence[StoredWindow]) -
     return row
 
 
-def _errors_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the errors of all models in free runs over whole records (Tables 2 and 3)."""
-    table = Table(
-        ["model", "split", *(f"{name} {unit}" for name, unit, _ in _AXES), "diverged"],
-        caption="Root mean square errors in free runs over whole records, with 95 % intervals by"
-        " moving blocks of the squared errors. Published figures are those of the document's own"
-        " ship and records.",
-    )
-    printed = published("moreno2019")
-    for row in rows:
-        numbers = printed["rmse"].get(row["model"], {}).get(row["split"], [None] * 3)
-        cells = [
-            _cell(row, name, factor, 4 if factor == 1.0 else 3, number)
-            for (name, _, factor), number in zip(_AXES, numbers, strict=True)
-        ]
-        diverged = f"{row['diverged']} of {row['records']}"
-        table.add(_NAMES[row["model"]], [Cell(row["split"], mark="text"), *cells, diverged])
-    for model, splits in printed["others"].items():
-        for split, numbers in splits.items():
-            notes = [
-                f"published {fixed(factor * number, 4 if factor == 1.0 else 3)}"
-                for (_, _, factor), number in zip(_AXES, numbers, strict=True)
-            ]
-            table.add(model, [Cell(split, mark="text"), *(Cell("", note) for note in notes), ""])
-    return table
-
-
-def _pairs_table(pairs: Sequence[Mapping[str, Any]]) -> Table:
-    table = Table(
-        ["model", "split", *(f"{name} %" for name, _, _ in _AXES)],
-        caption="Change of the mean square error from outputs tuned each for itself to outputs"
-        " tuned together, paired sample by sample, with 95 % intervals. Negative: together is"
-        " better.",
-    )
-    for row in pairs:
-        cells = [_cell(row, name, 100.0, 0) for name, _, _ in _AXES]
-        name = _NAMES[row["model"]].partition(",")[0]
-        table.add(name, [Cell(row["split"], mark="text"), *cells])
-    return table
-
-
-def _cell(
-    row: Mapping[str, Any], name: str, factor: float, decimals: int, printed: float | None = None
-) -> Cell:
-    """Return a value of a row, and in small print its interval and the published value in SI."""
-    notes = []
-    if row[f"{name}_ci95"]:
-        notes.append(" to ".join(fixed(factor * end, decimals) for end in row[f"{name}_ci95"]))
-    if printed is not None:
-        notes.append(f"published {fixed(factor * printed, decimals)}")
-    return Cell(fixed(factor * row[name], decimals), "; ".join(notes))
-
-
 def _record(records: Sequence[StoredWindow]) -> Figure:
     """Return measured and predicted velocities of the longest test record (Figure 8)."""
     record = max(records, key=lambda window: len(window.t))
-    paths = {"measured": record.measured} | {model: record.predicted[model] for model in _SHOWN}
-    return Figure(
+    title = "Figure 8 of document 001: test record in free run"
+    caption = "One free run over the whole record, without the wind as an input."
+    return histories(
         "8",
-        "Figure 8 of document 001: test record in free run",
-        "One free run over the whole record, without the wind as an input.",
+        (title, caption),
         {"measured": MEASURED}
         | {model: Look(_NAMES[model], color, width=1.1) for model, color in _SHOWN.items()},
-        [Panel(f"{name} [{unit}]", "time [s]", height=225, group="t") for name, unit, _ in _AXES],
-        [
-            Case(
-                "",
-                [
-                    {name: (record.t, factor * path[:, axis]) for name, path in paths.items()}
-                    for axis, (_, _, factor) in enumerate(_AXES)
-                ],
-            )
-        ],
+        record.t,
+        {"measured": record.measured} | {model: record.predicted[model] for model in _SHOWN},
+        [("u [m/s]", 1.0), ("v [m/s]", 1.0), ("r [deg/s]", DEG)],
+        height=225,
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from residnet.core.errors import UsageError
 from residnet.core.files import whole
 from residnet.documents import published
-from residnet.documents.cells import beside_published
+from residnet.documents.study import beside_published, compared
 from residnet.report.blocks import Block, Section, Table, Text, table_of
 from residnet.report.figure import (
     BLUE,
@@ -95,7 +95,21 @@ def sections(files: RunFiles) -> list[Section]:
     with whole(files.path / "study.json") as file:
         content = {"schema": "residnet.woo2018/1", "changes": changes}
         file.write_text(json.dumps(content, indent=1) + "\n")
-    blocks: list[Block] = [about, steady_table(files), figures[0], _changes_table(changes)]
+    shares = published("woo2018")["change_of_error"]
+    printed = {channel: 100 * share for channel, share in shares.items()}
+    table = table_of(
+        [
+            {"model": LOOKS[model].label, **of_model, "published": printed}
+            for model, of_model in changes.items()
+        ],
+        [
+            ("model", "model"),
+            *(column for c in _GROUPS for column in compared(c, f"{c} %", 3, 100)),
+        ],
+        caption="Change of the root mean square error on unseen manoeuvres from the linear model to"
+        " the LSTM. The document prints one figure for each velocity.",
+    )
+    blocks: list[Block] = [about, steady_table(files), figures[0], table]
     return [Section("Document 003 (Woo et al. 2018)", [*blocks, *figures[1:]])]
 
 
@@ -110,26 +124,6 @@ def changes_of_error(files: RunFiles, model: str) -> dict[str, float | None]:
         before, after = (None if row is None else row["rmse"][channel] for row in rows)
         changes[channel] = None if before is None or after is None else after / before - 1
     return changes
-
-
-def _changes_table(changes: Mapping[str, Mapping[str, float | None]]) -> Table:
-    printed = published("woo2018")["change_of_error"]
-
-    def shown(channel: str) -> Any:
-        def cell(item: tuple[str, Mapping[str, float | None]]) -> Any:
-            change = item[1][channel]
-            return beside_published(
-                None if change is None else 100 * change, 100 * printed[channel], 3
-            )
-
-        return cell
-
-    return table_of(
-        changes.items(),
-        [("model", lambda item: LOOKS[item[0]].label), *((f"{c} %", shown(c)) for c in _GROUPS)],
-        caption="Change of the root mean square error on unseen manoeuvres from the linear model to"
-        " the LSTM. The document prints one figure for each velocity.",
-    )
 
 
 def steady_table(files: RunFiles) -> Table:
@@ -186,83 +180,69 @@ def typical(files: RunFiles, unseen: Sequence[StoredWindow], kind: str) -> Store
     return ranked[(len(ranked) - 1) // 2]
 
 
-def _title(number: int, words: str) -> str:
-    return f"Figure {number} of document 003: {words}"
+def _figure(
+    number: int,
+    words: str,
+    caption: str,
+    looks: Mapping[str, Look],
+    parts: Sequence[tuple[Panel, Mapping[str, Curve]]],
+    columns: int = 1,
+) -> Figure:
+    """Return a figure of the document's number, from its panels and what they show."""
+    panels, curves = zip(*parts, strict=True)
+    title = f"Figure {number} of document 003: {words}"
+    return Figure(str(number), title, caption, looks, panels, [Case("", curves)], columns=columns)
 
 
 def _steady(files: RunFiles) -> Figure:
     notes = files.fit("baseline")
-    states, panels, curves = notes["steady_states"], [], []
+    states, parts = notes["steady_states"], []
     for state, (_, _, unit, factor) in _CHANNELS.items():
         (force, measure), found = _DRIVEN[state], notes["steady_constraints"][state]
         tau = np.array(states[force])
         ends = np.array([tau.min(), tau.max()])
         line = factor * (found["phi"] * ends + found["bias"])
-        curves.append({"points": (tau, factor * np.array(states[state])), "line": (ends, line)})
-        panels.append(Panel(f"steady {state} [{unit}]", f"{force} [{measure}]", height=285))
+        curves = {"points": (tau, factor * np.array(states[state])), "line": (ends, line)}
+        panel = Panel(f"steady {state} [{unit}]", f"{force} [{measure}]", height=285)
+        parts.append((panel, curves))
     looks = {"points": Look("", BLUE, kind="points", size=2.5), "line": Look("", ORANGE)}
-    return Figure(
-        "9",
-        _title(9, "steady states of the constant manoeuvres"),
-        "Points: means of the settled part of each manoeuvre. Lines: Phi tau + bias (32).",
-        looks,
-        panels,
-        [Case("", curves)],
-        columns=3,
-    )
-
-
-def _history(
-    window: StoredWindow, channel: str, models: Sequence[str]
-) -> tuple[list[Panel], list[dict[str, Curve]]]:
-    column, name, unit, factor = _CHANNELS[channel]
-    time, measured = window.t - window.t[0], factor * window.measured[:, column]
-    paths = {model: factor * window.predicted[model][:, column] for model in models}
-    group = f"{window.log} {channel}"
-    panels = [
-        Panel(f"{name} [{unit}]", title=window.log, height=210, group=group),
-        Panel(
-            f"error of {channel}\n[{unit}]",
-            "time since the start of the free run [s]",
-            height=110,
-            group=group,
-        ),
-    ]
-    histories = {"measured": (time, measured)}
-    histories |= {model: (time, path) for model, path in paths.items()}
-    errors = {model: (time, path - measured) for model, path in paths.items()}
-    return panels, [histories, {"zero": (np.zeros(1), np.zeros(1)), **errors}]
-
-
-def _looks(models: Sequence[str]) -> dict[str, Look]:
-    return {"measured": MEASURED, "zero": ZERO} | {model: LOOKS[model] for model in models}
+    caption = "Points: means of the settled part of each manoeuvre. Lines: Phi tau + bias (32)."
+    return _figure(9, "steady states of the constant manoeuvres", caption, looks, parts, 3)
 
 
 def _histories(
-    number: int, words: str, shown: Sequence[tuple[StoredWindow, str]], models: Sequence[str]
+    number: int,
+    words: str,
+    shown: Sequence[tuple[StoredWindow, str]],
+    models: Sequence[str],
+    first: Sequence[tuple[Panel, Mapping[str, Curve]]] = (),
 ) -> Figure:
-    parts = [_history(window, channel, models) for window, channel in shown]
-    panels = [panel for part, _ in parts for panel in part]
-    curves = [curve for _, part in parts for curve in part]
-    return Figure(
-        str(number), _title(number, words), _CAPTION, _looks(models), panels, [Case("", curves)]
-    )
+    """Return measured and predicted velocities of some runs, each with its errors below."""
+    parts = list(first)
+    for window, channel in shown:
+        column, name, unit, factor = _CHANNELS[channel]
+        time, measured = window.t - window.t[0], factor * window.measured[:, column]
+        paths = {model: factor * window.predicted[model][:, column] for model in models}
+        group = f"{window.log} {channel}"
+        above = Panel(f"{name} [{unit}]", title=window.log, height=210, group=group)
+        label = "time since the start of the free run [s]"
+        below = Panel(f"error of {channel}\n[{unit}]", label, height=110, group=group)
+        curves = {"measured": (time, measured)}
+        errors = {"zero": (np.zeros(1), np.zeros(1))}
+        for model, path in paths.items():
+            curves[model], errors[model] = (time, path), (time, path - measured)
+        parts += [(above, curves), (below, errors)]
+    looks = {"measured": MEASURED, "zero": ZERO} | {model: LOOKS[model] for model in models}
+    return _figure(number, words, _CAPTION, looks, parts)
 
 
 def _track(window: StoredWindow, models: Sequence[str]) -> Figure:
     start = window.measured[0, 4:6]
     paths = {"measured": window.measured} | {model: window.predicted[model] for model in models}
     track = {name: (path[:, 5] - start[1], path[:, 4] - start[0]) for name, path in paths.items()}
-    parts = [_history(window, channel, models) for channel in ("r", "v")]
-    map_panel = Panel("north [m]", "east [m]", window.log, kind="map", height=400)
-    return Figure(
-        "18",
-        _title(18, "A zigzag: track, yaw rate and sway velocity"),
-        _CAPTION,
-        _looks(models),
-        [map_panel, *(panel for part, _ in parts for panel in part)],
-        [Case("", [track, *(curve for _, part in parts for curve in part)])],
-    )
+    panel = Panel("north [m]", "east [m]", window.log, kind="map", height=400)
+    words = "A zigzag: track, yaw rate and sway velocity"
+    return _histories(18, words, [(window, "r"), (window, "v")], models, [(panel, track)])
 
 
 def _errors(
@@ -287,7 +267,7 @@ def _errors(
         "one": ZERO,
     }
     names = names_of(LOOKS[model].label for model in models)
-    panels, curves = [], []
+    parts: list[tuple[Panel, Mapping[str, Curve]]] = []
     for channel in channels:
         column, name, unit, factor = _CHANNELS[channel]
         bar: dict[str, Curve] = {}
@@ -316,19 +296,9 @@ def _errors(
             medians += [(place - 0.35, middle), (place + 0.35, middle), (np.nan, np.nan)]
         x, y = np.array(medians).T
         dots["median"] = (x, y)
-        curves += [bar, dots]
-        panels += [
-            Panel(f"RMSE, {name} [{unit}]", height=320, x_names=names),
-            Panel(
-                f"error of {channel} over the linear model's", height=320, x_names=names, y_log=True
-            ),
+        label = f"error of {channel} over the linear model's"
+        parts += [
+            (Panel(f"RMSE, {name} [{unit}]", height=320, x_names=names), bar),
+            (Panel(label, height=320, x_names=names, y_log=True), dots),
         ]
-    return Figure(
-        str(number),
-        _title(number, f"Errors of the {group} models"),
-        _RATIOS,
-        looks,
-        panels,
-        [Case("", curves)],
-        columns=2,
-    )
+    return _figure(number, f"Errors of the {group} models", _RATIOS, looks, parts, 2)

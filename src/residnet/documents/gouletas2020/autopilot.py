@@ -20,10 +20,8 @@ from residnet.core.errors import UsageError
 from residnet.core.progress import say
 from residnet.data.module import RowsDataModule
 from residnet.documents.gouletas2020.law import (
-    DocumentConfig,
     NetworkPredictor,
     PredictiveConfig,
-    PredictorSpec,
     PredictorTraining,
     SimulatedPredictor,
 )
@@ -90,9 +88,7 @@ def simulate_answers(
 
 @final
 class PredictorFit(EpochTraining):
-    """A training by least squares on the changes of heading and yaw rate.
-
-    Each is taken over its own spread.
+    """A training by least squares on the changes of heading and yaw rate, each over its spread.
 
     Args:
         predictor: what is trained, float64.
@@ -142,10 +138,8 @@ class PredictorFit(EpochTraining):
 def train_predictor(
     name: str,
     predictor: NetworkPredictor,
-    vessel: SteeredVessel,
-    exact: SimulatedPredictor,
-    rudder: Tensor,
-    settings: PredictorTraining,
+    config: PredictiveConfig,
+    steering: Steering,
     seed: int,
     folder: Path,
 ) -> dict[str, Any]:
@@ -156,10 +150,8 @@ def train_predictor(
     Args:
         name: of the controller.
         predictor: untrained.
-        vessel: in calm water.
-        exact: simulates the vessel over the horizon.
-        rudder: angles [C] in rad.
-        settings: see there.
+        config: of the controller and of the training.
+        steering: the vessel in calm water and the limit of its rudder.
         seed: of states and batches.
         folder: of the run.
 
@@ -170,18 +162,20 @@ def train_predictor(
     Raises:
         FitError: where no epoch gave a finite error.
     """
-    train = simulate_answers(vessel, exact, rudder, settings, settings.states, 2 * seed)
-    kept = simulate_answers(vessel, exact, rudder, settings, settings.states // 5, 2 * seed + 1)
+    settings, exact = config.training, config.exact(steering)
+    rudder = config.law(predictor, steering).rudder
+    train, kept = (
+        simulate_answers(steering.vessel, exact, rudder, settings, states, of)
+        for states, of in ((settings.states, 2 * seed), (settings.states // 5, 2 * seed + 1))
+    )
     predictor = predictor.double()
     predictor.calibrate(*train)
     fit = PredictorFit(predictor, kept, settings, seed)
     data = RowsDataModule((train.x, train.change), settings.batch, seed, lambda: fit.epoch)
     notes = run_epochs(name, fit, data, predictor, predictor, folder)
     with torch.no_grad():
-        heading, rate = (
-            (predictor.changes(kept.x) - kept.change).square().mean((0, 2)).sqrt().tolist()
-        )
-    return notes | {"rms_heading": heading, "rms_yaw_rate": rate}
+        missed = (predictor.changes(kept.x) - kept.change).square().mean((0, 2)).sqrt().tolist()
+    return notes | dict(zip(("rms_heading", "rms_yaw_rate"), missed, strict=True))
 
 
 def predictive(
@@ -203,31 +197,21 @@ def predictive(
         FitError: where training fails.
     """
     torch.manual_seed(seed)
-    law, network = _untrained(config, steering)
-    exact, controller = law.predictor(steering), law.law(network, steering)
-    store = FolderStore(folder)
+    spec, store = config.spec(steering), FolderStore(folder)
+    network = spec.build()
     notes = store.finished_module(name, network)
     if notes is None:
         started = time.time()
         say(f"  training {name}")
-        notes = train_predictor(
-            name,
-            network,
-            steering.vessel,
-            exact,
-            controller.rudder,
-            config.training,
-            seed,
-            folder.path,
-        )
+        notes = train_predictor(name, network, config, steering, seed, folder.path)
         notes["seconds"] = round(time.time() - started, 1)
-        store.keep_module(name, _spec(config, steering), network, notes)
+        store.keep_module(name, spec, network, notes)
     degrees = [DEG * notes[key] for key in ("rms_heading", "rms_yaw_rate")]
     say(
         f"  {name}: predicts {config.horizon:g} s ahead within {degrees[0]:.2g} deg and"
         f" {degrees[1]:.2g} deg/s (rms), {notes['seconds']:.0f} s"
     )
-    return controller, {"config": config.model_dump(mode="json")} | {
+    return config.law(network, steering), {"config": config.model_dump(mode="json")} | {
         key: value for key, value in notes.items() if key != "curve"
     }
 
@@ -240,23 +224,7 @@ def load_predictive(
     Raises:
         UsageError: where the run lacks it.
     """
-    law, network = _untrained(config, steering)
+    network = config.spec(steering).build()
     if FolderStore(folder).finished_module(name, network) is None:
         raise UsageError(f"{folder.path}: no trained '{name}' (models/{name}/model.json)")
-    return law.law(network, steering)
-
-
-def _untrained(
-    config: PredictiveConfig, steering: Steering
-) -> tuple[DocumentConfig, NetworkPredictor]:
-    law = DocumentConfig(horizon=config.horizon, candidates=config.candidates, weight=config.weight)
-    return law, _spec(config, steering).build()
-
-
-def _spec(config: PredictiveConfig, steering: Steering) -> PredictorSpec:
-    return PredictorSpec(
-        state=tuple(steering.vessel.state),
-        candidates=config.candidates,
-        hidden=tuple(config.hidden),
-        linear=config.linear,
-    )
+    return config.law(network, steering)

@@ -223,21 +223,14 @@ class NominalSteering(Dynamics):
         return self.inner.step(x, w, self.nominal.to(x.dtype).expand(x.shape[0], -1))[0], s
 
 
-class DocumentConfig(ControllerConfig):
-    """The predictive law of document 004 with an exact predictor of the nominal vessel.
+class _Law(Config):
+    """The settings of the law (6.4)."""
 
-    Attributes:
-        horizon: of the prediction; the source's 0.01 s cannot settle (corrections of document 004).
-        candidates: rudder angles.
-        weight: of the choice for the heading error.
-    """
-
-    kind: Literal["document"] = "document"
     horizon: Seconds = Field(gt=0)
     candidates: int = Field(default=41, ge=3, le=10_001)
     weight: float = Field(default=0.2, ge=0, le=1)
 
-    def predictor(self, steering: Steering) -> SimulatedPredictor:
+    def exact(self, steering: Steering) -> SimulatedPredictor:
         """Return the exact predictor: a simulation of the nominal vessel.
 
         Long horizons are predicted in steps of at most a twentieth of T.
@@ -252,9 +245,21 @@ class DocumentConfig(ControllerConfig):
             predictor, limit=steering.limit, candidates=self.candidates, weight=self.weight
         )
 
+
+class DocumentConfig(_Law, ControllerConfig):
+    """The predictive law of document 004 with an exact predictor of the nominal vessel.
+
+    Attributes:
+        horizon: of the prediction; the source's 0.01 s cannot settle (corrections of document 004).
+        candidates: rudder angles.
+        weight: of the choice for the heading error.
+    """
+
+    kind: Literal["document"] = "document"
+
     def build(self, steering: Steering) -> Policy:
         """Return the controller with the exact predictor."""
-        return self.law(self.predictor(steering), steering)
+        return self.law(self.exact(steering), steering)
 
 
 class PredictorSpec(Stored):
@@ -309,7 +314,7 @@ class PredictorTraining(OneStage):
     gradient_clip: float = Field(default=10.0, gt=0)
 
 
-class PredictiveConfig(Config):
+class PredictiveConfig(_Law):
     """The predictive autopilot of document 004: a trained predictor and the control law (6.4).
 
     The predictor is a perceptron. It says which heading error and yaw rate each candidate rudder
@@ -327,9 +332,15 @@ class PredictiveConfig(Config):
         training: how the perceptron is trained.
     """
 
-    horizon: Seconds = Field(gt=0)
-    candidates: int = Field(default=41, ge=3, le=10_001)
-    weight: float = Field(default=0.2, ge=0, le=1)
     hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (20,)
     linear: bool = False
     training: PredictorTraining = PredictorTraining()
+
+    def spec(self, steering: Steering) -> PredictorSpec:
+        """Return the description of the perceptron for a vessel."""
+        return PredictorSpec(
+            state=tuple(steering.vessel.state),
+            candidates=self.candidates,
+            hidden=tuple(self.hidden),
+            linear=self.linear,
+        )

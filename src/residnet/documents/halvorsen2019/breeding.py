@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from residnet.core import progress
-from residnet.core.config import Config, Seconds, load_config
-from residnet.core.files import read_json
-from residnet.documents.cells import pictures
+from residnet.core.config import Config, Seconds
+from residnet.documents.study import Results, Study, pictures
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.plant import MassSpringDamperConfig
 from residnet.regression.expressions import Algebra
-from residnet.regression.genetic import breed, limits_of, validating
+from residnet.regression.genetic import breed, limits_of, require_deap, validating
 from residnet.regression.writing import term
-from residnet.report.blocks import Block, Cell, Section, Table, Text, table_of
-from residnet.report.figure import COLORS, Case, Figure, Look, Panel, names_of, write_figure
+from residnet.report.blocks import Block, Cell, Section, Text, table_of
+from residnet.report.figure import COLORS, Case, Figure, Look, Panel, names_of
 from residnet.report.format import DASH, number
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure, Outcome, Task
+from residnet.runs.task import MainFigure
 
 Value = int | float | str
 Matrix = tuple[tuple[float | None, ...], ...]
 Record = dict[str, np.ndarray]
-Rows = Sequence[Mapping[str, Any]]
 CHANNELS = ("x", "u", "tau_x")
-FILE = "study.json"
 _LEAST = 1e-34
 """Least error in the picture, in (m/s^2)^2: what rounding leaves is less."""
 _PUBLISHED_RUNS = 10
@@ -75,7 +73,11 @@ class RecordConfig(Config):
         m, d, k = (getattr(self.system, name).value for name in ("m", "d", "k"))
         t = self.step * np.arange(round(self.length / self.step))
         given = self.system.tau_max * np.where(np.mod(t, period) < period / 2, 1.0, -1.0)
-        force, told = (self._late(given, seconds) for seconds in (self.delay, self.corrected))
+        # later than recorded, with its first value before
+        force, told = (
+            np.concatenate((np.full(steps, given[0]), given))[: len(given)]
+            for steps in (round(seconds / self.step) for seconds in (self.delay, self.corrected))
+        )
         block = np.zeros((3, 3))
         block[:2] = [[0.0, 1.0, 0.0], [-k / m, -d / m, 1.0 / m]]
         transition = expm(block * self.step)[:2]
@@ -84,11 +86,6 @@ class RecordConfig(Config):
             state[i] = transition @ [*state[i - 1], force[i - 1]]
         x, u = state.T
         return {"x": x, "u": u, "tau_x": told, "u_dot": (force - d * u - k * x) / m}
-
-    def _late(self, force: np.ndarray, seconds: float) -> np.ndarray:
-        """Return a force [N] some time later, its first value before."""
-        steps = round(seconds / self.step)
-        return np.concatenate((np.full(steps, force[0]), force))[: len(force)]
 
     def truth(self) -> dict[str, float]:
         """Return the true coefficients of u_dot (4.2) by term."""
@@ -110,8 +107,7 @@ class NoiseConfig(Config):
 
     def added(self, record: Record, random: np.random.Generator) -> Record:
         """Return the record with noise."""
-        of_output = ("u_dot",)
-        signals = {"output": of_output, "inputs": CHANNELS, "all": (*CHANNELS, *of_output)}
+        signals = {"output": ("u_dot",), "inputs": CHANNELS, "all": tuple(record)}
         noisy = signals.get(self.on, ())
         return {
             name: (
@@ -136,7 +132,7 @@ class Axis(Config):
 
 
 @final
-class BreedingTaskConfig(Task):
+class BreedingTaskConfig(Study):
     """A search for the equation with every combination of two settings, several times each.
 
     Attributes:
@@ -168,25 +164,21 @@ class BreedingTaskConfig(Task):
 
     @model_validator(mode="after")
     def _grid(self) -> BreedingTaskConfig:
-        shape = [len(self.columns.values)] * len(self.rows.values)
-        for name, table in (
-            ("published", self.published),
-            ("published_error", self.published_error),
-        ):
-            if table is not None and [len(row) for row in table] != shape:
+        high, wide = len(self.rows.values), len(self.columns.values)
+        for name in ("published", "published_error"):
+            table = getattr(self, name)
+            if table is not None and [len(row) for row in table] != [wide] * high:
                 raise ValueError(
-                    f"{name}: expected {len(self.rows.values)} rows of {len(self.columns.values)}"
-                    " numbers, as rows and columns have values"
+                    f"{name}: expected {high} rows of {wide} numbers, as rows and columns have"
+                    " values"
                 )
         for row, column in self.cells():
             try:
                 self.cell(row, column)
             except (ValidationError, KeyError) as error:
-                what = (
-                    error.errors()[0]["msg"]
-                    if isinstance(error, ValidationError)
-                    else f"no key {error}"
-                )
+                what = f"no key {error}"
+                if isinstance(error, ValidationError):
+                    what = error.errors()[0]["msg"]
                 raise ValueError(
                     f"{self.rows.key}={self.rows.values[row]},"
                     f" {self.columns.key}={self.columns.values[column]}: {what}"
@@ -227,79 +219,129 @@ class BreedingTaskConfig(Task):
         )
 
     def check(self) -> None:
-        from residnet.regression.genetic import require_deap
-
         require_deap()
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
         rows, cells = [], self.cells()
         for done, (i, j) in enumerate(cells):
             progress.report("searching equations", done, len(cells))
-            rows.append(self._row(i, j))
+            settings, started = self.cell(i, j), time.process_time()
+            trials = [attempt(*settings, seed) for seed in range(self.repeats)]
+            errors, equations = ([*part] for part in zip(*trials, strict=True))
+            true = set(settings[0].truth())
+            rows.append(
+                {
+                    "row": self.rows.values[i],
+                    "column": self.columns.values[j],
+                    "found": sum(error < self.threshold for error in errors),
+                    "published_found": self.published and self.published[i][j],
+                    "right": sum(set(equation) == true for equation in equations),
+                    "error": sum(errors) / len(errors),
+                    "published_error": self.published_error and self.published_error[i][j],
+                    "seconds": (time.process_time() - started) / self.repeats,
+                    "equations": equations,
+                }
+            )
         progress.report("searching equations", len(cells), len(cells))
         content = {
             "schema": "residnet.breeding/1",
             "run": self.name,
             "keys": (self.rows.key, self.columns.key),
             "rows": rows,
-            "least": {str(row["row"]): row["column"] for row in least(self, rows)},
+            # where the mean error is least, for each value of the first setting
+            "least": {
+                str(value): min(
+                    (row for row in rows if row["row"] == value), key=lambda row: row["error"]
+                )["column"]
+                for value in self.rows.values
+            },
         }
-        folder.write_json(folder.path / FILE, content)
-        write_figure(folder.figures, _drawing(self, rows))
-        runs = self.repeats * len(rows)
-        figures = {
-            f"share of runs {words}": MainFigure(sum(row[key] for row in rows) / runs)
-            for key, words in (
-                ("found", "that find the equation"),
-                ("right", "with the true terms"),
-            )
-        }
-        return Outcome(verdict(self, rows), figures)
+        return content, [_drawing(self, rows)]
 
-    def _row(self, i: int, j: int) -> dict[str, Any]:
-        settings = self.cell(i, j)
-        started = time.process_time()
-        trials = [attempt(*settings, seed) for seed in range(self.repeats)]
-        errors = [error for error, _ in trials]
-        true = set(settings[0].truth())
+    def main_figures(self, results: Results) -> dict[str, MainFigure]:
+        rows = results["rows"]
+        words = {"found": "that find the equation", "right": "with the true terms"}
         return {
-            "row": self.rows.values[i],
-            "column": self.columns.values[j],
-            "found": sum(error < self.threshold for error in errors),
-            "published_found": self.published and self.published[i][j],
-            "right": sum(set(equation) == true for _, equation in trials),
-            "error": sum(errors) / len(errors),
-            "published_error": self.published_error and self.published_error[i][j],
-            "seconds": (time.process_time() - started) / self.repeats,
-            "equations": [equation for _, equation in trials],
+            f"share of runs {what}": MainFigure(
+                sum(row[key] for row in rows) / (self.repeats * len(rows))
+            )
+            for key, what in words.items()
         }
 
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        config = load_config(run.resolved, [], cls)
-        rows = read_json(run.path / FILE)["rows"]
+    def verdict(self, results: Results) -> list[str]:
+        rows = results["rows"]
+        runs = self.repeats * len(rows)
+        sentences = [
+            f"The equation is found in {sum(row['found'] for row in rows)} of {runs} runs: their"
+            f" mean square error on the test record is below {self.threshold:g} (m/s^2)^2."
+        ]
+        printed = [row for row in rows if row["published_found"] is not None]
+        if printed:
+            ours, theirs = (
+                sum(row[key] for row in printed) for key in ("found", "published_found")
+            )
+            sentences.append(
+                f"Document 000 finds it in {theirs:g} of the {_PUBLISHED_RUNS * len(printed)} runs"
+                f" of the same table; here it is {ours} of {self.repeats * len(printed)}."
+            )
+        best = [f"{_text(column)} ({row})" for row, column in results["least"].items()]
+        sentences.append(f"The mean error is least at {self.columns.key} = {', '.join(best)}.")
+        right = sum(row["right"] for row in rows)
+        return [*sentences, f"In {right} of {runs} runs the terms are exactly the true ones."]
+
+    def sections(self, results: Results, run: Path) -> list[Section]:
+        rows = results["rows"]
         about = Text(
             [
-                f"Each cell shows in how many of {config.repeats} runs the mean square error on the"
-                f" test record is below {config.threshold:g} (m/s^2)^2. In small print stand the"
+                f"Each cell shows in how many of {self.repeats} runs the mean square error on the"
+                f" test record is below {self.threshold:g} (m/s^2)^2. In small print stand the"
                 " document's number of ten runs, in how many runs the terms are the true ones, and"
                 " the mean of the mean square errors.",
-                f"Rows: {config.rows.key}. Columns: {config.columns.key}.",
+                f"Rows: {self.rows.key}. Columns: {self.columns.key}.",
             ]
         )
-        equations = [
-            (f"{_text(row['row'])}, {_text(row['column'])}", seed, equation)
-            for row in rows
-            for seed, equation in enumerate(row["equations"])
+        cells = {(row["row"], row["column"]): row for row in rows}
+
+        def cell(value: Value, other: Value) -> Cell:
+            row = cells.get((value, other))
+            if row is None:
+                return Cell(DASH)
+            found = row["published_found"]
+            printed = "" if found is None else f"published {found:g}; "
+            said = f"{printed}{row['right']} true; {number(row['error'], 2)}"
+            return Cell(str(row["found"]), said)
+
+        table = table_of(
+            self.rows.values,
+            [
+                (self.rows.key, _text),
+                *(
+                    (_text(other), lambda value, other=other: cell(value, other))
+                    for other in self.columns.values
+                ),
+            ],
+        )
+        every = [
+            (row, seed, equation) for row in rows for seed, equation in enumerate(row["equations"])
         ]
-        columns = [
-            ("setting", lambda row: row[0]),
-            ("seed", lambda row: Cell(str(row[1]))),
-            ("equation of the acceleration", lambda row: _equation(row[2])),
+
+        def written(row: Any) -> str:
+            terms = [f"{number(value, 4)} {name}" for name, value in row[2].items()]
+            return " + ".join(terms) or DASH
+
+        equations = table_of(
+            every,
+            [
+                ("setting", lambda row: f"{_text(row[0]['row'])}, {_text(row[0]['column'])}"),
+                ("seed", lambda row: Cell(str(row[1]))),
+                ("equation of the acceleration", written),
+            ],
+        )
+        found: list[Block] = [about, table, *pictures(run, "study")]
+        return [
+            Section("Equations found", found),
+            Section("All equations", [equations], folded=True),
         ]
-        found: list[Block] = [about, _table(config, rows), *pictures(run.path, "study")]
-        every = [table_of(equations, columns)]
-        return [Section("Equations found", found), Section("All equations", every, folded=True)]
 
 
 def attempt(
@@ -334,61 +376,11 @@ def attempt(
     return error, dict(zip(names, bred.values, strict=True))
 
 
-def verdict(config: BreedingTaskConfig, rows: Rows) -> list[str]:
-    """Return the sentences that sum the search up."""
-    runs = config.repeats * len(rows)
-    found = sum(row["found"] for row in rows)
-    sentences = [
-        f"The equation is found in {found} of {runs} runs: their mean square error on the test"
-        f" record is below {config.threshold:g} (m/s^2)^2."
-    ]
-    printed = [row for row in rows if row["published_found"] is not None]
-    if printed:
-        ours, theirs = (sum(row[key] for row in printed) for key in ("found", "published_found"))
-        sentences.append(
-            f"Document 000 finds it in {theirs:g} of the {_PUBLISHED_RUNS * len(printed)} runs of"
-            f" the same table; here it is {ours} of {config.repeats * len(printed)}."
-        )
-    best = [f"{_text(row['column'])} ({_text(row['row'])})" for row in least(config, rows)]
-    sentences.append(f"The mean error is least at {config.columns.key} = {', '.join(best)}.")
-    right = sum(row["right"] for row in rows)
-    return [*sentences, f"In {right} of {runs} runs the terms are exactly the true ones."]
-
-
-def least(config: BreedingTaskConfig, rows: Rows) -> list[Mapping[str, Any]]:
-    """Return for each value of the first setting the row of the least mean error."""
-    return [
-        min((row for row in rows if row["row"] == value), key=lambda row: float(row["error"]))
-        for value in config.rows.values
-    ]
-
-
-def _table(config: BreedingTaskConfig, rows: Rows) -> Table:
-    cells = {(row["row"], row["column"]): row for row in rows}
-
-    def cell(row: Mapping[str, Any] | None) -> Cell:
-        if row is None:
-            return Cell(DASH)
-        found = row["published_found"]
-        printed = "" if found is None else f"published {found:g}; "
-        return Cell(str(row["found"]), f"{printed}{row['right']} true; {number(row['error'], 2)}")
-
-    table = Table([config.rows.key, *map(_text, config.columns.values)])
-    for value in config.rows.values:
-        of_row = [cell(cells.get((value, other))) for other in config.columns.values]
-        table.add(_text(value), of_row)
-    return table
-
-
-def _equation(equation: Mapping[str, float]) -> str:
-    return " + ".join(f"{number(value, 4)} {term}" for term, value in equation.items()) or DASH
-
-
 def _text(value: Value) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _drawing(config: BreedingTaskConfig, rows: Rows) -> Figure:
+def _drawing(config: BreedingTaskConfig, rows: Sequence[Mapping[str, Any]]) -> Figure:
     columns = list(config.columns.values)
     looks: dict[str, Look] = {}
     found: dict[str, Any] = {}

@@ -7,17 +7,17 @@ the data alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, final
 
 import numpy as np
 import torch
 from pydantic import Field, field_validator, model_validator
 
-from residnet.core.config import Config, Radians, Seconds, load_config
+from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import ConfigError
-from residnet.core.files import read_json
 from residnet.core.layout import RANGE_INPUTS, RANGE_VELOCITIES
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, VELOCITY, nearest
@@ -26,7 +26,6 @@ from residnet.core.stretches import stretches
 from residnet.data.sea import Disturbance, SensorNoise
 from residnet.data.simulated import Craft, Sea, fly
 from residnet.documents import published
-from residnet.documents.cells import beside_published, listed, pictures
 from residnet.documents.halvorsen2019.standard_model import (
     NAMES,
     PARAMETERS,
@@ -36,6 +35,7 @@ from residnet.documents.halvorsen2019.standard_model import (
     fit,
     truth,
 )
+from residnet.documents.study import Results, Study, compared, histories, listed, pictures
 from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
@@ -62,11 +62,10 @@ from residnet.report.figure import (
     Panel,
     names_of,
     whiskers,
-    write_figure,
 )
 from residnet.report.format import DASH, DEG, interval, number
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, MainFigure, Outcome
+from residnet.runs.task import ComputingTask, MainFigure
 
 CONTROLS, FORCES = ("cmd_n", "cmd_nozzle"), ("tau_x", "tau_y", "tau_n")
 CHANNELS = (*VELOCITY, *CONTROLS, *FORCES)
@@ -75,8 +74,6 @@ STANDARD, SEPARATE, PLANT = "standard", "separate", "plant"
 SETS = (*PHASES, ALL)
 """Sets of samples that a model is fitted to and judged on."""
 Published = dict[str, tuple[float, float, float]]
-Results = Mapping[str, Any]
-FILE = "study.json"
 SET_NAMES = {
     PHASES[0]: "displacement phase",
     PHASES[1]: "semi-displacement phase",
@@ -89,6 +86,7 @@ _STANDARD_PARAMETERS = (4.0, 8.0, 8.0)
 """Number of parameters of the standard model in surge, sway and yaw."""
 _EXCERPT = 60.0
 """Length in s of the stretch of accelerations that is shown."""
+_UNITS = dict(zip(ACCELERATION, ("m/s^2", "m/s^2", "rad/s^2"), strict=True))
 _SAME_COST = 1e-6
 """Costs that differ by a smaller share count as the same minimum."""
 
@@ -118,21 +116,22 @@ class ProgrammeConfig(Config):
         """Return the manoeuvres of one course in the order in which they are sailed."""
         levels = (*self.drives, *reversed(self.drives[:-1]))
         times = tuple(self.hold * i for i in range(len(levels)))
-        programme: list[Manoeuvre] = [
-            AccelerationDeceleration(times=times, levels=levels, duration=self.hold * len(levels))
+        straight = AccelerationDeceleration(
+            times=times, levels=levels, duration=self.hold * len(levels)
+        )
+        zigzags = [
+            Zigzag(
+                heading=self.heading,
+                start=self.zigzag / 4,
+                duration=self.zigzag,
+                drive=drive,
+                steer=steer,
+                first="starboard" if place % 2 == 0 else "port",
+            )
+            for drive in self.drives
+            for place, steer in enumerate(self.steers)
         ]
-        for drive in self.drives:
-            for place, steer in enumerate(self.steers):
-                first = "starboard" if place % 2 == 0 else "port"
-                programme.append(
-                    Zigzag.model_validate(
-                        {**self._zigzag(), "drive": drive, "steer": steer, "first": first}
-                    )
-                )
-        return programme
-
-    def _zigzag(self) -> dict[str, float]:
-        return {"heading": self.heading, "start": self.zigzag / 4, "duration": self.zigzag}
+        return [straight, *zigzags]
 
 
 class PreparationConfig(Config):
@@ -255,7 +254,7 @@ class EquationConfig(Config):
 
 
 @final
-class SeaTrialTaskConfig(ComputingTask):
+class SeaTrialTaskConfig(Study, ComputingTask):
     """Models of Odin fitted and judged by phase, on one simulated trial or several.
 
     Attributes:
@@ -278,49 +277,87 @@ class SeaTrialTaskConfig(ComputingTask):
 
     @model_validator(mode="after")
     def _names(self) -> SeaTrialTaskConfig:
-        for name in self.equations:
+        for name, equation in self.equations.items():
             if name in (STANDARD, SEPARATE, PLANT):
                 raise ValueError(f"equations: the name '{name}' is taken")
-        for key in ("published", "published_absolute"):
-            self._check_printed(key, getattr(self, key))
-        for name, equation in self.equations.items():
             try:
                 equation.build()
             except ConfigError as error:
                 raise ValueError(f"equations.{name}: {error}") from None
+        known = (STANDARD, *self.equations)
+        for key in ("published", "published_absolute"):
+            for where, models in getattr(self, key).items():
+                if where not in SETS:
+                    raise ValueError(f"{key}: no set '{where}'{nearest(where, SETS)}")
+                for model in models:
+                    if model not in known:
+                        raise ValueError(
+                            f"{key}.{where}: no model '{model}'{nearest(model, known)}"
+                        )
         return self
-
-    def _check_printed(self, key: str, printed: dict[str, dict[str, Published]]) -> None:
-        for where, models in printed.items():
-            if where not in SETS:
-                raise ValueError(f"{key}: no set '{where}'{nearest(where, SETS)}")
-            for model in models:
-                if model not in (STANDARD, *self.equations):
-                    raise ValueError(
-                        f"{key}.{where}: no model"
-                        f" '{model}'{nearest(model, (STANDARD, *self.equations))}"
-                    )
 
     def recorded_seed(self) -> int:
         return next(iter(self.trials.values())).seed
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
         found = {name: study(self, trial) for name, trial in self.trials.items()}
-        for name, one in found.items():
-            for figure in _drawings(name, one):
-                write_figure(folder.figures, figure)
-        results = {
-            "schema": "residnet.sea_trial/1",
-            "run": self.name,
-            "trials": {name: _content(self, one) for name, one in found.items()},
-        }
-        folder.write_json(folder.path / FILE, results)
-        return Outcome(_verdict(results), _main_figures(results))
+        figures = [figure for name, one in found.items() for figure in _drawings(name, one)]
+        trials = {name: _content(self, one) for name, one in found.items()}
+        return {"schema": "residnet.sea_trial/1", "run": self.name, "trials": trials}, figures
 
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        settings, results = load_config(run.resolved, [], cls), read_json(run.path / FILE)
-        return [_section(settings, name, run) for name in results["trials"]]
+    def verdict(self, results: Results) -> list[str]:
+        sentences = []
+        for name, trial in results["trials"].items():
+            where = next(iter(trial["rows"]))
+            each = [
+                f"{row['model']} for {axis} ({number(row['rmse'])})"
+                for axis, row in _best(trial["rows"][where]).items()
+            ]
+            sentences.append(
+                f"Trial {name}: on the validation stretches of the {SET_NAMES[where]}, the models"
+                f" with the least root mean square error are {listed(each)}."
+            )
+            open_names = trial["standard"][where]["undetermined"]
+            if open_names:
+                sentences.append(
+                    f"Of the standard model, the data of trial {name} determine only combinations"
+                    f" of {listed(open_names)}."
+                )
+        return sentences
+
+    def main_figures(self, results: Results) -> dict[str, MainFigure]:
+        out: dict[str, MainFigure] = {}
+        for name, trial in results["trials"].items():
+            where, rows = next(iter(trial["rows"].items()))
+            of_standard = [row for row in rows if row["model"] == STANDARD and row["on"] == where]
+            for row in (*_best(rows).values(), *of_standard):
+                key = f"{name}: rmse of {row['axis']}, {row['model']}"
+                out[key] = MainFigure(row["rmse"], _UNITS[row["axis"]])
+        return out
+
+    def sections(self, results: Results, run: Path) -> list[Section]:
+        out = []
+        for place, (name, trial) in enumerate(results["trials"].items()):
+            blocks: list[Text | Section] = [Text(_about(trial))]
+            printed = ({}, {}) if place else (self.published, self.published_absolute)
+            for where, rows in trial["rows"].items():
+                table = _goodness(where, rows, *(of.get(where, {}) for of in printed))
+                title = f"Validation, {SET_NAMES[where]}"
+                blocks.append(Section(title, [table, *pictures(run, f"{where}_{name}")]))
+            parameters: list[Block] = [_parameters(trial), Bullets(_notes(trial))]
+            parameters += pictures(run, f"parameters_{name}")
+            blocks.append(Section("Parameters of the standard model", parameters))
+            equations = [
+                (model.replace("_", "-"), text)
+                for model, texts in trial["equations"].items()
+                for text in texts.values()
+            ]
+            if equations:
+                columns = [("model", lambda row: row[0]), ("equation", lambda row: row[1])]
+                blocks.append(Section("Equations", [table_of(equations, columns)]))
+            blocks.append(Section("The trial", pictures(run, f"trial_{name}"), folded=True))
+            out.append(Section(f"Trial {name}: vessel {self.trials[name].vessel}", blocks))
+        return out
 
 
 @dataclass(frozen=True)
@@ -362,38 +399,23 @@ def sail(config: SeaTrialConfig) -> Trial:
         ConfigError: where the vessel cannot feel the disturbance or is of another kind.
         DataError: where the motion does not stay finite.
     """
-    name = config.vessel
+    name, given = config.vessel, config.disturbance
     vessel, logs = odin(name), []
     for place, course in enumerate(config.programme.courses):
         plant = vessel.build()
-        config.disturbance.check(plant, name)
-        craft = Craft(
-            name,
-            TracedPlantDynamics(plant, config.step),
-            Helm.from_plant(plant),
-            plant.commands,
-            plant.approach(1),
-        )
-        sea = Sea(plant, _turned(config.disturbance, course), config.noise, config.seed + place)
-        logs += [
-            flight.log
-            for flight in fly(
-                craft, config.programme.manoeuvres(), sea, config.programme.zigzag, config.step
-            )
-        ]
+        given.check(plant, name)
+        dynamics = TracedPlantDynamics(plant, config.step)
+        craft = Craft(name, dynamics, Helm.from_plant(plant), plant.commands, plant.approach(1))
+        turned = given
+        if given.waves is not None:
+            direction = given.waves.direction - course
+            waves = given.waves.model_copy(update={"direction": direction})
+            turned = given.model_copy(update={"waves": waves})
+        sea = Sea(plant, turned, config.noise, config.seed + place)
+        programme = config.programme.manoeuvres()
+        flights = fly(craft, programme, sea, config.programme.zigzag, config.step)
+        logs += [flight.log for flight in flights]
     return prepared(logs, vessel, config.preparation, config.seed)
-
-
-def _turned(disturbance: Disturbance, course: float) -> Disturbance:
-    if disturbance.waves is None:
-        return disturbance
-    return disturbance.model_copy(
-        update={
-            "waves": disturbance.waves.model_copy(
-                update={"direction": disturbance.waves.direction - course}
-            )
-        }
-    )
 
 
 def prepared(
@@ -407,68 +429,49 @@ def prepared(
         config: how the logs are prepared.
         seed: seed of the times of the samples.
     """
+    from scipy.signal import butter, filtfilt
+
     random, actuators = np.random.default_rng([seed, 11]), vessel.build().actuators
-    rows, rates, times, log_numbers, stretches = [], [], [], [], []
+    low_pass = butter(config.order, config.cutoff)
+    parts: list[tuple[np.ndarray, ...]] = []
     for place, given in enumerate(logs):
-        t, z = _even(given, config, random)
+        # from samples at uneven times to the uniform grid
+        end = float(given.t[-1])
+        at = np.cumsum(random.uniform(*config.interval, size=round(end / config.interval[0]) + 1))
+        taken = np.unique(np.searchsorted(given.t, at[at < end]))
+        t = np.arange(float(given.t[taken[0]]), float(given.t[taken[-1]]), config.step)
+        names = (*VELOCITY, *CONTROLS)
+        z = np.stack([np.interp(t, given.t[taken], given.channels[n][taken]) for n in names], 1)
         nu, command = torch.from_numpy(z[:, RANGE_VELOCITIES]), torch.from_numpy(z[:, RANGE_INPUTS])
         force = actuators.force(torch.zeros(len(t), 0, dtype=torch.float64), command, nu).numpy()
         inputs = np.concatenate((z[:, RANGE_INPUTS], force), axis=1)
-        velocity = _filtered(z[:, RANGE_VELOCITIES], config)
+        if config.filter_inputs:
+            inputs = filtfilt(*low_pass, inputs, axis=0)
+        velocity = filtfilt(*low_pass, z[:, RANGE_VELOCITIES], axis=0)
         cut = round(config.margin / config.step)
         kept = slice(cut, len(t) - 1 - cut)
-        rows.append(
-            np.concatenate(
-                (velocity, _filtered(inputs, config) if config.filter_inputs else inputs), axis=1
-            )[kept]
+        parts.append(
+            (
+                np.concatenate((velocity, inputs), axis=1)[kept],
+                (np.diff(velocity, axis=0) / config.step)[kept],
+                t[kept],
+                np.full(len(t[kept]), place),
+                (t[kept] // config.stretch).astype(int),
+            )
         )
-        rates.append((np.diff(velocity, axis=0) / config.step)[kept])
-        times.append(t[kept])
-        log_numbers.append(np.full(len(times[-1]), place))
-        stretches.append((times[-1] // config.stretch).astype(int))
-    log, stretch = np.concatenate(log_numbers), np.concatenate(stretches)
+    z, rates, t, log, stretch = (np.concatenate(part) for part in zip(*parts, strict=True))
     group = np.concatenate(([0], np.cumsum((np.diff(log) != 0) | (np.diff(stretch) != 0))))
-    z, t = np.concatenate(rows), np.concatenate(times)
     samples = Samples(
         torch.from_numpy(z),
-        torch.from_numpy(np.concatenate(rates)),
+        torch.from_numpy(rates),
         torch.from_numpy(group),
         torch.from_numpy(t),
         ("made",) * (group[-1] + 1),
         CHANNELS,
     )
-    phase = phase_of(
-        froude_number(samples.z[:, 0], samples.z[:, 1], float(vessel.length.value))
-    ).numpy()
-    return Trial(
-        samples,
-        log,
-        (stretch + log) % config.validate_every == config.validate_every - 1,
-        phase,
-        config.step,
-    )
-
-
-def _even(
-    log: Log, config: PreparationConfig, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [T] and channels [T, 5] on the uniform grid, from samples at uneven times."""
-    end = float(log.t[-1])
-    at = np.cumsum(random.uniform(*config.interval, size=round(end / config.interval[0]) + 1))
-    taken = np.unique(np.searchsorted(log.t, at[at < end]))
-    t = np.arange(float(log.t[taken[0]]), float(log.t[taken[-1]]), config.step)
-    return t, np.stack(
-        [np.interp(t, log.t[taken], log.channels[name][taken]) for name in (*VELOCITY, *CONTROLS)],
-        axis=1,
-    )
-
-
-def _filtered(values: np.ndarray, config: PreparationConfig) -> np.ndarray:
-    from scipy.signal import butter, filtfilt
-
-    b, a = butter(config.order, config.cutoff)
-    out: np.ndarray = filtfilt(b, a, values, axis=0)
-    return out
+    froude = froude_number(samples.z[:, 0], samples.z[:, 1], float(vessel.length.value))
+    validates = (stretch + log) % config.validate_every == config.validate_every - 1
+    return Trial(samples, log, validates, phase_of(froude).numpy(), config.step)
 
 
 class Fitted(NamedTuple):
@@ -507,6 +510,9 @@ class PhaseStudy:
 def study(settings: SeaTrialTaskConfig, config: SeaTrialConfig) -> PhaseStudy:
     """Simulate one trial, and fit and judge every model on every set of samples.
 
+    Beside the models that are fitted to one set stands for each one that consists of those of the
+    single phases.
+
     Raises:
         ResidnetError: where the trial cannot be sailed or a model is not determined.
     """
@@ -521,60 +527,32 @@ def study(settings: SeaTrialTaskConfig, config: SeaTrialConfig) -> PhaseStudy:
         if min((keep & ~trial.validates).sum(), (keep & trial.validates).sum()) >= _LEAST_SAMPLES
     }
     z, a = trial.samples.z.numpy(), trial.samples.target.numpy()
+    nu, tau = z[:, RANGE_VELOCITIES], z[:, 5:]
     standard: dict[str, StandardFit] = {}
     models: dict[tuple[str, str], Fitted] = {}
     for name, keep in sets.items():
         train = keep & ~trial.validates
-        standard[name] = found = fit(
-            z[train, RANGE_VELOCITIES], z[train, 5:], a[train], settings.standard
-        )
-        predicted = found.accelerations(z[:, RANGE_VELOCITIES], z[:, 5:])
-        models[STANDARD, name] = Fitted(predicted, _STANDARD_PARAMETERS, {})
+        standard[name] = found = fit(nu[train], tau[train], a[train], settings.standard)
+        models[STANDARD, name] = Fitted(found.accelerations(nu, tau), _STANDARD_PARAMETERS, {})
+        samples = trial.samples.where(torch.from_numpy(train))
         for equation, equation_config in settings.equations.items():
-            models[equation, name] = _fit_equation(equation_config, trial, train)
-    models |= _separate(models, sets, trial)
-    vessel = odin(config.vessel)
-    return PhaseStudy(
-        trial,
-        standard,
-        truth(vessel, settings.standard.mass),
-        models,
-        _judged(vessel, trial, sets, models),
-    )
-
-
-def _fit_equation(config: EquationConfig, trial: Trial, train: np.ndarray) -> Fitted:
-    """Find an equation from the training samples [N] bool, and evaluate it at all samples."""
-    head, samples = config.build(), trial.samples.where(torch.from_numpy(train))
-    head.calibrate(samples)
-    notes = head.solve(samples)
-    with torch.no_grad():
-        predicted = head(trial.samples.z, trial.samples.z[:, :0])[0].numpy()
-    return Fitted(
-        predicted,
-        tuple(head.parameter_count()),
-        {axis: equation["text"] for axis, equation in notes["equations"].items()},
-    )
-
-
-def _separate(
-    models: Mapping[tuple[str, str], Fitted], sets: Mapping[str, np.ndarray], trial: Trial
-) -> dict[tuple[str, str], Fitted]:
-    """Return for each model one that consists of the models fitted to the single phases.
-
-    Where a phase has no model, the one of all phases takes its place.
-    """
-    out = {}
-    for name in dict.fromkeys(model for model, _ in models):
-        predicted, parameter_count = models[name, ALL].predicted.copy(), np.zeros(3)
-        for place, phase in enumerate(PHASES):
+            head = equation_config.build()
+            head.calibrate(samples)
+            texts = {axis: of["text"] for axis, of in head.solve(samples)["equations"].items()}
+            with torch.no_grad():
+                predicted = head(trial.samples.z, trial.samples.z[:, :0])[0].numpy()
+            models[equation, name] = Fitted(predicted, tuple(head.parameter_count()), texts)
+    for model in (STANDARD, *settings.equations):
+        # where a phase has no model, the one of all phases takes its place
+        predicted, count = models[model, ALL].predicted.copy(), np.zeros(3)
+        for phase in PHASES:
             if phase in sets:
-                predicted[trial.phase == place] = models[name, phase].predicted[
-                    trial.phase == place
-                ]
-                parameter_count += models[name, phase].parameter_count
-        out[name, SEPARATE] = Fitted(predicted, tuple(parameter_count), {})
-    return out
+                predicted[sets[phase]] = models[model, phase].predicted[sets[phase]]
+                count += models[model, phase].parameter_count
+        models[model, SEPARATE] = Fitted(predicted, tuple(count), {})
+    vessel = odin(config.vessel)
+    known = truth(vessel, settings.standard.mass)
+    return PhaseStudy(trial, standard, known, models, _judged(vessel, trial, sets, models))
 
 
 def _judged(
@@ -589,11 +567,7 @@ def _judged(
     leave unexplained.
     """
     z, a = trial.samples.z, trial.samples.target.numpy()
-    known = Fitted(
-        vessel.hull()(z[:, RANGE_VELOCITIES], z[:, 5:]).numpy(),
-        (0.0, 0.0, 0.0),
-        {},
-    )
+    known = Fitted(vessel.hull()(z[:, RANGE_VELOCITIES], z[:, 5:]).numpy(), (0.0, 0.0, 0.0), {})
     out = {}
     for name, keep in sets.items():
         pieces = trial.pieces(keep & trial.validates)
@@ -648,14 +622,7 @@ def _content(settings: SeaTrialTaskConfig, study: PhaseStudy) -> dict[str, Any]:
 
 def _drawings(name: str, study: PhaseStudy) -> list[Figure]:
     """Return Figures 7.1, 7.2 (one) and 7.8 to 7.14, and the parameters beside the true ones."""
-    return [
-        _trial_figure(name, study.trial),
-        _parameters_figure(name, study),
-        *(_excerpt(name, study, where) for where in study.standard),
-    ]
-
-
-def _trial_figure(name: str, trial: Trial) -> Figure:
+    trial = study.trial
     z = trial.samples.z.numpy()
     t = np.arange(len(z)) * trial.step / 60
     rows = {
@@ -666,29 +633,23 @@ def _trial_figure(name: str, trial: Trial) -> Figure:
         "cmd_nozzle": ("nozzle [deg]", DEG),
     }
     starts, stops = stretches(trial.validates)
-    validation = (t[starts], t[stops - 1])
-    return Figure(
+    words = "Zigzags and steps of speed; stretches that validate are grey."
+    sailed = histories(
         f"trial_{name}",
-        "Simulated sea trial",
-        "Zigzags and steps of speed; stretches that validate are grey.",
+        ("Simulated sea trial", words),
         {
             "validation": Look("validation", "#D9D9D9", kind="strip", order=0),
             "line": Look("", BLUE, width=0.6),
         },
-        [
-            Panel(label, "time, logs end to end [min]", height=150, group="t")
-            for label, _ in rows.values()
-        ],
-        [
-            Case(
-                "",
-                [
-                    {"validation": validation, "line": (t, factor * z[:, CHANNELS.index(channel)])}
-                    for channel, (_, factor) in rows.items()
-                ],
-            )
-        ],
+        t,
+        {"line": z[:, [CHANNELS.index(channel) for channel in rows]]},
+        list(rows.values()),
+        height=150,
+        x_label="time, logs end to end [min]",
+        shared={"validation": (t[starts], t[stops - 1])},
     )
+    excerpts = [_excerpt(name, study, where) for where in study.standard]
+    return [sailed, _parameters_figure(name, study), *excerpts]
 
 
 def _parameters_figure(name: str, study: PhaseStudy) -> Figure:
@@ -739,54 +700,9 @@ def _excerpt(name: str, study: PhaseStudy, where: str) -> Figure:
             looks[label] = replace(look, label=label)
             paths[label] = study.models[key].predicted[piece]
     units = (("u' [m/s²]", 1.0), ("v' [m/s²]", 1.0), ("r' [deg/s²]", DEG))
-    return Figure(
-        f"{where}_{name}",
-        f"Validation, {SET_NAMES[where]}",
-        "Accelerations measured and predicted from measured velocities and inputs.",
-        looks,
-        [Panel(label, "time [s]", height=180, group="t") for label, _ in units],
-        [
-            Case(
-                "",
-                [
-                    {label: (t, factor * path[:, axis]) for label, path in paths.items()}
-                    for axis, (_, factor) in enumerate(units)
-                ],
-            )
-        ],
-    )
-
-
-def _verdict(results: Results) -> list[str]:
-    sentences = []
-    for name, trial in results["trials"].items():
-        where = next(iter(trial["rows"]))
-        best = _best(trial["rows"][where])
-        each = [f"{row['model']} for {axis} ({number(row['rmse'])})" for axis, row in best.items()]
-        sentences.append(
-            f"Trial {name}: on the validation stretches of the {SET_NAMES[where]}, the models with"
-            f" the least root mean square error are {listed(each)}."
-        )
-        open_names = trial["standard"][where]["undetermined"]
-        if open_names:
-            sentences.append(
-                f"Of the standard model, the data of trial {name} determine only combinations of"
-                f" {listed(open_names)}."
-            )
-    return sentences
-
-
-def _main_figures(results: Results) -> dict[str, MainFigure]:
-    units = dict(zip(ACCELERATION, ("m/s^2", "m/s^2", "rad/s^2"), strict=True))
-    out: dict[str, MainFigure] = {}
-    for name, trial in results["trials"].items():
-        where = next(iter(trial["rows"]))
-        rows = trial["rows"][where]
-        of_standard = [row for row in rows if row["model"] == STANDARD and row["on"] == where]
-        for row in (*_best(rows).values(), *of_standard):
-            key = f"{name}: rmse of {row['axis']}, {row['model']}"
-            out[key] = MainFigure(row["rmse"], units[row["axis"]])
-    return out
+    words = "Accelerations measured and predicted from measured velocities and inputs."
+    title = f"Validation, {SET_NAMES[where]}"
+    return histories(f"{where}_{name}", (title, words), looks, t, paths, units, height=180)
 
 
 def _best(rows: Sequence[Results]) -> dict[str, Results]:
@@ -800,48 +716,19 @@ def _best(rows: Sequence[Results]) -> dict[str, Results]:
     }
 
 
-def _section(settings: SeaTrialTaskConfig, name: str, run: RunFolder) -> Section:
-    trials = read_json(run.path / FILE)["trials"]
-    trial, first = trials[name], name == next(iter(trials))
-    printed = (settings.published, settings.published_absolute) if first else ({}, {})
-    blocks: list[Text | Section] = [Text(_about(trial))]
-    for where, rows in trial["rows"].items():
-        table = _goodness(where, rows, *(of.get(where, {}) for of in printed))
-        title = f"Validation, {SET_NAMES[where]}"
-        blocks.append(Section(title, [table, *pictures(run.path, f"{where}_{name}")]))
-    parameters: list[Block] = [_parameters(trial), Bullets(_notes(trial))]
-    parameters += pictures(run.path, f"parameters_{name}")
-    blocks.append(Section("Parameters of the standard model", parameters))
-    if trial["equations"]:
-        equations = [
-            (model.replace("_", "-"), text)
-            for model, texts in trial["equations"].items()
-            for text in texts.values()
-        ]
-        columns = [("model", lambda row: row[0]), ("equation", lambda row: row[1])]
-        blocks.append(Section("Equations", [table_of(equations, columns)]))
-    blocks.append(Section("The trial", pictures(run.path, f"trial_{name}"), folded=True))
-    return Section(f"Trial {name}: vessel {settings.trials[name].vessel}", blocks)
-
-
 def _about(trial: Results) -> str:
-    shares = listed(
-        [
-            f"{100 * share:.0f} % in the {SET_NAMES[phase]}"
-            for phase, share in trial["phases"].items()
-        ]
-    )
-    units = ("m/s^2", "m/s^2", "rad/s^2")
-    spread = listed(
-        [
-            f"{axis} {number(value)} {unit}"
-            for (axis, value), unit in zip(trial["acceleration_std"].items(), units, strict=True)
-        ]
-    )
+    shares = [
+        f"{100 * share:.0f} % in the {SET_NAMES[phase]}" for phase, share in trial["phases"].items()
+    ]
+    spread = [
+        f"{axis} {number(value)} {_UNITS[axis]}"
+        for axis, value in trial["acceleration_std"].items()
+    ]
     return (
         f"The trial lasts {trial['seconds'] / 60:.0f} minutes in {trial['logs']} logs, sampled at"
-        f" {1 / trial['step']:.0f} Hz: {shares}. The standard deviations of the accelerations are"
-        f" {spread}. {100 * trial['validation_share']:.0f} % of the stretches validate."
+        f" {1 / trial['step']:.0f} Hz: {listed(shares)}. The standard deviations of the"
+        f" accelerations are {listed(spread)}. {100 * trial['validation_share']:.0f} % of the"
+        " stretches validate."
     )
 
 
@@ -852,37 +739,37 @@ def _goodness(
     absolute: Mapping[str, Any],
 ) -> Table:
     """Return the goodness of fit of all models on one set (Tables 7.3 to 7.5)."""
-
-    def of_document(row: Results, of: Mapping[str, Any]) -> Sequence[float | None]:
-        fitted_to = where if row["model"] == STANDARD else ALL
-        found = of.get(row["model"], {}).get(row["axis"]) if row["on"] == fitted_to else None
-        return found or (None, None, None)
-
-    def beside(key: str, place: int) -> Any:
-        return lambda row: beside_published(row[key], of_document(row, printed)[place], 3)
+    shown = []
+    for row in rows:
+        beside: dict[str, Any] = {}
+        # the document fits its standard model to the phase, and its equations to all samples
+        if row["on"] == (where if row["model"] == STANDARD else ALL):
+            goodness, residual = (
+                of.get(row["model"], {}).get(row["axis"], ()) for of in (printed, absolute)
+            )
+            beside = dict(zip(("rmse", "cp", "r2_adjusted"), goodness, strict=False))
+            beside |= dict(zip(("mae", "low", "high"), residual, strict=False))
+        shown.append({**row, "published": beside})
 
     def as_printed(row: Results) -> Cell:
-        ends: list[Any] = list(of_document(row, absolute)[1:])
-        note = "" if ends[0] is None else f"published {interval(ends)}"
+        of = row["published"]
+        note = f"published {interval([of['low'], of['high']])}" if "low" in of else ""
         return Cell(interval(row["mae_ci95_independent"]), note)
 
+    def fitted_to(row: Results) -> str:
+        return DASH if row["model"] == PLANT else row["on"].replace("_", "-")
+
     return table_of(
-        rows,
+        shown,
         [
             ("model", "model"),
             ("acceleration", "axis"),
-            (
-                "fitted to",
-                lambda row: DASH if row["model"] == PLANT else row["on"].replace("_", "-"),
-            ),
+            ("fitted to", fitted_to),
             ("parameters", "parameters", 0),
-            ("RMSE", beside("rmse", 0)),
-            ("C_p", beside("cp", 1)),
-            ("adjusted R^2", beside("r2_adjusted", 2)),
-            (
-                "mean abs. residual",
-                lambda row: beside_published(row["mae"], of_document(row, absolute)[0], 3),
-            ),
+            *compared("rmse", "RMSE", 3),
+            *compared("cp", "C_p", 3),
+            *compared("r2_adjusted", "adjusted R^2", 3),
+            *compared("mae", "mean abs. residual", 3),
             ("95 %, blocks", "mae_ci95", interval),
             ("95 %, as printed", as_printed),
         ],
@@ -893,45 +780,32 @@ def _goodness(
 
 def _parameters(trial: Results) -> Table:
     fits, printed = trial["standard"], published("halvorsen2019")
+    columns = ["parameter", "true", *map(SET_NAMES.__getitem__, fits)]
     table = Table(
-        [
-            "parameter",
-            "true",
-            *(SET_NAMES[where] for where in fits),
-            "published before",
-            "published after",
-        ],
-        caption="SI units, with standard errors.",
+        [*columns, "published before", "published after"], caption="SI units, with standard errors."
     )
+
+    def with_error(value: float, error: float | None) -> Cell:
+        if error == 0.0:
+            return Cell(number(value, 5), "at its bound", mark="weak")
+        return Cell(number(value, 5), f"± {number(error, 2)}")
+
+    def estimate(fit: Results, name: str) -> Cell:
+        value = fit["values"][name]
+        if name in fit["undetermined"]:
+            return Cell(number(value, 4), "not determined", mark="weak")
+        if name in fit["at_bound"]:
+            return Cell(number(value), "at its bound", mark="weak")
+        return with_error(value, fit["standard_errors"][name])
+
     for name in NAMES:
-        table.add(
-            name,
-            [
-                number(trial["truth"][name], 5),
-                *(_estimate(fit, name) for fit in fits.values()),
-                number(printed["start"][name], 5),
-                number(printed["fitted"].get(name), 4),
-            ],
-        )
+        ours = [estimate(fit, name) for fit in fits.values()]
+        theirs = number(printed["start"][name], 5), number(printed["fitted"].get(name), 4)
+        table.add(name, [number(trial["truth"][name], 5), *ours, *theirs])
     for name in SUMS:
-        sums = [_with_error(*fit["sums"][name]) for fit in fits.values()]
+        sums = [with_error(*fit["sums"][name]) for fit in fits.values()]
         table.add(name, [number(trial["true_sums"][name], 5), *sums, "", ""])
     return table
-
-
-def _estimate(fit: Results, name: str) -> Cell:
-    value = fit["values"][name]
-    if name in fit["undetermined"]:
-        return Cell(number(value, 4), "not determined", mark="weak")
-    if name in fit["at_bound"]:
-        return Cell(number(value), "at its bound", mark="weak")
-    return _with_error(value, fit["standard_errors"][name])
-
-
-def _with_error(value: float, error: float | None) -> Cell:
-    if error == 0.0:
-        return Cell(number(value, 5), "at its bound", mark="weak")
-    return Cell(number(value, 5), f"± {number(error, 2)}")
 
 
 def _notes(trial: Results) -> list[str]:

@@ -6,10 +6,10 @@ residual models are identified from the course, and the course is flown again wi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, final
+from typing import Any, ClassVar, Literal, final
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from residnet.baselines.given import BelievedConfig, HullEquations
 from residnet.control.base import ClosedLoop, GivenReference, Reference
 from residnet.control.guidance.crossing import Crossing, CrossingConfig
 from residnet.control.motion.anticipation import Assisted, Lag, course, needed_force, reference_row
-from residnet.control.motion.pid import Allocated, Gain, MotionPID, MotionPIDConfig, NoFeedForward
+from residnet.control.motion.pid import Allocated, Gain, MotionPID, MotionPIDConfig
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
 from residnet.core.config import (
     Config,
@@ -30,11 +30,9 @@ from residnet.core.config import (
     Radians,
     RadiansPerSecond,
     Seconds,
-    load_config,
     quantity,
 )
 from residnet.core.errors import ConfigError, DataError, FitError
-from residnet.core.files import read_json
 from residnet.core.frames import wrap
 from residnet.core.layout import (
     ACCELERATIONS,
@@ -45,27 +43,23 @@ from residnet.core.layout import (
     POSITION,
     VELOCITIES,
 )
-from residnet.core.log import Log
 from residnet.core.names import STATE, nearest
 from residnet.data.simulated import SimulatedTrials, fly_trials
-from residnet.documents.cells import beside_published, joined, notes_text, pictures
 from residnet.documents.jervan2020.residual import (
-    ABOUT_COEFFICIENTS,
     AXES,
-    MODEL_PICTURES,
-    Fit,
+    FittedModel,
+    Name,
     Record,
     ResidualModelConfig,
     as_baseline_yaml,
-    coefficients_section,
     fit_as_json,
     fit_model,
     forward_equations,
     missing_coefficients,
     model_figures,
-    remaining,
-    unseen_mse,
+    model_sections,
 )
+from residnet.documents.study import Results, Study, compared, joined, notes_text, pictures
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
@@ -82,18 +76,17 @@ from residnet.physics.hull import HullConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.signals import FORCE_CHANNELS, SignalsConfig
 from residnet.physics.vessel import load_vessel
-from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text, table_of
-from residnet.report.figure import DASHED, SOLID, Case, Figure, Panel, family, write_figure
+from residnet.report.blocks import Block, Cell, Section, Table, table_of
+from residnet.report.figure import DASHED, SOLID, Case, Figure, Panel, family
 from residnet.report.format import DEG, number
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, MainFigure, Outcome
+from residnet.runs.task import ComputingTask, MainFigure
 
-FILE = "ferry.json"
-Results = Mapping[str, Any]
 _BELIEVED = "believed"
-_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 _FARTHEST = 3.0
 """Velocities of a free run in largest velocities of the true ferry from which it has diverged."""
+Feed = tuple[ForceModel, Lag | None]
+"""A model as feed-forward, and the lag of the thrusters that it leads."""
 
 
 class Published(Config):
@@ -162,7 +155,7 @@ class LoopConfig(Config):
             for part in (proportional, self.integral * omega * proportional, 2.0 * mass * omega)
         ]
         return MotionPIDConfig(proportional=gains[0], integral=gains[1], derivative=gains[2]).build(
-            self.step, NoFeedForward()
+            self.step
         )
 
 
@@ -211,11 +204,6 @@ class Disturbance(Config):
     east: Newtons = 0.0
 
 
-def _zigzags() -> tuple[FamilyConfig, ...]:
-    family = ZigzagFamily(count=6, drive=(0.03, 0.07), steer=(0.01, 0.03), heading=(0.17, 0.35))
-    return (family,)
-
-
 class ForwardRunsConfig(Config):
     """What the models are run forward in time beside.
 
@@ -226,7 +214,12 @@ class ForwardRunsConfig(Config):
         seed: of everything random in them.
     """
 
-    trials: tuple[FamilyConfig, ...] = Field(default_factory=_zigzags, min_length=1)
+    trials: tuple[FamilyConfig, ...] = Field(
+        default=(
+            ZigzagFamily(count=6, drive=(0.03, 0.07), steer=(0.01, 0.03), heading=(0.17, 0.35)),
+        ),
+        min_length=1,
+    )
     duration: Seconds = Field(default=60.0, gt=0)
     step: Seconds = Field(default=0.1, gt=0)
     seed: int = Field(default=0, ge=0)
@@ -251,7 +244,7 @@ class FerryModelConfig(ResidualModelConfig):
 
 
 @final
-class FerryStudyConfig(ComputingTask):
+class FerryStudyConfig(Study, ComputingTask):
     """A course with the believed model, residual models identified from it, and the course again.
 
     Attributes:
@@ -274,6 +267,8 @@ class FerryStudyConfig(ComputingTask):
         seed: seed of the noise.
     """
 
+    results_file: ClassVar[str] = "ferry.json"
+
     task: Literal["ferry_study"]
     believed: str = "milliampere"
     true: str = "milliampere_half"
@@ -284,7 +279,7 @@ class FerryStudyConfig(ComputingTask):
     disturbance: Disturbance = Disturbance()
     feed_forward_alone: bool = False
     forward: ForwardRunsConfig = ForwardRunsConfig()
-    models: dict[_Name, FerryModelConfig] = Field(min_length=1)
+    models: dict[Name, FerryModelConfig] = Field(min_length=1)
     published: Published = Published()
     later: str | None = None
     check_fit: StillFitsConfig = StillFitsConfig()
@@ -294,7 +289,7 @@ class FerryStudyConfig(ComputingTask):
     def _combination(self) -> FerryStudyConfig:
         known: list[str] = []
         for name, model in self.models.items():
-            if name == "believed":
+            if name == _BELIEVED:
                 raise ValueError("'believed' cannot name a model: it is the controller's own")
             if model.on and model.on not in known:
                 raise ValueError(
@@ -312,46 +307,78 @@ class FerryStudyConfig(ComputingTask):
                 " half test"
             )
         try:
-            self.ferry()
-            if self.later is not None:
-                self.ferry(self.later)
+            for true in (self.true, self.later or self.true):
+                Ferry(self, true)
             self.course.build(self.loop.step)
         except ConfigError as error:
             raise ValueError(str(error)) from None
         return self
 
-    def ferry(self, true: str | None = None) -> Ferry:
-        """Return the ferry in its control loop.
-
-        Args:
-            true: vessel that is simulated instead of `true` of the config.
-        """
-        return Ferry.of(
-            true or self.true, self.believed, self.loop, self.disturbance, self.noise, self.seed
-        )
-
     def recorded_seed(self) -> int:
         return self.seed
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
-        results = write_results(self, study(self), folder)
-        best = _best_model(results)
-        figures = {
-            f"residual left by {best}, {axis}": MainFigure(share)
-            for axis, share in zip(AXES, results["models"][best]["share_left"], strict=True)
-        }
-        figures |= {
+    def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        return written(self, study(self), folder)
+
+    def verdict(self, results: Results) -> list[str]:
+        models, best = results["models"], best_model(results)
+        left = joined([100 * share for share in models[best]["share_left"]])
+        sentences = [
+            f"Of {len(models)} residual models, {best} leaves the least of the residual force on"
+            f" the unseen half of the course: {left} % of its mean square in surge, sway and yaw."
+        ]
+        for kind in ("course", "crossing"):
+            missed = {name: flight["position_mae"] for name, flight in results[kind].items()}
+            before = missed.pop(_BELIEVED, None)
+            if missed:
+                closest = min(missed, key=missed.__getitem__)
+                moves = "falls" if missed[closest] < before else "does NOT fall: it goes"
+                sentences.append(
+                    f"With {closest} as feed-forward, the mean position error in the {kind} {moves}"
+                    f" from {number(before)} m to {number(missed[closest])} m."
+                )
+        return sentences + [
+            f"On the vessel as it is later, {name} {update['text']}."
+            for name, update in results["later"].items()
+        ]
+
+    def main_figures(self, results: Results) -> dict[str, MainFigure]:
+        best = best_model(results)
+        shares = zip(AXES, results["models"][best]["share_left"], strict=True)
+        return {f"residual left by {best}, {axis}": MainFigure(share) for axis, share in shares} | {
             f"mean position error on the course with {name}": MainFigure(
                 flight["position_mae"], "m"
             )
             for name, flight in results["course"].items()
         }
-        return Outcome(verdict(results), figures)
 
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        config = load_config(run.resolved, [], cls)
-        return sections(config, read_json(run.path / FILE), run.path)
+    def sections(self, results: Results, run: Path) -> list[Section]:
+        out = [Section("Residual force on the unseen half", [_residuals(self, results)])]
+        for kind, title in (
+            ("course", "Course in closed loop"),
+            ("crossing", "Operational crossing"),
+            ("feed_forward_alone", "Feed-forward without feedback"),
+        ):
+            if results[kind]:
+                drawn = pictures(run, f"errors_{kind}", f"forces_{kind}")
+                out.append(Section(title, [*_flown(self, results[kind], kind), *drawn]))
+        if results["later"]:
+            out.append(Section("The vessel as it is later", [_later(results["later"])]))
+        out.append(Section("Forward in time", [_forward(results["forward"])]))
+        # Table 4.11
+        others = {
+            name: {
+                "true": {} if model.on else results["true_coefficients"],
+                "published": model.published.coefficients,
+            }
+            for name, model in self.models.items()
+        }
+        return out + model_sections("Coefficients", results["models"], run, "notes", others)
+
+
+def measured(x: Tensor, noise: Tensor) -> Tensor:
+    """Return states [..., nx] with noise [..., 6] on pose and velocities."""
+    return torch.cat((x[..., MOTION] + noise, x[..., ACTUATORS]), dim=-1)
 
 
 @final
@@ -368,9 +395,7 @@ class Sensed(Source):
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m] that follow from the measured state."""
-        inputs, memory = self.loop(
-            torch.cat((x[:, MOTION] + self.noise[:, k], x[:, ACTUATORS]), dim=-1), w, k, memory
-        )
+        inputs, memory = self.loop(measured(x, self.noise[:, k]), w, k, memory)
         return inputs, memory
 
 
@@ -423,191 +448,124 @@ def force_hull(name: str) -> tuple[HullPlant, ForceActuators]:
     )
 
 
-@dataclass(frozen=True)
+@final
 class Ferry:
     """The true plant, the believed hull and the control loop between them.
 
-    Attributes:
-        true: the plant that is simulated.
-        believed: the plant whose hull the controller believes in.
-        loop: controller and sampling.
-        disturbance: force that is constant in earth axes.
-        noise: noise on what is measured; None for none.
-        seed: seed of the noise.
+    Args:
+        config: of the study.
+        true: vessel that is simulated instead of `true` of the config.
+
+    Raises:
+        ConfigError: where a vessel is no hull whose actuators make all three forces.
     """
 
-    true: HullPlant
-    believed: HullPlant
-    loop: LoopConfig
-    disturbance: Disturbance
-    noise: MotionNoise | None
-    seed: int
-
-    @classmethod
-    def of(
-        cls,
-        true: str,
-        believed: str,
-        loop: LoopConfig,
-        disturbance: Disturbance,
-        noise: MotionNoise | None,
-        seed: int,
-    ) -> Ferry:
-        """Build both plants from vessels by name or file.
-
-        Raises:
-            ConfigError: where a vessel is no hull whose actuators make all three forces.
-        """
-        plants = [force_hull(name)[0] for name in (true, believed)]
-        if not plants[0].actuators.state:
+    def __init__(self, config: FerryStudyConfig, true: str | None = None) -> None:
+        name = true or config.true
+        self.config = config
+        self.true, self.thrusters = force_hull(name)
+        self.believed = force_hull(config.believed)[0].hull
+        if not self.thrusters.state:
             raise ConfigError(
-                f"vessel '{true}': its forces follow at once; the study is about thrusters that"
+                f"vessel '{name}': its forces follow at once; the study is about thrusters that"
                 " lag, give actuators.response"
             )
-        if disturbance == Disturbance():
-            plants[0].in_calm_water()
-        return cls(plants[0], plants[1], loop, disturbance, noise, seed)
+        if config.disturbance == Disturbance():
+            self.true.in_calm_water()
 
-    @property
-    def thrusters(self) -> ForceActuators:
-        """What pushes the true ferry."""
-        actuators = self.true.actuators
-        assert isinstance(actuators, ForceActuators)
-        return actuators
-
-    def without_feedback(self) -> Ferry:
-        """Return the same ferry with the feed-forward alone."""
-        return replace(self, loop=self.loop.model_copy(update={"frequency": (0.0, 0.0, 0.0)}))
-
-    def fly_course(
-        self, config: ReferenceFilterConfig, models: Sequence[tuple[ForceModel, Lag | None]]
+    def fly(
+        self,
+        path: ReferenceFilterConfig | CrossingConfig,
+        feeds: Sequence[Feed],
+        *,
+        feedback: bool = True,
     ) -> list[Flight]:
-        """Fly the course with each model as feed-forward, all in one batch."""
-        motion = course(config, self.loop.step)
-        rows = [
-            reference_row(motion, needed_force(model, motion, lag, self.loop.step))
-            for model, lag in models
-        ]
-        return self._fly(
-            GivenReference(torch.stack(rows)), len(motion.pose), [lag for _, lag in models]
-        )
+        """Fly a course or a crossing with each model as feed-forward, all in one batch.
 
-    def fly_crossing(
-        self, config: CrossingConfig, models: Sequence[tuple[ForceModel, Lag | None]]
-    ) -> list[Flight]:
-        """Fly the crossing with each model as feed-forward, all in one batch."""
-        return self._fly(
-            Crossing(config, self.loop.step, models),
-            round(config.duration / self.loop.step),
-            [lag for _, lag in models],
-        )
-
-    def _fly(self, guidance: Reference, steps: int, lags: Sequence[Lag | None]) -> list[Flight]:
-        step, rows = self.loop.step, len(lags)
-        pid = self.loop.pid(self.believed.hull.mass)
-        w = torch.zeros(rows, steps, len(self.true.inputs), dtype=torch.float64)
-        if self.disturbance != Disturbance():
-            w[:, :, self.true.inputs.index("force_north")] = self.disturbance.north
-            w[:, :, self.true.inputs.index("force_east")] = self.disturbance.east
-        noise = (self.noise or MotionNoise()).draw((rows, steps), self.seed)
+        Raises:
+            DataError: where the closed loop is unstable.
+        """
+        config, gains = self.config, self.config.loop
+        step, lags = gains.step, [lag for _, lag in feeds]
+        guidance: Reference
+        if isinstance(path, CrossingConfig):
+            guidance, steps = Crossing(path, step, feeds), round(path.duration / step)
+        else:
+            motion = course(path, step)
+            needed = [needed_force(model, motion, lag, step) for model, lag in feeds]
+            asked = torch.stack([reference_row(motion, force) for force in needed])
+            guidance, steps = GivenReference(asked), len(motion.pose)
+        if not feedback:
+            gains = gains.model_copy(update={"frequency": (0.0, 0.0, 0.0)})
+        pid = gains.pid(self.believed.mass)
+        w = torch.zeros(len(feeds), steps, len(self.true.inputs), dtype=torch.float64)
+        if config.disturbance != Disturbance():
+            for key, force in config.disturbance:
+                w[:, :, self.true.inputs.index(f"force_{key}")] = force
+        noise = (config.noise or MotionNoise()).draw((len(feeds), steps), config.seed)
         loop = ClosedLoop(Allocated(Assisted(pid, lags, step), self.thrusters), guidance)
-        source: Source = Sensed(loop, noise[..., MOTION]) if self.noise is not None else loop
-        x0 = torch.zeros(rows, len(self.true.state), dtype=torch.float64)
+        source = loop if config.noise is None else Sensed(loop, noise[..., MOTION])
+        x0 = torch.zeros(len(feeds), len(self.true.state), dtype=torch.float64)
         with torch.no_grad():
-            states, inputs, _ = Rollout(TracedPlantDynamics(self.true, step), source)(
-                x0, w, x0[:, :0]
-            )
+            model = Rollout(TracedPlantDynamics(self.true, step), source)
+            states, inputs, _ = model(x0, w, x0[:, :0])
             states = states[:, :-1]
             if not bool(torch.isfinite(states).all()):
                 raise DataError(
                     "the ferry left all bounds in closed loop: with these gains and models the loop"
                     " is unstable"
                 )
-            references = self._replay(guidance, states, noise[..., MOTION])
+            seen = measured(states, noise[..., MOTION])
+            if isinstance(guidance, GivenReference):
+                references = guidance.values
+            else:
+                memory, followed = guidance.initial_state(states[:, 0]), []
+                for k in range(steps):
+                    reference, memory = guidance(seen[:, k], k, memory)
+                    followed.append(reference)
+                references = torch.stack(followed, dim=1)
             return [
-                self._flight(states[i], inputs[i], references[i], noise[i], pid)
-                for i in range(rows)
+                self._flight(states[i], inputs[i], references[i], seen[i], noise[i], pid)
+                for i in range(len(feeds))
             ]
 
-    @staticmethod
-    def _replay(guidance: Reference, states: Tensor, noise: Tensor) -> Tensor:
-        """Return the references [B, T, 18] that were followed."""
-        if isinstance(guidance, GivenReference):
-            return guidance.values
-        measured = torch.cat((states[..., MOTION] + noise, states[..., ACTUATORS]), dim=-1)
-        memory, out = guidance.initial_state(states[:, 0]), []
-        for k in range(states.shape[1]):
-            reference, memory = guidance(measured[:, k], k, memory)
-            out.append(reference)
-        return torch.stack(out, dim=1)
-
     def _flight(
-        self, x: Tensor, w: Tensor, reference: Tensor, noise: Tensor, pid: MotionPID
+        self, x: Tensor, w: Tensor, reference: Tensor, seen: Tensor, noise: Tensor, pid: MotionPID
     ) -> Flight:
-        given = w[:, : self.true.commands]
-        command = self.thrusters.asked(given)
-        measured_state = torch.cat((x[:, MOTION] + noise[:, MOTION], x[:, ACTUATORS]), dim=-1)
-        error = pid.error(measured_state, reference)
-        feedback, _ = pid(
-            measured_state, reference[:, :9], (error.cumsum(0) - error) * self.loop.step
-        )
+        loop, given = self.config.loop, w[:, : self.true.commands]
+        command, desired = self.thrusters.asked(given), reference[:, :9]
+        error = pid.error(seen, reference)
+        feedback, _ = pid(seen, desired, (error.cumsum(0) - error) * loop.step)
         rate = self.true.rate(x, w)
-        metrics = tracking(
-            x[:, POSE],
-            torch.cat((x[:, VELOCITIES], rate[:, VELOCITIES]), dim=-1),
-            reference[:, :9],
-            command,
-            feedback,
-            self.loop.step,
-        )
-        every, half = slice(None, None, self.loop.every), self.loop.every // 2
+        motion = torch.cat((x[:, VELOCITIES], rate[:, VELOCITIES]), dim=-1)
+        metrics = tracking(x[:, POSE], motion, desired, command, feedback, loop.step)
+        every, half = slice(None, None, loop.every), loop.every // 2
         ends = torch.cat((command[:1].expand(half, 3), command, command[-1:].expand(half, 3)))
-        averaged = ends.unfold(0, 2 * half + 1, 1).mean(-1)
-        measured = torch.cat((x[:, MOTION], rate[:, VELOCITIES]), dim=-1) + noise
-        t = torch.arange(len(x), dtype=torch.float64) * self.loop.step
+        t = torch.arange(len(x), dtype=torch.float64) * loop.step
+        acting = self.thrusters.force(x[:, ACTUATORS], given, x[:, VELOCITIES])
+        logged = torch.cat((x[:, MOTION], rate[:, VELOCITIES]), dim=-1) + noise
         return Flight(
             t[every],
             x[every, POSE],
             x[every, VELOCITIES],
             rate[every, VELOCITIES],
-            measured[every],
+            logged[every],
             command[every],
-            averaged[every],
+            ends.unfold(0, 2 * half + 1, 1).mean(-1)[every],
             feedback[every],
-            self.thrusters.force(x[:, ACTUATORS], given, x[:, VELOCITIES])[every],
+            acting[every],
             reference[every, POSE],
             metrics,
         )
 
 
-class FerryModel(NamedTuple):
-    """A fitted model of the ferry.
-
-    Attributes:
-        model: F = F_0 + corrections.
-        lag: lag of the thrusters; None where it was not fitted.
-        fit: coefficients.
-        test_mse: mean square of the remaining residual on the test half, by axis in N^2, N^2,
-            (N m)^2; against the command, or for a model with lag against the lagged command.
-        notes: what the estimator chose.
-    """
-
-    model: ForceModel
-    lag: Lag | None
-    fit: Fit
-    test_mse: list[float]
-    notes: dict[str, Any]
-
-
-def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> FerryModel:
-    """Fit one model on the training samples and judge it on the test samples as they were logged.
+def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> FittedModel:
+    """Fit one model on the training samples.
 
     Raises:
         FitError: where the data do not determine the model.
     """
-    used = record.smoothed() if config.smooth else record
-    model, lag, fit, notes = fit_model(config, used, base)
-    return FerryModel(model, lag, fit, unseen_mse(model, lag, record), notes)
+    return fit_model(config, record.smoothed() if config.smooth else record, base)
 
 
 @dataclass(frozen=True)
@@ -627,7 +585,7 @@ class Update:
 
 
 @dataclass(frozen=True)
-class Study:
+class Flown:
     """Everything that was flown and fitted.
 
     Attributes:
@@ -645,7 +603,7 @@ class Study:
     first: Flight
     record: Record
     unmodelled: list[float]
-    models: dict[str, FerryModel]
+    models: dict[str, FittedModel]
     courses: dict[str, Flight]
     crossings: dict[str, Flight]
     alone: dict[str, Flight]
@@ -673,117 +631,101 @@ def record_of(flight: Flight, interval: float, noise: MotionNoise | None) -> Rec
     )
 
 
-def study(config: FerryStudyConfig) -> Study:
+def study(config: FerryStudyConfig) -> Flown:
     """Fly with the believed model, identify residual models, and fly with these.
 
     Raises:
         ResidnetError: where a model cannot be identified or flown.
     """
-    ferry = config.ferry()
-    believed = ForceModel(ferry.believed.hull)
-    first = ferry.fly_course(config.course, [(believed, None)])[0]
+    ferry = Ferry(config)
+    believed = ForceModel(ferry.believed)
+    first = ferry.fly(config.course, [(believed, None)])[0]
     record = record_of(first, config.course.interval, config.noise)
     residual = believed.residual(record.command, record.nu_dot, record.nu, record.pose[:, HEADING])
-    models: dict[str, FerryModel] = {}
-    for name, model_config in config.models.items():
-        base = models[model_config.on].model if model_config.on else believed
-        models[name] = identify(model_config, record, base)
-    flown: dict[str, tuple[ForceModel, Lag | None]] = {
-        name: (fitted.model, fitted.lag)
-        for name, fitted in models.items()
-        if config.models[name].fly
-    }
-    every = {_BELIEVED: (believed, None), **flown}
+    models: dict[str, FittedModel] = {}
+    for name, model in config.models.items():
+        models[name] = identify(model, record, models[model.on].force if model.on else believed)
+    flying = {name: models[name] for name, model in config.models.items() if model.fly}
+    every: dict[str, Feed] = {_BELIEVED: (believed, None)}
+    every |= {name: (model.force, model.lag) for name, model in flying.items()}
 
-    def named(flights: Sequence[Flight]) -> dict[str, Flight]:
-        return dict(zip(list(every)[-len(flights) :], flights, strict=True))
+    def flown(
+        craft: Ferry,
+        path: ReferenceFilterConfig | CrossingConfig,
+        names: Iterable[str],
+        **how: bool,
+    ) -> dict[str, Flight]:
+        feeds = {name: every[name] for name in names}
+        if not feeds:
+            return {}
+        return dict(zip(feeds, craft.fly(path, list(feeds.values()), **how), strict=True))
 
-    courses, crossings, alone = {_BELIEVED: first}, {}, {}
-    if flown:
-        courses |= named(ferry.fly_course(config.course, list(flown.values())))
-    if config.feed_forward_alone:
-        open_loop = ferry.without_feedback()
-        alone = named(open_loop.fly_course(config.course, list(every.values())))
-    if config.crossing is not None:
-        crossings = named(ferry.fly_crossing(config.crossing, list(every.values())))
-    later = update(config, models, record, believed) if config.later is not None else {}
-    return Study(
-        first, record, mse(residual[~record.train]), models, courses, crossings, alone, later
-    )
-
-
-def update(
-    config: FerryStudyConfig, models: dict[str, FerryModel], record: Record, believed: ForceModel
-) -> dict[str, Update]:
-    """Fly the changed vessel with each model, and identify again those that no longer fit.
-
-    Args:
-        config: the study, which names the changed vessel.
-        models: fitted models; those that fly are taken.
-        record: the log that they were identified from.
-        believed: the model of the controller.
-    """
-    ferry = config.ferry(config.later)
-    known = {name: model for name, model in models.items() if config.models[name].fly}
-    flights = ferry.fly_course(
-        config.course, [(model.model, model.lag) for model in known.values()]
-    )
-    out: dict[str, Update] = {}
-    for (name, model), flight in zip(known.items(), flights, strict=True):
-        log = record_of(flight, config.course.interval, config.noise)
-        before = remaining(model.model, model.lag, record)[~record.train]
-        now = remaining(model.model, model.lag, log)
-        verdict = still_fits(config.check_fit, before, now, log.command, log.fold)
-        out[name] = Update(verdict, flight, flight)
-        if not verdict.fits:
-            again = identify(config.models[name], log, believed)
-            out[name] = Update(
-                verdict, flight, ferry.fly_course(config.course, [(again.model, again.lag)])[0]
+    later: dict[str, Update] = {}
+    if config.later is not None:
+        changed = Ferry(config, config.later)
+        for name, flight in flown(changed, config.course, flying).items():
+            log = record_of(flight, config.course.interval, config.noise)
+            before, now = (flying[name].remaining(of) for of in (record, log))
+            verdict = still_fits(
+                config.check_fit, before[~record.train], now, log.command, log.fold
             )
-    return out
+            after = flight
+            if not verdict.fits:
+                again = identify(config.models[name], log, believed)
+                after = changed.fly(config.course, [(again.force, again.lag)])[0]
+            later[name] = Update(verdict, flight, after)
+    return Flown(
+        first,
+        record,
+        mse(residual[~record.train]),
+        models,
+        {_BELIEVED: first, **flown(ferry, config.course, flying)},
+        flown(ferry, config.crossing, every) if config.crossing is not None else {},
+        flown(ferry, config.course, every, feedback=False) if config.feed_forward_alone else {},
+        later,
+    )
 
 
 def forward_runs(
-    config: ForwardRunsConfig, true: str, believed: str, models: Mapping[str, HullEquations]
+    config: FerryStudyConfig, models: Mapping[str, HullEquations]
 ) -> dict[str, dict[str, Any]]:
     """Run models forward in time from the commanded forces of the true ferry's manoeuvres.
 
     Args:
-        config: the manoeuvres.
-        true: vessel that flies them.
-        believed: vessel of the known hull, which stands beside the models.
-        models: equations of motion by name.
+        config: the study, with its manoeuvres.
+        models: equations of motion by name, beside which stand those of the known hull.
 
     Returns:
         By model, `believed` first: `rmse` of u, v, r in m/s, m/s, rad/s over the runs that did not
         diverge (None without any), `runs`, and `diverged`, how many of them did.
     """
+    forward = config.forward
+    given = forward.model_dump(include={"duration", "step", "seed"})
     trials = SimulatedTrials(
-        vessel=true,
-        trials=config.trials,
-        duration=config.duration,
-        step=config.step,
-        identification={},
-        validation={},
-        seed=config.seed,
+        vessel=config.true, trials=forward.trials, identification={}, validation={}, **given
     )
-    flown = [flight.motion for flight in fly_trials(trials.draw(), trials)]
-    thrusters, longest = force_hull(true)[1], max(map(len, flown))
+    logs = [flight.motion for flight in fly_trials(trials.draw(), trials)]
     # one that ended early shows no free run
-    complete = [log for log in flown if len(log) == longest]
-    x, w = (
-        torch.stack(part)
-        for part in zip(*(_columns(log, thrusters) for log in complete), strict=True)
+    logs = [log for log in logs if len(log) == max(map(len, logs))]
+    thrusters = force_hull(config.true)[1]
+    x, commands = (
+        torch.from_numpy(
+            np.stack([np.stack([log.channels[name] for name in names], 1) for log in logs])
+        )
+        for names in (STATE, thrusters.commands)
     )
+    w = thrusters.asked(commands)[:, :-1]
     limit = _FARTHEST * x[..., VELOCITIES].abs().amax(dim=(0, 1))
-    known = BelievedConfig(vessel=believed).equations()
-    out = {}
-    for name, equations in {"believed": known, **models}.items():
-        ran = _run(equations, x[:, 0], w[:, :-1], config.step)
-        error = (ran - x)[..., VELOCITIES]
-        finite = torch.isfinite(ran).all(dim=-1)
-        away = (~finite | (ran[..., VELOCITIES].abs() > limit).any(dim=-1)).any(dim=-1)
-        kept = error[~away]
+    known = BelievedConfig(vessel=config.believed).equations()
+    signals, out = SignalsConfig(inputs=FORCE_CHANNELS).build(), {}
+    for name, equations in {_BELIEVED: known, **models}.items():
+        baseline = BelievedConfig(vessel=equations).build(signals.names)
+        model = HybridDynamics(signals, baseline, ZeroHead(), forward.step).double()
+        with torch.no_grad():
+            ran = Rollout(model)(x[:, 0], w, x[:, 0, :0])[0]
+        beyond = (ran[..., VELOCITIES].abs() > limit).any(dim=-1)
+        away = (~torch.isfinite(ran).all(dim=-1) | beyond).any(dim=-1)
+        kept = (ran - x)[~away][..., VELOCITIES]
         out[name] = {
             "rmse": kept.square().mean(dim=(0, 1)).sqrt().tolist() if len(kept) else None,
             "runs": len(x),
@@ -792,109 +734,66 @@ def forward_runs(
     return out
 
 
-def why_refused(name: str, row: Mapping[str, Any]) -> str:
-    """Return why a model is refused to run forward; empty where it is not."""
-    if not row["diverged"]:
-        return ""
-    return (
-        f"model {name}: it diverges in {row['diverged']} of {row['runs']} free runs beside the true"
-        " ferry, so its equations are not written; take a model with fewer terms or with lag"
-    )
+def written(
+    config: FerryStudyConfig, found: Flown, folder: RunFolder
+) -> tuple[dict[str, Any], list[Figure]]:
+    """Return the contents of ferry.json and the figures of a study.
 
-
-def _columns(log: Log, thrusters: ForceActuators) -> tuple[Tensor, Tensor]:
-    """Return states [T, 6] and the forces [T, 3] that the commands ask for."""
-    states, commands = (
-        torch.from_numpy(np.stack([log.channels[name] for name in names], axis=1))
-        for names in (STATE, thrusters.commands)
-    )
-    return states, thrusters.asked(commands)
-
-
-def _run(equations: HullEquations, x0: Tensor, w: Tensor, step: float) -> Tensor:
-    """Return the states [B, T, 6] of a free run from x0 [B, 6] under forces w [B, T - 1, 3]."""
-    signals = SignalsConfig(inputs=FORCE_CHANNELS).build()
-    baseline = BelievedConfig(vessel=equations).build(signals.names)
-    model = HybridDynamics(signals, baseline, ZeroHead(), step).double()
-    with torch.no_grad():
-        states: Tensor = Rollout(model)(x0, w, x0[:, :0])[0]
-    return states
-
-
-def write_results(config: FerryStudyConfig, found: Study, folder: RunFolder) -> dict[str, Any]:
-    """Write ferry.json, the models' equations and feed-forwards, and figures.
-
-    Returns:
-        The contents of ferry.json.
+    The models' equations and feed-forwards are written into the folder.
     """
     # the range of what identified the models, not of the whole course
     motion = torch.cat((found.record.nu_dot, found.record.nu), dim=-1)[found.record.train]
     ranges = list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True))
     figures: list[Figure] = []
-    for name, model in found.models.items():
-        figures += model_figures(name, config.models[name], model.fit, found.unmodelled)
-        force = RequiredForce(*model.model.parts(), mirrored=True)
-        file = folder.exports / f"{name}_feed_forward.pt"
-        exported = ExportedForce(name, force, ranges, model.notes.get("lag"))
-        TorchScriptExporter().export(exported, file)
-    forward, not_forward = _run_forward(config, found, folder)
-    results = _content(config, found, not_forward) | {"forward": forward}
-    folder.write_json(folder.path / FILE, results)
-    for kind, flights in (
-        ("course", found.courses),
-        ("crossing", found.crossings),
-        ("feed_forward_alone", found.alone),
-    ):
-        if flights:
-            figures += _flights(flights, kind)
-    for figure in figures:
-        write_figure(folder.figures, figure)
-    return results
-
-
-def _run_forward(
-    config: FerryStudyConfig, found: Study, folder: RunFolder
-) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     equations: dict[str, HullEquations] = {}
     refused = dict.fromkeys(found.models, "")
     for name, model in found.models.items():
+        figures += model_figures(name, config.models[name], model.fit, found.unmodelled)
+        force = RequiredForce(*model.force.parts(), mirrored=True)
+        exported = ExportedForce(name, force, ranges, model.fit.notes.get("lag"))
+        TorchScriptExporter().export(exported, folder.exports / f"{name}_feed_forward.pt")
         try:
-            equations[name] = forward_equations(config.believed, model.model, f"model {name}")
+            equations[name] = forward_equations(config.believed, model.force, f"model {name}")
         except (ConfigError, FitError) as error:
             refused[name] = str(error)
-    rows = forward_runs(config.forward, config.true, config.believed, equations)
-    for name, model_equations in equations.items():
-        refused[name] = why_refused(name, rows[name])
-        if not refused[name]:
-            folder.write(
-                folder.path / "models" / f"{name}_forward.yaml",
-                as_baseline_yaml(model_equations, f"run {config.name}, model {name}"),
+    forward = forward_runs(config, equations)
+    for name, of_model in equations.items():
+        if forward[name]["diverged"]:
+            refused[name] = (
+                f"model {name}: it diverges in {forward[name]['diverged']} of"
+                f" {forward[name]['runs']} free runs beside the true ferry, so its equations are"
+                " not written; take a model with fewer terms or with lag"
             )
-    return rows, refused
-
-
-def _content(
-    config: FerryStudyConfig, found: Study, not_forward: Mapping[str, str]
-) -> dict[str, Any]:
-    models = {
-        name: {
-            "test_mse": model.test_mse,
-            "share_left": [a / b for a, b in zip(model.test_mse, found.unmodelled, strict=True)],
-            "notes": model.notes,
-            "not_forward": not_forward[name],
+        else:
+            text = as_baseline_yaml(of_model, f"run {config.name}, model {name}")
+            folder.write(folder.path / "models" / f"{name}_forward.yaml", text)
+    models = {}
+    for name, model in found.models.items():
+        left = model.test_mse(found.record)
+        models[name] = {
+            "test_mse": left,
+            "share_left": [a / b for a, b in zip(left, found.unmodelled, strict=True)],
+            "notes": model.fit.notes,
+            "not_forward": refused[name],
             **fit_as_json(config.models[name].terms, model.fit),
         }
-        for name, model in found.models.items()
+    flights = {
+        "course": found.courses,
+        "crossing": found.crossings,
+        "feed_forward_alone": found.alone,
     }
-    return {
+    for kind, flown in flights.items():
+        figures += _flights(flown, kind) if flown else []
+    content = {
         "schema": "residnet.ferry/1",
         "run": config.name,
         "unmodelled_test_mse": found.unmodelled,
         "true_coefficients": missing_coefficients(config.true, config.believed),
         "models": models,
-        "course": {name: flight.tracking.row() for name, flight in found.courses.items()},
-        "crossing": {name: flight.tracking.row() for name, flight in found.crossings.items()},
-        "feed_forward_alone": {name: flight.tracking.row() for name, flight in found.alone.items()},
+        **{
+            kind: {name: flight.tracking.row() for name, flight in flown.items()}
+            for kind, flown in flights.items()
+        },
         "later": {
             name: {
                 "verdict": asdict(update.verdict),
@@ -904,7 +803,9 @@ def _content(
             }
             for name, update in found.later.items()
         },
+        "forward": forward,
     }
+    return content, figures
 
 
 def _flights(flights: Mapping[str, Flight], kind: str) -> list[Figure]:
@@ -964,195 +865,106 @@ def _flights(flights: Mapping[str, Flight], kind: str) -> list[Figure]:
     return [errors, forces]
 
 
-def verdict(results: Results) -> list[str]:
-    """Return the sentences that sum a ferry study up."""
-    models = results["models"]
-    best = _best_model(results)
-    left = joined([100 * share for share in models[best]["share_left"]])
-    sentences = [
-        f"Of {len(models)} residual models, {best} leaves the least of the residual force on the"
-        f" unseen half of the course: {left} % of its mean square in surge, sway and yaw."
-    ]
-    for kind in ("course", "crossing"):
-        flights = results[kind]
-        flown = [name for name in flights if name != _BELIEVED]
-        if flown:
-            nearest = min(flown, key=lambda name: float(flights[name]["position_mae"]))
-            before, after = (flights[name]["position_mae"] for name in (_BELIEVED, nearest))
-            moves = "falls" if after < before else "does NOT fall: it goes"
-            sentences.append(
-                f"With {nearest} as feed-forward, the mean position error in the {kind} {moves}"
-                f" from {number(before)} m to {number(after)} m."
-            )
-    for name, update in results["later"].items():
-        sentences.append(f"On the vessel as it is later, {name} {update['text']}.")
-    return sentences
-
-
-def _best_model(results: Results) -> str:
+def best_model(results: Results) -> str:
+    """Return the model that leaves the least of the residual."""
     models: Results = results["models"]
     return min(models, key=lambda name: float(sum(models[name]["share_left"])))
-
-
-def sections(config: FerryStudyConfig, results: Results, run: Path) -> list[Section]:
-    """Return the sections of the report, with the document's figures beside ours."""
-    models = results["models"]
-    blocks: list[Block]
-    out = [Section("Residual force on the unseen half", [_residuals(config, results)])]
-    for kind, title in (("course", "Course in closed loop"), ("crossing", "Operational crossing")):
-        if results[kind]:
-            blocks = [
-                *_tracking(config, results[kind], kind),
-                *pictures(run, f"errors_{kind}", f"forces_{kind}"),
-            ]
-            out.append(Section(title, blocks))
-    if results["feed_forward_alone"]:
-        flights = results["feed_forward_alone"]
-        blocks = [
-            _alone(config, flights),
-            *_tracking(config, flights, "alone"),
-            *pictures(run, "errors_feed_forward_alone"),
-        ]
-        out.append(Section("Feed-forward without feedback", blocks))
-    if results["later"]:
-        out.append(Section("The vessel as it is later", [_later(results["later"])]))
-    out.append(Section("Forward in time", [_forward(results["forward"])]))
-    if causes := [model["not_forward"] for model in models.values() if model["not_forward"]]:
-        out.append(Section("Models that cannot run forward in time", [Bullets(causes)]))
-    # Table 4.11
-    coefficients = [
-        coefficients_section(
-            name,
-            model,
-            model["notes"],
-            {
-                "true": {} if config.models[name].on else results["true_coefficients"],
-                "published": config.models[name].published.coefficients,
-            },
-        )
-        for name, model in models.items()
-    ]
-    out.append(Section("Coefficients", [Text(ABOUT_COEFFICIENTS), *coefficients]))
-    return [*out, Section("Orders, weights and surfaces", pictures(run, *MODEL_PICTURES), True)]
 
 
 def _residuals(config: FerryStudyConfig, results: Results) -> Table:
     """Return the table of the remaining residual (Tables 4.2, 4.5, 4.7 and 4.15)."""
     unmodelled, base = results["unmodelled_test_mse"], config.published.mse
-
-    def mean(axis: int) -> Any:
-        return lambda row: beside_published(row[1][axis], row[2][axis] if row[2] else None)
-
-    def left(axis: int) -> Any:
-        def cell(row: Any) -> Cell:
-            printed = 100 * row[2][axis] / base[axis] if row[2] and base else None
-            return beside_published(100 * row[1][axis] / unmodelled[axis], printed, 3)
-
-        return cell
-
-    rows: list[Any] = [(_BELIEVED, unmodelled, base, "")]
-    rows += [
-        (name, model["test_mse"], config.models[name].published.mse, notes_text(model["notes"]))
-        for name, model in results["models"].items()
-    ]
-    units = ("surge N^2", "sway N^2", "yaw (N m)^2")
+    rows = []
+    first = {"test_mse": unmodelled, "notes": {}}
+    for name, model in {_BELIEVED: first, **results["models"]}.items():
+        given = config.published if name == _BELIEVED else config.models[name].published
+        both = {"ours": (model["test_mse"], unmodelled), "published": (given.mse, base)}
+        left = {
+            who: [100 * a / b for a, b in zip(mine, of, strict=True)] if mine and of else None
+            for who, (mine, of) in both.items()
+        }
+        rows.append(
+            {
+                "name": name,
+                "mse": model["test_mse"],
+                "left": left["ours"],
+                "published": {"mse": given.mse, "left": left["published"]},
+                "notes": notes_text(model["notes"]),
+            }
+        )
     return table_of(
         rows,
         [
-            ("model", lambda row: row[0]),
-            *((unit, mean(axis)) for axis, unit in enumerate(units)),
-            *((name, left(axis)) for axis, name in enumerate(AXES)),
-            ("chosen by the estimator", lambda row: row[3]),
+            ("model", "name"),
+            *compared("mse", ("surge N^2", "sway N^2", "yaw (N m)^2")),
+            *compared("left", AXES, 3),
+            ("chosen by the estimator", "notes"),
         ],
         caption="Mean square of the residual, and what is left of the believed model's.",
         groups=[("mean square", 3), ("left %", 3), ("", 1)],
     )
 
 
-def _published(config: FerryStudyConfig, name: str) -> Published:
-    return config.published if name == _BELIEVED else config.models[name].published
-
-
-def _tracking(config: FerryStudyConfig, flights: Mapping[str, Results], kind: str) -> list[Table]:
+def _flown(config: FerryStudyConfig, flights: Mapping[str, Results], kind: str) -> list[Block]:
     """Return how well a course is followed and with which forces.
 
-    Tables 4.4, 4.10, 4.12 and 4.13 of the document; Tables 4.3 and 4.9.
+    Tables 4.4, 4.8, 4.10, 4.12 and 4.13 of the document; Tables 4.3 and 4.9.
     """
-    errors = Table(
-        [
-            "feed-forward",
-            *("mean position error m", "mean square m^2", "mean heading error deg"),
-            *("power, position W", "power, heading W"),
-            *("IAEW, position m s J", "IAEW, heading rad s J"),
-        ],
-        caption="IAEW is the integral of the error times the work (3.18).",
-    )
-    forces = Table(
-        ["feed-forward", *("surge N", "sway N", "yaw N m") * 2],
-        groups=[("mean absolute force", 3), ("mean absolute feedback", 3)],
-    )
+    rows = []
     for name, metrics in flights.items():
-        printed = _of_kind(_published(config, name), kind)
-        errors.add(
-            name,
-            [
-                beside_published(metrics["position_mae"], printed.position_mae),
-                beside_published(metrics["position_mse"], printed.position_mse),
-                beside_published(metrics["heading_mae"] * DEG, printed.heading_mae),
-                *_each(metrics["power"], printed.crossing_power),
-                *_each(metrics["iaew"], None),
-            ],
-        )
-        tau = _each(metrics["tau"], printed.tau)
-        forces.add(name, [*tau, *_each(metrics["feedback"], printed.feedback)])
-    return [errors, forces]
-
-
-def _each(values: Sequence[float], published: Sequence[float] | None) -> list[Cell]:
-    printed = [None] * len(values) if published is None else published
-    return [beside_published(a, b) for a, b in zip(values, printed, strict=True)]
-
-
-def _of_kind(published: Published, kind: str) -> Published:
-    if kind == "course":
-        return published.model_copy(update={"crossing_power": None})
-    if kind == "crossing":
-        return Published(
-            position_mae=published.crossing_position_mae,
-            position_mse=published.crossing_position_mse,
-            heading_mae=published.crossing_heading_mae,
-            crossing_power=published.crossing_power,
-        )
-    return Published()
-
-
-def _alone(config: FerryStudyConfig, flights: Mapping[str, Results]) -> Table:
-    """Return the table of velocities and accelerations without feedback (Table 4.8)."""
-    table = Table(
-        ["feed-forward", "u", "v", "r", "u_dot", "v_dot", "r_dot"],
+        given = config.published if name == _BELIEVED else config.models[name].published
+        printed = given.model_dump()
+        if kind == "crossing":
+            crossing = {key.partition("crossing_")[2]: value for key, value in printed.items()}
+            printed = {key: value for key, value in crossing.items() if key}
+        elif kind == "feed_forward_alone":
+            printed = {"motion_mse": given.alone}
+        rows.append({"name": name, **metrics, "published": printed})
+    first = ("feed-forward", "name")
+    alone = table_of(
+        rows,
+        [first, *compared("motion_mse", ("u", "v", "r", "u_dot", "v_dot", "r_dot"))],
         caption="Mean square error against the desired motion without feedback, in (m/s)^2,"
         " (m/s)^2, (rad/s)^2, and the same per second squared.",
     )
-    for name, metrics in flights.items():
-        table.add(name, _each(metrics["motion_mse"], _published(config, name).alone))
-    return table
+    errors = table_of(
+        rows,
+        [
+            first,
+            *compared("position_mae", "mean position error m"),
+            *compared("position_mse", "mean square m^2"),
+            *compared("heading_mae", "mean heading error deg", factor=DEG),
+            *compared("power", ("power, position W", "power, heading W")),
+            *compared("iaew", ("IAEW, position m s J", "IAEW, heading rad s J")),
+        ],
+        caption="IAEW is the integral of the error times the work (3.18).",
+    )
+    units = ("surge N", "sway N", "yaw N m")
+    forces = table_of(
+        rows,
+        [first, *compared("tau", units), *compared("feedback", units)],
+        groups=[("mean absolute force", 3), ("mean absolute feedback", 3)],
+    )
+    return [*([alone] if kind == "feed_forward_alone" else []), errors, forces]
 
 
 def _forward(rows: Mapping[str, Results]) -> Table:
     """Return the table of free runs beside manoeuvres of the true ferry (3.22)."""
-
-    def rms(axis: int, factor: float) -> Any:
-        return lambda row: Cell(
-            "-" if row[1]["rmse"] is None else number(factor * row[1]["rmse"][axis])
-        )
-
-    units = (("u m/s", 1.0), ("v m/s", 1.0), ("r deg/s", DEG))
+    shown = [
+        {
+            "name": name,
+            **row,
+            "rmse": row["rmse"] and [*row["rmse"][:2], DEG * row["rmse"][2]],
+            "published": {},
+        }
+        for name, row in rows.items()
+    ]
     return table_of(
-        rows.items(),
+        shown,
         [
-            ("model", lambda row: row[0]),
-            *((unit, rms(axis, factor)) for axis, (unit, factor) in enumerate(units)),
-            ("diverged", lambda row: Cell(f"{row[1]['diverged']} of {row[1]['runs']}")),
+            ("model", "name"),
+            *compared("rmse", ("u m/s", "v m/s", "r deg/s"), 3),
+            ("diverged", lambda row: Cell(f"{row['diverged']} of {row['runs']}")),
         ],
         caption="Root mean square errors of free runs from the commanded forces, over the runs that"
         " did not diverge. A model that explains the force may still be no model of motion.",
@@ -1162,16 +974,16 @@ def _forward(rows: Mapping[str, Results]) -> Table:
 def _later(later: Mapping[str, Results]) -> Table:
     """Return the table of models on the changed vessel (section 3.7)."""
 
-    def error(when: str) -> Any:
-        return lambda row: Cell(number(row[1][when]["position_mae"], 4))
+    def short(value: float) -> str:
+        return number(value, 4)
 
     return table_of(
-        later.items(),
+        [{"name": name, **row} for name, row in later.items()],
         [
-            ("model", lambda row: row[0]),
-            ("mean position error m", error("before")),
-            ("after the update m", error("after")),
-            ("on the new log", lambda row: row[1]["text"]),
+            ("model", "name"),
+            ("mean position error m", "before.position_mae", short),
+            ("after the update m", "after.position_mae", short),
+            ("on the new log", "text"),
         ],
         caption="A model that no longer fits is identified again from the log of one course.",
     )

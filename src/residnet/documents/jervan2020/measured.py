@@ -6,38 +6,44 @@ alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, final
+from typing import Any, ClassVar, Literal, NamedTuple, final
 
 import numpy as np
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.core.config import Config, ConfigPath, Seconds, load_config
+from residnet.core.config import Config, ConfigPath, Seconds
 from residnet.core.errors import ConfigError, DataError, FitError
-from residnet.core.files import read_json
 from residnet.core.layout import ACCELERATIONS, HEADING, PLANAR, POSE, VELOCITIES
 from residnet.core.stretches import stretches
-from residnet.data.prepare import PrepareConfig, Prepared, prepare
+from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers import ReaderConfig
 from residnet.data.split import check_leaks, log_names, matches
-from residnet.documents.cells import beside_published, listed, notes_text, pictures
 from residnet.documents.jervan2020.residual import (
-    ABOUT_COEFFICIENTS,
     AXES,
-    MODEL_PICTURES,
     Fit,
+    Name,
     Record,
     ResidualModelConfig,
     SurfaceRegression,
-    coefficients_section,
     fit_as_json,
     fit_model,
     forward_equations,
     model_figures,
+    model_sections,
+)
+from residnet.documents.study import (
+    Results,
+    Study,
+    compared,
+    histories,
+    listed,
+    notes_text,
+    pictures,
 )
 from residnet.judge.metrics import Blocks, blocks, intervals
 from residnet.physics.force_model import ForceModel
@@ -58,27 +64,25 @@ from residnet.report.figure import (
     Panel,
     names_of,
     whiskers,
-    write_figure,
 )
 from residnet.report.format import fixed, interval, number, plural, signed
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, MainFigure, Outcome
+from residnet.runs.task import ComputingTask, MainFigure
 from residnet.training.lag import fit_lag, followed
 
-FILE = "force_residual.json"
-Results = Mapping[str, Any]
-_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 _Channels = tuple[str, str, str]
-_NULLS = ("zero", "believed")
-"""What needs no regression: no force at all, and the believed hull alone."""
+_NULLS = {"zero": "no force at all", "believed": "the believed model alone"}
+"""What needs no regression."""
 _LOGS_FOR_FOLDS = 3
 """Number of logs from which on whole logs are left out instead of stretches of time."""
 _LOGS_FOR_INTERVALS = 5
 """Number of logs from which on intervals resample logs instead of segments."""
 _LEAST_SEGMENTS = 5
 """Least number of segments for intervals."""
-_FORCE_UNITS = ("surge [N]", "sway [N]", "yaw [N m]")
-_ACCELERATION_UNITS = ("surge [m/s²]", "sway [m/s²]", "yaw [rad/s²]")
+_FORCE_UNITS = tuple((label, 1.0) for label in ("surge [N]", "sway [N]", "yaw [N m]"))
+_ACCELERATION_UNITS = tuple(
+    (label, 1.0) for label in ("surge [m/s²]", "sway [m/s²]", "yaw [rad/s²]")
+)
 
 
 class ForceLogs(Config):
@@ -120,10 +124,6 @@ class ForceChannels(Config):
     commanded: _Channels
     acceleration: _Channels | None = None
 
-    def columns(self) -> tuple[str, ...]:
-        """Return all channels: commanded, actual and measured acceleration."""
-        return (*self.commanded, *self.actual, *(self.acceleration or ()))
-
 
 class FoldsConfig(Config):
     """Cross-validation in which no model is fitted to data near what it predicts.
@@ -153,6 +153,15 @@ class MeasuredModelConfig(ResidualModelConfig):
     force: Literal["actual", "commanded"] = "actual"
     published: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 
+    @property
+    def judged_on(self) -> Literal["actual", "commanded"]:
+        """The force that judges the model.
+
+        A lag alone could make the residual of a command small: a model with lag is judged on the
+        actual force.
+        """
+        return "actual" if self.lag else self.force
+
     @model_validator(mode="after")
     def _combination(self) -> MeasuredModelConfig:
         if self.lag and self.force != "commanded":
@@ -168,7 +177,7 @@ class MeasuredModelConfig(ResidualModelConfig):
 
 
 @final
-class ForceResidualConfig(ComputingTask):
+class ForceResidualConfig(Study, ComputingTask):
     """Regressions of the residual force of a believed hull on measured logs, cross-validated.
 
     Attributes:
@@ -184,6 +193,8 @@ class ForceResidualConfig(ComputingTask):
         models: regressions by name.
     """
 
+    results_file: ClassVar[str] = "force_residual.json"
+
     task: Literal["force_residual"]
     believed: str
     data: ForceLogs
@@ -191,11 +202,11 @@ class ForceResidualConfig(ComputingTask):
     channels: ForceChannels
     acceleration: Literal["velocity", "measured"] = "velocity"
     validation: FoldsConfig = FoldsConfig()
-    models: dict[_Name, MeasuredModelConfig] = Field(min_length=1)
+    models: dict[Name, MeasuredModelConfig] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _combination(self) -> ForceResidualConfig:
-        if taken := sorted({"zero", "believed"} & set(self.models)):
+        if taken := sorted(set(_NULLS) & set(self.models)):
             raise ValueError(f"'{taken[0]}' cannot name a model: it stands beside all of them")
         if self.acceleration == "measured" and self.channels.acceleration is None:
             raise ValueError("acceleration: 'measured' needs channels.acceleration")
@@ -237,20 +248,64 @@ class ForceResidualConfig(ComputingTask):
     def input_files(self) -> Sequence[Path]:
         return self.data.files()
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
-        results = write_results(self, force_study(self), folder)
+    def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        return written(self, force_study(self))
+
+    def main_figures(self, results: Results) -> dict[str, MainFigure]:
         figures: dict[str, MainFigure] = {}
         for force, rows in _groups(results).items():
-            believed = next(row for row in rows if row["model"] == "believed")
-            for row in (believed, min(rows, key=lambda row: sum(row["of_zero"]))):
+            best = min(rows.values(), key=lambda row: sum(row["of_zero"]))
+            for row in (rows["believed"], best):
                 name = f"share of the {force} force left by {row['model']}"
                 figures[name] = MainFigure(sum(row["of_zero"]) / 3)
-        return Outcome(verdict(results), figures)
+        return figures
 
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        config = load_config(run.resolved, [], cls)
-        return sections(config, read_json(run.path / FILE), run.path)
+    def verdict(self, results: Results) -> list[str]:
+        """Return the sentences that say for each force whether a regression gained anything."""
+        sentences: list[str] = []
+        for force, rows in _groups(results).items():
+            if results["intervals"] is None:
+                sentences.append(
+                    f"{force.capitalize()} force: there are too few segments to say whether one"
+                    " model is better than another."
+                )
+                continue
+            believed = rows["believed"]
+            bounds = believed["minus_zero"]["ci95"][:3]
+            worse = [axis for axis, limits in zip(AXES, bounds, strict=True) if limits[0] > 0]
+            sentences.append(
+                f"{force.capitalize()} force: the believed model is better than no force"
+                f" {_where(better(believed, 'zero'))}"
+                + (f", and worse than no force in {listed(worse)}." if worse else ".")
+            )
+            sentences += _gains([row for name, row in rows.items() if name not in _NULLS])
+        thrusters = results["forces"]["lag"]
+        lags = {name: model["all"].get("lag") for name, model in results["models"].items()}
+        each = [
+            f"{number(lag['frequency'])} rad/s and {number(lag['delay'], 2)} s for {name}"
+            for name, lag in lags.items()
+            if lag
+        ]
+        if each and not isinstance(thrusters, str):
+            sentences.append(
+                f"The lag fitted together with the residual is {listed(each)}; the actual forces"
+                f" follow the commands with {number(thrusters['frequency'])} rad/s and"
+                f" {number(thrusters['delay'], 2)} s."
+            )
+        return sentences
+
+    def sections(self, results: Results, run: Path) -> list[Section]:
+        out = [_data(self, results), _forces(results, run)]
+        if results["acceleration"]:
+            out.append(_accelerations(self, results, run))
+        for force, rows in _groups(results).items():
+            out.append(Section(f"Residual of the {force} force", [_models(self, results, rows)]))
+        out.append(Section("Errors and residuals", pictures(run, "scores", "residual_")))
+        if results["failed"]:
+            causes = list(results["failed"].values())
+            out.append(Section("Not determined by these logs", [Bullets(causes)]))
+        title = "Coefficients of models fitted to all samples"
+        return out + model_sections(title, results["models"], run, "all", {})
 
 
 @dataclass(frozen=True)
@@ -297,23 +352,19 @@ class Measured:
             DataError: where either has no samples.
         """
         inside_fold = self.part == part
-        near = inside_fold.clone()
         reach = round(gap / self.record.dt)
-        start = 0
-        for length in self.record.runs:
-            flags = inside_fold[start : start + length].to(torch.float64)[None, None]
-            near[start : start + length] = (
-                torch.nn.functional.max_pool1d(flags, 2 * reach + 1, 1, reach)[0, 0] > 0
-            )
-            start += length
+        flags = inside_fold.to(torch.float64)[None, None].split(list(self.record.runs), dim=-1)
+        near = torch.cat(
+            [torch.nn.functional.max_pool1d(of, 2 * reach + 1, 1, reach)[0, 0] > 0 for of in flags]
+        )
         train, test = self.good & ~near, self.good & inside_fold
-        for name, samples in (
+        for what, samples in (
             ("nothing left to fit to beside", train),
             ("no sample to judge on in", test),
         ):
             if not bool(samples.any()):
                 raise DataError(
-                    f"validation: {name} fold {part + 1}; check the masks, or lower"
+                    f"validation: {what} fold {part + 1}; check the masks, or lower"
                     " validation.folds or validation.gap"
                 )
         return replace(self.record, train=train), test
@@ -355,33 +406,53 @@ def read_measured(config: ForceResidualConfig) -> Measured:
     """
     import pandas as pd
 
-    logs = _read(config)
-    joined = {
-        name: torch.from_numpy(np.concatenate([getattr(log, name) for log in logs]))
-        for name in ("smooth", "nu_dot", "recorded", "good")
-    }
-    good, columns = joined["good"], joined["recorded"]
-    derived, fold = joined["nu_dot"], _segments(logs, config)
-    sensed = columns[:, ACCELERATIONS] if config.channels.acceleration is not None else None
-    acceleration: dict[str, Any] = {}
-    nu_dot = derived
-    if sensed is not None:
-        acceleration = compare_accelerations(derived[good], sensed[good], fold[good])
-        nu_dot = (
-            _calibrated(logs, derived, sensed) if config.acceleration == "measured" else derived
-        )
-    part, parts = _parts(logs, config.validation)
-    step, count = config.prepare.grid.step, len(fold)
-    smooth = joined["smooth"]
-    # commands hold their last value over gaps, and are zero before the first
-    command = torch.cat(
-        [
-            torch.from_numpy(np.array(pd.DataFrame(part).ffill().fillna(0.0)))
-            for part in (log.recorded[:, : PLANAR.dof] for log in logs)
-        ]
+    reader, channels = config.data.reader.build(), config.channels
+    paths = log_names(config.data.files())
+    recorded = [reader.read(path).replace(name=name) for path, name in paths.items()]
+    # a model would be fitted to the very samples that judge it
+    check_leaks({log.name: [log] for log in recorded})
+    columns = (*channels.commanded, *channels.actual, *(channels.acceleration or ()))
+    logs = [prepare(log, "all", columns, config.prepare) for log in recorded]
+    names, lengths = [log.log.name for log in logs], [len(log) for log in logs]
+    step, validation = config.prepare.grid.step, config.validation
+    # whole logs are folds where there are enough; no segment reaches across logs
+    of_logs = len(logs) >= _LOGS_FOR_FOLDS
+    parts, segments, commands, masked, count = [], [], [], {}, 0
+    for place, (log, name, length) in enumerate(zip(logs, names, lengths, strict=True)):
+        if not log.good.any():
+            raise DataError(
+                f"log {name}: no stretch is as long as the derivative's window; leave it out or"
+                " shorten prepare.derivative"
+            )
+        at = torch.arange(length)
+        folds = min(validation.folds, len(logs)) if of_logs else validation.folds
+        parts.append(0 * at + place * folds // len(logs) if of_logs else at * folds // length)
+        of_log = max(round(length * step / validation.segment), 1)
+        segments.append(count + at * of_log // length)
+        count += of_log
+        # commands hold their last value over gaps, and are zero before the first
+        given = pd.DataFrame(log.recorded[:, : PLANAR.dof]).ffill().fillna(0.0)
+        commands.append(torch.from_numpy(np.array(given)))
+        shares = {reason: float(mask.mean()) for reason, mask in log.log.masks.items()}
+        masked[name] = {reason: share for reason, share in shares.items() if share}
+    smooth, nu_dot, measured, good = (
+        torch.from_numpy(np.concatenate([getattr(log, what) for log in logs]))
+        for what in ("smooth", "nu_dot", "recorded", "good")
     )
+    fold, derived, sensed = torch.cat(segments), nu_dot, None
+    acceleration: dict[str, Any] = {}
+    if channels.acceleration is not None:
+        sensed = measured[:, ACCELERATIONS]
+        acceleration = compare_accelerations(derived[good], sensed[good], fold[good])
+    if sensed is not None and config.acceleration == "measured":
+        # less their mean offset, log by log
+        parts_of_logs = (part.split(lengths) for part in (sensed, derived, good))
+        nu_dot = torch.cat(
+            [s - (s - d)[kept].mean(0) for s, d, kept in zip(*parts_of_logs, strict=True)]
+        )
+    command = torch.cat(commands)
     record = Record(
-        step * torch.arange(count, dtype=torch.float64),
+        step * torch.arange(len(fold), dtype=torch.float64),
         smooth[:, POSE],
         smooth[:, VELOCITIES],
         nu_dot,
@@ -390,76 +461,19 @@ def read_measured(config: ForceResidualConfig) -> Measured:
         fold,
         good,
         (0.0,) * 9,
-        tuple(len(log) for log in logs),
+        tuple(lengths),
     )
     return Measured(
-        tuple(log.log.name for log in logs),
+        tuple(names),
         record,
-        columns[:, VELOCITIES],
+        measured[:, VELOCITIES],
         good,
-        part,
-        parts,
-        {
-            log.log.name: {
-                reason: float(mask.mean()) for reason, mask in log.log.masks.items() if mask.any()
-            }
-            for log in logs
-        },
+        torch.cat(parts),
+        "logs" if of_logs else "stretches",
+        masked,
         derived,
         sensed,
         acceleration,
-    )
-
-
-def _read(config: ForceResidualConfig) -> list[Prepared]:
-    reader = config.data.reader.build()
-    names = log_names(config.data.files())
-    recorded = [reader.read(path).replace(name=name) for path, name in names.items()]
-    # a model would be fitted to the very samples that judge it
-    check_leaks({log.name: [log] for log in recorded})
-    logs = [prepare(log, "all", config.channels.columns(), config.prepare) for log in recorded]
-    for log in logs:
-        if not log.good.any():
-            raise DataError(
-                f"log {log.log.name}: no stretch is as long as the derivative's window; leave it"
-                " out or shorten prepare.derivative"
-            )
-    return logs
-
-
-def _calibrated(logs: Sequence[Prepared], derived: Tensor, sensed: Tensor) -> Tensor:
-    """Return measured accelerations [N, 3] less their mean offset from `derived`, log by log."""
-    out, start = sensed.clone(), 0
-    for log in logs:
-        inside, good = slice(start, start + len(log)), torch.from_numpy(log.good)
-        out[inside] -= (sensed[inside] - derived[inside])[good].mean(0)
-        start += len(log)
-    return out
-
-
-def _segments(logs: Sequence[Prepared], config: ForceResidualConfig) -> Tensor:
-    """Return the number of each sample's segment [N]; no segment reaches across logs."""
-    numbers, first = [], 0
-    for log in logs:
-        count = max(round(len(log) * config.prepare.grid.step / config.validation.segment), 1)
-        numbers.append(first + torch.arange(len(log)) * count // len(log))
-        first += count
-    return torch.cat(numbers)
-
-
-def _parts(logs: Sequence[Prepared], config: FoldsConfig) -> tuple[Tensor, str]:
-    """Return the number of each sample's fold [N], and what a fold consists of."""
-    if len(logs) >= _LOGS_FOR_FOLDS:
-        folds = min(config.folds, len(logs))
-        return (
-            torch.cat(
-                [torch.full((len(log),), i * folds // len(logs)) for i, log in enumerate(logs)]
-            ),
-            "logs",
-        )
-    return (
-        torch.cat([torch.arange(len(log)) * config.folds // len(log) for log in logs]),
-        "stretches",
     )
 
 
@@ -510,81 +524,67 @@ def compare_forces(measured: Measured) -> dict[str, Any]:
             good,
             record.runs,
         ).lag
-        out["lag"] = {"frequency": lag.frequency, "damping": lag.damping, "delay": lag.delay}
+        out["lag"] = lag.model_dump()
         after = followed(record.command, lag, record.dt, record.runs)
     except FitError as error:
         out["lag"], after = str(error), record.command
-    actual = measured.actual[good]
+    actual, commanded, late = measured.actual[good], record.command[good], after[good]
     total = (actual - actual.mean(0)).square().mean(0)
+    unexplained, unexplained_late = (
+        (actual - force).square().mean(0) / total for force in (commanded, late)
+    )
+    gain = (late * actual).sum(0) / late.square().sum(0).clamp(min=1e-300)
+    columns = {
+        "rms_commanded": commanded.square().mean(0).sqrt(),
+        "rms_actual": actual.square().mean(0).sqrt(),
+        "explained": 1 - unexplained,
+        "explained_with_lag": 1 - unexplained_late,
+        "gain_with_lag": gain,
+    }
     for axis, name in enumerate(AXES):
-        shares = [
-            float(1 - (actual[:, axis] - force[good][:, axis]).square().mean() / total[axis])
-            for force in (record.command, after)
-        ]
-        slope = float(
-            (after[good][:, axis] * actual[:, axis]).sum()
-            / after[good][:, axis].square().sum().clamp(min=1e-300)
-        )
-        out[name] = {
-            "rms_commanded": float(record.command[good][:, axis].square().mean().sqrt()),
-            "rms_actual": float(actual[:, axis].square().mean().sqrt()),
-            "explained": shares[0],
-            "explained_with_lag": shares[1],
-            "gain_with_lag": slope,
-        }
+        out[name] = {what: float(values[axis]) for what, values in columns.items()}
     return out
 
 
-class Final(NamedTuple):
-    """A model fitted to all good samples, to be read and not to be judged.
+class Model(NamedTuple):
+    """A model that the logs determine.
 
     Attributes:
-        fit: coefficients.
-        notes: what the estimator chose.
+        error: residual [N, 3] in N, N, N m that remains on folds that were left out of the fit; NaN
+            where a sample is not used.
+        folds: what the estimator chose in each fold.
+        fit: coefficients fitted to all good samples, to be read and not to be judged.
         not_forward: why it cannot run forward in time; empty where it can.
     """
 
+    error: Tensor
+    folds: list[dict[str, Any]]
     fit: Fit
-    notes: dict[str, Any]
     not_forward: str
 
 
-class Judged(NamedTuple):
-    """Errors of one model on the folds that were left out of its fit.
-
-    Attributes:
-        error: remaining residual [N, 3] in N, N, N m; NaN where a sample is not used.
-        notes: what the estimator chose in each fold.
-    """
-
-    error: Tensor
-    notes: list[dict[str, Any]]
-
-
 @dataclass(frozen=True)
-class ForceStudy:
+class Found:
     """Everything that was found.
 
     Attributes:
         measured: the logs.
-        judged: cross-validated errors by model.
-        final: models fitted to all samples, by name.
+        models: models by name.
         failed: models that the logs do not determine, with the reason.
         rows: rows of the tables; `zero` and `believed` are the first of each force.
         forces: comparison of commanded and actual force.
-        blocks: what the intervals resample; None without intervals.
+        unmodelled: residual [N, 3] of the believed model, by force.
     """
 
     measured: Measured
-    judged: dict[str, Judged]
-    final: dict[str, Final]
+    models: dict[str, Model]
     failed: dict[str, str]
     rows: list[dict[str, Any]]
     forces: dict[str, Any]
-    blocks: Blocks | None
+    unmodelled: dict[str, Tensor]
 
 
-def force_study(config: ForceResidualConfig) -> ForceStudy:
+def force_study(config: ForceResidualConfig) -> Found:
     """Read the logs, and fit and judge every model.
 
     A model that the logs do not determine is set aside with the reason.
@@ -592,93 +592,59 @@ def force_study(config: ForceResidualConfig) -> ForceStudy:
     Raises:
         ResidnetError: where a log cannot be used or no model is determined.
     """
-    measured = read_measured(config)
-    believed = ForceModel(config.hull())
-    judged, final, failed = dict[str, Judged](), dict[str, Final](), dict[str, str]()
-    for name, model_config in config.models.items():
+    measured, believed = read_measured(config), ForceModel(config.hull())
+    models, failed = dict[str, Model](), dict[str, str]()
+    for name, of_model in config.models.items():
         try:
-            errors = cross_validate(model_config, measured, believed, config.validation.gap)
-            model, _, fit, notes = fit_model(
-                model_config,
-                replace(measured.record, command=measured.force(model_config.force)),
-                believed,
-            )
+            models[name] = _judged(config, name, of_model, measured, believed)
         except FitError as error:
             failed[name] = f"model {name}: {error}"
-            continue
-        judged[name] = errors
-        final[name] = Final(fit, notes, _why_not_forward(config, model, name))
-    if not final:
+    if not models:
         raise FitError(next(iter(failed.values())))
-    return ForceStudy(
-        measured,
-        judged,
-        final,
-        failed,
-        table(config, measured, judged, believed),
-        compare_forces(measured),
-        measured.blocks(),
-    )
+    record = measured.record
+    motion = record.nu_dot, record.nu, record.pose[:, HEADING]
+    unmodelled = {
+        force: believed.residual(measured.force(force), *motion)
+        for force in ("actual", "commanded")
+    }
+    rows = _rows(config, measured, models, unmodelled)
+    return Found(measured, models, failed, rows, compare_forces(measured), unmodelled)
 
 
-def _why_not_forward(config: ForceResidualConfig, model: ForceModel, name: str) -> str:
-    try:
-        forward_equations(config.believed, model, f"model {name}")
-    except (ConfigError, FitError) as error:
-        return str(error)
-    return ""
-
-
-def cross_validate(
-    config: MeasuredModelConfig, measured: Measured, believed: ForceModel, gap: float
-) -> Judged:
-    """Fit a model for each fold on the samples outside and away from it, and predict the fold.
-
-    Args:
-        config: the model.
-        measured: the logs with their folds.
-        believed: the known hull.
-        gap: time in s around a fold that is left out of the fit.
+def _judged(
+    config: ForceResidualConfig,
+    name: str,
+    of_model: MeasuredModelConfig,
+    measured: Measured,
+    believed: ForceModel,
+) -> Model:
+    """Fit a model for each fold on the samples outside and away from it, and to all of them.
 
     Raises:
-        FitError: where a fold's training samples do not determine the model.
+        FitError: where the training samples do not determine the model.
     """
-    target = measured.force(judging_force(config))
-    error, notes = torch.full_like(target, torch.nan), []
+    target, command = measured.force(of_model.judged_on), measured.force(of_model.force)
+    error, folds = torch.full_like(target, torch.nan), []
     for part in range(int(measured.part.max()) + 1):
-        record, test = measured.split(part, gap)
-        model, _, _, chosen = fit_model(
-            config, replace(record, command=measured.force(config.force)), believed
-        )
-        error[test] = model.residual(
-            target[test], record.nu_dot[test], record.nu[test], record.pose[test, 2]
-        )
-        notes.append(chosen)
-    return Judged(error, notes)
+        record, test = measured.split(part, config.validation.gap)
+        model = fit_model(of_model, replace(record, command=command), believed)
+        motion = record.nu_dot[test], record.nu[test], record.pose[test, HEADING]
+        error[test] = model.force.residual(target[test], *motion)
+        folds.append(model.fit.notes)
+    model = fit_model(of_model, replace(measured.record, command=command), believed)
+    not_forward = ""
+    try:
+        forward_equations(config.believed, model.force, f"model {name}")
+    except (ConfigError, FitError) as refusal:
+        not_forward = str(refusal)
+    return Model(error, folds, model.fit, not_forward)
 
 
-def judging_force(config: MeasuredModelConfig) -> str:
-    """Return the force that a model is judged on, `actual` or `commanded`.
-
-    A lag alone could make the residual of a command small: a model with lag is judged on the actual
-    force.
-    """
-    return "actual" if config.lag else config.force
-
-
-def unmodelled(measured: Measured, believed: ForceModel, force: str) -> Tensor:
-    """Return the residual [N, 3] of the believed model for the `actual` or `commanded` force."""
-    record = measured.record
-    return believed.residual(
-        measured.force(force), record.nu_dot, record.nu, record.pose[:, HEADING]
-    )
-
-
-def table(
+def _rows(
     config: ForceResidualConfig,
     measured: Measured,
-    judged: Mapping[str, Judged],
-    believed: ForceModel,
+    models: Mapping[str, Model],
+    unmodelled: Mapping[str, Tensor],
 ) -> list[dict[str, Any]]:
     """Return the rows of all models, grouped by the force that judges them.
 
@@ -687,51 +653,44 @@ def table(
     better than it is then no gain yet.
     """
     groups: dict[str, list[str]] = {}
-    for name in judged:
-        groups.setdefault(judging_force(config.models[name]), []).append(name)
+    for name in models:
+        groups.setdefault(config.models[name].judged_on, []).append(name)
     segments, parts = measured.segments(), measured.blocks()
-
-    def by_segment(error: Tensor) -> np.ndarray:
-        return np.stack([error[segment].square().mean(0).numpy() for segment in segments])
-
     rows: list[dict[str, Any]] = []
     for force, names in groups.items():
+        left = {"zero": measured.force(force), "believed": unmodelled[force]}
+        left |= {name: models[name].error for name in names}
         errors = {
-            "zero": by_segment(measured.force(force)),
-            "believed": by_segment(unmodelled(measured, believed, force)),
+            name: np.stack([error[segment].square().mean(0).numpy() for segment in segments])
+            for name, error in left.items()
         }
         choice = [min(_NULLS, key=lambda name: float(errors[name][:, a].mean())) for a in range(3)]
-        reference = np.stack([errors[name][:, a] for a, name in enumerate(choice)], axis=1)
-        errors |= {name: by_segment(judged[name].error) for name in names}
+        others = {name: errors[name] for name in _NULLS}
+        others["reference"] = np.stack(
+            [errors[name][:, a] for a, name in enumerate(choice)], axis=1
+        )
         level = np.maximum(errors["zero"].mean(0), 1e-300)
         for name, error in errors.items():
-            rows.append(
-                {
-                    "force": force,
-                    "model": name,
-                    "mse": error.mean(0).tolist(),
-                    "of_zero": (error.mean(0) / level).tolist(),
-                    "segments": len(segments),
-                    "reference": choice,
-                    **{
-                        f"minus_{other}": _difference((error - errors[other]) / level, parts)
-                        for other in _NULLS
-                        if other != name
-                    },
-                    "minus_reference": _difference((error - reference) / level, parts),
-                }
-            )
+            row = {
+                "force": force,
+                "model": name,
+                "mse": error.mean(0).tolist(),
+                "of_zero": (error.mean(0) / level).tolist(),
+                "segments": len(segments),
+                "reference": choice,
+            }
+            for other, theirs in others.items():
+                if other != name:
+                    # by axis, and for their mean
+                    apart = (error - theirs) / level
+                    columns = np.concatenate((apart, apart.mean(1, keepdims=True)), axis=1)
+                    row[f"minus_{other}"] = {
+                        "mean": columns.mean(0).tolist(),
+                        "ci95": intervals(columns, parts),
+                        "segments_below": (columns < 0).mean(0).tolist(),
+                    }
+            rows.append(row)
     return rows
-
-
-def _difference(difference: np.ndarray, parts: Blocks | None) -> dict[str, Any]:
-    """Return mean and 95 % intervals of differences [W, 3], by axis and for their mean."""
-    columns = np.concatenate((difference, difference.mean(1, keepdims=True)), axis=1)
-    return {
-        "mean": columns.mean(0).tolist(),
-        "ci95": intervals(columns, parts),
-        "segments_below": (columns < 0).mean(0).tolist(),
-    }
 
 
 def better(row: Mapping[str, Any], than: str) -> list[bool]:
@@ -747,118 +706,87 @@ def better(row: Mapping[str, Any], than: str) -> list[bool]:
     return [interval is not None and interval[1] < 0 for interval in row[f"minus_{than}"]["ci95"]]
 
 
-def write_results(
-    config: ForceResidualConfig, found: ForceStudy, folder: RunFolder
-) -> dict[str, Any]:
-    """Write force_residual.json and all figures; returns the contents of the JSON file."""
-    results = _content(config, found)
-    folder.write_json(folder.path / FILE, results)
-    figures, start = [_scores(found.rows)], 0
-    for name, length in zip(found.measured.names, found.measured.record.runs, strict=True):
-        figures += _log_figures(config, found, name, slice(start, start + length))
-        start += length
-    believed = {row["force"]: row["mse"] for row in found.rows if row["model"] == "believed"}
-    for name, model in found.final.items():
-        base = believed[judging_force(config.models[name])]
-        figures += model_figures(name, config.models[name], model.fit, base)
-    for figure in figures:
-        write_figure(folder.figures, figure)
-    return results
-
-
-def _content(config: ForceResidualConfig, found: ForceStudy) -> dict[str, Any]:
-    measured = found.measured
-    return {
+def written(config: ForceResidualConfig, found: Found) -> tuple[dict[str, Any], list[Figure]]:
+    """Return the contents of force_residual.json and all figures."""
+    measured, record, parts = found.measured, found.measured.record, found.measured.blocks()
+    content = {
         "schema": "residnet.force_residual/1",
         "run": config.name,
         "logs": [
-            {"name": name, "samples": count, "seconds": count * measured.record.dt}
-            for name, count in zip(measured.names, measured.record.runs, strict=True)
+            {"name": name, "samples": count, "seconds": count * record.dt}
+            for name, count in zip(measured.names, record.runs, strict=True)
         ],
         "samples": len(measured.good),
         "used": int(measured.good.sum()),
         "masked": measured.masked,
         "folds": {"of": measured.parts, "count": int(measured.part.max()) + 1},
-        "intervals": None if found.blocks is None else found.blocks.row(),
+        "intervals": None if parts is None else parts.row(),
         "forces": found.forces,
         "acceleration": measured.acceleration,
         "rows": found.rows,
         "failed": found.failed,
         "models": {
             name: {
-                "folds": found.judged[name].notes,
-                "all": model.notes,
+                "folds": model.folds,
+                "all": model.fit.notes,
                 "runs_forward": not model.not_forward,
                 "not_forward": model.not_forward,
                 **fit_as_json(config.models[name].terms, model.fit),
             }
-            for name, model in found.final.items()
+            for name, model in found.models.items()
         },
     }
+    figures, start = [_scores(found.rows)], 0
+    for name, length in zip(measured.names, record.runs, strict=True):
+        figures += _log_figures(found, name, slice(start, start + length))
+        start += length
+    believed = {row["force"]: row["mse"] for row in found.rows if row["model"] == "believed"}
+    for name, model in found.models.items():
+        of_model = config.models[name]
+        figures += model_figures(name, of_model, model.fit, believed[of_model.judged_on])
+    return content, figures
 
 
-def _log_figures(
-    config: ForceResidualConfig, found: ForceStudy, name: str, inside: slice
-) -> list[Figure]:
+def _log_figures(found: Found, name: str, inside: slice) -> list[Figure]:
     measured = found.measured
     t = (measured.record.t[inside] - measured.record.t[inside.start]).numpy()
     starts, stops = stretches(~measured.good[inside].numpy())
     masked = (t[starts], t[stops - 1])
 
     def pair(
-        kind: str,
-        title: str,
-        labels: Sequence[str],
-        signals: Sequence[Tensor],
-        units: Sequence[str],
+        kind: str, title: str, signals: Mapping[str, Tensor], units: Sequence[tuple[str, float]]
     ) -> Figure:
-        looks = {
-            label: replace(look, label=label, width=1.1)
-            for label, look in zip(labels, (DASHED, SOLID), strict=True)
-        }
-        paths = [signal[inside].numpy() for signal in signals]
-        return Figure(
-            f"{kind}_{name}",
-            f"{title}, log {name}",
-            f"{title}, log {name}; {labels[0]} (dashed) and {labels[1]} (solid).",
-            {"masked": MASKED, **looks},
-            [Panel(unit, "time [s]", height=165, group="t") for unit in units],
-            [
-                Case(
-                    "",
-                    [
-                        {"masked": masked}
-                        | {
-                            label: (t, path[:, axis])
-                            for label, path in zip(labels, paths, strict=True)
-                        }
-                        for axis in range(3)
-                    ],
-                )
-            ],
-        )
+        first, second = signals
+        looks = {"masked": MASKED, first: DASHED, second: SOLID}
+        for label in signals:
+            looks[label] = replace(looks[label], label=label, width=1.1)
+        title = f"{title}, log {name}"
+        caption = f"{title}; {first} (dashed) and {second} (solid)."
+        paths = {label: signal[inside].numpy() for label, signal in signals.items()}
+        shared = {"masked": masked}
+        return histories(f"{kind}_{name}", (title, caption), looks, t, paths, units, shared=shared)
 
-    forces = (measured.record.command, measured.actual)
-    title = "Commanded and actual force"
-    out = [pair("forces", title, ("commanded", "actual"), forces, _FORCE_UNITS)]
+    both = {"commanded": measured.record.command, "actual": measured.actual}
+    out = [pair("forces", "Commanded and actual force", both, _FORCE_UNITS)]
     if measured.sensed is not None:
         title = "Measured acceleration and derivative of velocity"
-        labels = ("measured acceleration", "derivative of velocity")
-        both = (measured.sensed, measured.derived)
-        out.append(pair("accelerations", title, labels, both, _ACCELERATION_UNITS))
+        both = {
+            "measured acceleration": measured.sensed,
+            "derivative of velocity": measured.derived,
+        }
+        out.append(pair("accelerations", title, both, _ACCELERATION_UNITS))
     # of the models of the actual force, the one with the least cross-validated error
     of_actual = {
         row["model"]: row["minus_believed"]["mean"][3]
         for row in found.rows
-        if row["force"] == "actual" and row["model"] in found.judged
+        if row["force"] == "actual" and row["model"] in found.models
     }
     if of_actual:
-        best = min(of_actual, key=lambda model: of_actual[model])
-        residual = unmodelled(measured, ForceModel(config.hull()), "actual")
+        best, residual = min(of_actual, key=of_actual.__getitem__), found.unmodelled["actual"]
         title = f"Residual of the believed model and what {best} predicts on left-out folds"
-        labels = ("residual of the believed model", f"predicted by {best}")
-        both = (residual, residual - found.judged[best].error)
-        out.append(pair("residual", title, labels, both, _FORCE_UNITS))
+        both = {"residual of the believed model": residual}
+        both[f"predicted by {best}"] = residual - found.models[best].error
+        out.append(pair("residual", title, both, _FORCE_UNITS))
     return out
 
 
@@ -912,35 +840,20 @@ def _scores(rows: Sequence[Results]) -> Figure:
     )
 
 
-def verdict(results: Results) -> list[str]:
-    """Return the sentences that say for each force whether a regression gained anything."""
-    sentences: list[str] = []
-    for force, rows in _groups(results).items():
-        fits = [row for row in rows if row["model"] not in _NULLS]
-        if results["intervals"] is None:
-            sentences.append(
-                f"{force.capitalize()} force: there are too few segments to say whether one model"
-                " is better than another."
-            )
-            continue
-        believed = next(row for row in rows if row["model"] == "believed")
-        sentences.append(
-            f"{force.capitalize()} force: the believed model is better than no force"
-            f" {_where(better(believed, 'zero'))}{_worse_than_nothing(believed)}."
-        )
-        sentences += [*_gains(fits), _advice(fits)]
-    return sentences + _lags(results)
-
-
-def _worse_than_nothing(believed: Results) -> str:
-    bounds = believed["minus_zero"]["ci95"][:3]
-    names = [axis for axis, limits in zip(AXES, bounds, strict=True) if limits[0] > 0]
-    return f", and worse than no force in {listed(names)}" if names else ""
+def _where(flags: Sequence[bool]) -> str:
+    names = [name for name, yes in zip((*AXES, "the mean over axes"), flags, strict=False) if yes]
+    return f"in {listed(names)}" if names else "on no axis"
 
 
 def _gains(fits: Sequence[Results]) -> list[str]:
+    """Return what the regressions of one force gain, and what to use on each axis.
+
+    A regression is recommended where it is reliably better on that axis; of several, the one with
+    the least error. Otherwise it is the better of no force and the believed model.
+    """
     best = "the better of no force and the believed model on each axis"
-    winners = [row for row in fits if better(row, "reference")[3]]
+    sure = {row["model"]: better(row, "reference") for row in fits}
+    winners = [row for row in fits if sure[row["model"]][3]]
     if not winners:
         sentences = [
             f"None of the {len(fits)} regressions is better than {best}: every interval of the mean"
@@ -953,11 +866,7 @@ def _gains(fits: Sequence[Results]) -> list[str]:
             f" {listed([row['model'] for row in winners])}. The largest gain is {fixed(gain, 1)} %"
             " of the force's mean square."
         ]
-    single = [
-        f"{row['model']} ({_where(flags)})"
-        for row in fits
-        if any(flags := better(row, "reference")[:3])
-    ]
+    single = [f"{name} ({_where(flags[:3])})" for name, flags in sure.items() if any(flags[:3])]
     if single:
         sentences.append(
             f"Better on single axes: {listed(single)}; of {3 * len(fits)} such comparisons, one in"
@@ -966,83 +875,23 @@ def _gains(fits: Sequence[Results]) -> list[str]:
     worse = [row["model"] for row in fits if row["minus_reference"]["ci95"][3][0] > 0]
     if worse:
         sentences.append(f"Worse than that: {listed(worse)}.")
-    return sentences
-
-
-def _advice(fits: Sequence[Results]) -> str:
-    """Return the sentence that says what to use on each axis.
-
-    A regression is named where it is reliably better on that axis; of several, the one with the
-    least error. Otherwise it is the better of no force and the believed model.
-    """
-    names = {"zero": "no force at all", "believed": "the believed model alone"}
     chosen: dict[str, list[str]] = {}
     for axis, name in enumerate(AXES):
-        sure = [row for row in fits if better(row, "reference")[axis]]
-        best = min(sure, key=lambda row: float(row["mse"][axis]), default=None)
-        use = names[fits[0]["reference"][axis]] if best is None else str(best["model"])
+        able = [row for row in fits if sure[row["model"]][axis]]
+        use = _NULLS[fits[0]["reference"][axis]]
+        if able:
+            use = min(able, key=lambda row: float(row["mse"][axis]))["model"]
         chosen.setdefault(use, []).append(name)
     parts = [f"{use} in {listed(axes)}" for use, axes in chosen.items()]
-    return f"Recommended: {', '.join(parts)}."
+    return [*sentences, f"Recommended: {', '.join(parts)}."]
 
 
-def _where(flags: Sequence[bool]) -> str:
-    names = [name for name, yes in zip((*AXES, "the mean over axes"), flags, strict=False) if yes]
-    return f"in {listed(names)}" if names else "on no axis"
-
-
-def _lags(results: Results) -> list[str]:
-    thrusters = results["forces"]["lag"]
-    fitted = {
-        name: model["all"]["lag"]
-        for name, model in results["models"].items()
-        if "lag" in model["all"]
-    }
-    if isinstance(thrusters, str) or not fitted:
-        return []
-    each = [
-        f"{number(lag['frequency'])} rad/s and {number(lag['delay'], 2)} s for {name}"
-        for name, lag in fitted.items()
-    ]
-    return [
-        f"The lag fitted together with the residual is {listed(each)}; the actual forces follow the"
-        f" commands with {number(thrusters['frequency'])} rad/s and"
-        f" {number(thrusters['delay'], 2)} s."
-    ]
-
-
-def _groups(results: Results) -> dict[str, list[Results]]:
-    out: dict[str, list[Results]] = {}
+def _groups(results: Results) -> dict[str, dict[str, Results]]:
+    """Return the rows by force and model."""
+    out: dict[str, dict[str, Results]] = {}
     for row in results["rows"]:
-        out.setdefault(row["force"], []).append(row)
+        out.setdefault(row["force"], {})[row["model"]] = row
     return out
-
-
-def sections(config: ForceResidualConfig, results: Results, run: Path) -> list[Section]:
-    """Return the sections of the report."""
-    out = [_data(config, results), _forces(results, run)]
-    if results["acceleration"]:
-        out.append(_accelerations(config, results, run))
-    for force, rows in _groups(results).items():
-        out.append(Section(f"Residual of the {force} force", [_models(config, results, rows)]))
-    out.append(Section("Errors and residuals", pictures(run, "scores", "residual_")))
-    if results["failed"]:
-        causes = list(results["failed"].values())
-        out.append(Section("Not determined by these logs", [Bullets(causes)]))
-    causes = [model["not_forward"] for model in results["models"].values() if model["not_forward"]]
-    if causes:
-        out.append(Section("Models that cannot run forward in time", [Bullets(causes)]))
-    coefficients = [
-        coefficients_section(name, model, model["all"], {})
-        for name, model in results["models"].items()
-    ]
-    out.append(
-        Section(
-            "Coefficients of models fitted to all samples",
-            [Text(ABOUT_COEFFICIENTS), *coefficients],
-        )
-    )
-    return [*out, Section("Orders, weights and surfaces", pictures(run, *MODEL_PICTURES), True)]
 
 
 def _data(config: ForceResidualConfig, results: Results) -> Section:
@@ -1124,15 +973,46 @@ def _accelerations(config: ForceResidualConfig, results: Results, run: Path) -> 
     return Section(title, [table, *pictures(run, "accelerations_")])
 
 
-def _models(config: ForceResidualConfig, results: Results, rows: Sequence[Results]) -> Table:
+def _models(config: ForceResidualConfig, results: Results, group: Mapping[str, Results]) -> Table:
     """Return the table of the models that are judged on one force (Tables 5.1, 5.2, 5.4, 5.5)."""
-    table = Table(
+    base, rows = group["believed"]["mse"], []
+    for name, row in group.items():
+        of_model, printed, notes = config.models.get(name), None, ""
+        if of_model is not None:
+            notes = notes_text(results["models"][name]["all"])
+            if of_model.published is not None:
+                printed = [
+                    100 * after / before for before, after in zip(*of_model.published, strict=True)
+                ]
+        left = [100 * a / b for a, b in zip(row["mse"], base, strict=True)]
+        rows.append({**row, "left": left, "published": {"left": printed}, "notes": notes})
+
+    def apart(other: str) -> list[Any]:
+        def cell(row: Any) -> Cell:
+            bounds = row[other]["ci95"][3] if other in row else None
+            return Cell(" to ".join(signed(100 * bound, 1) for bound in bounds or ()))
+
+        def mean(row: Any) -> Cell:
+            return Cell(signed(100 * row[other]["mean"][3], 1) if other in row else "")
+
+        def below(row: Any) -> Cell:
+            return Cell(fixed(100 * row[other]["segments_below"][3], 0) if other in row else "")
+
+        return [("mean", mean), ("95 % interval", cell), ("segments better %", below)]
+
+    def each(key: str, titles: Sequence[str], text: Any) -> list[Any]:
+        return [(title, lambda row, i=i: Cell(text(row[key][i]))) for i, title in enumerate(titles)]
+
+    return table_of(
+        rows,
         [
-            "model",
-            *("surge N^2", "sway N^2", "yaw (N m)^2"),
-            *("surge", "sway", "yaw") * 2,
-            *("mean", "95 % interval", "segments better %") * 2,
-            "chosen by the estimator",
+            ("model", "model"),
+            *each("mse", ("surge N^2", "sway N^2", "yaw (N m)^2"), lambda value: number(value, 4)),
+            *each("of_zero", AXES, lambda value: fixed(100 * value, 0)),
+            *compared("left", AXES, 3),
+            *apart("minus_believed"),
+            *apart("minus_reference"),
+            ("chosen by the estimator", "notes"),
         ],
         caption="Published: the share that the document's model of that kind left of its believed"
         " model's residual, in other trials.",
@@ -1145,28 +1025,3 @@ def _models(config: ForceResidualConfig, results: Results, rows: Sequence[Result
             ("", 1),
         ],
     )
-    base = next(row for row in rows if row["model"] == "believed")["mse"]
-    for row in rows:
-        model_config = config.models.get(row["model"])
-        published = None if model_config is None else model_config.published
-        cells = [Cell(number(value, 4)) for value in row["mse"]]
-        cells += [Cell(fixed(100 * value, 0)) for value in row["of_zero"]]
-        for axis in range(3):
-            left = 100 * published[1][axis] / published[0][axis] if published else None
-            cells.append(beside_published(100 * row["mse"][axis] / base[axis], left, 3))
-        difference = row.get("minus_believed")
-        cells += [Cell("")] * 3 if difference is None else _difference_cells(difference)
-        cells += _difference_cells(row["minus_reference"])
-        notes = "" if model_config is None else notes_text(results["models"][row["model"]]["all"])
-        table.add(row["model"], [*cells, Cell(notes, mark="text")])
-    return table
-
-
-def _difference_cells(difference: Results) -> list[Cell]:
-    bounds = difference["ci95"][3]
-    shown = "" if bounds is None else " to ".join(signed(100 * bound, 1) for bound in bounds)
-    return [
-        Cell(signed(100 * difference["mean"][3], 1)),
-        Cell(shown),
-        Cell(fixed(100 * difference["segments_below"][3], 0)),
-    ]

@@ -11,7 +11,8 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, final
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, final
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from residnet.core.errors import FitError
 from residnet.core.frames import to_body
 from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
 from residnet.core.names import ACCELERATION, VELOCITY
-from residnet.documents.cells import notes_text
+from residnet.documents.study import Results, notes_text, pictures
 from residnet.judge.courses import mse
 from residnet.physics.force_model import (
     FERRY_TERMS,
@@ -42,7 +43,7 @@ from residnet.regression.least_squares import CentredLeastSquares, ElasticNet
 from residnet.regression.shrinkage import PLSR, Ridge, pls_path
 from residnet.regression.surface import Surface, SurfacePLSR
 from residnet.report import figure as drawing
-from residnet.report.blocks import Section, Table, Text
+from residnet.report.blocks import Bullets, Section, Table, Text
 from residnet.report.figure import (
     BLUE,
     GREY,
@@ -57,9 +58,11 @@ from residnet.report.figure import (
     names_of,
 )
 from residnet.report.format import number
-from residnet.training.lag import LagFit, fit_lag, followed
+from residnet.training.lag import fit_lag, followed
 
 AXES = ("surge", "sway", "yaw")
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+"""Of a model."""
 _FORCES = ("surge force", "sway force", "yaw moment")
 _PENALTIES = tuple(10.0**k for k in range(-10, 1))
 """Ridge penalties tried where none is given, in units of a standardised column's energy."""
@@ -69,13 +72,6 @@ _LEAST_EARTH_FORCE_SPREAD = 0.02
 """Least root mean square that turning must leave of a unit force fixed in earth axes."""
 _COLOURS_SPAN = (6.3, 316.0)
 """Shares in % of the first and the last colour of a surface."""
-ABOUT_COEFFICIENTS = (
-    "The force of a model is that of the believed hull plus the sum of coefficient times basis"
-    " function, in SI units. A weight is the magnitude of the coefficient of scaled variables: it"
-    " says how much a basis function matters."
-)
-MODEL_PICTURES = ("orders_", "surface_", "weights_")
-"""What the names of the figures of `model_figures` begin with."""
 
 
 @dataclass(frozen=True)
@@ -116,19 +112,6 @@ class Regression:
 
 
 @dataclass(frozen=True)
-class OrderErrors:
-    """Mean square errors of a PLSR over its order: forces [A, 3] in N^2, N^2, (N m)^2.
-
-    Attributes:
-        left_out: over samples whose fold was left out; NaN without folds.
-        test: over the test half; NaN without one.
-    """
-
-    left_out: Tensor
-    test: Tensor
-
-
-@dataclass(frozen=True)
 class Fit:
     """Coefficients of y = intercept + x coefficients.
 
@@ -139,7 +122,8 @@ class Fit:
         notes: what was chosen.
         surface: errors of all models that the choice was made from, where a surface analysis made
             it.
-        orders: errors over the order of a PLSR.
+        orders: mean square errors [A, 3] over the order of a PLSR in N^2, N^2, (N m)^2, by the
+            samples that they are of; NaN where there are none.
     """
 
     coefficients: Tensor
@@ -147,17 +131,7 @@ class Fit:
     pre: Tensor
     notes: dict[str, Any] = field(default_factory=dict)
     surface: Surface | None = None
-    orders: OrderErrors | None = None
-
-    @classmethod
-    def from_pre(cls, data: Regression, pre: Tensor, notes: dict[str, Any]) -> Fit:
-        """Return the fit with coefficients of scaled variables.
-
-        Theta_post = diag(scale)^-1 Theta_pre diag(std y) (3.12), correction J15.
-        """
-        _, _, mean_x, mean_y, std_y = data.standardised
-        post = pre / data.scale[:, None] * std_y
-        return cls(post, mean_y - mean_x @ post, pre, notes)
+    orders: dict[str, Tensor] = field(default_factory=dict)
 
     def predict(self, x: Tensor) -> Tensor:
         """Return the outputs [N, 3] at basis functions [N, J]."""
@@ -176,33 +150,23 @@ class RegressionKind(Config, ABC):
         """
 
 
-class _ScaledRegression(RegressionKind):
+class _ScaledRegression(RegressionKind, ABC):
     """An estimator that runs on scaled columns and outputs."""
 
     @abstractmethod
-    def estimator(self) -> Estimator:
-        """Return the estimator; columns are scaled already."""
+    def estimator(self) -> tuple[Estimator, bool]:
+        """Return the estimator, and whether it leaves folds out to choose something."""
 
-    @abstractmethod
-    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
-        """Return what to report of a solution's choice and notes."""
-
-    def fixed(self) -> bool:
-        """Return whether nothing is left to choose, so that folds do not matter."""
-        return False
-
-    @final
     def fit(self, data: Regression) -> Fit:
         """Return the coefficients; see `RegressionKind.fit`."""
-        e, f, *_ = data.standardised
-        groups = None if self.fixed() else data.fold
-        first = self.estimator().fit(e, f, groups, names=data.terms, outputs=_FORCES)[0]
-        out = Fit.from_pre(data, first.coefficients, self.chosen(first.choice, first.notes))
-        return replace(out, orders=self.over_orders(data))
-
-    def over_orders(self, data: Regression) -> OrderErrors | None:
-        """Return the errors over all orders; None for an estimator without an order."""
-        return None
+        e, f, mean_x, mean_y, std_y = data.standardised
+        estimator, chooses = self.estimator()
+        groups = data.fold if chooses else None
+        first = estimator.fit(e, f, groups, names=data.terms, outputs=_FORCES)[0]
+        # Theta_post = diag(scale)^-1 Theta_pre diag(std y) (3.12), correction J15
+        post = first.coefficients / data.scale[:, None] * std_y
+        notes = first.choice or first.notes
+        return Fit(post, mean_y - mean_x @ post, first.coefficients, notes)
 
 
 @final
@@ -216,43 +180,41 @@ class PlsrRegression(_ScaledRegression):
     kind: Literal["plsr"]
     order: int | None = Field(default=None, ge=1)
 
-    def estimator(self) -> Estimator:
-        return PLSR(self.order, max_order=None, folds=None, scale=False)
+    def estimator(self) -> tuple[Estimator, bool]:
+        return PLSR(self.order, max_order=None, folds=None, scale=False), self.order is None
 
-    def fixed(self) -> bool:
-        return self.order is not None
+    def fit(self, data: Regression) -> Fit:
+        """Return the coefficients, and the errors over all orders (Figures 4.4, 4.22, 4.42, 5.7).
 
-    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
-        if choice["order"] == 0:
+        See `RegressionKind.fit`.
+        """
+        found = super().fit(data)
+        if found.notes["order"] == 0:
             raise FitError("PLSR: nothing in the residual varies with the basis functions")
-        return choice
-
-    def over_orders(self, data: Regression) -> OrderErrors:
-        """Return the errors over all orders (document 002 Figures 4.4, 4.22, 4.42, 5.7)."""
         e, f, mean_x, mean_y, std_y = data.standardised
-        folds = data.fold.unique()
-        orders, left_out = e.shape[1], torch.full_like(f, torch.nan).repeat(e.shape[1], 1, 1)
-        if len(folds) > 1:
-            for fold in folds:
-                out = data.fold == fold
-                left_out[:, out] = _error_by_order(e[~out], f[~out], e[out], f[out], orders)
-        test = torch.full((orders, 3), torch.nan, dtype=f.dtype)
+        folds, count = data.fold.unique(), e.shape[1]
+        left_out = torch.full_like(f, torch.nan).repeat(count, 1, 1)
+        for fold in folds if len(folds) > 1 else ():
+            out = data.fold == fold
+            left_out[:, out] = _error_by_order(e[~out], f[~out], e[out], f[out])
+        test = torch.full((count, 1, 3), torch.nan, dtype=f.dtype)
         if data.test is not None and len(data.test[0]):
             x, y = data.test
-            scaled = (x - mean_x) / data.scale, (y - mean_y) / std_y
-            test = _error_by_order(e, f, *scaled, orders).square().mean(1)
+            test = _error_by_order(e, f, (x - mean_x) / data.scale, (y - mean_y) / std_y)
+        errors = {"left-out segments": left_out, "test half": test}
         square = std_y.square()
-        return OrderErrors(left_out.square().mean(1) * square, test * square)
+        orders = {what: error.square().mean(1) * square for what, error in errors.items()}
+        return replace(found, orders=orders)
 
 
-def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor, orders: int) -> Tensor:
-    """Return the errors [A, N, 3] at x of a PLSR of f on e, for each order up to `orders`."""
+def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return the errors [J, N, 3] at x of a PLSR of f on e, for each order."""
     mean_e, mean_f = e.mean(0), f.mean(0)
-    centred = e - mean_e
+    centred, orders = e - mean_e, e.shape[1]
     path = pls_path(centred.T @ centred, centred.T @ (f - mean_f), orders)
     if len(path) < orders:
         # what is left explains nothing: higher orders change no more
-        last = path[-1:] if len(path) else torch.zeros(1, e.shape[1], f.shape[1], dtype=e.dtype)
+        last = path[-1:] if len(path) else torch.zeros(1, orders, f.shape[1], dtype=e.dtype)
         path = torch.cat((path, last.expand(orders - len(path), -1, -1)))
     return y - mean_f - (x - mean_e) @ path
 
@@ -292,11 +254,8 @@ class LeastSquaresRegression(_ScaledRegression):
 
     kind: Literal["ols"]
 
-    def estimator(self) -> Estimator:
-        return CentredLeastSquares()
-
-    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
-        return notes
+    def estimator(self) -> tuple[Estimator, bool]:
+        return CentredLeastSquares(), False
 
 
 @final
@@ -311,15 +270,14 @@ class RidgeRegression(_ScaledRegression):
     kind: Literal["ridge"]
     penalty: float | None = Field(default=None, gt=0)
 
-    def estimator(self) -> Estimator:
+    def estimator(self) -> tuple[Estimator, bool]:
         penalties = _PENALTIES if self.penalty is None else (self.penalty,)
-        return Ridge(penalties, folds=None, scale=False, shared=True)
+        return Ridge(penalties, folds=None, scale=False, shared=True), self.penalty is None
 
-    def fixed(self) -> bool:
-        return self.penalty is not None
-
-    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
-        return {"penalty": choice["penalty"][0]}
+    def fit(self, data: Regression) -> Fit:
+        """Return the coefficients with the one penalty of all axes; see `RegressionKind.fit`."""
+        found = super().fit(data)
+        return replace(found, notes={"penalty": found.notes["penalty"][0]})
 
 
 @final
@@ -334,11 +292,8 @@ class ShrinkRegression(_ScaledRegression):
     kind: Literal["lasso", "elastic_net"]
     l1_ratio: float = Field(default=0.5, gt=0, lt=1)
 
-    def estimator(self) -> Estimator:
-        return ElasticNet(1.0 if self.kind == "lasso" else self.l1_ratio)
-
-    def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
-        return choice
+    def estimator(self) -> tuple[Estimator, bool]:
+        return ElasticNet(1.0 if self.kind == "lasso" else self.l1_ratio), True
 
 
 RegressionConfig = Annotated[
@@ -413,17 +368,42 @@ class Record:
 
         measured = torch.cat((self.pose, self.nu, self.nu_dot), dim=-1)
         motion = torch.from_numpy(smooth_motion(measured.numpy(), self.noise, self.dt))
-        return replace(
-            self,
-            pose=motion[:, POSE],
-            nu=motion[:, VELOCITIES],
-            nu_dot=motion[:, ACCELERATIONS],
-        )
+        pose, nu, nu_dot = (motion[:, part] for part in (POSE, VELOCITIES, ACCELERATIONS))
+        return replace(self, pose=pose, nu=nu, nu_dot=nu_dot)
 
 
-def fit_model(
-    config: ResidualModelConfig, record: Record, base: ForceModel
-) -> tuple[ForceModel, Lag | None, Fit, dict[str, Any]]:
+class FittedModel(NamedTuple):
+    """A fitted model of a residual force.
+
+    Attributes:
+        force: F = F_base + correction.
+        lag: of the thrusters; None where it was not fitted.
+        fit: coefficients, and in its notes what was chosen.
+    """
+
+    force: ForceModel
+    lag: Lag | None
+    fit: Fit
+
+    def remaining(self, record: Record) -> Tensor:
+        """Return the residual [N, 3] that the model leaves along a record, in N, N, N m.
+
+        The model is compared with the command, or through its lag with the force that follows it.
+        """
+        force = record.command
+        if self.lag is not None:
+            force = followed(record.averaged, self.lag, record.dt, record.runs)
+        return self.force.residual(force, record.nu_dot, record.nu, record.pose[:, HEADING])
+
+    def test_mse(self, record: Record) -> list[float]:
+        """Return the mean square of what remains of the measurements as logged, by axis.
+
+        It is over the test samples, in N^2, N^2, (N m)^2.
+        """
+        return mse(self.remaining(record)[~record.train])
+
+
+def fit_model(config: ResidualModelConfig, record: Record, base: ForceModel) -> FittedModel:
     """Fit one model of the residual force of `base` on the training samples of a record.
 
     Args:
@@ -431,28 +411,33 @@ def fit_model(
         record: motion and commanded force.
         base: the known model, F_base(nu_dot, nu).
 
-    Returns:
-        The model F = F_base + correction, the thrusters' lag where it was fitted, the coefficients,
-        and what the estimator chose.
-
     Raises:
         FitError: where the data do not determine the model.
     """
-    train = record.train
+    train, psi = record.train, record.pose[:, HEADING]
     x = TermLibrary(config.terms, MOTION)(torch.cat((record.nu_dot, record.nu), dim=-1))
-    needed = base.at_heading(record.nu_dot, record.nu, record.pose[:, HEADING])
-    earth_axes = _earth_axes(record.pose[:, HEADING])
-    lag_fit: LagFit | None = None
-    force = record.command
+    needed = base.at_heading(record.nu_dot, record.nu, psi)
+    # unit forces to north and to east in body axes, without a moment
+    unit = torch.eye(2, dtype=psi.dtype)
+    earth_axes = torch.stack(
+        [
+            torch.stack((*to_body(north, east, psi), torch.zeros_like(psi)), dim=-1)
+            for north, east in unit
+        ],
+        dim=-1,
+    )
+    lag, force = None, record.command
+    notes: dict[str, Any] = {}
     if config.lag:
         regressors = torch.cat((x, earth_axes[:, 0]), dim=-1) if config.earth else x
-        lag_fit = fit_lag(record.averaged, needed, regressors, record.dt, train, record.runs)
-        force = followed(record.averaged, lag_fit.lag, record.dt, record.runs)
-    y = force - needed
-    earth_force = torch.zeros(2, dtype=torch.float64)
+        lag = fit_lag(record.averaged, needed, regressors, record.dt, train, record.runs).lag
+        force = followed(record.averaged, lag, record.dt, record.runs)
+        notes["lag"] = lag.model_dump()
+    y, earth_force = force - needed, None
     if config.earth:
         earth_force = constant_force(x[train], y[train], -earth_axes[train])
         y = y + torch.einsum("nad,d->na", earth_axes, earth_force)
+        notes["earth"] = dict(zip(("north", "east"), earth_force.tolist(), strict=True))
     data = Regression(
         config.terms,
         x[train],
@@ -462,49 +447,9 @@ def fit_model(
         (x[~train], y[~train]),
     )
     fit = config.fit.fit(data)
-    model = base.extended(Correction(config.terms, fit.coefficients, fit.intercept), earth_force)
-    notes = dict(fit.notes)
-    if lag_fit is not None:
-        lag = lag_fit.lag
-        notes["lag"] = {
-            "frequency": lag.frequency,
-            "damping": lag.damping,
-            "delay": lag.delay,
-        }
-    if config.earth:
-        notes["earth"] = {"north": float(earth_force[0]), "east": float(earth_force[1])}
-    return model, lag_fit.lag if lag_fit is not None else None, fit, notes
-
-
-def _earth_axes(psi: Tensor) -> Tensor:
-    """Unit forces to north and to east in body axes [N, 3, 2], without a moment."""
-    one, zero = torch.ones(()), torch.zeros(())
-    nothing = torch.zeros_like(psi)
-    columns = [
-        torch.stack((*to_body(north, east, psi), nothing), dim=-1)
-        for north, east in ((one, zero), (zero, one))
-    ]
-    return torch.stack(columns, dim=-1)
-
-
-def remaining(model: ForceModel, lag: Lag | None, record: Record) -> Tensor:
-    """Return the residual [N, 3] that a model leaves along a record, in N, N, N m.
-
-    The model is compared with the command, or through its lag with the force that follows it.
-    """
-    force = (
-        record.command if lag is None else followed(record.averaged, lag, record.dt, record.runs)
-    )
-    residual: Tensor = model.residual(force, record.nu_dot, record.nu, record.pose[:, HEADING])
-    return residual
-
-
-def unseen_mse(model: ForceModel, lag: Lag | None, record: Record) -> list[float]:
-    """Return the mean square of a model's remaining residual on the test samples, by axis.
-
-    The residual is that of the measurements as logged, through the model's lag where it has one.
-    """
-    return mse(remaining(model, lag, record)[~record.train])
+    correction = Correction(config.terms, fit.coefficients, fit.intercept)
+    model = base.extended(correction, earth_force)
+    return FittedModel(model, lag, replace(fit, notes=fit.notes | notes))
 
 
 def constant_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
@@ -520,9 +465,8 @@ def constant_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
     Raises:
         FitError: where the vessel hardly turned, so that a constant in body axes explains as much.
     """
-    centred = torch.cat(
-        (torch.ones_like(x[:, :1]), (x - x.mean(0)) / x.std(0).clamp(min=1e-300)), dim=-1
-    )
+    scaled = (x - x.mean(0)) / x.std(0).clamp(min=1e-300)
+    centred = torch.cat((torch.ones_like(x[:, :1]), scaled), dim=-1)
     left, singular, _ = torch.linalg.svd(centred, full_matrices=False)
     left = left[:, singular > _RANK_TOLERANCE * singular[0]]
 
@@ -531,12 +475,8 @@ def constant_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
         return rest
 
     weight = unexplained(y).std(0).clamp(min=1e-9)
-    design = torch.cat(
-        [
-            torch.stack([unexplained(unit_forces[:, a, d]) for d in range(2)], dim=-1) / weight[a]
-            for a in range(2)
-        ]
-    )
+    # a moment is none of its doing
+    design = torch.cat([unexplained(unit_forces[:, a]) / weight[a] for a in range(2)])
     target = torch.cat([unexplained(y[:, a]) / weight[a] for a in range(2)])
     spread = float(torch.linalg.svdvals(design * weight[:2].mean())[-1]) / len(y) ** 0.5
     if spread < _LEAST_EARTH_FORCE_SPREAD:
@@ -546,6 +486,14 @@ def constant_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
         )
     solution: Tensor = torch.linalg.lstsq(design, target[:, None]).solution
     return solution[:, 0]
+
+
+def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Tensor]:
+    """Return the coefficients [3] of each term of three rows."""
+    return {
+        term: torch.tensor([row.get(term, 0.0) for row in rows], dtype=torch.float64)
+        for term in dict.fromkeys(term for row in rows for term in row)
+    }
 
 
 def forward_equations(believed: str, model: ForceModel, label: str) -> HullEquations:
@@ -563,32 +511,26 @@ def forward_equations(believed: str, model: ForceModel, label: str) -> HullEquat
         ConfigError: where a basis function is not affine in nu_dot.
         FitError: where the augmented mass cannot be inverted safely.
     """
-    hull_rows = BelievedConfig(vessel=believed).equations().rows()
-    known = list(dict.fromkeys(term for row in hull_rows for term in row))
-    hull = torch.tensor(
-        [[row.get(term, 0.0) for term in known] for row in hull_rows], dtype=torch.float64
-    )
-    mass, constant = model.hull.mass.clone(), torch.zeros(3, dtype=torch.float64)
-    total, extra = mass, dict[str, Tensor]()
+    total = model.hull.mass
+    nothing = torch.zeros(3, dtype=torch.float64)
+    extra = {"1": nothing}
     for correction in model.corrections:
         assert isinstance(correction, Correction)
         terms, coefficients = correction.library.terms, correction.coefficients
         total, rest = augmented(total, terms, coefficients, label)
-        constant = constant + correction.intercept
-        for j in rest:
-            extra[terms[j]] = (
-                extra.get(terms[j], torch.zeros(3, dtype=torch.float64)) + coefficients[j]
-            )
+        added = {"1": correction.intercept} | {terms[j]: coefficients[j] for j in rest}
+        for term, force in added.items():
+            extra[term] = extra.get(term, nothing) + force
     inverse = torch.linalg.inv(total)
-    rows = inverse @ mass @ hull
-    table = {term: rows[:, j] for j, term in enumerate(known)}
-    for term, force in {"1": constant, **extra}.items():
-        table[term] = table.get(term, torch.zeros(3, dtype=torch.float64)) - inverse @ force
-    by_axis = [
+    known = _columns(BelievedConfig(vessel=believed).equations().rows())
+    table = {term: inverse @ model.hull.mass @ column for term, column in known.items()}
+    for term, force in extra.items():
+        table[term] = table.get(term, nothing) - inverse @ force
+    u, v, r = (
         {term: float(value[axis]) for term, value in table.items() if float(value[axis]) != 0.0}
         for axis in range(3)
-    ]
-    return HullEquations(u=by_axis[0], v=by_axis[1], r=by_axis[2])
+    )
+    return HullEquations(u=u, v=v, r=r)
 
 
 def missing_coefficients(true: str, believed: str) -> dict[str, list[float]]:
@@ -597,39 +539,31 @@ def missing_coefficients(true: str, believed: str) -> dict[str, list[float]]:
     They are those of the true hull less those of the believed one, where document 002 misprints the
     cross terms (correction J19).
     """
-    of_true, of_believed = (_force_coefficients(name) for name in (true, believed))
-    zero = torch.zeros(3, dtype=torch.float64)
-    out: dict[str, list[float]] = {}
+
+    def factors(term: str) -> tuple[Any, ...]:
+        return tuple(sorted(parse_term(term, MOTION)))
+
+    names = {factors(term): term for term in FERRY_TERMS}
+
+    def of_force(vessel: str) -> dict[str, Tensor]:
+        """Return the coefficients [3] of F(nu_dot, nu) by basis function of document 002."""
+        columns = _columns(BelievedConfig(vessel=vessel).equations().rows())
+        mass = torch.linalg.inv(torch.stack([columns.pop(name) for name in FORCE_CHANNELS], dim=1))
+        out = {name: mass[:, axis] for axis, name in enumerate(ACCELERATION)}
+        return out | {
+            names.get(factors(term), term): -mass @ column for term, column in columns.items()
+        }
+
+    of_true, of_believed = of_force(true), of_force(believed)
+    zero, out = torch.zeros(3, dtype=torch.float64), {}
     for key in dict.fromkeys((*of_believed, *of_true)):
-        difference = of_true.get(key, zero) - of_believed.get(key, zero)
+        whole = of_true.get(key, zero)
+        difference = whole - of_believed.get(key, zero)
         # equal coefficients differ by rounding alone
-        difference = torch.where(
-            difference.abs() > 1e-9 * (1 + of_true.get(key, zero).abs()), difference, zero
-        )
-        if bool(difference.any()):
-            out[key] = difference.tolist()
+        known = difference.abs() > 1e-9 * (1 + whole.abs())
+        if bool(known.any()):
+            out[key] = torch.where(known, difference, zero).tolist()
     return out
-
-
-def _force_coefficients(vessel: str) -> dict[str, Tensor]:
-    """Return the coefficients [3] of F(nu_dot, nu) by basis function of document 002."""
-    names = {_factors(term): term for term in FERRY_TERMS}
-    rows = BelievedConfig(vessel=vessel).equations().rows()
-    columns = {
-        term: torch.tensor([row.get(term, 0.0) for row in rows], dtype=torch.float64)
-        for term in dict.fromkeys(t for row in rows for t in row)
-    }
-    mass = torch.linalg.inv(torch.stack([columns[name] for name in FORCE_CHANNELS], dim=1))
-    out = {name: mass[:, axis] for axis, name in enumerate(ACCELERATION)}
-    return out | {
-        names.get(_factors(term), term): -mass @ column
-        for term, column in columns.items()
-        if term not in FORCE_CHANNELS
-    }
-
-
-def _factors(term: str) -> tuple[Any, ...]:
-    return tuple(sorted(parse_term(term, MOTION)))
 
 
 def as_baseline_yaml(equations: HullEquations, label: str) -> str:
@@ -654,44 +588,55 @@ def fit_as_json(terms: Sequence[str], fit: Fit) -> dict[str, Any]:
     }
 
 
-def coefficients_section(
-    name: str,
-    model: Mapping[str, Any],
-    notes: Mapping[str, Any],
-    others: Mapping[str, Mapping[str, Sequence[float]]],
-) -> Section:
-    """Return a folded section with the coefficients of one model.
+def model_sections(
+    title: str,
+    models: Mapping[str, Results],
+    run: Path,
+    notes: str,
+    others: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]],
+) -> list[Section]:
+    """Return what both studies tell of fitted models: refusals, coefficients, and their figures.
 
     Args:
-        name: name of the model.
-        model: its entry in the results (`fit_as_json`).
-        notes: what its estimator chose.
-        others: coefficients [3] by basis function to stand beside it, by what they are, such as
-            `true` and `published`.
+        title: of the section of coefficients.
+        models: entries of the results (`fit_as_json`) by name.
+        run: folder that holds `model_figures`.
+        notes: key of what the estimator chose.
+        others: coefficients [3] by basis function to stand beside those of a model, by its name and
+            by what they are, such as `true` and `published`.
     """
-    others = {what: values for what, values in others.items() if values}
-    kept = {
-        term: row
-        for term, row in zip(model["terms"], model["coefficients"], strict=True)
-        if any(row)
-    }
-    rows = {"1": model["intercept"], **kept}
-    weights = dict(zip(model["terms"], model["weights"], strict=True))
-    groups = [(what, 3) for what in ("coefficient", "weight", *others)]
-    table = Table(["basis function", *AXES * len(groups)], groups=groups)
-    absent = (0.0, 0.0, 0.0)
-    for term in dict.fromkeys((*rows, *(term for values in others.values() for term in values))):
-        cells = [number(value, 4) for value in rows.get(term, absent)]
-        cells += [number(value, 3) for value in weights[term]] if term in weights else [""] * 3
-        for values in others.values():
-            cells += [number(value, 4) for value in values.get(term, absent)]
-        table.add(term, cells)
-    chosen = notes_text(notes)
-    return Section(
-        name,
-        [Text(f"Chosen by the estimator: {chosen}." if chosen else ""), table],
-        folded=True,
+    causes = [model["not_forward"] for model in models.values() if model["not_forward"]]
+    refused = Section("Models that cannot run forward in time", [Bullets(causes)])
+    about = Text(
+        "The force of a model is that of the believed hull plus the sum of coefficient times basis"
+        " function, in SI units. A weight is the magnitude of the coefficient of scaled variables:"
+        " it says how much a basis function matters."
     )
+    parts = []
+    for name, model in models.items():
+        terms = model["terms"]
+        kept = {t: row for t, row in zip(terms, model["coefficients"], strict=True) if any(row)}
+        beside = {what: values for what, values in others.get(name, {}).items() if values}
+        forces = {"coefficient": {"1": model["intercept"], **kept}, **beside}
+        weights = dict(zip(terms, model["weights"], strict=True))
+        groups = [(what, 3) for what in ("coefficient", "weight", *beside)]
+        table = Table(["basis function", *AXES * len(groups)], groups=groups)
+        for term in dict.fromkeys(term for of in forces.values() for term in of):
+            ours, *theirs = (
+                [number(value, 4) for value in of.get(term, (0.0, 0.0, 0.0))]
+                for of in forces.values()
+            )
+            weight = [number(value, 3) for value in weights[term]] if term in weights else [""] * 3
+            table.add(term, [*ours, *weight, *(text for texts in theirs for text in texts)])
+        chosen = notes_text(model[notes])
+        words = Text(f"Chosen by the estimator: {chosen}." if chosen else "")
+        parts.append(Section(name, [words, table], folded=True))
+    figures = pictures(run, "orders_", "surface_", "weights_")
+    return [
+        *([refused] if causes else []),
+        Section(title, [about, *parts]),
+        Section("Orders, weights and surfaces", figures, True),
+    ]
 
 
 def model_figures(
@@ -707,33 +652,27 @@ def model_figures(
         fit: its coefficients.
         unmodelled: mean square of the believed model's residual by axis.
     """
-    out = [_weights(name, config.terms, fit.pre)]
-    if fit.orders is not None:
-        curves = {"left-out segments": fit.orders.left_out, "test half": fit.orders.test}
-        out.append(_orders(name, curves, unmodelled, int(fit.notes["order"])))
-    if isinstance(config.fit, SurfaceRegression) and fit.surface is not None:
+    at, weights, names = np.arange(len(config.terms)), fit.pre.abs().numpy(), names_of(config.terms)
+    out = [
+        Figure(
+            f"weights_{name}",
+            f"Weights of the basis functions in {name}",
+            "Magnitude of the coefficients of scaled basis functions. It shows how much each one"
+            " weighs in the model.",
+            {"weights": Look("", BLUE, kind="fill")},
+            [Panel(f"{axis}, scaled [-]", height=165, group="w", x_names=names) for axis in AXES],
+            [Case("", [{"weights": bars(at, weights[:, axis])} for axis in range(3)])],
+        )
+    ]
+    if fit.orders:
+        out.append(_orders(name, fit.orders, unmodelled, int(fit.notes["order"])))
+    if fit.surface is not None:
         choices = {
             "chosen": list(zip(fit.notes["order"], fit.notes["terms"], strict=True)),
             "least": [fit.surface.least(axis) for axis in range(3)],
         }
         out.append(_surface(name, fit.surface.error, unmodelled, choices))
     return out
-
-
-def _weights(name: str, terms: Sequence[str], pre: Tensor) -> Figure:
-    at = np.arange(len(terms))
-    return Figure(
-        f"weights_{name}",
-        f"Weights of the basis functions in {name}",
-        "Magnitude of the coefficients of scaled basis functions. It shows how much each one"
-        " weighs in the model.",
-        {"weights": Look("", BLUE, kind="fill")},
-        [
-            Panel(f"{axis}, scaled [-]", height=165, group="w", x_names=names_of(terms))
-            for axis in AXES
-        ],
-        [Case("", [{"weights": bars(at, pre[:, axis].abs().numpy())} for axis in range(3)])],
-    )
 
 
 def _orders(

@@ -1,0 +1,176 @@
+"""What the studies share: the order of one, its figures, and the document's own numbers."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, final
+
+import numpy as np
+
+from residnet.core.config import load_config
+from residnet.core.files import read_json
+from residnet.report.blocks import Cell, Column, Section
+from residnet.report.figure import Case, Curve, Figure, Look, Panel, read_figures, write_figure
+from residnet.report.format import minus, number
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome, Task
+
+Results = Mapping[str, Any]
+"""What a study found, as its file in the run folder holds it."""
+
+
+class Study(Task):
+    """An experiment of a document: its results stand in one file, and all that is said in them."""
+
+    results_file: ClassVar[str] = "study.json"
+
+    @abstractmethod
+    def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        """Carry the study out; return its results in terms of JSON, and its pictures.
+
+        Raises:
+            ResidnetError: where the input does not allow it.
+        """
+
+    @abstractmethod
+    def verdict(self, results: Results) -> list[str]:
+        """Return the sentences that sum the results up."""
+
+    @abstractmethod
+    def main_figures(self, results: Results) -> dict[str, MainFigure]:
+        """Return the numbers that sum the results up, by what they are."""
+
+    @abstractmethod
+    def sections(self, results: Results, run: Path) -> list[Section]:
+        """Return the sections of the report, with the document's figures beside ours."""
+
+    @final
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        found, figures = self.results(folder)
+        folder.write_json(folder.path / self.results_file, found)
+        for figure in figures:
+            write_figure(folder.figures, figure)
+        # as a reader of the file sees them
+        read = read_json(folder.path / self.results_file)
+        return Outcome(self.verdict(read), self.main_figures(read))
+
+    @classmethod
+    @final
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
+        results = read_json(run.path / cls.results_file)
+        return load_config(run.resolved, [], cls).sections(results, run.path)
+
+
+def beside_published(value: float | None, published: float | None, digits: int = 4) -> Cell:
+    """Return a cell with a number of the run, and in small print the document's own number.
+
+    Args:
+        value: number of the run; None where there is none.
+        published: number that the document prints; None where it prints none.
+        digits: significant digits.
+    """
+    # the document's number keeps the digits that it is printed with
+    note = "" if published is None else f"published {minus(f'{published:.{digits}g}')}"
+    return Cell(number(value, digits), note)
+
+
+def compared(
+    key: str, titles: str | Sequence[str], digits: int = 4, factor: float = 1.0
+) -> list[Column]:
+    """Return the columns of a row's number, or of each of its numbers, beside the document's own.
+
+    Args:
+        key: of the numbers in a row; those of the document stand under it in `published`, a part of
+            the row.
+        titles: of one number, or of each of several.
+        digits: significant digits.
+        factor: from our number to its unit in the table, in which the document prints its own.
+    """
+
+    def shown(pick: Callable[[Any], float]) -> Callable[[Any], Cell]:
+        def cell(row: Any) -> Cell:
+            ours, printed = row[key], row["published"].get(key)
+            return beside_published(
+                None if ours is None else factor * pick(ours),
+                None if printed is None else pick(printed),
+                digits,
+            )
+
+        return cell
+
+    if isinstance(titles, str):
+        return [(titles, shown(lambda number: number))]
+    return [
+        (title, shown(lambda numbers, i=i: numbers[i]))  # type: ignore[misc]
+        for i, title in enumerate(titles)
+    ]
+
+
+def joined(values: Sequence[float], digits: int = 3) -> str:
+    """Return several numbers as text, with slashes between them."""
+    return " / ".join(number(value, digits) for value in values)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as a list in a sentence, as in "a, b and c"."""
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def notes_text(notes: Mapping[str, Any]) -> str:
+    """Return what an estimator chose in one line, such as "penalty 0.1; order 3/3/1"."""
+
+    def text(value: Any) -> str:
+        if isinstance(value, dict):
+            return ", ".join(f"{key} {text(part)}" for key, part in value.items())
+        if isinstance(value, list):
+            return "/".join(text(part) for part in value)
+        return number(value, 4) if isinstance(value, float) else str(value)
+
+    return "; ".join(f"{key} {text(value)}" for key, value in notes.items())
+
+
+def pictures(run: Path, *beginnings: str) -> list[Figure]:
+    """Return the figures of a run whose names begin with one of the given beginnings.
+
+    They stand in the order of the beginnings, then in that of their names.
+    """
+    stored = read_figures(run / "figures")
+    return [
+        figure for beginning in beginnings for figure in stored if figure.name.startswith(beginning)
+    ]
+
+
+def histories(
+    name: str,
+    words: tuple[str, str],
+    looks: Mapping[str, Look],
+    t: np.ndarray,
+    paths: Mapping[str, np.ndarray],
+    units: Sequence[tuple[str, float]],
+    *,
+    height: int = 165,
+    x_label: str = "time [s]",
+    shared: Mapping[str, Curve] | None = None,
+) -> Figure:
+    """Return a figure of one panel beneath the other, each with one column of all paths over time.
+
+    Args:
+        name: of the figure.
+        words: its title and its caption.
+        looks: of the paths and of what all panels share, by name.
+        t: time [T].
+        paths: columns [T, n] by name.
+        units: label of each column with its unit, and the factor to that unit.
+        height: of a panel.
+        x_label: of the time.
+        shared: curves of all panels by name.
+    """
+    curves = [
+        dict(shared or {}) | {key: (t, factor * path[:, i]) for key, path in paths.items()}
+        for i, (_, factor) in enumerate(units)
+    ]
+    panels = [Panel(label, x_label, height=height, group="t") for label, _ in units]
+    return Figure(name, *words, looks, panels, [Case("", curves)])
