@@ -21,7 +21,7 @@ from made_task_runs import (
 from read_page import Page, plain
 
 from residnet.report.blocks import Section
-from residnet.report.fit import fit_sections
+from residnet.report.fit import fit_sections, write_fit_figures, write_fit_page
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import actuators, autopilot, course, import_logs, manoeuvres, study
@@ -88,6 +88,22 @@ def test_nothing_is_wider_than_the_window_and_no_word_is_broken(task: str, tmp_p
     for width in (360, 820):
         found = layout(page, width, tmp_path)
         assert (found.overflow, found.broken) == (0, []), width
+
+
+@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (390, 844)])
+def test_the_first_screen_holds_verdict_picture_and_the_best_rows(
+    width: int, height: int, tmp_path: Path
+) -> None:
+    run = RunFiles(made_run(tmp_path / "run"))
+    write_fit_figures(run)
+    found = layout(write_fit_page(run), width, tmp_path)
+    assert found.first["verdict"] < height
+    assert found.first["pictures"]
+    assert max(found.first["pictures"]) < height
+    # what is selected, the baseline, and zero
+    assert found.first["rows"][2] < height
+    assert found.first["words"] < 6_000
 
 
 @pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")

@@ -34,16 +34,18 @@ const cut = root => {
   const first = told();
   sliders[0].value = String(Number(sliders[0].value) + 1);
   sliders[0].dispatchEvent(new Event("input"));
-  const plot = root.ownerDocument.defaultView.Bokeh.documents[0].get_model_by_name(root.id + "-2");
+  const plot = root.ownerDocument.defaultView.Bokeh.documents.map(
+    one => one.get_model_by_name(root.id + "-2")).find(found => found);
   const curve = plot.renderers[0];
   return {cut: [first, told()], section: Array.from(curve.data_source.data[curve.name])};
 };
 const use = async (page, pause) => {
-  const root = page.querySelector(".explorer");
+  const root = page.querySelector("main > section:not(.opening) .explorer:has(.note)") ||
+    page.querySelector("main > section:not(.opening) .explorer");
   if (root === null) return {};
-  const plots = page.defaultView.Bokeh.documents[0];
-  const plot = plots.get_model_by_name(root.id + "-1") ||
-    plots.get_model_by_name(root.id + "-0");
+  const model = name => page.defaultView.Bokeh.documents.map(
+    one => one.get_model_by_name(name)).find(found => found);
+  const plot = model(root.id + "-1") || model(root.id + "-0");
   const range = plot.x_range;
   const width = () => range.end - range.start, begin = width();
   const press = async text => {
@@ -71,14 +73,24 @@ const use = async (page, pause) => {
   return {focused: focused, zoomed: near / begin, reset: again / begin, hidden: hidden,
           chosen: note() !== first};
 };
+const opening = page => {
+  const ends = box => box === null ? null : box.getBoundingClientRect().bottom;
+  const places = name => [...page.querySelectorAll(name)].map(ends);
+  return {verdict: ends(page.querySelector(".verdict p")),
+          pictures: places(".opening .panel, .opening figure:not(.still)"),
+          rows: places(".opening tbody tr"),
+          words: page.body.innerText.split(/\\s+/).length};
+};
 const frame = document.querySelector("iframe");
-const drawn = page => page.documentElement.classList.contains("drawn");
+const drawn = root => root.classList.contains("drawn");
 frame.onload = async () => {
   const page = frame.contentDocument, root = page.documentElement;
   const pause = () => new Promise(done => setTimeout(done, 50));
-  while (page.querySelector(".explorer") && !drawn(page)) await pause();
+  while (![...page.querySelectorAll(".live .opening .explorer")].every(drawn)) await pause();
   await pause();
+  const first = opening(page);
   page.querySelectorAll("details").forEach(part => part.open = true);
+  while (![...page.querySelectorAll(".live .explorer")].every(drawn)) await pause();
   const broken = [];
   page.querySelectorAll("td, th, h1, h2, h3, p, li, summary, figcaption").forEach(box => {
     const walker = page.createTreeWalker(box, NodeFilter.SHOW_TEXT);
@@ -106,7 +118,7 @@ frame.onload = async () => {
     return canvas !== null && canvas.width > 0 && inked(canvas);
   });
   const found = {scroll: root.scrollWidth, width: root.clientWidth, broken: broken,
-                 smallest: smallest, panels: panels, used: await use(page, pause)};
+                 smallest: smallest, panels: panels, first: first, used: await use(page, pause)};
   document.querySelector("pre").textContent = JSON.stringify(found);
 };
 frame.srcdoc = document.querySelector("template").innerHTML;
@@ -122,6 +134,8 @@ class Layout:
         broken: words that do not stand in one line.
         smallest: size of the smallest text in pixels.
         panels: for each panel of an interactive figure, whether something is drawn in it.
+        first: lower edges in pixels of the verdict's first sentence, of the pictures and of the
+            rows of the first screen, and how many words the page shows before anything is unfolded.
         used: what became of pressing the first interactive figure's controls; empty without one.
     """
 
@@ -129,6 +143,7 @@ class Layout:
     broken: list[str]
     smallest: float
     panels: list[bool]
+    first: dict[str, Any]
     used: dict[str, Any]
 
 
@@ -158,5 +173,6 @@ def layout(page: Path, width: int, scratch: Path) -> Layout:
         found["broken"],
         found["smallest"],
         found["panels"],
+        found["first"],
         found["used"],
     )

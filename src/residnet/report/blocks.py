@@ -101,11 +101,13 @@ class Cell:
         text: a formatted number or a few words.
         note: small print below it.
         mark: `bad`, `best` or `weak` set it off; `text` is aligned to the left and may wrap.
+        si: the number in its SI unit where it stands in another, shown under the pointer.
     """
 
     text: str
     note: str = ""
     mark: Mark = ""
+    si: str = ""
 
 
 @dataclass(frozen=True)

@@ -17,18 +17,12 @@ if TYPE_CHECKING:
     from bokeh.plotting import figure as Canvas
 
 _FONT = "12px"
-_RANDOM = re.compile(
-    r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b|(?<=\")p\d{4,}(?=\")"
-)
-"""Names that Bokeh gives to the parts of a page and to its models."""
 HEIGHT = "height of a cell"
 """Name of the column of a surface's heights; of their logarithms on a page where they are so."""
 _DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
 _MARKERS = {"o": "circle", "s": "square", "x": "x", "^": "triangle"}
 _TOLD = ("line", "points", "cells")
 """Kinds of marks whose values stand beside the pointer."""
-_MOST_PANELS = 60
-"""Most panels of the figures of one page, which a browser has to draw."""
 
 
 @dataclass(frozen=True)
@@ -36,52 +30,44 @@ class Drawn:
     """What a page holds of its interactive figures.
 
     Attributes:
-        parts: HTML of the panels of each figure by its key.
-        cases: the figure's cases as JSON, curves in base 64, by its key.
-        script: that draws all panels.
+        figures: each figure's panels and cases as JSON, curves in base 64, by its key.
         library: BokehJS itself, so that the page loads nothing.
     """
 
-    parts: dict[str, list[str]]
-    cases: dict[str, str]
-    script: str
+    figures: dict[str, str]
     library: str
 
 
 def draw(figures: Sequence[Figure]) -> Drawn | None:
-    """Draw as many figures as a page has room for; None where there are none."""
-    sums = np.cumsum([len(figure.panels) for figure in figures])
-    afforded = [one for one, panels in zip(figures, sums, strict=True) if panels <= _MOST_PANELS]
-    afforded = afforded or list(figures[:1])
-    if not afforded:
+    """Draw figures; None where there are none. The page's own script lays them out when seen."""
+    if not figures:
         return None
-    from bokeh.embed import components
-    from bokeh.model import Model
     from bokeh.resources import Resources
 
-    canvases: dict[str, Model] = {
-        f"{one.key}-{number}": canvas
-        for one in afforded
-        for number, canvas in enumerate(_panels(one))
-    }
-    script, given = components(canvases)
-    # random names are counted, so that the same run has the same page
+    library = Resources(mode="inline", components=["bokeh"], minified=True).js_raw
+    return Drawn({one.key: _json(one) for one in figures}, "\n".join(library))
+
+
+def _document(figure: Figure) -> dict[str, Any]:
+    """Return the panels as Bokeh's JSON, and in which part of the page each is to stand."""
+    from bokeh.document import Document
+
+    # models are numbered in their order, so that the same run has the same page
+    document, panels = Document(), _panels(figure)
+    for panel in panels:
+        document.add_root(panel)
     names: dict[str, str] = {}
-    script, *divisions = [
-        _RANDOM.sub(lambda found: names.setdefault(found[0], f"bokeh-{len(names)}"), text)
-        for text in (script, *given.values())
-    ]
-    parts = dict(zip(given, divisions, strict=True))
-    library = Resources(mode="inline", components=["bokeh"], minified=True).render_js()
-    return Drawn(
-        {
-            one.key: [parts[f"{one.key}-{number}"] for number in range(len(one.panels))]
-            for one in afforded
-        },
-        {one.key: _cases(one) for one in afforded},
-        script,
-        library,
+    text = json.dumps(document.to_json(deferred=False))
+    for number, panel in enumerate(panels):
+        names[panel.id] = f"{figure.key}-root-{number}"
+    text = re.sub(
+        r"(?<=\")p\d{4,}(?=\")",
+        lambda found: names.setdefault(found[0], f"{figure.key}-{len(names)}"),
+        text,
     )
+    places = {f"{figure.key}-root-{i}": f"{figure.key}-{i}-panel" for i in range(len(panels))}
+    item = {"docid": figure.key, "roots": places, "root_ids": list(places)}
+    return {"documents": {figure.key: json.loads(text)}, "items": [item]}
 
 
 def _panels(figure: Figure) -> list[Canvas]:
@@ -120,7 +106,7 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
     canvas = new_canvas(
         name=f"{figure.key}-{number}",
         title=Title(text=panel.words, text_font_size=_FONT),
-        height=380 if panel.kind == "map" else panel.height,
+        height=panel.height,
         sizing_mode="stretch_width",
         toolbar_location=None,
         tools=[],
@@ -163,6 +149,14 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
         tooltips=tips,
         point_policy="follow_mouse",
     )
+    if told and panel.si:
+        unit, factor = panel.si
+        both = models.CustomJSHover(
+            args={"unit": unit, "factor": factor},
+            code="return `${+value.toPrecision(4)} (${+(value / factor).toPrecision(4)} ${unit})`",
+        )
+        hover.tooltips = [("$name", "@$name{custom}")]
+        hover.formatters = {f"@{{{name}}}": both for name in figure.names(number)}
     canvas.add_tools(hover, models.BoxZoomTool(match_aspect=panel.kind == "map"))
     canvas.toolbar.active_drag = None
     canvas.xaxis.axis_label = panel.x_label or None
@@ -253,10 +247,11 @@ def _columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarray]:
     return columns
 
 
-def _cases(figure: Figure) -> str:
-    """Return the cases as JSON that may stand in a page's script."""
+def _json(figure: Figure) -> str:
+    """Return a figure as the page's script takes it."""
     surface = figure.surface
     content = {
+        **_document(figure),
         "looks": {
             name: {"color": look.color, "shown": look.shown} for name, look in figure.looks.items()
         },
@@ -281,4 +276,4 @@ def _cases(figure: Figure) -> str:
             for case in figure.cases
         ],
     }
-    return json.dumps(content, separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
+    return json.dumps(content, separators=(",", ":"))

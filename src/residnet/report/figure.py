@@ -111,6 +111,7 @@ class Panel:
         x_log, y_log: whether an axis is logarithmic.
         group: of panels that share their horizontal axis.
         x_names, y_names: what stands at an axis in place of numbers, by place.
+        si: SI unit of the vertical values, and their factor from it; empty where they are in it.
         x_limits, y_limits: where an axis begins and ends at first; empty for all that is shown.
     """
 
@@ -126,6 +127,7 @@ class Panel:
     y_names: Mapping[str, str] = field(default_factory=dict)
     x_limits: Sequence[float] = ()
     y_limits: Sequence[float] = ()
+    si: tuple[str, float] | tuple[()] = ()
 
     @property
     def words(self) -> str:

@@ -2,46 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from residnet.judge.soundness import read_findings
 from residnet.report.blocks import Section
-from residnet.report.figure import Figure, figures_section, read_figures, write_figures
+from residnet.report.figure import Figure, read_figures, write_figures
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import data, free_runs, manoeuvres, models, runs, verdict
 
-_INTERACTIVE = "free_runs|horizon|residuals"
-"""Names of the figures that stand before the numbers."""
 
+def _sections(run: RunFiles) -> Iterator[Section | None]:
+    """Yield the sections of the page in their order; None is left out.
 
-def _sections(run: RunFiles) -> list[Callable[[RunFiles], Section | None]]:
-    """Return what gives each section of the page, in their order; None is left out.
-
-    A section is added here, and its figures below.
+    A section is added here, and its figures below. What most readers look for stands open.
     """
-    findings = read_findings(run.path)
-    return [
-        partial(verdict.cautions, findings=findings),
-        verdict.figures_of_lead,
-        _looked_into,
-        free_runs.limits,
-        data.fitted_on_what,
-        data.doctor,
-        models.models,
-        manoeuvres.booklet,
-        free_runs.bands,
-        models.goodness,
-        free_runs.errors,
-        _other_figures,
-        partial(verdict.sanity, findings=findings),
-    ]
+    folder, findings = run.path / "figures", read_findings(run.path)
+    yield verdict.opening(run, read_figures(folder, "track"))
+    yield verdict.cautions(run, findings)
+    yield _figures_as("Error against horizon", folder, "horizon")
+    yield free_runs.worst(run, read_figures(folder, "free_runs"))
+    yield data.doctor(run)
+    for found in (
+        free_runs.errors(run),
+        free_runs.limits(run),
+        data.fitted_on_what(run),
+        models.models(run),
+        manoeuvres.booklet(run),
+        free_runs.bands(run),
+        models.goodness(run),
+        _figures_as("Figures", folder, "(?!(track|horizon|free_runs)$).*"),
+        verdict.sanity(run, findings),
+    ):
+        yield found and replace(found, folded=True)
+
+
+def _figures_as(title: str, folder: Path, names: str) -> Section | None:
+    found = read_figures(folder, names)
+    return Section(title, found) if found else None
 
 
 def _figures(run: RunFiles) -> Iterator[Figure | None]:
     windows = run.windows(run.focus)
+    yield runs.track(run, windows)
     yield runs.free_runs(run, windows)
     yield runs.horizon(run, windows)
     yield runs.residuals(run)
@@ -82,7 +87,14 @@ def write_fit_page(run: RunFiles) -> Path:
         DataError: where a file in it cannot be read.
     """
     title = str(run.metrics.get("run") or run.path.name)
-    return write_page(run.path, title, run.description, verdict.verdict(run), fit_sections(run))
+    return write_page(
+        run.path,
+        title,
+        run.description,
+        verdict.verdict(run),
+        fit_sections(run),
+        level=verdict.level(run),
+    )
 
 
 def fit_sections(run: RunFiles) -> list[Section]:
@@ -92,14 +104,4 @@ def fit_sections(run: RunFiles) -> list[Section]:
         UsageError: where the folder holds no metrics.json.
         DataError: where a file in it cannot be read.
     """
-    found = [section(run) for section in _sections(run)]
-    return [section for section in found if section is not None]
-
-
-def _looked_into(run: RunFiles) -> Section | None:
-    found = read_figures(run.path / "figures", _INTERACTIVE)
-    return Section("Runs to look into", found) if found else None
-
-
-def _other_figures(run: RunFiles) -> Section | None:
-    return next(iter(figures_section(run.path / "figures", f"(?!({_INTERACTIVE})$).*")), None)
+    return [section for section in _sections(run) if section is not None]

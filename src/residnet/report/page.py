@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+import zlib
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -32,6 +33,8 @@ _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (
 _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
 
 
+LEVELS = {"good": "✓ Good", "limited": "! Limited", "do not use": "✗ Do not use"}
+"""Levels of a verdict in words; what they look like stands in the page's styles."""
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """The space between a number and its unit."""
 _LONG = 20
@@ -53,6 +56,7 @@ def write_page(
     verdict: Sequence[str],
     sections: Sequence[Section],
     drawn: Drawn | None = None,
+    level: str = "",
 ) -> Path:
     """Write `report.html` of a run folder, whole or not at all.
 
@@ -67,8 +71,10 @@ def write_page(
         title: of the page.
         description: what the run was made for, empty where nothing is to be said.
         verdict: sentences that stand first, the first of them in bold.
-        sections: from top to bottom.
+        sections: from top to bottom. One without a title is the rest of the first screen: its
+            first block stands beside the others where there is room.
         drawn: what `draw_sections` returned for the sections; None to draw them now.
+        level: of the verdict, a key of `LEVELS`; empty where none was passed.
 
     Returns:
         Path of the page.
@@ -92,6 +98,7 @@ def write_page(
         "breakable": _breakable,
         "embedded": lambda path: base64.b64encode(path.read_bytes()).decode("ascii"),
         "pixels": _pixels,
+        "deflated": lambda text: base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii"),
         "anchor": _anchor,
         "linked": lambda text: glossary.linked(_breakable(str(text))),
     }
@@ -102,7 +109,9 @@ def write_page(
         version=str(record.get("residnet") or ""),
         date=str(record.get("started") or "")[:10],
         verdict=[sentence for sentence in verdict if sentence],
-        sections=parts,
+        level=level and (level.replace(" ", "-"), LEVELS[level]),
+        opening=[part for part in sections if not part.title],
+        sections=[part for part in parts if part.title],
         glossary=glossary,
         interactive=drawn or draw_sections(sections),
     )

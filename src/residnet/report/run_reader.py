@@ -16,9 +16,10 @@ from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_table
 from residnet.core.layout import RANGE_VELOCITIES
-from residnet.core.names import CHANNEL_UNITS
+from residnet.core.names import CHANNEL_UNITS, to_si
+from residnet.core.units import known_unit
 from residnet.judge.rollout_files import INPUT
-from residnet.report.format import shown_unit
+from residnet.report.format import SHOWN_UNITS, shown_unit
 
 Content = Mapping[str, Any]
 """What a JSON object holds."""
@@ -229,6 +230,22 @@ class RunFiles:
         names = list(dict.fromkeys(row["protocol"] for row in self.rows))
         return sorted(names, key=lambda name: name != self.evaluation.get("selection"))
 
+    @cached_property
+    def main(self) -> str:
+        """The protocol of the first screen: the first whose free runs have one length, if any has.
+
+        That which selects comes first.
+        """
+        kinds = self.evaluation.get("protocols") or {}
+        timed = [name for name in self.protocols if (kinds.get(name) or {}).get("length")]
+        return (timed or self.protocols)[0]
+
+    @cached_property
+    def horizon(self) -> str:
+        """When the errors of the main protocol are taken: after so many seconds, or at the end."""
+        length = ((self.evaluation.get("protocols") or {}).get(self.main) or {}).get("length")
+        return f"after {length:g} s" if length else "at the end"
+
     @property
     def evaluation(self) -> Content:
         """The section `evaluation` of the configuration."""
@@ -270,9 +287,21 @@ class RunFiles:
         return f"{model} (selected)" if model == self.selected else model
 
     def unit(self, channel: str) -> tuple[str, float]:
-        """Return the unit in which a channel is shown and the factor to it from SI."""
+        """Return the unit in which a channel is shown and the factor to it from SI.
+
+        It is that of the log's channel map, and degrees where that has radians.
+        """
+        reader = (self.resolved.get("data") or {}).get("reader") or {}
+        given = (reader.get("channels") or {}).get(channel) or {}
+        if unit := given.get("unit"):
+            known = known_unit(unit, CHANNEL_UNITS.get(channel))
+            return shown_unit(known) if known in SHOWN_UNITS else (known, 1.0 / to_si(known))
+        return shown_unit(self.si(channel))
+
+    def si(self, channel: str) -> str:
+        """Return the SI unit of a channel, `-` where it is not known."""
         known = self.metrics.get("channels") or {}
-        return shown_unit(known.get(channel) or CHANNEL_UNITS.get(channel, "-"))
+        return str(known.get(channel) or CHANNEL_UNITS.get(channel, "-"))
 
     def card(self, model: str) -> Content:
         """Return what models/<model>/model.json holds."""

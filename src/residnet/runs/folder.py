@@ -218,6 +218,7 @@ class RunFolder:
         verdict: Sequence[str],
         figures: Mapping[str, Mapping[str, Any]],
         *,
+        level: str = "",
         finished: bool,
     ) -> None:
         """Write summary.json; its `finished` is the mark that the run came to its end."""
@@ -225,6 +226,7 @@ class RunFolder:
             "schema": SUMMARY,
             "task": task,
             "finished": finished,
+            **({"level": level} if level else {}),
             "verdict": list(verdict),
             "figures": {name: dict(figure) for name, figure in figures.items()},
         }

@@ -73,6 +73,7 @@ class Outcome:
         table: text for the terminal; empty for none.
         failure: a line where a result fails a check; the run is complete, and ends as a `DataError`
             with this line.
+        level: of the verdict, one of `residnet.report.page.LEVELS`; empty where none was passed.
         exports: what writes each model for controllers once the report stands, by its name; one
             that fails is reported, and the complete run ends as an `ExportError`. One that is
             withheld is reported alone.
@@ -83,6 +84,7 @@ class Outcome:
     table: str = ""
     failure: str = ""
     exports: Exports = field(default_factory=dict)
+    level: str = ""
 
 
 @dataclass(frozen=True)
@@ -249,8 +251,11 @@ class Task(Config):
         (folder.path / EXPORTS).unlink(missing_ok=True)
         with self.resources():
             outcome = work(folder)
-            figures = {name: figure.as_json() for name, figure in outcome.figures.items()}
-            folder.write_summary(self.task, outcome.verdict, figures, finished=False)
+            about: Any = {
+                "figures": {name: figure.as_json() for name, figure in outcome.figures.items()},
+                "level": outcome.level,
+            }
+            folder.write_summary(self.task, outcome.verdict, **about, finished=False)
             # the last time, since the report shows it and must come out the same again
             made_from.write(folder)
             verdict, exported = list(outcome.verdict), Exported()
@@ -263,10 +268,10 @@ class Task(Config):
                 if outcome.exports:
                     exported = _write_exports(folder, outcome.exports)
                     verdict += [f"Not exported: {fault}." for fault in exported.faults]
-                    folder.write_summary(self.task, verdict, figures, finished=False)
+                    folder.write_summary(self.task, verdict, **about, finished=False)
                     self._write_page(folder, sections, drawn)
         seal(folder.path)
-        folder.write_summary(self.task, verdict, figures, finished=True)
+        folder.write_summary(self.task, verdict, **about, finished=True)
         if outcome.failure:
             raise DataError(outcome.failure)
         for fault in exported.faults:
@@ -285,15 +290,14 @@ class Task(Config):
     ) -> Path:
         from residnet.report.page import exports_section, title_and_description, write_page
 
-        title, description = title_and_description(run.path)
-        exports = exports_section(run.path)
+        exports, summary = exports_section(run.path), run.read_summary()
         return write_page(
             run.path,
-            title,
-            description,
-            run.read_summary()["verdict"],
+            *title_and_description(run.path),
+            summary["verdict"],
             [*sections, *([] if exports is None else [exports])],
             drawn,
+            level=str(summary.get("level") or ""),
         )
 
     @contextmanager

@@ -49,7 +49,7 @@ from residnet.judge.soundness import sanity_content
 from residnet.judge.verdict import objections
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import errors_table
-from residnet.report.sections.verdict import evidence, verdict
+from residnet.report.sections.verdict import evidence, level, verdict
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.provenance import Provenance
@@ -221,7 +221,14 @@ def fit_outcome(
             "heading_error_end": MainFigure(row["heading_error_end"], "rad"),
         }
     sentences = [sentence for sentence in verdict(files) if sentence]
-    return Outcome(sentences, figures, errors_table(files, split).text(), failure, exports or {})
+    return Outcome(
+        sentences,
+        figures,
+        errors_table(files, split).text(),
+        failure,
+        exports or {},
+        level(files),
+    )
 
 
 def export_model(

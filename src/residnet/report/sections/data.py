@@ -26,22 +26,6 @@ _LEVELS = ("fatal", "will mislead")
 
 def fitted_on_what(run: RunFiles) -> Section | None:
     """Return the section on the data, None where the folder says nothing about them."""
-    facts = fitted_on(run)
-    blocks: list[Block] = [Facts(facts)] if facts else []
-    if run.quality:
-        short, full = quality_tables(run)
-        short.caption = (
-            "Scored: share of the samples on which u and v are compared. Learned from: share on"
-            " which smoothed states and accelerations are defined."
-        )
-        blocks += [
-            Section("Data quality", [short, Section("Log by log", [full], folded=True)]),
-        ]
-    return Section("What was fitted on what", blocks) if blocks else None
-
-
-def fitted_on(run: RunFiles) -> list[tuple[str, str]]:
-    """Return what was fitted on what, as pairs of a name and a text."""
     baseline = run.resolved.get("baseline") or {}
     samples = run.fit(run.baseline or "baseline").get("samples")
     fit = f", fitted on {samples} samples" if samples else ""
@@ -73,7 +57,18 @@ def fitted_on(run: RunFiles) -> list[tuple[str, str]]:
             )
         )
     facts.append(("NRMSE divides by", ", ".join(scales)))
-    return [(name, text) for name, text in facts if text]
+    facts = [(name, text) for name, text in facts if text]
+    blocks: list[Block] = [Facts(facts)] if facts else []
+    if run.quality:
+        short, full = quality_tables(run)
+        short.caption = (
+            "Scored: share of the samples on which u and v are compared. Learned from: share on"
+            " which smoothed states and accelerations are defined."
+        )
+        blocks += [
+            Section("Data quality", [short, Section("Log by log", [full], folded=True)]),
+        ]
+    return Section("What was fitted on what", blocks) if blocks else None
 
 
 def _data(run: RunFiles) -> str:
@@ -163,7 +158,8 @@ def quality_tables(run: RunFiles) -> tuple[Table, Table]:
                 number,
                 factor,
             )
-            for name, unit, factor in (("u", "m/s", 1.0), ("v", "m/s", 1.0), ("r", "deg/s", DEG))
+            for name in ("u", "v", "r")
+            for unit, factor in [run.unit(name)]
         ),
     ]
     short: list[Column] = [("split, manoeuvre", label), ("logs", len, str), *columns]

@@ -18,6 +18,7 @@ from residnet.report.blocks import (
     bad_where,
     table_of,
 )
+from residnet.report.figure import Figure
 from residnet.report.format import (
     DASH,
     DEG,
@@ -31,11 +32,6 @@ from residnet.report.format import (
 )
 from residnet.report.run_reader import Content, RunFiles
 
-_DRAWN = {
-    "logs": "whole logs",
-    "windows": "runs of consecutive windows, since there are too few logs to draw whole ones",
-}
-"""What the blocks of the bootstrap are."""
 _BANDS = ("u", "v", "r", "heading", "position")
 
 
@@ -204,7 +200,8 @@ def _quantity(run: RunFiles, key: str, row: Content | None, base: Content | None
         worse = base is not None and value > 1.005 * base["rmse"][key]
         small = change(value, base["rmse"][key]) if base is not None else ""
     note = "; ".join(text for text in (small, lost) if text)
-    return Cell(number(factor * value), note, "bad" if worse or row["diverged"] else "")
+    si = f"{number(value)} {run.si(key)}" if factor != 1.0 else ""
+    return Cell(number(factor * value), note, "bad" if worse or row["diverged"] else "", si)
 
 
 def limits(run: RunFiles) -> Section | None:
@@ -219,9 +216,8 @@ def limits(run: RunFiles) -> Section | None:
         if row is not None:
             known = (run.limits.get("splits") or {}).get(run.focus, {}).get(protocol, {})
             blocks = [
-                Text(_how_good(lead, row)),
                 _where(run, lead, protocol, known),
-                _worst(run, lead, known),
+                None if protocol == run.main else _worst(run, lead, known),
                 Text(_what_limits(run, lead, row, protocol, known)),
             ]
             title = f"Protocol {protocol}" + ("" if parts else f", {run.focus} data")
@@ -238,38 +234,8 @@ def limits(run: RunFiles) -> Section | None:
     return Section(title, [*parts, Text(notes, quiet=True)])
 
 
-def _how_good(lead: str, row: Content) -> str:
-    drawn, interval = row.get("ci95_blocks"), row.get("nrmse_mean_ci95")
-    text = f"{lead}: NRMSE {number(row['nrmse']['mean'])}"
-    if row["diverged"]:
-        text += f" ({diverged_note(row)})"
-    if interval:
-        text += f", 95 % interval {number(interval[0])} to {number(interval[1])}"
-    if drawn:
-        text += f" (bootstrap of {drawn['count']} blocks: {_DRAWN[drawn['of']]})"
-    elif "ci95_blocks" in row:
-        text += "; too few logs for an interval"
-    return f"{text}. {against(lead, row.get('difference'))}".strip()
-
-
-def against(lead: str, difference: Content | None) -> str:
-    """Return a paired difference as a sentence, empty where there is none."""
-    if not difference:
-        return ""
-    value, interval = difference["nrmse_mean"], difference["ci95"]
-    text = f"Against {difference['to']} over the same windows: {signed(value)}"
-    if difference["ratio"] is not None:
-        text += f" ({percent(100 * (difference['ratio'] - 1))})"
-    if interval is None:
-        return text + "; too few logs for an interval of the difference."
-    text += f", paired 95 % interval {signed(interval[0])} to {signed(interval[1])}"
-    if not difference["excludes_zero"]:
-        return text + ". The interval holds zero: these data cannot tell the two apart."
-    return text + f". The interval excludes zero: {lead} is {'better' if value < 0 else 'WORSE'}."
-
-
-def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table | None:
-    """Return the errors by kind of manoeuvre, speed and wind, None where there is a single row."""
+def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table:
+    """Return the errors by kind of manoeuvre, speed and wind."""
     lines: list[Content] = []
     for kind in ["all", *distinct(run, run.focus, protocol)]:
         row = run.row(lead, run.focus, protocol, kind)
@@ -286,8 +252,6 @@ def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table | N
             lines.append(
                 {**shown, "windows": band["windows"], "difference": found["difference"] or {}}
             )
-    if len(lines) < 2:
-        return None
     reference = next((line["difference"]["to"] for line in lines if line["difference"]), None)
 
     def ratio(line: Content) -> Cell:
@@ -321,6 +285,13 @@ def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table | N
 
 def _signed(value: float | None) -> str:
     return DASH if value is None else signed(value)
+
+
+def worst(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
+    """Return the worst free runs of the main protocol, and a figure to look into them with."""
+    known = (run.limits.get("splits") or {}).get(run.focus, {}).get(run.main, {})
+    shown = [block for block in (_worst(run, run.lead, known), *figures) if block is not None]
+    return Section("Worst runs", shown) if shown else None
 
 
 def _worst(run: RunFiles, lead: str, known: Content) -> Table | None:
@@ -438,8 +409,6 @@ def bands(run: RunFiles) -> Section | None:
         if len(kinds) > 1:
             title = f"manoeuvre, {run.lead}"
             parts.append(_coverage(kinds, title, lambda row: row["manoeuvre"].replace("_", " ")))
-        if found := models.get(run.lead, {}).get(protocol):
-            parts.append(_widths(found))
         blocks.append(Section(f"Protocol {protocol}", parts, folded=protocol != run.protocols[0]))
     return Section("Bands", blocks)
 
@@ -481,26 +450,4 @@ def _coverage(
         ],
         groups=[("coverage", 7), ("score", 3)],
         selected=lambda row: row["model"] == selected,
-    )
-
-
-def _widths(band: Content) -> Table:
-    """Return the half widths of the leading model at a few horizons."""
-    steps, widths = band["steps"], band["half_width_of_any_run"]
-    places = [
-        min(range(len(steps)), key=lambda i: abs(steps[i] - share * steps[-1]))
-        for share in (0.1, 0.25, 0.5, 1.0)
-    ]
-    units = {"r": ("deg/s", DEG), "heading": ("deg", DEG), "position": ("m", 1.0)}
-
-    def column(name: str) -> Column:
-        unit, factor = units.get(name, ("m/s", 1.0))
-        return f"{name} [{unit}]", lambda i: number(factor * widths[name][i]), str
-
-    return table_of(
-        places,
-        [
-            ("half width after", lambda i: f"{number(steps[i] * band['step'])} s"),
-            *map(column, _BANDS),
-        ],
     )

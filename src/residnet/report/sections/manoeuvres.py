@@ -225,7 +225,7 @@ def flight_figures(flown: Mapping[str, Sequence[Flight]]) -> Iterator[Figure]:
     channels = channels[:_MOST_PANELS]
     units = {name: shown_unit(log.units[name]) for log in logs for name in log.channels}
     units |= {name: ("rpm", 60.0) for log in logs for name in log.units if log.units[name] == "1/s"}
-    panels = [Panel("north [m]", "east [m]", kind="map")]
+    panels = [Panel("north [m]", "east [m]", kind="map", height=380)]
     panels += [
         Panel(f"{_CHANNELS.get(name, name)} [{units[name][0]}]".replace("\n ", "\n"), height=145)
         for name in channels
@@ -504,7 +504,7 @@ def _circles(
         f" lines are {content['draws']} draws of the model's parameters. Black lines mark"
         " advance (to 90 deg) and tactical diameter (to 180 deg) of the fitted model.",
         looks | {"start": START},
-        [Panel("north [hull lengths]", "east [hull lengths]", kind="map")],
+        [Panel("north [hull lengths]", "east [hull lengths]", kind="map", height=380)],
         [Case("", [panel])],
     )
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
+from residnet.core.names import CHANNEL_UNITS
 from residnet.core.stretches import stretches
 from residnet.report.figure import (
     BLUE,
@@ -30,20 +32,24 @@ from residnet.report.figure import (
     names_of,
     whiskers,
 )
-from residnet.report.format import DEG, fixed
-from residnet.report.run_reader import RunFiles, StoredWindow
+from residnet.report.format import DEG, fixed, shown_unit
+from residnet.report.run_reader import COLUMNS, RunFiles, StoredWindow
 
+Units: TypeAlias = Mapping[str, tuple[str, str, float]]
+"""By channel its SI unit, the unit in which it is shown, and the factor to that."""
 _MOST_CASES = 12
 _MOST_STILLS = 6
 _BINS = 60
 _TRACK = Panel("north [m]", "east [m]", kind="map", height=380)
-_MOTION = (
-    ("surge velocity\nu [m/s]", 1.0),
-    ("sway velocity\nv [m/s]", 1.0),
-    ("yaw rate\nr [deg/s]", DEG),
-    ("heading\n[deg]", DEG),
-)
-_ERRORS = ("u [m/s]", "v [m/s]", "r [deg/s]", "position [m]", "heading [deg]")
+_MOTION = {
+    "u": "surge velocity\nu",
+    "v": "sway velocity\nv",
+    "r": "yaw rate\nr",
+    "psi": "heading\n",
+}
+_ERRORS = {"u": "u", "v": "v", "r": "r", "x": "position", "psi": "heading"}
+"""Channel whose unit an error has, and the name of the error."""
+_SI: Units = {name: (unit, *shown_unit(unit)) for name, unit in CHANNEL_UNITS.items()}
 _AXES = (
     ("u_dot", "surge", "m/s²", 1.0),
     ("v_dot", "sway", "m/s²", 1.0),
@@ -94,14 +100,8 @@ def free_runs(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     if not chosen:
         return None
     inputs = list(chosen[0][0].inputs)
-    units = [run.unit(name) for name in inputs]
-    panels = [
-        *_panels(""),
-        *(
-            Panel(f"{name}\n[{unit}]" if unit != "-" else name, height=125)
-            for name, (unit, _) in zip(inputs, units, strict=True)
-        ),
-    ]
+    units = units_of(run, inputs)
+    panels = [*_panels("", units), *(_panel(f"{name}\n", units[name], 125) for name in inputs)]
     panels[-1] = replace(panels[-1], x_label="time since the start of the free run [s]")
     looks = {"measured": MEASURED, "masked": MASKED} | model_looks(run)
     if any(run.lead in window.low for window, _ in chosen):
@@ -112,10 +112,10 @@ def free_runs(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     stills = [window for window, rank in chosen if rank == _RANKS[0]]
     stills = [one for one in stills if one.protocol == stills[0].protocol][:_MOST_STILLS]
     for window, rank in chosen:
-        curves = _curves(window, run.lead)
+        curves = _curves(window, run.lead, units)
         time = window.t - window.t[0]
-        for name, (_, factor) in zip(inputs, units, strict=True):
-            curves.append({"measured": (time, factor * window.inputs[name])})
+        for name in inputs:
+            curves.append({"measured": (time, units[name][2] * window.inputs[name])})
         kind = window.manoeuvre.replace("_", " ")
         number = f", window {window.number + 1}" if window.number else ""
         note = f"{window.log}: {fixed(float(time[-1]), 1)} s under protocol {window.protocol}."
@@ -141,28 +141,57 @@ def free_runs(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     )
 
 
+def track(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
+    """Draw the track of the run of median error under the main protocol, for the first screen."""
+    ranked = _ranked(run, [one for one in windows if one.protocol == run.main])
+    if not ranked:
+        return None
+    window = ranked[(len(ranked) - 1) // 2]
+    shown = {"measured", "start", run.lead, run.baseline}
+    looks = {"measured": MEASURED, **model_looks(run), "start": START}
+    curves = {name: curve for name, curve in _curves(window, "", _SI)[0].items() if name in shown}
+    return Figure(
+        "track",
+        "Track of the median run",
+        f"Median of {len(ranked)} {run.focus} runs: {window.log}.",
+        {name: replace(look, shown=True) for name, look in looks.items() if name in curves},
+        [replace(_TRACK, height=280)],
+        [Case("", [curves])],
+    )
+
+
 def window_figure(window: StoredWindow, title: str) -> Figure:
     """Return the figure of one free run that is held in memory: track, then velocities."""
     looks = {"measured": MEASURED} | family(window.predicted) | {"start": START}
-    panels = _panels(title)
+    panels = _panels(title, _SI)
     panels[-1] = replace(panels[-1], x_label="time since the start of the free run [s]")
     curves = [
         {name: curve for name, curve in of_panel.items() if name in looks}
-        for of_panel in _curves(window, "")
+        for of_panel in _curves(window, "", _SI)
     ]
     return Figure("free_run", title, "", looks, panels, [Case(title, curves)])
 
 
-def _panels(title: str) -> list[Panel]:
-    panels = [replace(_TRACK, title=title), *(Panel(text) for text, _ in _MOTION)]
+def units_of(run: RunFiles, names: Iterable[str] = ()) -> Units:
+    """Return the units of the states, and of further channels of a run."""
+    return {name: (run.si(name), *run.unit(name)) for name in (*COLUMNS, *names)}
+
+
+def _panel(text: str, unit: tuple[str, str, float], height: int = 165) -> Panel:
+    si, shown, factor = unit
+    label = f"{text} [{shown}]".replace("\n ", "\n") if shown != "-" else text.strip()
+    return Panel(label, height=height, si=() if factor == 1.0 else (si, factor))
+
+
+def _panels(title: str, units: Units) -> list[Panel]:
+    panels = [replace(_TRACK, title=title)]
+    panels += [_panel(text, units[name]) for name, text in _MOTION.items()]
     panels[1] = replace(panels[1], title=title)
     return panels
 
 
 def _chosen(run: RunFiles, windows: Sequence[StoredWindow]) -> list[tuple[StoredWindow, str]]:
     """Return the runs to choose from with the rank of each among its kind."""
-    scales = run.metrics.get("scales") or {}
-    divisor = np.array([float(scales.get(name, 1.0)) for name in ("u", "v", "r")])
     groups: dict[tuple[int, str], list[StoredWindow]] = {}
     for window in windows:
         if run.lead in window.predicted:
@@ -172,9 +201,7 @@ def _chosen(run: RunFiles, windows: Sequence[StoredWindow]) -> list[tuple[Stored
     # the kind of manoeuvre with the most runs comes first
     by_count = sorted(groups.items(), key=lambda item: (item[0][0], -len(item[1])))
     for place, (_, members) in enumerate(by_count):
-        members.sort(
-            key=lambda one: (float((one.rmse(run.lead) / divisor).mean()), one.log, one.number)
-        )
+        members = _ranked(run, members)
         for rank, index in enumerate(((len(members) - 1) // 2, len(members) - 1, 0)):
             if all(members[index] is not entry[2] for entry in ranked):
                 ranked.append((rank, place, members[index]))
@@ -184,7 +211,17 @@ def _chosen(run: RunFiles, windows: Sequence[StoredWindow]) -> list[tuple[Stored
     return [(window, _RANKS[rank]) for rank, _, window in kept]
 
 
-def _curves(window: StoredWindow, lead: str) -> list[dict[str, Curve]]:
+def _ranked(run: RunFiles, windows: Sequence[StoredWindow]) -> list[StoredWindow]:
+    """Return the runs of the leading model, the one of least error first."""
+    scales = run.metrics.get("scales") or {}
+    divisor = np.array([float(scales.get(name, 1.0)) for name in ("u", "v", "r")])
+    return sorted(
+        (one for one in windows if run.lead in one.predicted),
+        key=lambda one: (float((one.rmse(run.lead) / divisor).mean()), one.log, one.number),
+    )
+
+
+def _curves(window: StoredWindow, lead: str, units: Units) -> list[dict[str, Curve]]:
     """Return track and motion of a run, measured and predicted, and the band of one model."""
     time, usable = window.t - window.t[0], window.usable
     # headings begin within half a turn of north, tracks at their start
@@ -203,7 +240,8 @@ def _curves(window: StoredWindow, lead: str) -> list[dict[str, Curve]]:
         | {model: track(states, all_good) for model, states in window.predicted.items()}
         | {"start": (np.zeros(1), np.zeros(1))}
     ]
-    for column, (_, factor) in enumerate(_MOTION):
+    for column, name in enumerate(_MOTION):
+        factor = units[name][2]
         good = usable | (column >= 2)
         measured = factor * (window.measured - origin)[:, column]
         panel: dict[str, Curve] = {"measured": (time, np.where(good, measured, np.nan))}
@@ -226,9 +264,9 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
         model: whose errors are taken.
 
     Returns:
-        Middles of time bins [K] in s, and errors [K, 5] of u, v (m/s), r (deg/s), position (m),
-        heading (deg). Bins that fewer than half of the windows reach are left out. u, v and
-        position count where usable.
+        Middles of time bins [K] in s, and errors [K, 5] of u, v, r, position, heading in SI. Bins
+        that fewer than half of the windows reach are left out. u, v and position count where
+        usable.
     """
     of_model = [window for window in windows if model in window.predicted]
     longest = max(float(window.t[-1] - window.t[0]) for window in of_model)
@@ -244,19 +282,21 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
         np.add.at(samples, index, weight)
     keep = reached >= 0.5 * len(of_model)
     with np.errstate(invalid="ignore", divide="ignore"):
-        error = np.sqrt(squares / samples) * [1.0, 1.0, DEG, 1.0, DEG]
+        error = np.sqrt(squares / samples)
     return ((np.arange(count) + 0.5) * longest / count)[keep], error[keep]
 
 
 def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the error of every model against the horizon, on a logarithmic scale."""
-    cases = []
+    cases, units = [], units_of(run)
+    factors = [units[name][2] for name in _ERRORS]
     for protocol in run.protocols:
         members = [window for window in windows if window.protocol == protocol]
         curves: list[dict[str, Curve]] = [{} for _ in _ERRORS]
         for model in run.kinds:
             if any(model in window.predicted for window in members):
                 time, errors = growth(members, model)
+                errors *= factors
                 # errors that start from zero would stretch the scale
                 errors[:1] = np.nan if len(errors) > 1 else errors[:1]
                 for panel, column in zip(curves, errors.T, strict=True):
@@ -266,7 +306,10 @@ def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
             cases.append(Case(f"{protocol} ({len(members)} {runs})", curves))
     if not cases:
         return None
-    panels = [Panel(f"RMS error of\n{text}", height=175, y_log=True) for text in _ERRORS]
+    panels = [
+        replace(_panel(f"RMS error of\n{text}", units[name], 175), y_log=True)
+        for name, text in _ERRORS.items()
+    ]
     panels[-2:] = [replace(one, x_label="time since the start [s]") for one in panels[-2:]]
     return Figure(
         "horizon",
@@ -291,7 +334,8 @@ def error_bars(run: RunFiles) -> Figure:
     models = [model for model, kind in run.kinds.items() if kind != "zero"]
     thick = 0.8 / len(run.sides)
     curves, panels = [], []
-    for channel, text, factor in (("u", "surge", 1.0), ("v", "sway", 1.0), ("r", "yaw", DEG)):
+    for channel, text in (("u", "surge"), ("v", "sway"), ("r", "yaw")):
+        unit, factor = run.unit(channel)
         group = bar_group(run, protocol, channel)
         panel: dict[str, Curve] = {}
         spread = []
@@ -313,7 +357,7 @@ def error_bars(run: RunFiles) -> Figure:
         panels.append(
             Panel(
                 "",
-                f"RMSE of {channel} [{'deg/s' if channel == 'r' else 'm/s'}]",
+                f"RMSE of {channel} [{unit}]",
                 title + (f"\n({group.replace('_', ' ')} runs)" if group != "all" else ""),
                 height=70 + 44 * len(models),
                 group=channel,
@@ -333,7 +377,7 @@ def error_bars(run: RunFiles) -> Figure:
             else f" ({run.focus} data)."
         ),
         {
-            split: Look(split, BLUE, kind="fill", alpha=0.85 if split == run.focus else 0.3)
+            split: Look(split, BLUE if split == run.focus else ORANGE, kind="fill", alpha=0.85)
             for split in run.sides
         }
         | {"interval": Look("95 % interval", width=0.9, order=4)},
@@ -416,7 +460,8 @@ def bands(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the half width of the leading model's bands beside the errors that they are to hold."""
     model = run.lead
     known = (run.json("bands.json").get("models") or {}).get(model) or {}
-    cases, level = [], 0.0
+    cases, level, units = [], 0.0, units_of(run)
+    factors = [units[name][2] for name in _ERRORS]
     for protocol, found in known.items():
         members = [one for one in windows if one.protocol == protocol and model in one.low]
         if not members:
@@ -440,12 +485,12 @@ def bands(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
         # u, v, r, position, heading
         panels = [
             {"width": (time[few], f * mean[few, k]), "errors": (time[few], f * held[few, k])}
-            for k, f in ((0, 1.0), (1, 1.0), (2, DEG), (4, 1.0), (3, DEG))
+            for k, f in zip((0, 1, 2, 4, 3), factors, strict=True)
         ]
         cases.append(Case(protocol, panels))
     if not cases:
         return None
-    panels_of = [Panel(text, height=165) for text in _ERRORS]
+    panels_of = [_panel(text, units[name]) for name, text in _ERRORS.items()]
     panels_of[-2:] = [replace(one, x_label="time since the start [s]") for one in panels_of[-2:]]
     return Figure(
         "bands",

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 from residnet.data.doctor import summary
 from residnet.judge.soundness import CHECKS, Finding
-from residnet.judge.verdict import UNSEEN, Evidence
+from residnet.judge.verdict import UNSEEN, Evidence, diverged_note, soundness, useless
 from residnet.judge.verdict import verdict as judged
-from residnet.report.blocks import Bullets, Cell, Facts, Section, table_of
-from residnet.report.format import DEG, minus, number, percent, title_of
+from residnet.report.blocks import Bullets, Cell, Facts, Section, Text, table_of
+from residnet.report.figure import Figure
+from residnet.report.format import DASH, DEG, minus, number, percent, plural, title_of
 from residnet.report.run_reader import Content, RunFiles
 from residnet.report.sections.free_runs import distinct
 
@@ -28,24 +29,8 @@ def verdict(run: RunFiles) -> list[str]:
     return judged(evidence(run, lead))
 
 
-def figures_of_lead(run: RunFiles) -> Section | None:
-    """Return the figures behind the verdict in words, None where the model has no free runs.
-
-    The model is compared with the baseline and, where the logs are simulated, with the plant.
-    """
-    protocol, split, lead = run.protocols[0], run.focus, run.lead
-    row = run.row(lead, split, protocol)
-    if row is None:
-        return None
-    base = run.row(run.baseline, split, protocol)
-    out = [_seen(run, lead, row), _level(run, lead, row, base)]
-    truth = run.row(run.truth, split, protocol)
-    if truth is not None and run.truth != lead:
-        out.append(_against_plant(run, row, truth, base))
-    out += [_end(run, row, base, lead), _divergence(run, split)]
-    return Section(f"Figures of {lead}", [Bullets([minus(text) for text in out if text])])
-
-
+_MEASURED = "measurements"
+"""Row of what the measured velocities leave, integrated."""
 _NO_PLACE = (
     "The logs hold no {}: judge the model by its velocities, for errors of position and heading are"
     " those of integrated velocities."
@@ -71,97 +56,73 @@ def evidence(run: RunFiles, selected: str) -> Evidence:
     )
 
 
-def _seen(run: RunFiles, lead: str, row: Content) -> str:
-    protocol, split = str(row["protocol"]), str(row["split"])
-    unseen = (
-        "that no fit has seen"
-        if split in UNSEEN
-        else f"of the {split} data (not unseen: read with care)"
-    )
-    why = "chosen on validation data" if run.selected else "the first head; nothing was selected"
-    kind = ((run.evaluation.get("protocols") or {}).get(protocol) or {}).get("kind")
-    runs = {"manoeuvre": "whole manoeuvre", "windows": "window"}.get(str(kind), "run") + (
-        "" if row["windows"] == 1 else "s"
-    )
-    return (
-        f"Model {lead} ({why}) was free-run over {row['windows']} {runs} {unseen} (protocol"
-        f" {protocol})."
-    )
-
-
-def _level(run: RunFiles, lead: str, row: Content, base: Content | None) -> str:
-    parts = []
-    for channel in run.channels:
-        unit, factor = run.unit(channel)
-        text = f"{title_of(channel)} {number(factor * row['rmse'][channel])} {unit}"
-        interval = (row.get("rmse_ci95") or {}).get(channel)
-        if interval:
-            text += f" ({number(factor * interval[0])} to {number(factor * interval[1])})"
-        if base is not None and lead != run.baseline and base["rmse"][channel] > 0:
-            cut = 100 * (1 - row["rmse"][channel] / base["rmse"][channel])
-            text += f", {abs(cut):.0f} % {'below' if cut >= 0 else 'ABOVE'} the baseline"
-        parts.append(text)
-    return (
-        "Root mean square"
-        f" errors{' (95 % interval of the mean)' if row.get('nrmse_mean_ci95') else ''}: "
-        + "; ".join(parts)
-        + "."
-    )
-
-
-def _against_plant(run: RunFiles, row: Content, truth: Content, base: Content | None) -> str:
-    parts = []
-    for channel in run.channels:
-        unit, factor = run.unit(channel)
-        text = f"{title_of(channel)} {number(factor * truth['rmse'][channel])} {unit}"
-        if base is not None and base["rmse"][channel] > 1.02 * truth["rmse"][channel]:
-            share = (base["rmse"][channel] - row["rmse"][channel]) / (
-                base["rmse"][channel] - truth["rmse"][channel]
-            )
-            text += f" (attained: {100 * share:.0f} % of the possible reduction)"
-        parts.append(text)
-    intro = (
-        "The simulated plant itself, started from the same measured state and knowing neither noise"
-        " nor disturbance, leaves "
-    )
-    return intro + "; ".join(parts) + "."
-
-
-def _end(run: RunFiles, row: Content, base: Content | None, lead: str) -> str:
-    if "position_error_end" not in row:
+def level(run: RunFiles) -> str:
+    """Return the level of the verdict on the selected model, empty where it has no free runs."""
+    given = evidence(run, run.lead)
+    if run.lead not in given.rows:
         return ""
+    if useless(given):
+        return "do not use"
+    row, base = given.rows[run.lead], given.rows.get(given.baseline)
+    worse = base is not None and row["nrmse"]["mean"] > 1.05 * base["nrmse"]["mean"]
+    return "limited" if worse or "UNSOUND" in soundness(given) or row["windows"] < 5 else "good"
 
-    def off(judged: Content) -> tuple[str, str]:
-        return (
-            number(judged["position_error_end"], 2) + " m",
-            number(DEG * judged["heading_error_end"], 2) + " deg",
-        )
 
-    position, heading = off(row)
-    text = (
-        f"At the end of a free run the position is off by {position} and the heading by {heading}"
-        " on average"
+def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
+    """Return the rest of the first screen: a run of median error beside the models' errors.
+
+    The rows: what was selected, the baseline, zero, what the measurements themselves leave, then
+    the others, the nearest first. None where there is no free run.
+    """
+    rows = {one: row for one in run.kinds if (row := run.row(one, run.focus, run.main))}
+    if run.lead not in rows or "position_error_end" not in rows[run.lead]:
+        return None
+    known = {entry["model"]: entry for entry in run.json("selection.json").get("models") or []}
+    limits = (run.limits.get("splits") or {}).get(run.focus, {}).get(run.main, {})
+    first = [run.lead, run.metrics.get("selected_ensemble"), run.baseline, "zero"]
+    others = sorted(set(rows) - set(first), key=lambda one: float(rows[one]["position_error_end"]))
+    table: list[Content] = [rows[one] for one in dict.fromkeys(first) if one in rows]
+    if floor := limits.get("kinematics"):
+        ends = {f"{of}_error_end": floor[f"{of}_mean"] for of in ("position", "heading")}
+        table.append({"model": _MEASURED, "diverged": 0, **ends})
+    table += [rows[one] for one in others]
+
+    def error(row: Content, key: str, factor: float) -> Cell:
+        span = row.get(f"{key}_ci95")
+        least = min(rows[one][key] for one in rows if one != run.truth)
+        note = "–".join(number(factor * end, 2) for end in span) if span else ""
+        return Cell(number(factor * row[key], 2), note, "best" if row[key] == least else "")
+
+    def sound(row: Content) -> Cell:
+        faults = list((known.get(row["model"]) or {}).get("faults") or [])
+        faults += [note] if (note := diverged_note(row)) else []
+        if faults:
+            return Cell("✗", faults[0], "bad")
+        return Cell("✓" if row["model"] in known else DASH)
+
+    told = (
+        f"Mean of {plural(rows[run.lead]['windows'], 'free run')} on {run.focus} data"
+        f" ({run.main}); small: 95 % interval."
     )
-    if base is not None and lead != run.baseline:
-        position, heading = off(base)
-        text += f" (baseline: {position}, {heading})"
-    return text + "."
-
-
-def _divergence(run: RunFiles, split: str) -> str:
-    whole = [
-        row for row in run.rows if row["split"] == split and row.get("manoeuvre", "all") == "all"
-    ]
-    lost = [
-        f"{row['model']} {row['diverged']} of {row['windows']} ({row['protocol']})"
-        for row in whole
-        if row["diverged"]
-    ]
-    if not lost:
-        return f"No free run of any model diverged on {split} data."
-    return (
-        f"DIVERGED on {split} data, counted with the error of held velocities: {', '.join(lost)}."
+    if run.focus not in UNSEEN:
+        told += " These data are not unseen: read with care."
+    if floor:
+        told += " Measurements: where the measured velocities themselves lead."
+    shown = table_of(
+        table,
+        [
+            (
+                "model",
+                lambda row: _MEASURED if row["model"] == _MEASURED else run.label(row["model"]),
+            ),
+            ("position [m]", lambda row: error(row, "position_error_end", 1.0)),
+            ("heading [deg]", lambda row: error(row, "heading_error_end", DEG)),
+            ("sound", sound),
+        ],
+        groups=[(f"error {run.horizon}", 2)],
+        selected=lambda row: row["model"] == run.selected,
     )
+    return Section("", [*figures, shown, Text(told, quiet=True)])
 
 
 def cautions(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
@@ -194,18 +155,9 @@ def cautions(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
                 f"Protocol {protocol}: the {run.focus} error of {lead} is {times}; it may be"
                 f" overfitted, or the {run.focus} data differ."
             )
-        if row["windows"] < 5:
-            out.append(
-                f"Protocol {protocol}: only {row['windows']} free runs on {run.focus} data; the"
-                " intervals say little."
-            )
     out += [
         text for text in (worse_than_reference(run, protocol) for protocol in run.protocols) if text
     ]
-    if lead is not None and lead == run.baseline and run.heads:
-        out.append(
-            "The baseline was selected: on validation data no sound model is clearly better."
-        )
     # the first sentence; the figures stand in the section on sanity
     failed = [finding for finding in findings if finding.ok is False and finding.model == lead]
     out += [

@@ -1,4 +1,4 @@
-// Explorers: a list of cases, switches for curves, buttons for zoom. Loaded after BokehJS.
+// Explorers: a list of cases, switches for curves, buttons for zoom. Each is drawn when it is unfolded.
 (function () {
   "use strict";
   var GAP = 65535;
@@ -13,6 +13,12 @@
     return out;
   }
 
+  // what is stored deflated in a script of the page
+  function inflated(script) {
+    var raw = Uint8Array.from(atob(script.textContent), function (letter) { return letter.charCodeAt(0); });
+    return new Response(new Blob([raw]).stream().pipeThrough(new DecompressionStream("deflate"))).text();
+  }
+
   function plotOf(name) {
     for (var i = 0; i < Bokeh.documents.length; i++) {
       var model = Bokeh.documents[i].get_model_by_name(name);
@@ -25,9 +31,9 @@
     return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   }
 
-  function Explorer(root) {
+  function Explorer(root, data) {
     this.root = root;
-    this.data = JSON.parse(root.querySelector("script[type='application/json']").textContent);
+    this.data = data;
     this.plots = [];
     for (var i = 0; i < this.data.panels; i++) { this.plots.push(plotOf(root.id + "-" + i)); }
     this.wire();
@@ -178,9 +184,10 @@
   };
 
   Explorer.prototype.paint = function () {
-    var ink = color("--ink"), line = color("--line"), quiet = color("--quiet"), looks = this.data.looks;
+    var ink = color("--ink"), line = color("--line"), quiet = color("--quiet"), paper = color("--paper");
+    var looks = this.data.looks;
     this.plots.forEach(function (plot) {
-      plot.setv({ background_fill_color: null, border_fill_color: null, outline_line_color: line });
+      plot.setv({ background_fill_color: paper, border_fill_color: paper, outline_line_color: line });
       if (plot.title && plot.title.setv) { plot.title.text_color = ink; }
       (plot.above.concat(plot.below, plot.left, plot.right, plot.center)).forEach(function (part) {
         if (part.type === "Grid") { part.grid_line_color = line; }
@@ -201,22 +208,48 @@
 
   function start() {
     var roots = Array.prototype.slice.call(document.querySelectorAll(".explorer"));
-    if (!roots.length || typeof Bokeh === "undefined") { return; }
-    var wait = setInterval(function () {
-      var ready = roots.every(function (root) { return plotOf(root.id + "-0"); });
-      if (!ready) { return; }
-      clearInterval(wait);
-      var explorers = roots.map(function (root) { return new Explorer(root); });
-      // frames were laid out before the labels beside them were known
-      setTimeout(function () {
-        explorers.forEach(function (one) {
-          one.plots.forEach(function (plot) { plot.min_border_right = plot.min_border_right - 1; });
+    if (!roots.length) { return; }
+    if (typeof DecompressionStream === "undefined") {
+      document.documentElement.classList.remove("live");
+      return;
+    }
+    var explorers = [];
+    var library = inflated(document.getElementById("library")).then(function (text) {
+      var script = document.createElement("script");
+      script.textContent = text;
+      document.head.appendChild(script);
+    });
+
+    function draw(root) {
+      return Promise.all([inflated(root.querySelector("script")), library]).then(function (texts) {
+        var data = JSON.parse(texts[0]);
+        return Bokeh.embed.embed_items(data.documents, data.items).then(function () {
+          var one = new Explorer(root, data);
+          explorers.push(one);
+          // frames were laid out before the labels beside them were known
+          setTimeout(function () {
+            one.plots.forEach(function (plot) { plot.min_border_right = plot.min_border_right - 1; });
+          }, 0);
+          root.classList.add("drawn");
         });
-      }, 0);
-      document.documentElement.classList.add("drawn");
-      var dark = window.matchMedia("(prefers-color-scheme: dark)");
-      dark.addEventListener("change", function () { explorers.forEach(function (one) { one.paint(); }); });
-    }, 20);
+      });
+    }
+
+    // one after the other, so that the first screen stands first; what is folded waits
+    var queue = library;
+    function look() {
+      roots.forEach(function (root) {
+        if (root.classList.contains("begun") || root.closest("details:not([open])")) { return; }
+        root.classList.add("begun");
+        queue = queue.then(function () { return draw(root); }).then(function () {
+          return new Promise(function (done) { setTimeout(done, 0); });
+        });
+      });
+    }
+    document.addEventListener("toggle", look, true);
+    look();
+    var dark = window.matchMedia("(prefers-color-scheme: dark)");
+    dark.addEventListener("change", function () { explorers.forEach(function (one) { one.paint(); }); });
   }
   if (document.readyState === "loading") { document.addEventListener("DOMContentLoaded", start); } else { start(); }
 })();
