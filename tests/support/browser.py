@@ -40,8 +40,8 @@ const cut = root => {
   return {cut: [first, told()], section: Array.from(curve.data_source.data[curve.name])};
 };
 const use = async (page, pause) => {
-  const root = page.querySelector("main > section:not(.opening) .explorer:has(.note)") ||
-    page.querySelector("main > section:not(.opening) .explorer");
+  const root = ["input[type='range']", ".note", "div"].map(part => page.querySelector(
+    `main > section:not(.opening) .explorer:has(${part})`)).find(found => found) || null;
   if (root === null) return {};
   const model = name => page.defaultView.Bokeh.documents.map(
     one => one.get_model_by_name(name)).find(found => found);
