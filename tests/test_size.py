@@ -16,16 +16,16 @@ import residnet
 
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
-    "api": (699, 80),
+    "api": (707, 81),
     "baselines": (793, 117),
-    "control": (3197, 352),
+    "control": (3267, 362),
     "core": (1312, 186),
     "data": (8288, 741),
-    "documents": (2414, 223),
+    "documents": (2475, 229),
     "dynamics": (835, 124),
-    "export": (2205, 265),
+    "export": (2264, 269),
     "heads": (932, 152),
-    "identification": (2112, 219),
+    "identification": (2120, 220),
     "judge": (1888, 209),
     "manoeuvres": (897, 136),
     "physics": (1987, 249),
@@ -33,10 +33,10 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2843, 320),
     "runs": (365, 48),
     "simulators": (355, 44),
-    "tasks": (2976, 252),
+    "tasks": (3086, 259),
     "testing": (484, 33),
     "training": (1308, 157),
-    "": (409, 49),
+    "": (420, 50),
 }
 
 

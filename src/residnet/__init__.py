@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         baseline,
         head,
         manoeuvre,
+        own_autopilot,
         run,
         simulate,
         vessel,
@@ -44,7 +45,10 @@ _HOME = {
     "api.data": "Data draft inspect prepare read_logs",
     "api.models": "Model Monitor export_model load save",
     "api.fitting": "FreeRuns Models fit free_run metrics select",
-    "api.tasks": "Result Trials autopilot available baseline head manoeuvre run simulate vessel",
+    "api.tasks": (
+        "Result Trials autopilot available baseline head manoeuvre own_autopilot run simulate"
+        " vessel"
+    ),
 }
 
 __all__ = [
@@ -71,6 +75,7 @@ __all__ = [
     "load",
     "manoeuvre",
     "metrics",
+    "own_autopilot",
     "prepare",
     "read_logs",
     "run",

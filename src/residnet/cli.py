@@ -395,6 +395,48 @@ def export(
 
 
 @app.command()
+def autopilot(
+    source: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN|LOGS...|K,T",
+            help="A finished fit, logs with turns, or K in 1/s and T in s, such as 0.31,7.4.",
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="CONFIG", help="Config to write, and the run's name.")
+    ] = Path("my_autopilot.yaml"),
+    rudder: Annotated[
+        str | None,
+        typer.Option(help="Largest rudder angle; that of the logs, or 20 deg, if not given."),
+    ] = None,
+    rate: Annotated[
+        str | None, typer.Option(help="Rate of the steering gear; from the logs if not given.")
+    ] = None,
+    speed: Annotated[str | None, typer.Option(help="Speed at which K and T hold.")] = None,
+    draft: Annotated[bool, typer.Option("--draft", help="Write the config alone.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace earlier files and an earlier run.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Train a heading autopilot for your vessel under the conditions that its logs show."""
+    from residnet.tasks.own_autopilot import draft_autopilot
+    from residnet.tasks.registry import load_task
+
+    with drawn_progress(quiet=quiet):
+        config = draft_autopilot(
+            source, out, rudder=rudder, rate=rate, speed=speed, overwrite=overwrite
+        )
+        print(f"config: {config}")
+        if draft:
+            return
+        finished = load_task(config, []).run(source=config, overwrite=overwrite)
+    show(finished)
+    print(f"next: residnet export {finished.folder.path} --format c")
+
+
+@app.command()
 def ardupilot(
     source: Annotated[
         str, typer.Argument(metavar="VESSEL|RUN", help="A vessel, or the folder of a finished fit.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -84,6 +85,30 @@ def test_the_number_of_threads_changes_nothing() -> None:
     assert all(map(torch.equal, one, torch.autograd.grad(alone(*given)[0].sum(), weights)))
 
 
+class Cut(Helm):
+    """A controller that does not answer for what it makes of its last command."""
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        held = memory[:, :1].detach()
+        acting, memory = super().forward(x, w, k, memory)
+        steep = (200.0 * (held - x[:, :1])).clamp(-1.0, 1.0) * self.gain.detach()
+        return torch.cat((acting[:, :1] + 0.1 * steep, acting[:, 1:]), dim=1), memory
+
+
+def test_what_a_loop_detaches_has_no_gradient_and_a_steep_one_is_compiled() -> None:
+    rollout, given = loop()
+    rollout.source = Cut()
+    fast = CompiledLoop(rollout, *given)
+    short = (given[0], given[1][:, :3], given[2])
+    weights = list(rollout.parameters())
+    found, known = (
+        torch.autograd.grad(x.square().mean() + w.sum() * 0.01, weights)
+        for x, w in (fast(*short), rollout(*short)[:2])
+    )
+    for one, other in zip(found, known, strict=True):
+        assert torch.allclose(one, other, rtol=2e-3, atol=2e-4)
+
+
 def test_a_loop_that_is_off_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     rollout, given = loop()
     wrong = closed_loop.BACK.replace("AT(gx, N_X, k)[i * width + l] +=", "(void)")
@@ -115,9 +140,9 @@ def test_the_same_source_is_compiled_once(tmp_path: Path, monkeypatch: pytest.Mo
     calls: list[Path] = []
     compile_one = c_code._compile
 
-    def counted(tool: str, source: str, out: Path) -> None:
+    def counted(tool: str, source: str, flags: Sequence[str], out: Path) -> None:
         calls.append(out)
-        compile_one(tool, source, out)
+        compile_one(tool, source, flags, out)
 
     monkeypatch.setattr(c_code, "_compile", counted)
     assert [called(c_code.compiled_library(SOURCE)) for _ in range(2)] == [3.0, 3.0]

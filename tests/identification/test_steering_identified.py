@@ -12,10 +12,18 @@ from residnet.core.log import Log
 from residnet.identification.steering import identify_steering
 
 
-def sailed(gain: float, time: float, delay: float, bias: float, noise: float, seed: int) -> Log:
+def sailed(
+    gain: float,
+    time: float,
+    delay: float,
+    bias: float,
+    noise: float,
+    seed: int,
+    gear: float = math.inf,
+) -> Log:
     """A zigzag of T r_dot + r = K (delta(t - delay) + bias), by Euler's rule in small steps."""
     dt, fine, rng = 0.5, 50, np.random.default_rng(seed)
-    rate, heading, side = 0.01, 0.0, 1.0
+    rate, heading, rudder, side = 0.01, 0.0, 0.0, 1.0
     commands, rates, held = [], [], [0.0] * max(round(delay / dt * fine), 1)
     for _ in range(800):
         if side * heading > math.radians(20):
@@ -24,7 +32,9 @@ def sailed(gain: float, time: float, delay: float, bias: float, noise: float, se
         rates.append(rate)
         for _ in range(fine):
             held.append(commands[-1])
-            rudder = held[-1 - round(delay / dt * fine)]
+            wanted = held[-1 - round(delay / dt * fine)]
+            most = gear * dt / fine
+            rudder += min(max(wanted - rudder, -most), most)
             rate += dt / fine * (gain * (rudder + bias) - rate) / time
             heading += dt / fine * rate
     values = np.array(rates) + noise * rng.normal(size=len(rates))
@@ -34,13 +44,24 @@ def sailed(gain: float, time: float, delay: float, bias: float, noise: float, se
 
 def test_gain_time_constant_delay_and_bias_are_found() -> None:
     logs = [sailed(0.12, 18.0, 1.5, 0.01, 2e-4, seed) for seed in (0, 1)]
-    found, speed = identify_steering(logs, longest_delay=5.0)
+    found, speed, noise, *_ = identify_steering(logs, longest_delay=5.0)
+    assert noise[1] == pytest.approx(2e-4, rel=0.1)
+    assert found.rate is None
+    assert found.spread[0] < 0.01 * found.gain
     assert found.gain == pytest.approx(0.12, rel=0.02)
     assert found.time == pytest.approx(18.0, rel=0.03)
     assert found.delay == pytest.approx(1.5, abs=0.3)
     assert found.bias == pytest.approx(0.01, abs=1e-3)
     assert found.rms == pytest.approx(2e-4, rel=0.2)
     assert speed == pytest.approx(7.0)
+
+
+def test_the_rate_of_the_rudder_does_not_count_as_time_constant() -> None:
+    logs = [sailed(0.31, 7.4, 0.3, 0.0, 2e-3, seed, gear=math.radians(6)) for seed in (0, 1)]
+    found = identify_steering(logs).response
+    assert found.time == pytest.approx(7.4, rel=0.05)
+    assert found.rate == pytest.approx(math.radians(6), rel=0.1)
+    assert found.gain == pytest.approx(0.31, rel=0.02)
 
 
 def test_what_is_no_response_to_the_rudder_is_refused() -> None:

@@ -6,6 +6,7 @@ import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final, get_args
 
@@ -30,6 +31,7 @@ from residnet.physics.vessel import load_vessel
 from residnet.physics.vessel_file import VesselFile
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
+from residnet.tasks.own_autopilot import draft_autopilot
 from residnet.tasks.registry import TaskConfig, catalogue
 from residnet.tasks.simulate import Programme
 
@@ -342,6 +344,43 @@ def _overrides(given: Any) -> list[str]:
     if isinstance(given, list | tuple) and all(isinstance(text, str) for text in given):
         return list(given)
     raise UsageError(f"run: overrides: expected a list or a mapping, given {described(given)}")
+
+
+def own_autopilot(
+    source: PathGiven | Sequence[PathGiven],
+    config: PathGiven = "my_autopilot.yaml",
+    *,
+    rudder: str | None = None,
+    rate: str | None = None,
+    speed: str | None = None,
+    folder: PathGiven | None = None,
+    overwrite: bool = False,
+    progress: ProgressCallback | None = None,
+) -> Result:
+    """Train a heading autopilot for one's own vessel, as `residnet autopilot` does.
+
+    Args:
+        source: logs, the folder of a finished fit, or `K,T` in 1/s and s.
+        config: file to write; the vessel's file lies beside it.
+        rudder: largest angle that controllers may use, with its unit; None for that of the logs.
+        rate: of the steering gear, with its unit; None for what the logs show.
+        speed: at which K and T hold, with its unit; None for the mean of the logs.
+        folder: where the run is kept; without one it vanishes with the result.
+        overwrite: replace earlier files and an earlier run.
+        progress: is told how far the training is.
+
+    Raises:
+        DataError: where logs lack rudder or yaw rate.
+        FitError: where the logs show no answer to the rudder.
+
+    Example:
+        residnet.own_autopilot("0.31,7.4", rate="6 deg/s", folder="runs/own")
+    """
+    given = [source] if isinstance(source, str | PathLike) else source
+    told = {"rudder": rudder, "rate": rate, "speed": speed}
+    place = path(config, "own_autopilot")
+    file = draft_autopilot([str(one) for one in given], place, overwrite=overwrite, **told)
+    return run(file, folder=folder, overwrite=overwrite, progress=progress)
 
 
 def autopilot(

@@ -15,7 +15,7 @@ from residnet.report.blocks import Cell, Column, Section
 from residnet.report.figure import Case, Curve, Figure, Look, Panel, read_figures, write_figure
 from residnet.report.format import minus, number
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure, Outcome, Task
+from residnet.runs.task import Exports, MainFigure, Outcome, Task
 
 Results = Mapping[str, Any]
 """What a study found, as its file in the run folder holds it."""
@@ -46,6 +46,10 @@ class Study(Task):
     def sections(self, results: Results, run: Path) -> list[Section]:
         """Return the sections of the report, with the document's figures beside ours."""
 
+    def exports(self, folder: RunFolder) -> Exports:
+        """Return what writes each export of the study, by its name: none."""
+        return {}
+
     @final
     def carry_out(self, folder: RunFolder) -> Outcome:
         found, figures = self.results(folder)
@@ -54,7 +58,7 @@ class Study(Task):
             write_figure(folder.figures, figure)
         # as a reader of the file sees them
         read = read_json(folder.path / self.results_file)
-        return Outcome(self.verdict(read), self.main_figures(read))
+        return Outcome(self.verdict(read), self.main_figures(read), exports=self.exports(folder))
 
     @classmethod
     @final

@@ -616,24 +616,29 @@ _KEPT = 64
 """Libraries that are kept, those used last."""
 
 
-def compiled_library(source: str) -> ctypes.CDLL:
+def compiled_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
     """Return a C source as a library compiled for this machine, from the cache where it is there.
 
     The cache is `residnet/compiled` in `XDG_CACHE_HOME`, or in `~/.cache`; `RESIDNET_CACHE` names
     another folder. Without a folder to write to the library is compiled every time.
 
+    Args:
+        source: in C.
+        quick: whether it is compiled in little time and runs slowly, rather than the reverse.
+
     Raises:
         ExportError: where there is no compiler, or it fails.
     """
     tool = compiler()
-    key = hashlib.sha256("\n".join((source, *_FLAGS, *_machine(tool))).encode()).hexdigest()
+    flags = ("-O0", *_FLAGS[1:]) if quick else _FLAGS
+    key = hashlib.sha256("\n".join((source, *flags, *_machine(tool))).encode()).hexdigest()
     file = _folder() / f"{key[:32]}.so"
     try:
         if not file.is_file():
             file.parent.mkdir(parents=True, exist_ok=True)
             # two processes that compile the same source do not write to one file
             partial = file.with_name(f"{file.stem}.{os.getpid()}")
-            _compile(tool, source, partial)
+            _compile(tool, source, flags, partial)
             partial.replace(file)
             _forget(file.parent)
         file.touch()
@@ -641,7 +646,7 @@ def compiled_library(source: str) -> ctypes.CDLL:
     except OSError:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "closed_loop.so"
-            _compile(tool, source, out)
+            _compile(tool, source, flags, out)
             return ctypes.CDLL(str(out))
 
 
@@ -659,7 +664,7 @@ def _machine(tool: str) -> tuple[str, ...]:
     return tool, said, platform.node(), platform.machine(), platform.processor()
 
 
-def _compile(tool: str, source: str, out: Path) -> None:
+def _compile(tool: str, source: str, flags: Sequence[str], out: Path) -> None:
     """Compile a C source to a library.
 
     Raises:
@@ -668,7 +673,7 @@ def _compile(tool: str, source: str, out: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "closed_loop.c"
         file.write_text(source)
-        call = [tool, "-std=gnu99", *_FLAGS, str(file), "-o", str(out), "-lm"]
+        call = [tool, "-std=gnu99", *flags, str(file), "-o", str(out), "-lm"]
         done = subprocess.run(call, capture_output=True, text=True)
     if done.returncode:
         said = done.stderr.strip().splitlines() or ["no message"]

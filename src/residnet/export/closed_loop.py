@@ -25,8 +25,12 @@ from residnet.dynamics.rollout import Rollout
 from residnet.export.c_code import FUNCTIONS, Body, Tables, compiled_library, literal
 from residnet.export.lowering import in_numbers, lowered
 
-_CHECKED, _SAME = 40, 5e-3
-"""Steps of the flight that the compiled loop is checked by, and how far it may be off."""
+_VISITED, _ROWS, _STEPS = 40, 16, 3
+"""The compiled loop is checked over so many steps from every state that some flights visit in their
+first steps: long enough that a step hands all on, too short for rounding to grow in a steep law.
+"""
+_SAME, _ROUNDED = 1e-6, 5e-3
+"""How far it may be off: in double precision, and the median row in the precision of flights."""
 _HANDED_ON = ("x", "s", "q")
 """State, memory of the vessel and memory of the controller, which a step hands on."""
 _WHAT = "closed loop"
@@ -165,28 +169,49 @@ def loop_source(
                 weights[f"rollout.{name}"] = piece.reshape(part.shape)
         return torch.func.functional_call(one, weights, (x, w, s, q))
 
-    arguments = [(name, sizes[name]) for name in ("x", "w", "s", "q", "theta", "own")]
+    arguments = [(name, sizes[name]) for name in _GIVEN]
     after = [f"{name}_after" for name in (*_HANDED_ON, "a")]
-    function = in_numbers(lowered(step, arguments, after, _WHAT, examples))
-    functions = [_function("step", function)]
+    function = in_numbers(lowered(step, arguments, after, _WHAT, examples, detached=gradient))
+    functions = [_function("step", _flowing(function) if gradient else function)]
     if gradient:
         functions.append(_function("slope", _slope(function, sizes)))
     numbers = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in sizes.items())
     return "".join((prelude(dtype), numbers, _AT, *functions, FLY, *([BACK] if gradient else [])))
 
 
+_GIVEN = ("x", "w", "s", "q", "theta", "own")
+
+
+def _known(step: ca.Function, found: ca.SX, given: Sequence[ca.SX]) -> ca.SX:
+    """Return an expression of a step's arguments with what the step detaches put in."""
+    apart, values = list(given[len(_GIVEN) :]), step.call(given)[len(_HANDED_ON) + 1 :]
+    # what is detached may hang on what was detached before it
+    for symbol, value in zip(reversed(apart), reversed(values), strict=True):
+        found = ca.substitute(found, symbol, value)
+    return found
+
+
+def _flowing(step: ca.Function) -> ca.Function:
+    """Return a step that computes what it detaches."""
+    given = [ca.SX.sym(name, step.numel_in(name)) for name in step.name_in()]
+    names = step.name_out()[: len(_HANDED_ON) + 1]
+    found = [_known(step, part, given) for part in step.call(given)[: len(names)]]
+    return ca.Function("step", given[: len(_GIVEN)], ca.cse(found), list(_GIVEN), names)
+
+
 def _slope(step: ca.Function, sizes: Mapping[str, int]) -> ca.Function:
     """Return the product of a step's Jacobian with the slopes of what it gives."""
-    given = [ca.SX.sym(name, sizes[name]) for name in step.name_in()]
+    given = [ca.SX.sym(name, step.numel_in(name)) for name in step.name_in()]
     slopes = [ca.SX.sym(f"{name}_slope", sizes[name]) for name in (*_HANDED_ON, "a")]
-    x, _, s, q, theta, _ = given
+    x, _, s, q, theta, *_ = given
     known = ca.vertcat(x, s, q, theta)
-    pulled = ca.jtimes(ca.vertcat(*step.call(given)), known, ca.vertcat(*slopes), True)
+    results = ca.vertcat(*step.call(given)[: len(slopes)])
+    pulled = _known(step, ca.jtimes(results, known, ca.vertcat(*slopes), True), given)
     places = np.cumsum([0, *(sizes[name] for name in (*_HANDED_ON, "theta"))]).tolist()
     parts = [pulled[a:b] for a, b in pairwise(places)]
-    names = [*step.name_in(), *(f"{name}_slope" for name in (*_HANDED_ON, "a"))]
+    names = [*_GIVEN, *(f"{name}_slope" for name in (*_HANDED_ON, "a"))]
     found = [*(f"{name}_before" for name in _HANDED_ON), "total"]
-    return ca.Function("slope", [*given, *slopes], ca.cse(parts), names, found)
+    return ca.Function("slope", [*given[: len(_GIVEN)], *slopes], ca.cse(parts), names, found)
 
 
 _AT = """
@@ -284,11 +309,13 @@ class CompiledLoop:
             for name, part in zip(("x", "w", "s", "q", "theta", "own"), given, strict=True)
         }
         self.sizes = sizes | {"a": acting.shape[1]}
-        self.library = compiled_library(
-            loop_source(alone, given, shared, rows, self.sizes, x.dtype, self.gradient)
-        )
+        one = (alone, given, shared, rows, self.sizes)
+        self.library = compiled_library(loop_source(*one, x.dtype, self.gradient))
         self.pool = ThreadPoolExecutor(max(torch.get_num_threads(), 1))
-        self._check(x, w[:, :_CHECKED], s)
+        exact = copy.copy(self)
+        exact.dtype = torch.float64
+        exact.library = compiled_library(loop_source(*one, exact.dtype, self.gradient), quick=True)
+        self._check(exact, alone, x[:_ROWS], w[:_ROWS], s[:_ROWS])
         self.most = most
 
     def of(self, rollout: Rollout) -> CompiledLoop:
@@ -337,24 +364,85 @@ class CompiledLoop:
         self.run("fly", blocks, *known, acting, steps, width)
         return (kept[0].permute(2, 0, 1)[:count], acting.permute(2, 0, 1)[:count]), known
 
-    def _check(self, x: Tensor, w: Tensor, s: Tensor) -> None:
-        """Compare a short flight and its gradient with those of the closed loop itself.
+    def _check(self, exact: CompiledLoop, alone: Rollout, x: Tensor, w: Tensor, s: Tensor) -> None:
+        """Compare a few steps from all that flights visit, and their gradient, with the loop's own.
+
+        Rounding doubles from step to step where a law is steep, and tells nothing then: the text of
+        the library is compared in double precision, from equal states.
+
+        Args:
+            exact: the same flights in double precision.
+            alone: the closed loop in double precision.
+            x, w, s: of some flights.
 
         Raises:
             ExportError: where they differ by more than the precision explains.
         """
-        weights = [_numbers(self.rollout)[name] for name in self.shared if self.gradient]
-        found = []
-        for flown in (self(x, w, s), self.rollout(x, w, s)[:2]):
-            parts = [part.detach() for part in flown]
-            if weights:
-                slopes = torch.autograd.grad(flown[0].square().mean() + flown[1].sum(), weights)
-                parts.append(torch.cat([part.reshape(-1) for part in slopes]))
-            found.append(parts)
-        for fast, slow in zip(*found, strict=True):
-            off = float((fast - slow).abs().max() / slow.abs().max().clamp(min=1e-9))
-            if not off <= _SAME:
-                raise ExportError(f"the compiled closed loop is off by {off:.2g} of its size")
+        step = _Step(alone)
+        held = {f"rollout.{name}": part.detach() for name, part in _numbers(alone).items()}
+        for name in self.own:
+            held[f"rollout.{name}"] = held[f"rollout.{name}"][: len(x)]
+
+        def flown(*start: Tensor, taken: Tensor, numbers: dict[str, Tensor]) -> list[Any]:
+            """Return x, s and q at every step, and what acted."""
+            states, acted = [tuple(start)], []
+            for k in range(taken.shape[1]):
+                x, s, q = states[-1]
+                *after, acting = torch.func.functional_call(step, numbers, (x, taken[:, k], s, q))
+                states.append(tuple(after))
+                acted.append(acting)
+            return [*zip(*states, strict=True), acted]
+
+        count = min(_VISITED, w.shape[1])
+        w, x, s = w[:, :count].double(), x.double(), s.double()
+        with torch.no_grad():
+            seen = flown(x, s, alone.source.initial(x), taken=w, numbers=held)
+        # the rows of a visited step are one flight each, under the inputs that came next
+        last = max(count - _STEPS, 0) + 1
+        starts = [torch.cat(parts[:last]) for parts in seen[:3]]
+        taken = torch.cat([w[:, k : k + _STEPS] for k in range(last)])
+        many = {
+            name: held[f"rollout.{name}"].repeat(last, *[1] * (held[f"rollout.{name}"].dim() - 1))
+            for name in self.own
+        }
+        weights = {name: held[f"rollout.{name}"].requires_grad_() for name in self.shared}
+        numbers = held | {f"rollout.{name}": part for name, part in {**many, **weights}.items()}
+        states, _, _, acted = flown(*starts, taken=taken, numbers=numbers)
+        slow = (torch.stack(states, 1), torch.stack(acted, 1))
+        rows = torch.cat(
+            [torch.zeros(len(taken), 0), *(part.reshape(len(taken), -1) for part in many.values())],
+            dim=1,
+        )
+        theta = _flat(weights)
+        given = (starts[0], taken, starts[1], starts[2])
+
+        def fly(loop: CompiledLoop) -> tuple[Tensor, Tensor]:
+            parts = [part.to(loop.dtype) for part in (theta, rows, *given)]
+            if not self.gradient:
+                return loop.flown(*parts)[0]
+            apply: Any = _Flight.apply
+            found: tuple[Tensor, Tensor] = apply(*parts, loop)
+            return found
+
+        fast, quick = fly(exact), fly(self)
+        pairs = list(zip(fast, slow, strict=True))
+        if self.gradient:
+            slopes = (
+                torch.autograd.grad(states.square().mean() + acted.sum(), list(weights.values()))
+                for states, acted in (fast, slow)
+            )
+            flat = [torch.cat([part.reshape(-1) for part in parts]) for parts in slopes]
+            pairs.append((flat[0], flat[1]))
+        offs = [(found - wanted).detach().abs().max() for found, wanted in pairs]
+        # rounding moves single rows far, a fault most of them
+        offs += [
+            (found - wanted).detach().abs().flatten(1).amax(1).median() * (_SAME / _ROUNDED)
+            for found, wanted in zip(quick, fast, strict=True)
+        ]
+        sizes = [wanted.detach().abs().max().clamp(min=1e-9) for _, wanted in (*pairs, *pairs[:2])]
+        off = max(float(one / size) for one, size in zip(offs, sizes, strict=True))
+        if not off <= _SAME:
+            raise ExportError(f"the compiled closed loop is off by {off:.2g} of its size")
 
     def run(self, name: str, blocks: int, *arguments: Tensor | int) -> None:
         """Call a function of the library for all blocks of rows, in as many threads as torch."""

@@ -96,6 +96,8 @@ def lowered(
     results: Sequence[str],
     what: str,
     examples: Sequence[Tensor] | None = None,
+    *,
+    detached: bool = False,
 ) -> ca.Function:
     """Return the CasADi function of a step for one row in float64.
 
@@ -105,6 +107,8 @@ def lowered(
         results: names.
         what: is lowered, for messages.
         examples: arguments to record with; zeros where not given.
+        detached: whether what the step detaches is an argument more, `detached_<k>`, and a
+            result more, `detached_<k>_value`, so that derivatives leave it out.
 
     Raises:
         ExportError: where an operation is not known, by its name, or Python decides by values.
@@ -113,6 +117,7 @@ def lowered(
         examples = [torch.zeros(1, size, dtype=torch.float64) for _, size in arguments]
     columns = [ca.MX.sym(name, size) for name, size in arguments]
     values: dict[Node, Any] = {}
+    apart: list[tuple[ca.MX, ca.MX]] = []
     given = iter(map(_Value, examples, columns))
     graph = _recorded(step, examples, what)
     for node in graph.graph.nodes:
@@ -124,8 +129,19 @@ def lowered(
             found = [values[output].column for output in tree.tree_leaves(node.args[0])]
         else:
             args, settings = torch.fx.node.map_arg((node.args, node.kwargs), values.__getitem__)
-            values[node] = _called(node.target, args, settings, what)
-    return ca.Function("step", columns, found, [name for name, _ in arguments], list(results))
+            values[node] = value = _called(node.target, args, settings, what)
+            if detached and node.target is torch.ops.aten.detach.default and not value.constant:
+                symbol = ca.MX.sym(f"detached_{len(apart)}", value.column.numel())
+                apart.append((symbol, value.column))
+                values[node] = _Value(value.example, symbol)
+    more = [f"detached_{k}" for k in range(len(apart))]
+    return ca.Function(
+        "step",
+        [*columns, *(symbol for symbol, _ in apart)],
+        [*found, *(column for _, column in apart)],
+        [*(name for name, _ in arguments), *more],
+        [*results, *(f"{name}_value" for name in more)],
+    )
 
 
 def in_numbers(function: ca.Function) -> ca.Function:
@@ -149,6 +165,8 @@ def _recorded(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")
             table: Any = core_aten_decompositions()
+            # else it would be recorded as an alias, as much else is
+            table.pop(torch.ops.aten.detach.default, None)
             return make_fx(wrapped, decomposition_table=table)(*examples)
     except (RuntimeError, TypeError, ValueError, NotImplementedError) as error:
         first = str(error).strip().splitlines()

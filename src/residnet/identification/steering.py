@@ -21,12 +21,19 @@ class IdentifiedSteering(NamedTuple):
     """What logs say about a vessel's steering.
 
     Attributes:
-        response: K, T, delay and how well they simulate the yaw rates.
+        response: K, T, delay and rudder rate, and how well they simulate the yaw rates.
         speed: mean surge velocity in m/s; NaN where no log has it.
+        noise: standard deviations of the white noise on the heading in rad and on the yaw rate in
+            rad/s, at the step of the logs; NaN where no log has the channel.
+        dt: median step of the logs in s.
+        rudder: largest angle in rad that the logs hold.
     """
 
     response: SteeringResponse
     speed: float
+    noise: tuple[float, float]
+    dt: float
+    rudder: float
 
 
 def identify_steering(
@@ -46,7 +53,8 @@ def identify_steering(
     """
     if not logs:
         raise DataError("steering: no logs given")
-    records = [_record(log, rudder) for log in logs]
+    found = [_record(log, rudder) for log in logs]
+    records, names = [record for record, _ in found], {name for _, name in found}
     spread = max(float(np.std(record.rudder)) for record in records)
     if spread < _LEAST:
         raise DataError(
@@ -55,11 +63,28 @@ def identify_steering(
         )
     speeds = [log["u"][log.usable] for log in logs if "u" in log.channels]
     speed = float(np.nanmean(np.concatenate(speeds))) if speeds else float("nan")
-    return IdentifiedSteering(fit_response(records, longest_delay), speed)
+    return IdentifiedSteering(
+        fit_response(records, longest_delay, commands=names == {"cmd_delta"}),
+        speed,
+        (_noise(logs, "psi"), _noise(logs, "r")),
+        float(np.median([record.dt for record in records])),
+        max(float(np.abs(record.rudder).max()) for record in records),
+    )
 
 
-def _record(log: Log, rudder: str | None) -> Record:
-    """Return a log on a uniform grid at its median step."""
+def _noise(logs: Sequence[Log], name: str) -> float:
+    """Return the standard deviation of white noise, from what no motion does within two samples.
+
+    The second difference of white noise has six times its variance; half of its sizes are below
+    .6745 standard deviations.
+    """
+    bends = [np.abs(np.diff(log[name][log.usable], 2)) for log in logs if name in log.channels]
+    finite = np.concatenate([np.zeros(0), *(bend[np.isfinite(bend)] for bend in bends)])
+    return float(np.median(finite) / (0.6745 * np.sqrt(6.0))) if len(finite) else float("nan")
+
+
+def _record(log: Log, rudder: str | None) -> tuple[Record, str]:
+    """Return a log on a uniform grid at its median step, and the rudder's channel."""
     names = _RUDDERS if rudder is None else (rudder,)
     name = next((name for name in names if name in log.channels), None)
     source = next((name for name in ("r", "psi") if name in log.channels), None)
@@ -81,4 +106,4 @@ def _record(log: Log, rudder: str | None) -> Record:
     # a command stands until the next
     held = np.clip(np.searchsorted(good, grid + 1e-9 * dt, side="right") - 1, 0, None)
     near = np.clip(np.searchsorted(log.t, grid - 0.5 * dt), 0, len(log.t) - 1)
-    return Record(dt, log[name][usable][held], rate, usable[near])
+    return Record(dt, log[name][usable][held], rate, usable[near]), name

@@ -405,7 +405,7 @@ def _check_flights(config: AutopilotConfig, turning: Turning, rate: float | None
 
 
 _STEP = math.radians(30.0)
-_REFERENCE = Turning(3.47, 3.94, 3.2), math.radians(5.0)
+REFERENCE = Turning(3.47, 3.94, 3.2), math.radians(5.0)
 """K, T and rudder of the vessel of document 004, whose times configs state at a pace of one."""
 
 
@@ -445,7 +445,7 @@ def paced(config: AutopilotConfig) -> AutopilotConfig:
         turning = vessel.turning(config.rudder, config.turning_time)
         slow = least_time(turning, config.rudder, vessel.rate)
         # two digits are enough, and steps stay numbers that can be read
-        pace = float(f"{slow / least_time(*_REFERENCE, None):.2g}")
+        pace = float(f"{slow / least_time(*REFERENCE, None):.2g}")
         say(f"  pace {pace:g}: a change of 30 deg takes {slow:.3g} s at least")
     if pace == 1.0 or config.conditions is None:
         return config

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple, final
 
@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.control.base import Policy
-from residnet.control.heading.classical import BangBangHeading, HeadingPID, RatedBangBangHeading
+from residnet.control.heading.classical import BangBangHeading, RatedBangBangHeading
 from residnet.control.heading.laws import HeadingLaw, RegulatorLaw, StoppingLaw, regulator_gains
 from residnet.control.heading.policies import CONSTANTS, NetworkPolicy, ObservedPolicy
 from residnet.control.heading.turning import Turning
@@ -40,26 +40,48 @@ class SearchRange(NamedTuple):
 
 
 @final
-class LinearRows(Policy):
-    """`HeadingPID` with gains of its own for every row: kp, kd, ki [B]."""
+class LinearLaw(Policy):
+    """The law kp e - kd r + ki I on filtered measurements, with gains of its own for every row.
 
-    def __init__(self, steering: Steering, gains: tuple[Tensor, Tensor, Tensor]) -> None:
+    Heading and yaw rate pass a low pass of first order each, as autopilots have one against noise
+    and waves; the integral stops while the rudder is saturated by it.
+
+    Memory [B, 3]: I [rad s], and the filtered heading [rad] and yaw rate [rad/s].
+
+    Args:
+        steering: the controller's task.
+        gains: kp, kd [s], ki [1/s] and the filter's time constant [s]; [B] or one number each.
+    """
+
+    NUMBERS: ClassVar[tuple[str, ...]] = ("kp", "kd", "ki", "lag")
+
+    def __init__(self, steering: Steering, gains: Sequence[Tensor]) -> None:
         super().__init__()
         self.psi, self.r = steering.vessel.column("psi"), steering.vessel.column("r")
         self.limit, self.dt = steering.limit, steering.dt
-        for name, gain in zip(("kp", "kd", "ki"), gains, strict=True):
-            self.register_buffer(name, gain.unsqueeze(-1), persistent=False)
+        for name, gain in zip(self.NUMBERS, gains, strict=True):
+            self.register_buffer(name, gain.reshape(-1, 1), persistent=False)
         self.kp: Tensor
         self.kd: Tensor
         self.ki: Tensor
-        self.n_state = 1
+        self.lag: Tensor
+        self.n_state = 3
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Return the memory at the start: the filters stand at what is measured."""
+        seen = x[:, [self.psi, self.r]]
+        return torch.cat((torch.zeros_like(seen[:, :1]), seen), dim=1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] and integral [B, 1]."""
-        error = wrap(reference - x[:, self.psi : self.psi + 1])
-        wish = self.kp * error - self.kd * x[:, self.r : self.r + 1] + self.ki * s
+        """Return the rudder command [B, 1] and the memory."""
+        share = 1.0 - torch.exp(-self.dt / self.lag.clamp(min=1e-6))
+        heading = s[:, 1:2] + share * wrap(x[:, self.psi : self.psi + 1] - s[:, 1:2])
+        rate = s[:, 2:3] + share * (x[:, self.r : self.r + 1] - s[:, 2:3])
+        error, integral = wrap(reference - heading), s[:, 0:1]
+        wish = self.kp * error - self.kd * rate + self.ki * integral
         winding = (wish.abs() > self.limit) & (wish * error > 0)
-        return wish.clamp(-self.limit, self.limit), torch.where(winding, s, s + self.dt * error)
+        after = torch.where(winding, integral, integral + self.dt * error)
+        return wish.clamp(-self.limit, self.limit), torch.cat((after, heading, rate), dim=1)
 
 
 class ControllerConfig(Config, ABC):
@@ -109,9 +131,23 @@ class TunableConfig(ControllerConfig, ABC):
 
 
 class TunedConfig(TunableConfig, ABC):
-    """A linear law kp e - kd r + ki I whose missing parameters are tuned."""
+    """A linear law kp e - kd r + ki I whose missing parameters are tuned.
 
-    own: ClassVar[tuple[str, ...]] = ("kp", "kd", "ki")
+    Attributes:
+        filter_time: time constant of the low pass of heading and yaw rate; null to tune it with the
+            others, and none where these are all given.
+    """
+
+    own: ClassVar[tuple[str, ...]] = LinearLaw.NUMBERS
+    filter_time: Seconds | None = Field(default=None, ge=0)
+
+    @abstractmethod
+    def constants(self) -> dict[str, float | None]:
+        """Return the law's own parameters by name; None where they are to be tuned."""
+
+    @abstractmethod
+    def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
+        """Return the ranges of the law's own parameters."""
 
     @abstractmethod
     def gains(
@@ -119,25 +155,27 @@ class TunedConfig(TunableConfig, ABC):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return kp, kd, ki of parameters, any shape."""
 
+    @final
+    def parameters(self) -> dict[str, float | None]:
+        """Return the parameters by name; None where they are to be tuned."""
+        given, lag = self.constants(), self.filter_time
+        return {**given, "filter_time": 0.0 if lag is None and None not in given.values() else lag}
+
+    @final
+    def axes(self, turning: Turning) -> dict[str, SearchRange]:
+        """Return the ranges; the filter's goes from nearly none to where it slows the loop."""
+        lag = SearchRange(0.002 * turning.time, 0.3 * turning.time)
+        return {**self.law_axes(turning), "filter_time": lag}
+
     def build(self, steering: Steering) -> Policy:
-        """Return a PID controller with these gains."""
-        parameters = {
-            name: torch.tensor(value, dtype=torch.float64)
-            for name, value in self.complete().items()
-        }
-        kp, kd, ki = (float(gain) for gain in self.gains(parameters, steering.turning))
-        return HeadingPID(
-            steering.vessel.state,
-            kp=kp,
-            kd=kd,
-            ki=ki,
-            limit=steering.limit,
-            dt=steering.dt if ki > 0 else None,
-        )
+        """Return the law with these parameters."""
+        found = {name: torch.tensor([value]).double() for name, value in self.complete().items()}
+        return self.rows(found, steering)
 
     def rows(self, parameters: dict[str, Tensor], steering: Steering) -> Policy:
         """Return the law with gains of its own for every row."""
-        return LinearRows(steering, self.gains(parameters, steering.turning))
+        gains = self.gains(parameters, steering.turning)
+        return LinearLaw(steering, [*gains, parameters["filter_time"]])
 
 
 class PdConfig(TunedConfig):
@@ -152,11 +190,11 @@ class PdConfig(TunedConfig):
     kp: float | None = Field(default=None, gt=0)
     damping_time: Seconds | None = Field(default=None, gt=0)
 
-    def parameters(self) -> dict[str, float | None]:
+    def constants(self) -> dict[str, float | None]:
         """Return kp and damping_time; None where they are to be tuned."""
         return {"kp": self.kp, "damping_time": self.damping_time}
 
-    def axes(self, turning: Turning) -> dict[str, SearchRange]:
+    def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return the ranges: two decades of kp, damping_time from a twentieth of T to twice T."""
         return {
             "kp": SearchRange(0.3, 60.0),
@@ -188,7 +226,7 @@ class PidConfig(TunedConfig):
     damping_time: Seconds | None = Field(default=None, gt=0)
     integral_time: Seconds | None = Field(default=None, gt=0)
 
-    def parameters(self) -> dict[str, float | None]:
+    def constants(self) -> dict[str, float | None]:
         """Return kp, damping_time and integral_time; None where they are to be tuned."""
         return {
             "kp": self.kp,
@@ -196,9 +234,9 @@ class PidConfig(TunedConfig):
             "integral_time": self.integral_time,
         }
 
-    def axes(self, turning: Turning) -> dict[str, SearchRange]:
+    def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return the ranges of a PD law, and an integral_time from T to 50 T."""
-        pd = PdConfig().axes(turning)
+        pd = PdConfig().law_axes(turning)
         return {**pd, "integral_time": SearchRange(turning.time, 50.0 * turning.time)}
 
     def gains(
@@ -226,11 +264,11 @@ class LqrConfig(TunedConfig):
     heading_weight: float | None = Field(default=None, gt=0)
     rate_weight: float | None = Field(default=None, ge=0)
 
-    def parameters(self) -> dict[str, float | None]:
+    def constants(self) -> dict[str, float | None]:
         """Return heading_weight and rate_weight; None where they are to be tuned."""
         return {"heading_weight": self.heading_weight, "rate_weight": self.rate_weight}
 
-    def axes(self, turning: Turning) -> dict[str, SearchRange]:
+    def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return both weights over decades."""
         return {
             "heading_weight": SearchRange(0.1, 3600.0),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.signal import lfilter
 from torch import Tensor
 
@@ -17,14 +17,22 @@ from residnet.core.errors import FitError
 from residnet.dynamics.base import Dynamics
 
 Array = NDArray[np.float64]
-_TIMES, _DELAYS = 24, 12
+_TIMES, _DELAYS, _RATES = 20, 8, 10
+_THIN = 4000
+"""Samples of a manoeuvre that the first, coarse search looks at."""
+_GEARS = (math.radians(1.0), math.radians(40.0))
+"""Rates of steering gears in rad/s that are searched: SOLAS II-1/29 asks ships for 2.3 deg/s, and
+beyond the fastest a rudder of 20 deg is there within half a second.
+"""
 _EXPLAINED = 0.5
 """Least share of the yaw rate's variance that a response must explain."""
+_SURE = 3.84
+"""Point of chi squared with one degree of freedom that one value in twenty exceeds."""
 
 
 @dataclass(frozen=True)
 class SteeringResponse:
-    """T r_dot + r = K (delta(t - delay) + bias).
+    """T r_dot + r = K (delta(t - delay) + bias), with a rudder that follows its command at a rate.
 
     Attributes:
         gain: K in 1/s.
@@ -33,6 +41,9 @@ class SteeringResponse:
         bias: rudder angle in rad that is felt with the rudder amidships.
         rms: error of the simulated yaw rate in rad/s.
         explained: share of the yaw rate's variance that the response explains.
+        rate: of the rudder in rad/s; None where the records show none, or are of the rudder angle.
+        spread: standard deviations of `gain`, `time` and `delay`, SI, from the fit's covariance
+            with the residual's correlation over time counted in.
     """
 
     gain: float
@@ -41,6 +52,8 @@ class SteeringResponse:
     bias: float
     rms: float
     explained: float
+    rate: float | None = None
+    spread: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -59,79 +72,168 @@ class Record:
     rate: Array
     usable: NDArray[np.bool_]
 
+    def thinned(self) -> Record:
+        """Return every so many of the samples."""
+        every = slice(None, None, -(-len(self.rudder) // _THIN))
+        dt = self.dt * (every.step or 1)
+        return Record(dt, self.rudder[every], self.rate[every], self.usable[every])
 
-def fit_response(records: Sequence[Record], longest_delay: float) -> SteeringResponse:
+
+def slewed(command: Array, rate: float, dt: float) -> Array:
+    """Return the angles [N] of a rudder that follows commands [N] in rad at a rate in rad/s.
+
+    It begins at the first command.
+    """
+    most = rate * dt
+    if not math.isfinite(most):
+        return command
+    angle, out = float(command[0]), []
+    for wanted in command.tolist():
+        angle += min(max(wanted - angle, -most), most)
+        out.append(angle)
+    return np.array(out)
+
+
+def fit_response(
+    records: Sequence[Record], longest_delay: float, *, commands: bool = False
+) -> SteeringResponse:
     """Return K, T and delay that simulate the yaw rates of manoeuvres best, each in one run.
 
     K, the bias and the yaw rate that each manoeuvre begins with enter linearly and are solved for;
-    T and the delay are searched for on a grid, then refined.
+    T, the delay and the rate of the rudder are searched for on a grid, then refined. A rate is kept
+    where the errors without one are larger than chance explains.
 
     Args:
         records: manoeuvres; turns to both sides tell most.
         longest_delay: that is searched for, in s.
+        commands: whether the records are of rudder commands, which a rudder follows at a rate.
 
     Raises:
         FitError: where no response to the rudder is found.
     """
     longest = max(record.dt * len(record.rudder) for record in records)
     shortest = min(record.dt for record in records)
-    grid = [
-        (float(np.log(time)), float(delay))
-        for time in np.geomspace(shortest, longest, _TIMES)
-        for delay in np.linspace(0.0, longest_delay, _DELAYS)
-    ]
-
-    def cost(point: Sequence[float]) -> float:
-        return _fit(records, float(np.exp(point[0])), min(max(point[1], 0.0), longest_delay))[0]
-
-    begin = min(grid, key=cost)
-    step = longest_delay / (_DELAYS - 1)
-    # its types know no options of this method
-    search: Any = minimize
-    found = search(
-        cost,
-        begin,
-        method="Nelder-Mead",
-        options={
-            "initial_simplex": [begin, (begin[0] + 0.3, begin[1]), (begin[0], begin[1] + step)],
-            "xatol": 1e-4,
-            "fatol": 0.0,
-            "maxiter": 200,
-        },
+    thin = [record.thinned() for record in records]
+    rates = [math.inf, *np.geomspace(*_GEARS, _RATES)] if commands else [math.inf]
+    found: dict[float, tuple[float, tuple[float, float]]] = {}
+    for rate in rates:
+        known = [
+            Record(one.dt, slewed(one.rudder, rate, one.dt), one.rate, one.usable) for one in thin
+        ]
+        found[rate] = min(
+            (_fit(known, float(time), float(delay))[0], (float(time), float(delay)))
+            for time in np.geomspace(shortest, longest, _TIMES)
+            for delay in np.linspace(0.0, longest_delay, _DELAYS)
+        )
+    best = min(rates, key=lambda rate: found[rate][0])
+    refined = {
+        rate: _refined(records, *found[rate][1], rate, longest_delay) for rate in (best, math.inf)
+    }
+    gain, time, delay, bias, rate = refined[best].values
+    values = np.concatenate([record.rate[record.usable] for record in records])
+    explained = 1.0 - refined[best].square / max(
+        float(((values - values.mean()) ** 2).sum()), 1e-30
     )
-    time, delay = float(np.exp(found.x[0])), float(np.clip(found.x[1], 0.0, longest_delay))
-    square, gain, bias = _fit(records, time, delay)
-    rates = np.concatenate([record.rate[record.usable] for record in records])
-    explained = 1.0 - square / max(float(((rates - rates.mean()) ** 2).sum()), 1e-30)
     if gain <= 0 or explained < _EXPLAINED:
         raise FitError(
             f"steering: the best response found has K {gain:.3g} 1/s and explains"
             f" {100 * explained:.0f} % of the yaw rate; check the rudder's sign and unit, and that"
             " the vessel answers its rudder"
         )
-    rms = float(np.sqrt(square / len(rates)))
-    return SteeringResponse(gain, time, delay, bias / gain, rms, explained)
+    # the rate must explain more than chance does
+    gained = refined[math.inf].square / refined[best].square - 1.0
+    chosen = refined[best if gained * refined[best].independent >= _SURE else math.inf]
+    gain, time, delay, bias, rate = chosen.values
+    return SteeringResponse(
+        gain,
+        time,
+        delay,
+        bias,
+        float(np.sqrt(chosen.square / len(values))),
+        explained,
+        rate if math.isfinite(rate) else None,
+        chosen.spread,
+    )
+
+
+class _Refined(NamedTuple):
+    """K, T, delay, bias and rate of least error, and how sure they are.
+
+    Attributes:
+        values: SI.
+        square: sum of squared errors.
+        independent: number of errors that do not hang together over time.
+        spread: standard deviations of K, T and delay.
+    """
+
+    values: tuple[float, float, float, float, float]
+    square: float
+    independent: float
+    spread: tuple[float, float, float]
+
+
+def _refined(
+    records: Sequence[Record], time: float, delay: float, rate: float, longest_delay: float
+) -> _Refined:
+    """Return the response of least error near one of the grid; an infinite rate is kept."""
+    from scipy.optimize import least_squares
+
+    def moved(rate: float) -> list[Record]:
+        return [replace(one, rudder=slewed(one.rudder, rate, one.dt)) for one in records]
+
+    def errors(point: Array) -> Array:
+        size = math.exp(point[4]) if len(point) > 4 else math.inf
+        parts = [_answers(one, math.exp(point[1]), point[2]) for one in moved(size)]
+        return np.concatenate([point[0] * (a[:, 0] + point[3] * a[:, 1]) - r for a, r in parts])
+
+    _, gain, push = _fit(moved(rate), time, delay)
+    first = [gain, math.log(time), delay, push / (gain or 1.0)]
+    first += [math.log(rate)] if math.isfinite(rate) else []
+    low, high = np.full((2, len(first)), math.inf) * [[-1.0], [1.0]]
+    low[2], high[2] = -1e-9, longest_delay + 1e-9
+    # steps of derivatives are a share of a sample: delays lie between samples
+    found = least_squares(
+        errors, first, bounds=(low, high), x_scale="jac", diff_step=np.full(len(first), 1e-4)
+    )
+    left, values = found.fun, [*found.x, math.inf][:5]
+    along = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-30)
+    # errors that hang together over time count less often
+    independent = max(len(left) * (1.0 - along) / (1.0 + along), 8.0)
+    square = float(left @ left)
+    slopes = np.asarray(found.jac)
+    covariance = np.linalg.pinv(slopes.T @ slopes) * (square / independent)
+    deviation = np.sqrt(np.diag(covariance).clip(min=0.0))
+    time = math.exp(values[1])
+    return _Refined(
+        (values[0], time, max(values[2], 0.0), values[3], math.exp(values[4])),
+        square,
+        independent,
+        (float(deviation[0]), time * float(deviation[1]), float(deviation[2])),
+    )
+
+
+def _answers(record: Record, time: float, delay: float) -> tuple[Array, Array]:
+    """Return the answers [N, 2] to the rudder and to a constant one at K = 1, and yaw rates [N].
+
+    The answer to the yaw rate that the record begins with is projected out of all three.
+    """
+    count = len(record.rudder)
+    shifted = np.interp(np.arange(count) - delay / record.dt, np.arange(count), record.rudder)
+    keep = float(np.exp(-record.dt / time))
+    answers = np.zeros((count, 2))
+    answers[1:, 0] = lfilter([1.0 - keep], [1.0, -keep], shifted[:-1])
+    first = keep ** np.arange(count)
+    answers[:, 1] = 1.0 - first
+    part, rate, own = answers[record.usable], record.rate[record.usable], first[record.usable]
+    own = own / max(float(np.linalg.norm(own)), 1e-12)
+    return part - own[:, None] * (own @ part), rate - own * (own @ rate)
 
 
 def _fit(records: Sequence[Record], time: float, delay: float) -> tuple[float, float, float]:
     """Return the sum of squared errors, K and K bias of the best response with T and a delay."""
-    total = np.zeros((2, 2))
-    right = np.zeros(2)
-    square = 0.0
+    total, right, square = np.zeros((2, 2)), np.zeros(2), 0.0
     for record in records:
-        count = len(record.rudder)
-        steps = np.arange(count) - delay / record.dt
-        shifted = np.interp(steps, np.arange(count), record.rudder)
-        keep = float(np.exp(-record.dt / time))
-        # the answers to the rudder, to a constant rudder, and to the first yaw rate
-        answers = np.zeros((count, 3))
-        answers[1:, 0] = lfilter([1.0 - keep], [1.0, -keep], shifted[:-1])
-        answers[:, 2] = keep ** np.arange(count)
-        answers[:, 1] = 1.0 - answers[:, 2]
-        part, rate = answers[record.usable], record.rate[record.usable]
-        # each log's own first yaw rate is projected out
-        own = part[:, 2] / max(float(np.linalg.norm(part[:, 2])), 1e-12)
-        part, rate = part[:, :2] - own[:, None] * (own @ part[:, :2]), rate - own * (own @ rate)
+        part, rate = _answers(record, time, delay)
         total += part.T @ part
         right += part.T @ rate
         square += float(rate @ rate)
@@ -172,6 +274,8 @@ class Steered:
         s: memory [1, n_state] of the model.
         columns: of u, r and psi in the state.
         steps: the first length of a step and the largest, in s.
+        rate: of the rudder in rad/s; infinite where it stands at its command, or K and T are to
+            hold what moves it.
     """
 
     build: Callable[[float], Dynamics]
@@ -180,12 +284,14 @@ class Steered:
     s: Tensor
     columns: tuple[int, int, int]
     steps: tuple[float, float]
+    rate: float = math.inf
 
 
 def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
     """Return K and T of the answer to a rudder angle.
 
-    The angle is held first: T is the area above the yaw rate's answer over its end. The yaw rate of
+    The angle is held first: T is the area above the yaw rate's answer over its end, less that above
+    the rudder's own way to the angle. The yaw rate of
     a vessel that hardly holds its course overshoots in hard turns, or is not steady for long. Then
     K and T are those that simulate its yaw rate best in a zigzag, with a delay beside them.
 
@@ -206,9 +312,10 @@ def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
     steady = float(rates[-1])
     straight = steady * angle > 0 and _settled(times, rates)
     if straight and (rates / steady).max() <= 1.0 + _OVERSHOOT:
-        area = float(np.trapezoid(steady - rates, times))
-        if area > 0:
-            return Turning(gain=steady / angle, time=area / steady, speed=speed)
+        time = float(np.trapezoid(steady - rates, times)) / steady
+        time -= 0.5 * abs(angle) / steered.rate
+        if time > 0:
+            return Turning(gain=steady / angle, time=time, speed=speed)
     turned = np.flatnonzero(headings * np.sign(angle) >= abs(angle))
     if len(turned) == 0:
         raise FitError(
@@ -275,4 +382,5 @@ def _zigzag(steered: Steered, angle: float, first: float) -> Record:
             rudder.append(side * abs(angle))
             x, s = model.step(x, w, s)
     rate = np.array(rates)
-    return Record(dt, np.array(rudder), rate, np.isfinite(rate))
+    angle_taken = slewed(np.array([0.0, *rudder]), steered.rate, dt)[1:]
+    return Record(dt, angle_taken, rate, np.isfinite(rate))

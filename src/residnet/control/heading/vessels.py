@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -81,7 +82,8 @@ class SteeredVessel(ABC):
         variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
         columns = (self.column("u"), self.column("r"), self.column("psi"))
         steps = (dt, max(dt, _LONG_STEP) if self.any_step else dt)
-        steered = Steered(self.model, x, w, self.memory(variation), columns, steps)
+        rate = math.inf if self.rate is None else self.rate
+        steered = Steered(self.model, x, w, self.memory(variation), columns, steps, rate)
         return measure_turning(steered, angle, duration)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, final
 
@@ -32,7 +33,8 @@ from residnet.core.config import (
     Seconds,
     quantity,
 )
-from residnet.core.errors import ConfigError, DataError, FitError
+from residnet.core.errors import ConfigError, DataError, FitError, UsageError
+from residnet.core.files import read_json
 from residnet.core.frames import wrap
 from residnet.core.layout import (
     ACCELERATIONS,
@@ -63,15 +65,16 @@ from residnet.documents.study import Results, Study, compared, joined, notes_tex
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.export import exporter
+from residnet.export.base import place_of, released
 from residnet.export.feed_forward import ExportedForce, RequiredForce
-from residnet.export.torchscript import TorchScriptExporter
 from residnet.heads.zero import ZeroHead
 from residnet.judge.courses import Tracking, mse, tracking
 from residnet.judge.still_fits import StillFitsConfig, Verdict, still_fits
 from residnet.manoeuvres import FamilyConfig
 from residnet.manoeuvres.closed_loop import ZigzagFamily
 from residnet.physics.actuators import ForceActuators
-from residnet.physics.force_model import ForceModel
+from residnet.physics.force_model import Correction, ForceModel
 from residnet.physics.hull import HullConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.signals import FORCE_CHANNELS, SignalsConfig
@@ -80,7 +83,7 @@ from residnet.report.blocks import Block, Cell, Section, Table, table_of
 from residnet.report.figure import DASHED, SOLID, Case, Figure, Panel, family
 from residnet.report.format import DEG, number
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, MainFigure
+from residnet.runs.task import ComputingTask, Exports, MainFigure
 
 _BELIEVED = "believed"
 _FARTHEST = 3.0
@@ -285,6 +288,8 @@ class FerryStudyConfig(Study, ComputingTask):
     check_fit: StillFitsConfig = StillFitsConfig()
     seed: int = Field(default=0, ge=0)
 
+    verbs: ClassVar[tuple[str, ...]] = ("report", "export")
+
     @model_validator(mode="after")
     def _combination(self) -> FerryStudyConfig:
         known: list[str] = []
@@ -296,9 +301,11 @@ class FerryStudyConfig(Study, ComputingTask):
                     f"models.{name}.on: no model before it is named"
                     f" '{model.on}'{nearest(model.on, known)}"
                 )
-            if model.on and self.models[model.on].lag != model.lag:
+            below = self.models.get(model.on)
+            if below and (below.searched or bool(below.lag) != bool(model.lag)):
                 raise ValueError(
-                    f"models.{name}.on: '{model.on}' and it must both be with lag or without"
+                    f"models.{name}.on: '{model.on}' and it must both be with lag or without; say"
+                    " which of both by 'lag'"
                 )
             known.append(name)
         if len(self.course.waypoints) < 4:
@@ -319,6 +326,44 @@ class FerryStudyConfig(Study, ComputingTask):
 
     def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
         return written(self, study(self), folder)
+
+    def exports(self, folder: RunFolder) -> Exports:
+        return {name: partial(self.export_model, folder, name) for name in self.models}
+
+    def export_model(
+        self,
+        run: RunFolder,
+        model: str,
+        out: Path | None = None,
+        file_format: str = "torchscript",
+        *,
+        anyway: bool = False,
+    ) -> Path:
+        """Write the feed-forward of a model; `selected` leaves the least of the residual force.
+
+        Raises:
+            UsageError: where there is no such model or format.
+            WithheldError: where it is worse than the believed one on what judges, but for `anyway`.
+            ExportError: where the file does not reproduce it.
+        """
+        results, chosen = read_json(run.path / self.results_file), exporter(file_format)
+        name = best_model(results) if model == "selected" else model
+        if name not in self.models:
+            raise UsageError(f"{run.path}: no model '{name}'{nearest(name, self.models)}")
+        chain = [name]
+        while below := self.models[chain[0]].on:
+            chain.insert(0, below)
+        rows = [results["models"][one] for one in chain]
+        force = ForceModel(force_hull(self.believed)[0].hull)
+        for row in rows:
+            numbers = (torch.tensor(row[key]).double() for key in ("coefficients", "intercept"))
+            force = force.extended(Correction(row["terms"], *numbers))
+        ranges = [(low, high) for low, high in results["training_range"]]
+        made = RequiredForce(*force.parts(), mirrored=True)
+        exported = ExportedForce(name, made, ranges, rows[-1]["notes"].get("lag"))
+        file = place_of(out, run.exports / f"{name}_feed_forward{chosen.suffix}", chosen.suffix)
+        chosen.export(released(exported, objections(name, results), anyway=anyway), file)
+        return file
 
     def verdict(self, results: Results) -> list[str]:
         models, best = results["models"], best_model(results)
@@ -739,19 +784,15 @@ def written(
 ) -> tuple[dict[str, Any], list[Figure]]:
     """Return the contents of ferry.json and the figures of a study.
 
-    The models' equations and feed-forwards are written into the folder.
+    The models' equations are written into the folder.
     """
     # the range of what identified the models, not of the whole course
     motion = torch.cat((found.record.nu_dot, found.record.nu), dim=-1)[found.record.train]
-    ranges = list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True))
     figures: list[Figure] = []
     equations: dict[str, HullEquations] = {}
     refused = dict.fromkeys(found.models, "")
     for name, model in found.models.items():
         figures += model_figures(name, config.models[name], model.fit, found.unmodelled)
-        force = RequiredForce(*model.force.parts(), mirrored=True)
-        exported = ExportedForce(name, force, ranges, model.fit.notes.get("lag"))
-        TorchScriptExporter().export(exported, folder.exports / f"{name}_feed_forward.pt")
         try:
             equations[name] = forward_equations(config.believed, model.force, f"model {name}")
         except (ConfigError, FitError) as error:
@@ -787,6 +828,7 @@ def written(
     content = {
         "schema": "residnet.ferry/1",
         "run": config.name,
+        "training_range": list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True)),
         "unmodelled_test_mse": found.unmodelled,
         "true_coefficients": missing_coefficients(config.true, config.believed),
         "models": models,
@@ -863,6 +905,30 @@ def _flights(flights: Mapping[str, Flight], kind: str) -> list[Figure]:
         columns=len(shown),
     )
     return [errors, forces]
+
+
+def objections(name: str, results: Results) -> list[str]:
+    """Return what speaks against a feed-forward rather than the believed one.
+
+    That is what it leaves of the residual force on the unseen half, mean over the axes, and the
+    position error of every flight with it.
+    """
+    shares = results["models"][name]["share_left"]
+    out = []
+    if sum(shares) > len(shares):
+        left = joined([100 * share for share in shares])
+        out.append(
+            f"on the unseen half it leaves {left} % of the residual force in surge, sway and yaw"
+        )
+    for kind in ("course", "crossing", "feed_forward_alone"):
+        if name in (flights := results[kind]):
+            own, known = (flights[one]["position_mae"] for one in (name, _BELIEVED))
+            if own > known:
+                out.append(
+                    f"its mean position error in the {kind.replace('_', ' ')} is {number(own)} m,"
+                    f" the believed model's {number(known)} m"
+                )
+    return out
 
 
 def best_model(results: Results) -> str:

@@ -145,11 +145,13 @@ class MeasuredModelConfig(ResidualModelConfig):
     """One regression of the residual of measured forces.
 
     Attributes:
+        lag: as there, but never searched: an actual force has none.
         force: force that the model explains: the actual or the commanded one.
         published: mean square of the residual on the document's own test half, without and with
             this model, in N^2, N^2, (N m)^2; from other trials, with the ferry as it was then.
     """
 
+    lag: bool = False
     force: Literal["actual", "commanded"] = "actual"
     published: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 

@@ -314,14 +314,21 @@ class ResidualModelConfig(Config):
         terms: basis functions, written as products of u_dot, v_dot, r_dot, u, v, r and their
             absolute values; the 30 of (4.12) unless given.
         lag: identify the thrusters' lag together with the coefficients, and explain the force that
-            follows the command through it.
+            follows the command through it. Null where an estimator searches its order: with lag,
+            without, and no residual at all are then tried too, over the same left-out folds; for
+            other estimators null is without.
         earth: also identify a force that is constant in earth axes, such as that of wind.
     """
 
     fit: RegressionConfig
     terms: tuple[str, ...] = FERRY_TERMS
-    lag: bool = False
+    lag: bool | None = None
     earth: bool = False
+
+    @property
+    def searched(self) -> bool:
+        """Whether lag and no residual at all are candidates beside the orders."""
+        return self.lag is None and isinstance(self.fit, PlsrRegression) and self.fit.order is None
 
     def model_post_init(self, context: Any) -> None:
         """Parse the terms, so that a wrong one is found when the config is read."""
@@ -414,6 +421,8 @@ def fit_model(config: ResidualModelConfig, record: Record, base: ForceModel) -> 
     Raises:
         FitError: where the data do not determine the model.
     """
+    if config.searched:
+        return _searched(config, record, base)
     train, psi = record.train, record.pose[:, HEADING]
     x = TermLibrary(config.terms, MOTION)(torch.cat((record.nu_dot, record.nu), dim=-1))
     needed = base.at_heading(record.nu_dot, record.nu, psi)
@@ -450,6 +459,33 @@ def fit_model(config: ResidualModelConfig, record: Record, base: ForceModel) -> 
     correction = Correction(config.terms, fit.coefficients, fit.intercept)
     model = base.extended(correction, earth_force)
     return FittedModel(model, lag, replace(fit, notes=fit.notes | notes))
+
+
+def _searched(config: ResidualModelConfig, record: Record, base: ForceModel) -> FittedModel:
+    """Return the model with lag, without, or without a residual, by the error over left-out folds.
+
+    Errors are in units of what the base leaves, so that no residual has an error of one.
+    """
+    none = FittedModel(base, None, Fit(torch.zeros(0), torch.zeros(0), torch.zeros(0)))
+    nothing = torch.tensor(mse(none.remaining(record)[record.train]))
+    tried, faults = [], []
+    for lag in (False, True):
+        try:
+            found = fit_model(config.model_copy(update={"lag": lag}), record, base)
+        except FitError as error:
+            faults.append(error)
+            continue
+        left = found.fit.orders["left-out segments"][found.fit.notes["order"] - 1] / nothing
+        tried.append((float(left.nan_to_num(torch.inf).mean()), found))
+    if not tried:
+        raise faults[0]
+    least, best = min(tried, key=lambda pair: pair[0])
+    if least < 1.0:
+        notes = {**best.fit.notes, "left_out": least}
+        return best._replace(fit=replace(best.fit, notes=notes))
+    zero = torch.zeros_like(best.fit.coefficients)
+    fit = Fit(zero, zero[0], zero, {"order": 0, "left_out": 1.0})
+    return FittedModel(base.extended(Correction(config.terms, zero, zero[0])), None, fit)
 
 
 def constant_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:

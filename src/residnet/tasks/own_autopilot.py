@@ -1,0 +1,267 @@
+"""`residnet autopilot`: the vessel file and the config of an autopilot, from logs or K and T."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+from pydantic import Field
+
+from residnet.control.heading.turning import Turning
+from residnet.core.config import (
+    Config,
+    MetresPerSecond,
+    Radians,
+    RadiansPerSecond,
+    load_mapping,
+    validate,
+)
+from residnet.core.errors import DataError, UsageError
+from residnet.core.log import Log
+from residnet.core.progress import say
+from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.reading import log_files, read_drafted
+from residnet.identification.steering import identify_steering
+from residnet.tasks.autopilot import REFERENCE, least_time
+from residnet.tasks.registry import finished_task
+
+_PAIR = re.compile(r"\s*([0-9.eE+-]+)\s*,\s*([0-9.eE+-]+)\s*")
+_SPREAD = 0.2
+"""Share by which K and T may be off where nobody has measured how far."""
+_LEAST = 0.1
+"""Least such share: K goes with the speed and T against it, and few vessels keep their speed within
+a tenth in wind and turns.
+"""
+_DELAY = (0.0, 0.4)
+"""Delay in s of electronics that nobody has measured, from at once to two cycles at 5 Hz."""
+_NOISE = 0.1
+"""Noise in deg and deg/s of a magnetic compass and a MEMS gyro, where no log shows it."""
+_BIAS, _PUSH = 1.0, 0.5
+"""Rudder offset and slow push in deg that are usual, where logs show no more."""
+_STEP = 0.02
+"""Step in s of the vessel of document 004, which `pace` multiplies."""
+
+
+class OwnVessel(NamedTuple):
+    """What is known of a vessel's steering, and how well.
+
+    Attributes:
+        gain, time: K in 1/s and T in s.
+        rate: of the rudder in rad/s; None where it stands at its command at once.
+        speed: at which they hold, in m/s.
+        rudder: largest angle in rad that controllers may use.
+        effect, slow: ranges of K and T as multiples.
+        delay: shortest and longest in s between a command and the steering gear.
+        bias: rudder angle in rad that may be felt amidships.
+        noise: of heading and yaw rate in rad and rad/s, and the step in s that it is of; None where
+            nothing shows it.
+        source: where all this is from.
+    """
+
+    gain: float
+    time: float
+    rate: float | None
+    speed: float
+    rudder: float
+    effect: tuple[float, float]
+    slow: tuple[float, float]
+    delay: tuple[float, float]
+    bias: float
+    noise: tuple[float, float, float] | None
+    source: str
+
+
+class _Asked(Config):
+    """What a user says of the vessel beside logs or K and T."""
+
+    rudder: Radians | None = Field(default=None, gt=0, lt=1.5)
+    rate: RadiansPerSecond | None = Field(default=None, gt=0)
+    speed: MetresPerSecond | None = Field(default=None, gt=0)
+
+
+def draft_autopilot(
+    source: Sequence[str | Path],
+    out: Path,
+    *,
+    rudder: str | None = None,
+    rate: str | None = None,
+    speed: str | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write the vessel file and the config of an autopilot; returns the config's path.
+
+    Args:
+        source: `K,T` in 1/s and s; logs; or the folder of a finished fit, whose logs are taken.
+        out: the config; the vessel's file lies beside it.
+        rudder: largest angle that controllers may use, with its unit; by default what the logs
+            hold, and 20 deg without logs.
+        rate: of the steering gear, with its unit; by default what the logs show.
+        speed: at which K and T hold, with its unit; by default the mean of the logs.
+        overwrite: replace earlier files.
+
+    Raises:
+        UsageError: where the source is neither, or a file stands there already.
+        DataError: where logs lack the channels.
+        FitError: where the logs show no answer to the rudder.
+    """
+    vessel_file = out.with_name(f"{out.stem}_vessel.yaml")
+    for file in (out, vessel_file):
+        if file.exists() and not overwrite:
+            raise UsageError(f"{file}: exists; give --overwrite, or another name by --out")
+    told = {"rudder": rudder, "rate": rate, "speed": speed}
+    given = {key: value for key, value in told.items() if value is not None}
+    asked = validate(given, _Asked, "residnet autopilot").model_dump(exclude_none=True)
+    vessel = _known(source)
+    vessel = vessel._replace(**asked)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    vessel_file.write_text(
+        f"# The steering of your vessel, from {vessel.source}; written by `residnet autopilot`.\n"
+        + yaml.safe_dump(_vessel(vessel, vessel_file.stem), sort_keys=False)
+    )
+    out.write_text(
+        f"# An autopilot for your vessel, drafted from {vessel.source} by `residnet autopilot`.\n"
+        # each of its own, so that no part is shared under a made-up name
+        + yaml.safe_dump(json.loads(json.dumps(_config(vessel, out, vessel_file))), sort_keys=False)
+    )
+    return out
+
+
+def _known(source: Sequence[str | Path]) -> OwnVessel:
+    """Return what a source says of a vessel's steering."""
+    if len(source) == 1 and (pair := _PAIR.fullmatch(str(source[0]))):
+        try:
+            gain, time = (float(number) for number in pair.groups())
+        except ValueError:
+            gain = time = math.nan
+        if not (gain > 0 and time > 0):
+            raise UsageError(f"{source[0]}: K in 1/s and T in s, both positive, such as 0.12,18")
+        spread = (1.0 - _SPREAD, 1.0 + _SPREAD)
+        bias = math.radians(_BIAS)
+        return OwnVessel(
+            gain, time, None, 1.0, math.radians(20.0), spread, spread, _DELAY, bias, None,
+            f"K = {gain:g} 1/s and T = {time:g} s as given",
+        )  # fmt: skip
+    logs, name = _logs([Path(one) for one in source])
+    found = identify_steering(logs)
+    response, dt = found.response, found.dt
+    say(
+        f"  {name}: K = {response.gain:.4g} 1/s, T = {response.time:.4g} s, delay"
+        f" {response.delay:.2g} s, rudder"
+        f" {'at once' if response.rate is None else f'{math.degrees(response.rate):.3g} deg/s'};"
+        f" {100 * response.explained:.0f} % of the yaw rate explained"
+    )
+
+    def around(value: float, deviation: float) -> tuple[float, float]:
+        # two standard deviations hold nineteen of twenty
+        share = min(max(2.0 * deviation / value, _LEAST), 0.5)
+        return round(1.0 - share, 3), round(1.0 + share, 3)
+
+    gain, time, late = response.spread
+    # a command is logged up to a step after it was given
+    room = 2.0 * late + 0.5 * dt
+    noise = None if math.isnan(found.noise[1]) else (found.noise[0], found.noise[1], dt)
+    return OwnVessel(
+        response.gain,
+        response.time,
+        response.rate,
+        found.speed if found.speed > 0 else 1.0,
+        found.rudder,
+        around(response.gain, gain),
+        around(response.time, time),
+        (round(max(response.delay - room, 0.0), 3), round(response.delay + room, 3)),
+        max(abs(response.bias), math.radians(_BIAS)),
+        noise,
+        name,
+    )
+
+
+def _logs(paths: Sequence[Path]) -> tuple[list[Log], str]:
+    """Return the logs of files, or those that a finished fit has learned from, and their name."""
+    if len(paths) == 1 and (paths[0] / "resolved.yaml").is_file():
+        task = load_mapping(paths[0] / "resolved.yaml").get("task")
+        if task != "fit":
+            raise UsageError(f"{paths[0]}: a run of task '{task}'; give that of a fit, or logs")
+        _, config = finished_task(paths[0], "evaluate")
+        splits = config.logs()
+        logs = [*splits["train"], *splits["validation"]]
+        return logs, f"the logs of run {paths[0]}"
+    read = read_drafted(log_files(list(paths), folders=True), Marks(None))
+    logs = list(read.logs.values())
+    if not logs:
+        raise DataError(f"{paths[0]}: no log can be used")
+    return logs, f"{len(logs)} log{'' if len(logs) == 1 else 's'}, {paths[0]}"
+
+
+def _vessel(vessel: OwnVessel, name: str) -> dict[str, Any]:
+    """Return the content of the vessel's file."""
+
+    def quantity(value: float, unit: str) -> dict[str, Any]:
+        return {"value": float(f"{value:.5g}"), "unit": unit, "source": vessel.source}
+
+    gear = {} if vessel.rate is None else {"rate": f"{math.degrees(vessel.rate):.4g} deg/s"}
+    return {
+        "kind": "nomoto",
+        "name": name,
+        "description": "Own vessel, Nomoto model of first order",
+        # no controller asks for it
+        "length": {"value": 1.0, "unit": "m", "source": "not known, and not used for steering"},
+        "speed": float(f"{vessel.speed:.4g}"),
+        "K": quantity(vessel.gain, "1/s"),
+        "T": quantity(vessel.time, "s"),
+        "rudder": {"limit": f"{math.degrees(1.001 * vessel.rudder):.4g} deg", **gear},
+    }
+
+
+def _config(vessel: OwnVessel, out: Path, vessel_file: Path) -> dict[str, Any]:
+    """Return the content of the config."""
+    turning = Turning(vessel.gain, vessel.time, vessel.speed)
+    pace = float(
+        f"{least_time(turning, vessel.rudder, vessel.rate) / least_time(*REFERENCE, None):.2g}"
+    )
+    noise = (_NOISE, _NOISE)
+    if vessel.noise is not None:
+        heading, rate, dt = vessel.noise
+        # the same spectrum at the controller's step
+        scale = math.degrees(math.sqrt(dt / (_STEP * pace)))
+        noise = (_NOISE if math.isnan(heading) else scale * heading, scale * rate)
+    bias = min(math.degrees(vessel.bias), 0.3 * math.degrees(vessel.rudder))
+    stated = {
+        "effect": list(vessel.effect),
+        "time": list(vessel.slow),
+        "delay": [f"{delay:g} s" for delay in vessel.delay],
+        "bias": f"{bias:.3g} deg",
+        "push": f"{min(_PUSH, 0.1 * math.degrees(vessel.rudder)):.3g} deg",
+        "noise_psi": f"{noise[0]:.3g} deg",
+        "noise_r": f"{noise[1]:.3g} deg/s",
+    }
+    low, high = vessel.delay
+    # three quarters up the range, as the configs that come with residnet have it
+    lag = {"lag": f"{low + 0.75 * (high - low):.3g} s"} if high > 0 else {}
+    beyond = {
+        "weak": {**stated, "effect": [0.55, 0.55], "time": [1.6, 1.6]},
+        "waves": {**stated, "waves": "0.5 deg"},
+        "bias": {**stated, "bias": f"{min(2.0 * bias, 0.6 * math.degrees(vessel.rudder)):.3g} deg"},
+    }
+    return {
+        "task": "autopilot",
+        "name": out.stem,
+        "description": f"Heading autopilot of a vessel from {vessel.source}",
+        # found from wherever a run is exported
+        "vessel": str(vessel_file.resolve()),
+        "rudder": f"{math.degrees(vessel.rudder):.4g} deg",
+        "pace": pace,
+        "test": {"heading": "30 deg", "dt": "0.02 s", "duration": "14 s", "plants": 100},
+        "conditions": {"stated": stated, "flights": 1000, "beyond": beyond},
+        "policies": {"learned": {"start": "ptos"}},
+        "peers": {
+            "pd": {"kind": "pd"},
+            "pid": {"kind": "pid"},
+            "lqr": {"kind": "lqr_observer", **lag},
+            "ptos": {"kind": "ptos", **lag},
+        },
+    }

@@ -1,0 +1,72 @@
+"""From logs of one's own vessel, or K and T, to the config of its autopilot."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from residnet.core.config import load_config, load_mapping
+from residnet.core.errors import UsageError
+from residnet.tasks.autopilot import AutopilotConfig
+from residnet.tasks.own_autopilot import draft_autopilot
+
+GAIN, TIME, GEAR, DELAY, NOISE = 0.31, 7.4, 6.0, 0.3, 0.15
+
+
+def zigzag(file: Path, angle: float, seed: int) -> Path:
+    """Write a zigzag of Nomoto's model with a steering gear, integrated here by Euler's rule."""
+    dt, fine, rng = 0.1, 10, np.random.default_rng(seed)
+    r = psi = rudder = 0.0
+    side, held, rows = 1.0, [0.0] * (round(DELAY / dt) + 1), []
+    for k in range(2400):
+        side = -side if side * psi > angle else side
+        noise = NOISE * rng.normal(size=2)
+        rows.append((k * dt, psi + noise[0], r + noise[1], side * angle))
+        held.append(side * angle)
+        for _ in range(fine):
+            step = GEAR * dt / fine
+            rudder += min(max(held[-1 - round(DELAY / dt)] - rudder, -step), step)
+            r += dt / fine * (GAIN * rudder - r) / TIME
+            psi += dt / fine * r
+    names = ("time [s]", "heading [deg]", "yaw rate [deg/s]", "rudder command [deg]")
+    pd.DataFrame(rows, columns=names).to_csv(file, index=False)
+    return file
+
+
+def test_logs_give_the_vessel_and_the_conditions(tmp_path: Path) -> None:
+    logs = [zigzag(tmp_path / f"zigzag{a}.csv", a, a) for a in (10, 20)]
+    file = draft_autopilot(logs, tmp_path / "mine.yaml")
+    vessel = load_mapping(tmp_path / "mine_vessel.yaml")
+    assert vessel["K"]["value"] == pytest.approx(GAIN, rel=0.03)
+    assert vessel["T"]["value"] == pytest.approx(TIME, rel=0.05)
+    assert float(vessel["rudder"]["rate"].split()[0]) == pytest.approx(GEAR, rel=0.05)
+    config = load_config(file, [], AutopilotConfig)
+    config.check()
+    assert config.conditions is not None
+    stated = config.conditions.stated
+    assert stated.delay[0] < DELAY < stated.delay[1] < 0.6
+    # as dense over frequency as that of the logs
+    assert not isinstance(config.pace, str)
+    density = math.degrees(stated.noise_r) * math.sqrt(0.02 * config.pace)
+    assert density == pytest.approx(NOISE * math.sqrt(0.1), rel=0.1)
+    assert stated.effect[0] >= 0.8
+    assert math.degrees(config.rudder) == pytest.approx(20.0, rel=1e-3)
+
+
+def test_gain_and_time_are_enough(tmp_path: Path) -> None:
+    file = draft_autopilot(["0.31, 7.4"], tmp_path / "kt.yaml", rate="6 deg/s", rudder="15 deg")
+    config = load_config(file, [], AutopilotConfig)
+    assert math.degrees(config.steered.rate or 0.0) == pytest.approx(6.0)
+    turning = config.steered.turning(config.rudder, config.turning_time)
+    # the gear's way to its angle is no part of T
+    assert turning.time == pytest.approx(7.4, rel=0.02)
+    with pytest.raises(UsageError, match="exists; give --overwrite"):
+        draft_autopilot(["0.31,7.4"], file)
+    with pytest.raises(UsageError, match="both positive"):
+        draft_autopilot(["0,7.4"], tmp_path / "other.yaml")
+    with pytest.raises(UsageError, match="rudder"):
+        draft_autopilot(["0.31,7.4"], tmp_path / "other.yaml", rudder="15 kg")
