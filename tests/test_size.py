@@ -36,7 +36,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "tasks": (3086, 259),
     "testing": (484, 33),
     "training": (1308, 157),
-    "": (420, 50),
+    "": (445, 54),
 }
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import sys
+import time
 
 import pytest
 
+from residnet import terminal
 from residnet.core.progress import report, say
 from residnet.terminal import drawn_progress
 
@@ -43,17 +45,33 @@ class Terminal(io.StringIO):
 
 
 def test_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stderr", screen)
     monkeypatch.setenv("TERM", "xterm")
     with drawn_progress():
         say("reading [logs]")
         report("training lstm", 1, 4)
         report("searching", 3)
         report("training lstm", 4, 4)
-    text = terminal.getvalue()
+    text = screen.getvalue()
     assert "reading [logs]" in text
     assert "searching" in text
+
+
+def test_long_work_is_never_silent(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal, "SILENCE", 0.05)
+    with drawn_progress():
+        say("  calibrating bands")
+        time.sleep(0.3)
+        report("free runs", 3, 8)
+        time.sleep(0.3)
+    told = capsys.readouterr().err.splitlines()
+    assert told[:2] == ["  calibrating bands", "  calibrating bands: 0 s so far"]
+    assert "  free runs, 3 of 8: 0 s so far" in told
+    time.sleep(0.1)
+    assert capsys.readouterr().err == ""
 
 
 def test_nothing_is_drawn_outside(capsys: pytest.CaptureFixture[str]) -> None:

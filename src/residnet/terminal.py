@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from residnet.data.drafting.questions import Answer, Question
 
 
+SILENCE = 5.0
+"""Seconds without a line after which one says what is still being done."""
 Keep = Callable[[str], None]
 """Is given one line after the other."""
 
@@ -31,12 +34,22 @@ def drawn_progress(*, quiet: bool = False, kept: Keep | None = None) -> Iterator
         quiet: draw nothing.
         kept: is given every line, whatever is drawn.
     """
-    if quiet or not sys.stderr.isatty():
-        with listen(_Kept(kept, None if quiet else _Lines())):
+    if quiet:
+        with listen(_Kept(kept, None)):
+            yield
+        return
+    if not sys.stderr.isatty():
+        with _Lines() as lines, listen(_Kept(kept, lines)):
             yield
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
     from rich.progress import Progress as Bars
 
     console = Console(stderr=True, highlight=False, markup=False)
@@ -45,6 +58,7 @@ def drawn_progress(*, quiet: bool = False, kept: Keep | None = None) -> Iterator
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(elapsed_when_finished=True),
+        TimeElapsedColumn(),
     )
     with Bars(*columns, console=console, transient=True) as bars, listen(_Kept(kept, _Bars(bars))):
         yield
@@ -66,27 +80,53 @@ class _Kept:
 
 
 class _Lines:
-    """One line for each message, and one for each counted stage that ends without a message."""
+    """One line for each message, and one for each counted stage that ends without a message.
+
+    Where neither comes for a while, a line tells what is still being done, how far, and since when.
+    """
 
     def __init__(self) -> None:
         self._complete: set[str] = set()
+        self._ended = threading.Event()
+        self._doing, self._since, self._told = "", 0.0, 0.0
+
+    def __enter__(self) -> _Lines:
+        threading.Thread(target=self._watch, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(SILENCE / 5):
+            now = time.monotonic()
+            if self._doing and now - self._told >= SILENCE:
+                self._print(f"  {self._doing}: {now - self._since:.0f} s so far")
+
+    def _print(self, line: str) -> None:
+        self._told = time.monotonic()
+        print(line, file=sys.stderr, flush=True)
 
     def __call__(self, progress: Progress) -> None:
         if progress.message:
-            print(progress.message, file=sys.stderr, flush=True)
+            self._print(progress.message)
+            self._doing, self._since = progress.message.strip(), self._told
         if progress.done is None or progress.total is None:
             return
         if progress.done < progress.total:
             self._complete.discard(progress.stage)
+            self._doing = f"{progress.stage}, {progress.done:g} of {progress.total:g}"
         elif progress.stage not in self._complete:
             self._complete.add(progress.stage)
             if not progress.message:
-                line = f"  {progress.stage}: all {progress.total:g} done"
-                print(line, file=sys.stderr, flush=True)
+                self._print(f"  {progress.stage}: all {progress.total:g} done")
 
 
 class _Bars:
-    """One bar for each stage that is under way; messages stand above the bars."""
+    """One bar for each stage that is under way, and one for the last message, which stands above.
+
+    Bars move, and tell the time that is gone, without a word of the work.
+    """
 
     def __init__(self, bars: Bars) -> None:
         self._bars = bars
@@ -95,6 +135,9 @@ class _Bars:
     def __call__(self, progress: Progress) -> None:
         if progress.message:
             self._bars.console.print(progress.message)
+            if "" in self._stages:
+                self._bars.remove_task(self._stages.pop(""))
+            self._stages[""] = self._bars.add_task(progress.message.strip()[:40], total=None)
         if progress.done is None and progress.total is None:
             return
         if progress.stage not in self._stages:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -181,7 +180,7 @@ def calibrate_bands(
         validation: logs that chose between models.
         config: level, folds and starts.
     """
-    started = time.perf_counter()
+    say("  calibrating bands")
     fold = fold_numbers([log.log.manoeuvre for log in identified.train], config.folds, config.seed)
     left_out = FoldModels(identified, fold)
     refitted = left_out.models if int(fold.max()) > 0 else [{}]
@@ -196,7 +195,6 @@ def calibrate_bands(
         runs.add({name: entry.model for name, entry in identified.items()}, validation, True)
         for name, band in runs.bands().items():
             out.setdefault(name, {})[protocol] = band
-    say(f"  bands calibrated in {time.perf_counter() - started:.1f} s")
     return {name: _banded(entry, out.get(name, {})) for name, entry in identified.items()}
 
 

@@ -23,6 +23,10 @@ _SHEET, _LETTER, _PADDING = 700.0, 5.8, 6.0
 """Pixels of a sheet of A4 between its margins, of a bold letter of a table, and beside a cell."""
 
 
+_WIDE = 6
+"""Columns of a table that half of a page, 34 rem, no longer holds at 5 to 6 rem each."""
+
+
 class Block(Protocol):
     """A part of a section, drawn by the template macro that bears its `kind`."""
 
@@ -318,7 +322,7 @@ class Section:
     """A titled part of a page; it may hold sections itself.
 
     Attributes:
-        title: a few words.
+        title: a few words; empty for the rest of a page's first screen.
         blocks: what it shows, from top to bottom.
         folded: closed at first, for what most readers skip.
     """
@@ -332,3 +336,9 @@ class Section:
     def shown(self) -> list[Block]:
         """Return the blocks that are there; a section may be handed None for an absent part."""
         return [block for block in self.blocks if block is not None]
+
+    @property
+    def beside(self) -> bool:
+        """Return whether its parts stand beside each other, each in half of the page."""
+        tables = [block for block in self.shown if isinstance(block, Table)]
+        return len(self.shown) > 1 and all(len(table.columns) < _WIDE for table in tables)

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Literal, TypeAlias
 import numpy as np
 
 from residnet.core.files import file_stem, whole
+from residnet.core.progress import say
 from residnet.core.stretches import stretches
 from residnet.report.blocks import Section
 
@@ -336,6 +337,7 @@ def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
         before = _read(path)
         for file in (path, *before.stills) if before else ():
             file.unlink(missing_ok=True)
+    say("  drawing figures")
     # the number keeps the order for whoever lists the folder
     return [
         write_figure(folder, one, f"{i:02d}_{one.name}") for i, one in enumerate(figures, start=1)

@@ -25,12 +25,12 @@ def _sections(run: RunFiles) -> Iterator[Section | None]:
     yield _figures_as("Error against horizon", folder, "horizon")
     yield free_runs.worst(run, read_figures(folder, "free_runs"))
     yield data.doctor(run)
+    yield manoeuvres.booklet(run)
     for found in (
         free_runs.errors(run),
         free_runs.limits(run),
         data.fitted_on_what(run),
         models.models(run),
-        manoeuvres.booklet(run),
         free_runs.bands(run),
         models.goodness(run),
         _figures_as("Figures", folder, "(?!(track|horizon|free_runs)$).*"),

@@ -85,7 +85,8 @@ def write_page(
     # jinja2 is only needed where a page is written, not where a config is checked
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    record = _record(run)
+    path = run / "provenance.json"
+    record: Mapping[str, Any] = read_json(path) if path.is_file() else {}
     environment = Environment(
         loader=PackageLoader("residnet.report", "templates"),
         autoescape=True,
@@ -99,7 +100,7 @@ def write_page(
         "embedded": lambda path: base64.b64encode(path.read_bytes()).decode("ascii"),
         "pixels": _pixels,
         "deflated": lambda text: base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii"),
-        "anchor": _anchor,
+        "anchor": lambda title: re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-"),
         "linked": lambda text: glossary.linked(_breakable(str(text))),
     }
     parts = [*sections, *_made_of(run, record)]
@@ -167,11 +168,6 @@ def exports_section(run: Path) -> Section | None:
     return Section("Exports for controllers", [*blocks, table_of(rows, columns)])
 
 
-def _record(run: Path) -> Mapping[str, Any]:
-    path = run / "provenance.json"
-    return read_json(path) if path.is_file() else {}
-
-
 def _made_of(run: Path, record: Mapping[str, Any]) -> list[Section]:
     """Return the section on provenance and configuration, none where the folder holds neither."""
     blocks: list[Block] = []
@@ -206,11 +202,6 @@ def provenance_facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     if record.get("overrides"):
         facts.append(("overrides", " ".join(record["overrides"])))
     return facts
-
-
-def _anchor(title: str) -> str:
-    """Return the name by which a section is linked."""
-    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def _breakable(text: str) -> Markup:

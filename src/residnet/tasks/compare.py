@@ -71,7 +71,7 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
     verdict = _sentence(runs, pairs)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        sections = [Section("On common logs", [tables[1], _curves(runs, out)])] if pairs else []
+        sections = [Section("", [tables[1], _curves(runs, out)])] if pairs else []
         sections += [
             Section("Every model of every run", [tables[0]]),
             Section("Where the runs differ", [tables[-1]]),
@@ -167,7 +167,12 @@ def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, An
                 told = (f"{entry['nrmse_mean']:+.3f}", interval)
             cells = [Cell(run.model, mark="text"), Cell(protocol, mark="text")]
             texts = (str(entry["windows"]), f"{entry['mean']:.3g}", *told)
-            table.add(run.name, [*cells, *map(Cell, texts)], rule=run is runs[0])
+            table.add(
+                run.name,
+                [*cells, *map(Cell, texts)],
+                rule=run is runs[0],
+                selected=entry["mean"] == min(one["mean"] for one in entries.values()),
+            )
     return table
 
 

@@ -211,11 +211,12 @@ def sections(run: RunFiles) -> list[Section]:
     out = []
     for protocol, (nominal, drawn) in _by_protocol(run.rows).items():
         blocks: list[Block] = [Text(_rule(nominal)), nominal_table(nominal)]
+        if not out:
+            out.append(Section("", [*blocks[1:], *read_figures(run.path / "figures", "courses")]))
+            blocks = blocks[:1]
         if drawn:
             blocks.append(Section("Spread of vessels and currents", [spread_table(drawn)]))
         out.append(Section(f"Protocol {protocol}", blocks))
-    if flown := read_figures(run.path / "figures", "courses"):
-        out.append(Section("Flights to look into", flown))
     out.append(Section("What the numbers mean", [Text(_definition(run))]))
     return [*out, *figures_section(run.path / "figures", "spread")]
 

@@ -216,7 +216,7 @@ def doctor(run: RunFiles) -> Section | None:
             ("finding", lambda row: row[0][1].replace("_", " ")),
             ("level", lambda row: bad_where(_LEVELS[row[0][0]], row[0][0] == 0)),
             ("logs", lambda row: len({name for name, _ in row[1]}), str),
-            ("for example", lambda row: _example(*row[1][0])),
+            ("for example", lambda row: Cell(minus(row[1][0][1]["text"]), row[1][0][0], "text")),
             ("what to do", lambda row: row[1][0][1]["action"]),
         ]
         blocks.append(table_of(sorted(kinds.items(), key=lambda row: row[0]), columns))
@@ -229,7 +229,3 @@ def doctor(run: RunFiles) -> Section | None:
         by_log = [Section(name, [Bullets(texts)]) for name, texts in notes.items()]
         blocks.append(Section("Notes, log by log", by_log, folded=True))
     return Section("Data doctor", blocks)
-
-
-def _example(name: str, finding: Content) -> Cell:
-    return Cell(minus(str(finding["text"])), note=name, mark="text")

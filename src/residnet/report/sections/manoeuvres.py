@@ -14,7 +14,17 @@ from residnet.data.simulated import Flight
 from residnet.manoeuvres.closed_loop import Spiral, Zigzag
 from residnet.manoeuvres.courses import Waypoints
 from residnet.manoeuvres.replay import Replay
-from residnet.report.blocks import Block, Bullets, Cell, Column, Section, Table, Text, table_of
+from residnet.report.blocks import (
+    Block,
+    Bullets,
+    Cell,
+    Column,
+    Section,
+    Table,
+    Text,
+    bad_where,
+    table_of,
+)
 from residnet.report.figure import (
     DASHED,
     GREY,
@@ -72,18 +82,35 @@ def index_title(name: str) -> str:
 def sections(run: RunFiles) -> list[Section]:
     """Return the manoeuvring indices and the figures that stand in the folder."""
     content = run.json("indices.json")
+    flown = read_figures(run.path / "figures", "manoeuvres")
     out = []
     if content.get("rows"):
-        blocks: list[Block] = []
-        if faulty := [row for row in content["rows"] if row["fault"]]:
-            faults = [f"{row['craft']}, {row['log']}: {row['fault']}" for row in faulty]
-            blocks.append(Bullets(faults, warning=True))
-        blocks.append(Text(_about(content), quiet=True))
+        out.append(Section("", [*flown, _flights(content)]))
+        blocks: list[Block] = [Text(_about(content), quiet=True)]
         blocks += [Section(title, [table]) for title, table in index_tables(content)]
         out.append(Section("Manoeuvring indices", blocks))
-    if flown := read_figures(run.path / "figures", "manoeuvres"):
-        out.append(Section("Runs to look into", flown))
     return [*out, *figures_section(run.path / "figures", "(?!manoeuvres).*")]
+
+
+def _flights(content: Content) -> Table:
+    """Return a row for each flight: how it ended, and the first of its indices."""
+
+    def first(row: Content) -> str:
+        for name, value in row["indices"].items():
+            unit, factor = shown_unit(str(content["units"].get(name, "-")))
+            return f"{index_title(name)} {number(_times(factor, value))} {unit}"
+        return DASH
+
+    rows = sorted(content["rows"], key=lambda row: not row["fault"])
+    return table_of(
+        rows[:_EACH],
+        [
+            ("flight", "log"),
+            ("vessel", "craft"),
+            ("ended", lambda row: bad_where(row["fault"] or "as it should", row["fault"])),
+            ("for example", first),
+        ],
+    )
 
 
 def _about(content: Content) -> str:

@@ -19,9 +19,9 @@ from residnet.report.figure import (
     Figure,
     Look,
     Panel,
-    figures_section,
     joined,
     names_of,
+    read_figures,
     whiskers,
     write_figures,
 )
@@ -206,8 +206,7 @@ def sections(run: RunFiles) -> list[Section]:
         " blocks of windows.",
     ]
     shown = variants_table(rows, content["reference"])
-    section = Section("Variants", [shown, Text(about, quiet=True)])
-    return [section, *figures_section(run.path / "figures")]
+    return [Section("", [shown, *read_figures(run.path / "figures"), Text(about, quiet=True)])]
 
 
 def variants_table(rows: Sequence[Content], reference: str) -> Table:
@@ -226,7 +225,9 @@ def variants_table(rows: Sequence[Content], reference: str) -> Table:
         # a study of an earlier version does not know what diverged
         lost = int(row.get("diverged", 0))
         note = f"{lost} diverged" if lost else ""
-        return Cell(f"{row['nrmse_mean']:.4f}", note, "bad" if lost else "")
+        same = [other for other in rows if other["protocol"] == row["protocol"]]
+        least = row["nrmse_mean"] == min(other["nrmse_mean"] for other in same)
+        return Cell(f"{row['nrmse_mean']:.4f}", note, "bad" if lost else "best" if least else "")
 
     def difference(row: Content) -> str:
         return signed(row["difference"]) if row["difference_ci95"] else ""

@@ -20,9 +20,9 @@ from residnet.report.figure import (
     Look,
     Panel,
     bars,
-    figures_section,
     joined,
     names_of,
+    read_figures,
     steps,
     write_figures,
 )
@@ -184,9 +184,10 @@ def sections(run: RunFiles) -> list[Section]:
         "best.yaml holds the config of the best trial with all its keys.",
     ]
     by_number = sorted(content["trials"], key=lambda row: int(row["number"]))
+    figures = read_figures(run.path / "figures")
     return [
-        Section("The best trials", [trials_table(content), Text(about, quiet=True)]),
-        *figures_section(run.path / "figures"),
+        Section("", [trials_table(content), *figures[:1], Text(about, quiet=True)]),
+        *([Section("Figures", figures[1:])] if figures[1:] else []),
         Section("All trials", [_table(content, by_number)], folded=True),
     ]
 

@@ -80,12 +80,14 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     known = {entry["model"]: entry for entry in run.json("selection.json").get("models") or []}
     limits = (run.limits.get("splits") or {}).get(run.focus, {}).get(run.main, {})
     first = [run.lead, run.metrics.get("selected_ensemble"), run.baseline, "zero"]
-    others = sorted(set(rows) - set(first), key=lambda one: float(rows[one]["position_error_end"]))
     table: list[Content] = [rows[one] for one in dict.fromkeys(first) if one in rows]
     if floor := limits.get("kinematics"):
         ends = {f"{of}_error_end": floor[f"{of}_mean"] for of in ("position", "heading")}
         table.append({"model": _MEASURED, "diverged": 0, **ends})
-    table += [rows[one] for one in others]
+    table += sorted(
+        (row for one, row in rows.items() if one not in first),
+        key=lambda row: float(row["position_error_end"]),
+    )
 
     def error(row: Content, key: str, factor: float) -> Cell:
         span = row.get(f"{key}_ci95")
@@ -100,14 +102,12 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
             return Cell("✗", faults[0], "bad")
         return Cell("✓" if row["model"] in known else DASH)
 
-    told = (
+    told = [
         f"Mean of {plural(rows[run.lead]['windows'], 'free run')} on {run.focus} data"
-        f" ({run.main}); small: 95 % interval."
-    )
-    if run.focus not in UNSEEN:
-        told += " These data are not unseen: read with care."
-    if floor:
-        told += " Measurements: where the measured velocities themselves lead."
+        f" ({run.main}); small: 95 % interval.",
+        "" if run.focus in UNSEEN else "These data are not unseen: read with care.",
+        "Measurements: where the measured velocities themselves lead." if floor else "",
+    ]
     shown = table_of(
         table,
         [
@@ -122,7 +122,7 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         groups=[(f"error {run.horizon}", 2)],
         selected=lambda row: row["model"] == run.selected,
     )
-    return Section("", [*figures, shown, Text(told, quiet=True)])
+    return Section("", [*figures, shown, Text(" ".join(filter(None, told)), quiet=True)])
 
 
 def cautions(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
