@@ -103,7 +103,7 @@ def _flights(content: Content) -> Table:
 
     rows = sorted(content["rows"], key=lambda row: not row["fault"])
     return table_of(
-        rows[:_EACH],
+        rows[: max(_EACH, sum(bool(row["fault"]) for row in rows))],
         [
             ("flight", "log"),
             ("vessel", "craft"),
