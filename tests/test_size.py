@@ -33,7 +33,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2843, 320),
     "runs": (365, 48),
     "simulators": (355, 44),
-    "tasks": (3086, 259),
+    "tasks": (3096, 261),
     "testing": (484, 33),
     "training": (1308, 157),
     "": (445, 54),

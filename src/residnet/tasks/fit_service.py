@@ -34,6 +34,10 @@ from residnet.identification.planning import Aim, Plan, TrialLimits, plan, share
 from residnet.identification.prepared import prepare_logs, require_window, through_currents
 from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
 from residnet.judge.metrics import find
+from residnet.report.blocks import Section, Table, table_of
+from residnet.report.figure import Case, Figure, Panel, family, write_figure
+from residnet.report.format import fixed
+from residnet.report.page import write_page
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.provenance import Provenance
@@ -321,26 +325,37 @@ class PlannedTrials:
     model: str
     plan: Plan
 
-    def text(self) -> str:
-        """Return the table and the choice in words."""
-        lines = [
-            f"Next trials for {self.model}; candidates by what they narrow per minute:",
-            f"{'manoeuvre':38s}{'min':>6s}{'reach m':>9s}{'narrower %':>12s}{'volume/min':>12s}",
-        ]
-        lines += [
-            f"{trial.flight.motion.name:38s}{trial.minutes:6.1f}{trial.reach:9.0f}"
-            f"{100 * trial.shrinks:12.1f}{trial.volume:12.2f}"
-            for trial in self.plan.trials[:_SHOWN]
-        ]
+    @property
+    def table(self) -> Table:
+        """The candidates, the most telling per minute first; those to run are marked."""
+        return table_of(
+            self.plan.trials[:_SHOWN],
+            [
+                ("manoeuvre", lambda trial: trial.flight.motion.name),
+                ("time [min]", lambda trial: fixed(trial.minutes, 1), str),
+                ("reach [m]", lambda trial: fixed(trial.reach, 0), str),
+                ("narrower by [%]", lambda trial: fixed(100 * trial.shrinks, 1), str),
+                ("volume per minute", lambda trial: fixed(trial.volume, 2), str),
+            ],
+            caption=f"Next trials for {self.model}; candidates by what they narrow per minute.",
+            selected=lambda trial: any(trial is one for one in self.plan.chosen),
+        )
+
+    @property
+    def choice(self) -> str:
+        """What to run, and by how much that narrows predictions, in a sentence."""
         names = ", ".join(trial.flight.motion.name for trial in self.plan.chosen)
-        lines.append(
+        return (
             f"Run {names}: together they narrow the intervals of predictions by"
             f" {100 * self.plan.shrinks:.0f} %, as the model expects it."
         )
-        return "\n".join(lines)
+
+    def text(self) -> str:
+        """Return the table and the choice in words."""
+        return f"{self.table.text()}\n{self.choice}"
 
     def write(self, folder: Path) -> list[Path]:
-        """Write the chosen manoeuvres as YAML and their tracks as CSV; returns the files."""
+        """Write the chosen manoeuvres as YAML, tracks as CSV, and a page; returns the files."""
         folder.mkdir(parents=True, exist_ok=True)
         trials, tracks = folder / "next_trials.yaml", folder / "next_tracks.csv"
         flights = [trial.flight for trial in self.plan.chosen]
@@ -356,7 +371,18 @@ class PlannedTrials:
             file.write_text(yaml.safe_dump({"manoeuvres": chosen}, sort_keys=False))
         with whole(tracks) as file:
             file.write_text("\n".join(lines) + "\n")
-        return [trials, tracks]
+        curves = {
+            motion.name: (motion["y"] - motion["y"][0], motion["x"] - motion["x"][0])
+            for motion in (flight.motion for flight in flights)
+        }
+        panel = Panel("north [m]", "east [m]", kind="map", height=300)
+        figure = Figure(
+            "tracks", "Tracks", "As the model flies them.", family(curves), [panel],
+            [Case("", [curves])],
+        )  # fmt: skip
+        shown = Section("", [self.table, write_figure(folder / "figures", figure)])
+        page = write_page(folder, "Next trials", f"For {self.model}.", [self.choice], [shown])
+        return [trials, tracks, page]
 
 
 def plan_trials(

@@ -1,0 +1,42 @@
+"""The page, the table and the files of planned trials."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import yaml
+from read_page import Page, plain
+
+from residnet.core.log import Log
+from residnet.manoeuvres.closed_loop import Zigzag
+from residnet.tasks.fit_service import PlannedTrials
+
+
+def trial(name: str, volume: float) -> Any:
+    t = np.arange(0.0, 30.0, 0.5)
+    channels = dict.fromkeys(("x", "y", "psi", "u", "v", "r"), 0.1 * t)
+    flight = SimpleNamespace(
+        motion=Log(name, t, channels),
+        manoeuvre=Zigzag(kind="zigzag", drive=0.5, steer=0.5, heading=0.3),
+    )
+    return SimpleNamespace(flight=flight, minutes=0.5, reach=12.0, shrinks=0.25, volume=volume)
+
+
+def test_what_to_run_stands_in_table_page_and_files(tmp_path: Path) -> None:
+    trials: Any = [trial("zigzag_1", 3.0), trial("turn_1", 2.0)]
+    plan: Any = SimpleNamespace(trials=trials, chosen=trials[:1], shrinks=0.4)
+    planned = PlannedTrials("hull", plan)
+    text = planned.text().splitlines()
+    assert text[0].startswith("Next trials for hull")
+    assert text[2].split() == ["zigzag_1", "0.5", "12", "25.0", "3.00"]
+    assert text[-1].startswith("Run zigzag_1: together they narrow the intervals")
+    files = planned.write(tmp_path)
+    assert [file.name for file in files] == ["next_trials.yaml", "next_tracks.csv", "report.html"]
+    assert yaml.safe_load(files[0].read_text())["manoeuvres"][0]["kind"] == "zigzag"
+    page = plain(files[2])
+    assert "Run zigzag_1" in page.partition('id="at-a-glance"')[0]
+    assert "<tr data-selected><th" in page
+    assert Page(page).tables[0][1][0] == "zigzag_1"
