@@ -104,7 +104,8 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
 
     told = [
         f"Mean of {plural(rows[run.lead]['windows'], 'free run')} on {run.focus} data"
-        f" ({run.main}); small: 95 % interval.",
+        f" ({run.main})"
+        + ("; small: 95 % interval." if rows[run.lead].get("position_error_end_ci95") else "."),
         "" if run.focus in UNSEEN else "These data are not unseen: read with care.",
         "Measurements: where the measured velocities themselves lead." if floor else "",
     ]
