@@ -208,7 +208,7 @@ def sections(run: RunFiles) -> list[Section]:
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
-    out = []
+    out: list[Section] = []
     for protocol, (nominal, drawn) in _by_protocol(run.rows).items():
         blocks: list[Block] = [Text(_rule(nominal)), nominal_table(nominal)]
         if not out:
