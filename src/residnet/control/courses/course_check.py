@@ -113,8 +113,8 @@ def _side(track: Array, at: int, buoy: Asked) -> str:
 
 def first_fault(
     track: Array, buoys: Sequence[Asked], protocol: Protocol, slack: float
-) -> str | None:
-    """Return what a track [N, 2] does wrong at the first buoy where it does; None where nothing.
+) -> tuple[int, str] | None:
+    """Return the first buoy, from 0, where a track [N, 2] does wrong, and what; None where nowhere.
 
     Args:
         track: north, east in m.
@@ -122,17 +122,17 @@ def first_fault(
         protocol: see there.
         slack: of distances in m.
     """
-    for number, (passage, buoy) in enumerate(
-        zip(passages(track, buoys), buoys, strict=True), start=1
-    ):
+    for place, (passage, buoy) in enumerate(zip(passages(track, buoys), buoys, strict=True)):
+        number = place + 1
         if protocol == "enter":
             if passage.distance > buoy.radius + slack:
-                return (
+                return place, (
                     f"buoy {number}: passed at {passage.distance:.4g} m, its circle of"
                     f" {buoy.radius:.4g} m is not entered in its turn"
                 )
         elif passage.least < buoy.radius - slack:
-            return f"buoy {number}: its circle of {buoy.radius:.4g} m is cut, {passage.least:.4g} m"
+            cut = f"its circle of {buoy.radius:.4g} m is cut, {passage.least:.4g} m"
+            return place, f"buoy {number}: {cut}"
         elif {passage.side, passage.side_there} != {buoy.leave_to}:
-            return f"buoy {number}: it is not left to {buoy.leave_to} where it is nearest"
+            return place, f"buoy {number}: it is not left to {buoy.leave_to} where it is nearest"
     return None

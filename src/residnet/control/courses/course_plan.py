@@ -136,6 +136,10 @@ _EFFORT = 600
 _RINGS = (0.0, 0.25)
 _TOLERANCE = 2e-3
 """Of distances, as a share of the vessel's turning radius."""
+_LAST = 1e-2
+"""The same before a course is refused: what buoys ask for is checked all the same, and plans keep a
+margin to that.
+"""
 _FAR = 0.1
 _MENDED = 0.1
 """Change of z within which a course is mended whose turns fit each other."""
@@ -206,9 +210,36 @@ def plan(
     Raises:
         ConfigError: where none is found.
     """
-    reasons: list[tuple[float, str]] = []
+    reasons: list[tuple[float, int, str]] = []
+    course = _planned(request, step, beyond, make, reasons)
+    if course is None:
+        raise ConfigError(_refusal(request, reasons, _excluding(request, step, make, reasons)))
+    return course
+
+
+def _planned(
+    request: CourseRequest,
+    step: float,
+    beyond: float,
+    make: TurnMaker | None,
+    reasons: list[tuple[float, int, str]],
+) -> Course | None:
+    """Return the quickest course found that passes the check; None, and reasons, where none is."""
     known: set[tuple[object, ...]] = set()
     effort = 0
+    near: list[tuple[Fit, Fitted]] = []
+
+    def settled(found: list[tuple[Fit, Fitted]], tolerance: float) -> Course | None:
+        found.sort(key=lambda one: one[1].time)
+        for fit, fitted in found if make is None else joined(request.turns, found, make):
+            if _right(request, fit, fitted, step, reasons, tolerance):
+                return _sampled(fit.route, fitted.z, step, beyond)
+            if fitted.missed <= tolerance * request.turns.radius:
+                fitted = fit.alone(fitted.z, _MENDED)
+                if _right(request, fit, fitted, step, reasons, tolerance):
+                    return _sampled(fit.route, fitted.z, step, beyond)
+        return None
+
     for number, tries in enumerate((_TRIES, *((one,) for one in _MORE))):
         report("planning", number, 1 + len(_MORE))
         found: list[tuple[Fit, Fitted]] = []
@@ -228,19 +259,44 @@ def plan(
                     fit, fitted = min(close, key=lambda one: one[1].time)
                     fitted = fit.alone(fitted.z)
                     right = [(fit, fitted)] if _right(request, fit, fitted, step, reasons) else []
+                near += [one for one in fits if one[1].missed <= _LAST * request.turns.radius]
                 found += right
                 effort += sum(fit.effort for fit, _ in fits)
                 if found:
                     break
-        found.sort(key=lambda one: one[1].time)
-        for fit, fitted in found if make is None else joined(request.turns, found, make):
-            if _right(request, fit, fitted, step, reasons):
-                return _sampled(fit.route, fitted.z, step, beyond)
-            if fitted.missed <= _TOLERANCE * request.turns.radius:
-                fitted = fit.alone(fitted.z, _MENDED)
-                if _right(request, fit, fitted, step, reasons):
-                    return _sampled(fit.route, fitted.z, step, beyond)
-    raise ConfigError(_refusal(request, reasons))
+        if (course := settled(found, _TOLERANCE)) is not None:
+            return course
+    return settled(near, _LAST)
+
+
+def _excluding(
+    request: CourseRequest,
+    step: float,
+    make: TurnMaker | None,
+    reasons: Sequence[tuple[float, int, str]],
+) -> tuple[int, ...]:
+    """Return the numbers of two or three buoys in a row that are refused by themselves, from 1.
+
+    They are begun at the buoy before them, in any direction. Empty where each row has a course.
+    """
+    count = len(request.circles)
+    worst = min(reasons)[1] if reasons else 0
+    for length in (2, 3):
+        if length >= count:
+            break
+        for first in range(max(worst - length + 1, 0), min(worst, count - length) + 1):
+            row = slice(first, first + length)
+            before = request.circles[first - 1].place if first else complex(*request.start)
+            part = replace(
+                request,
+                start=(before.real, before.imag),
+                heading=None if first else request.heading,
+                circles=request.circles[row],
+                buoys=request.buoys[row],
+            )
+            if _planned(part, step, step, make, []) is None:
+                return tuple(range(first + 1, first + length + 1))
+    return ()
 
 
 def _simplified(request: CourseRequest, sketch: Sketch) -> list[Sketch]:
@@ -254,29 +310,42 @@ def _right(
     fit: Fit,
     fitted: Fitted,
     step: float,
-    reasons: list[tuple[float, str]],
+    reasons: list[tuple[float, int, str]],
+    tolerance: float = _TOLERANCE,
 ) -> bool:
-    """Return whether a course passes the check; where it does not, the reason is added."""
-    if fitted.missed > _TOLERANCE * request.turns.radius:
-        reasons.append((fitted.missed, f"buoy {fitted.worst + 1}"))
+    """Return whether a course passes the check; where it does not, the reason is added.
+
+    A reason is what is missed in m, the number of the buoy from 0, and the words for it.
+    """
+    if fitted.missed > tolerance * request.turns.radius:
+        reasons.append((fitted.missed, fitted.worst, f"buoy {fitted.worst + 1}"))
         return False
     course = _sampled(fit.route, fitted.z, step, step)
     # to the end, between samples
     track = course.track[: math.ceil(course.length / step) + 1]
     wrong = first_fault(track, request.buoys, request.protocol, 0.5 * step)
     if wrong is not None:
-        reasons.append((0.0, wrong))
+        reasons.append((0.0, *wrong))
     return wrong is None
 
 
-def _refusal(request: CourseRequest, reasons: Sequence[tuple[float, str]]) -> str:
+def _refusal(
+    request: CourseRequest, reasons: Sequence[tuple[float, int, str]], rows: Sequence[int]
+) -> str:
+    if rows:
+        *first, last = (str(number) for number in rows)
+        return (
+            f"no course found: buoys {', '.join(first)} and {last} exclude each other for this"
+            " vessel's turns, even alone and begun at the one before them; move one, give them"
+            " smaller circles, or allow more rudder"
+        )
     advice = "move it, give it a smaller circle, or allow more rudder"
     if not reasons:
         return (
             f"no course found past the {len(request.circles)} buoys: circles leave no way between"
             f" them; {advice}"
         )
-    missed, what = min(reasons)
+    missed, _, what = min(reasons)
     if missed > 0:
         what += (
             f": the best course found with this vessel's turns misses its circle by {missed:.3g} m"
