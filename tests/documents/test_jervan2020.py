@@ -4,6 +4,7 @@ what is refused.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,11 @@ from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, FitError
 from residnet.documents.jervan2020.ferry import (
     Ferry,
+    FerryModelConfig,
     FerryStudyConfig,
     Flown,
     identify,
+    objections,
     record_of,
     study,
     written,
@@ -142,6 +145,37 @@ def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
     torch.testing.assert_close(flight.acting, moved, rtol=1e-9, atol=1e-6)
     late = (flight.acting[4:] - flight.command[:-4]).square().mean(0)
     assert bool((late < (flight.acting - flight.command).square().mean(0)).all())
+
+
+def test_lag_and_no_residual_are_tried_with_every_order(short: Flown) -> None:
+    believed, wanted = ForceModel(hull("milliampere")), FerryModelConfig(fit={"kind": "plsr"})
+    late = identify(wanted, short.record, believed)
+    assert late.lag is not None
+    assert late.fit.notes["left_out"] < 0.1
+    # a command that the believed model explains but for noise
+    record = short.record
+    force = believed(record.nu_dot, record.nu)
+    noise = 50.0 * torch.randn(force.shape, generator=torch.Generator().manual_seed(0)).double()
+    explained = replace(record, command=force + noise, averaged=force + noise)
+    nothing = identify(wanted, explained, believed)
+    assert (nothing.lag, nothing.fit.notes["order"]) == (None, 0)
+    torch.testing.assert_close(nothing.force(record.nu_dot, record.nu), force)
+
+
+def test_a_feed_forward_worse_than_the_believed_one_is_objected_to() -> None:
+    flown = {"believed": {"position_mae": 0.232}, "plsr": {"position_mae": 0.688}}
+    results: dict[str, Any] = {
+        "models": {"plsr": {"share_left": [1.47, 1.47, 1.28]}},
+        "course": flown,
+        "crossing": {},
+        "feed_forward_alone": {},
+    }
+    against = objections("plsr", results)
+    assert len(against) == 2
+    assert "0.688 m, the believed model's 0.232 m" in against[1]
+    results["models"]["plsr"]["share_left"] = [0.1, 0.2, 1.1]
+    flown["plsr"]["position_mae"] = 0.1
+    assert objections("plsr", results) == []
 
 
 @pytest.mark.long
