@@ -172,7 +172,7 @@ def demo(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write realistic logs of a simulated boat to try things on, as csv and MCAP."""
+    """Write realistic logs of a simulated boat to try things on, in several layouts."""
     from residnet.tasks.demo import write_demo
 
     with drawn_progress(quiet=quiet):

@@ -63,8 +63,9 @@ def test_trips_are_found_by_the_names_of_their_files(tmp_path: Path) -> None:
         "gps": ["gps_1.csv", "gps_2.csv"],
         "motor": ["motor_1.csv", "motor_2.csv"],
     }
-    assert partners(files("gps_1.csv", "gps_2.csv", "motor_1.csv")) == {}
-    assert partners(files("gps_1.csv", "gps_2.csv", "motor_1.csv", "motor_3.csv")) == {}
+    whole = partners(files("gps_1.csv", "gps_2.csv", "motor_1.csv", "motor_3.csv"))
+    assert [path.name for group in whole.values() for path in group] == ["gps_1.csv", "motor_1.csv"]
+    assert partners(files("gps_1.csv", "gps_2.csv", "motor_3.csv", "motor_4.csv")) == {}
     assert partners(files("a_1.csv", "a_2.csv")) == {}
     apart = {tmp_path / run / f"{word}.csv": (word,) for run in "12" for word in ("imu", "cmd")}
     assert set(partners(apart)) == {"imu", "cmd"}

@@ -14,7 +14,7 @@ from residnet.core.log import Log
 from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
 from residnet.data.simulated import SimulatedTrials, simulate
-from residnet.data.split import SplitConfig, check_leaks, data_files, divided, log_names
+from residnet.data.split import SplitConfig, check_leaks, divided, log_names
 
 Splits = dict[str, list[Log]]
 
@@ -83,4 +83,5 @@ def input_files(config: MeasuredLogs | SimulatedTrials) -> list[Path]:
     """Return files whose contents the run depends on."""
     if isinstance(config, SimulatedTrials):
         return []
-    return data_files(config.split.files())
+    reader = config.reader.build()
+    return [file for path in dict.fromkeys(config.split.files()) for file in reader.files(path)]

@@ -449,11 +449,6 @@ def _name(path: Path, real: Path, above: int, beside: Mapping[tuple[Path, str], 
     return "_".join([*(parent.name for parent in reversed(real.parents[:above])), own])
 
 
-def data_files(paths: Iterable[Path]) -> list[Path]:
-    """Return the files that logs consist of: those below a folder that is a recording, too."""
-    return [file for path in dict.fromkeys(paths) for file in files_of(path)]
-
-
 def matches(root: Path, patterns: Sequence[str], where: str) -> list[Path]:
     """Return logs of all patterns, each once: files, recordings, and what lies below folders."""
     found: dict[Path, None] = {}

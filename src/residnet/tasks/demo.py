@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.progress import report
 from residnet.data.simulated import SimulatedTrials, simulate
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 TRIALS: dict[str, Any] = {
     "vessel": "example_rudder_boat",
@@ -65,35 +68,39 @@ _EPOCH = 1_717_000_000
 
 
 def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
-    """Write the logs as csv, and as MCAP where rosbags is installed; returns what to say.
+    """Write the logs in several layouts, as MCAP too where rosbags is installed; returns what to say.
 
     Args:
-        folder: that the folders csv and mcap are made in.
+        folder: that a folder for each layout is made in.
         overwrite: replace them.
 
     Raises:
         UsageError: where they exist already, or cannot be written.
     """
-    for name in ("csv", "mcap"):
+    for name in (*LAYOUTS, "mcap"):
         if (folder / name).exists() and not overwrite:
             raise UsageError(f"{folder / name}: exists; give --overwrite, or another folder")
         shutil.rmtree(folder / name, ignore_errors=True)
     config = validate(TRIALS, SimulatedTrials, "demo")
     logs = [_with_gap(log, number) for number, log in enumerate(simulate(config.draw(), config))]
     try:
-        (folder / "csv").mkdir(parents=True)
-        for number, log in enumerate(logs):
-            report("writing logs", number, len(logs))
-            _csv(log, folder / "csv" / f"{log.name}.csv")
-        report("writing logs", len(logs), len(logs))
+        for number, (name, (_, tables)) in enumerate(LAYOUTS.items()):
+            report("writing logs", number, len(LAYOUTS))
+            (folder / name).mkdir(parents=True)
+            for log in logs:
+                for word, table in tables(_table(log)).items():
+                    file = folder / name / f"{word}{log.name}.csv"
+                    table.to_csv(file, index=False, float_format="%.4f")
+        report("writing logs", len(LAYOUTS), len(LAYOUTS))
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written ({error.strerror})") from error
     seconds = sum(float(log.t[-1] - log.t[0]) for log in logs)
     lines = [
-        f"{len(logs)} logs of a simulated boat in wind, {seconds / 60.0:.0f} minutes: {folder}/csv",
+        f"{len(logs)} logs of a simulated boat in wind, {seconds / 60.0:.0f} minutes, as",
+        *(f"{folder}/{name}: {about}" for name, (about, _) in LAYOUTS.items()),
         "their faults: positions 0.3 s late, a rudder that stands 2 degrees off, gaps, noise",
     ]
-    return [*lines, *_mcap_lines(logs, folder / "mcap"), f"next: residnet new {folder}/csv"]
+    return [*lines, *_mcap_lines(logs, folder / "mcap"), f"next: residnet new {folder}/two_files"]
 
 
 def _with_gap(log: Log, number: int) -> Log:
@@ -105,14 +112,60 @@ def _with_gap(log: Log, number: int) -> Log:
     return log.replace(t=log.t[keep], channels=channels, masks={})
 
 
-def _csv(log: Log, file: Path) -> None:
+def _table(log: Log) -> pd.DataFrame:
+    """Return a log in the units of its recorder, its time first."""
     import pandas as pd
 
     table = {"time [s]": np.round(log.t, 3)}
     for name, (column, factor) in COLUMNS.items():
         values = log[name] * factor
         table[column] = np.remainder(values, 360.0) if name in ("psi", "wind_dir") else values
-    pd.DataFrame(table).to_csv(file, index=False, float_format="%.4f")
+    return pd.DataFrame(table)
+
+
+_POSE = [COLUMNS[name][0] for name in ("x", "y", "psi")]
+_OWN = [COLUMNS[name][0] for name in ("u", "v", "r")]
+_ACTS = [COLUMNS[name][0] for name in ("delta", "n")]
+
+
+def _pulses(table: pd.DataFrame) -> pd.DataFrame:
+    """Return rudder and propeller as the pulses that drive them, in us: 35 deg, 1500 rpm."""
+    rudder, propeller = (table[name] for name in _ACTS)
+    table = table.drop(columns=_ACTS)
+    table["rudder_pwm"] = (1500.0 + 500.0 / 35.0 * rudder).round().astype(int)
+    table["motor_pwm"] = (1500.0 + 500.0 / 1500.0 * propeller).round().astype(int)
+    return table
+
+
+def _two_files(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return what a receiver with compass and anemometer writes, and what the motors do."""
+    acts = _pulses(table)[["time [s]", "rudder_pwm", "motor_pwm"]]
+    # the board was switched on seven seconds before the receiver began
+    acts["time [s]"] = (1e3 * acts["time [s]"] + 7e3).round().astype(int)
+    fixes = table.drop(columns=[*_OWN, *_ACTS])[::2]
+    fixes["time [s]"] += _EPOCH
+    return {
+        "gnss_": fixes.rename(columns={"time [s]": "utc [s]"}),
+        "motors_": acts.rename(columns={"time [s]": "millis"}),
+    }
+
+
+def _rates(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return positions in each fifth row and wind in each tenth, as one logger of all writes."""
+    table = table.copy()
+    for every, names in ((5, ("x", "y")), (10, ("wind_speed", "wind_dir"))):
+        table.loc[np.arange(len(table)) % every > 0, [COLUMNS[name][0] for name in names]] = np.nan
+    return {"": table}
+
+
+LAYOUTS: dict[str, tuple[str, Callable[[pd.DataFrame], dict[str, pd.DataFrame]]]] = {
+    "csv": ("one table a log", lambda table: {"": table}),
+    "two_files": ("a receiver and the motors, each with a file and a clock of its own", _two_files),
+    "rates": ("one table whose columns come at three rates", _rates),
+    "pwm": ("commands as pulses", lambda table: {"": _pulses(table)}),
+    "no_pose": ("velocities and commands alone", lambda table: {"": table.drop(columns=_POSE)}),
+}
+"""Folder -> what it holds, and the tables of a log by the word that its file's name begins with."""
 
 
 def _mcap_lines(logs: Sequence[Log], folder: Path) -> list[str]:

@@ -52,11 +52,13 @@ class Draft:
         config: the content of the YAML file.
         guesses: key -> why its value is a guess.
         text: the YAML with its comments.
+        unused: what the logs hold and the config does not use, and what would mislead a fit.
     """
 
     config: dict[str, Any]
     guesses: tuple[tuple[str, str], ...]
     text: str
+    unused: tuple[str, ...] = ()
 
     def save(self, file: Path | str) -> Path:
         """Write the config as YAML with its comments; returns the path of the file.
@@ -108,7 +110,7 @@ def new_config(
         lines.insert(0, "one value is a guess, marked in the file:")
     elif count:
         lines.insert(0, f"{count} values are guesses, each marked in the file:")
-    return [*lines, f"config: {file}", f"next: residnet run {file}"]
+    return [*lines, *draft.unused, f"config: {file}", f"next: residnet run {file}"]
 
 
 def drafted(
@@ -183,7 +185,10 @@ def drafted(
     }
     validate(config, FitConfig, "draft", folder)
     guesses = tuple((".".join(key), text) for key, text in marks.guesses)
-    return Draft(config, guesses, commented(config, marks.comments, read.head()))
+    unused = [text for key, text in marks.notes if key[-1] == "channels" or key == ("data",)]
+    left_out = [f"left out: {path.name}: {why}" for path, why in read.left_out.items()]
+    text = commented(config, marks.comments, read.head())
+    return Draft(config, guesses, text, (*left_out, *unused))
 
 
 class _Read:
@@ -289,7 +294,7 @@ def _findings(logs: Sequence[Log], inputs: Sequence[str], marks: Marks) -> set[s
             marks.note(("data",), f"data doctor: {log.name}: {error}")
             continue
         for finding in found.findings:
-            if finding.level != "note":
+            if finding.level != "note" or finding.code == "roll":
                 told.setdefault(finding.code, []).append(f"{log.name}: {finding.text}")
     for texts in told.values():
         more = f" (and {len(texts) - 1} more logs)" if len(texts) > 1 else ""

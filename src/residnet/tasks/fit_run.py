@@ -21,7 +21,7 @@ from residnet.data.prepare import Prepared, prepare
 from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.simulated import SimulatedTrials
-from residnet.data.split import data_files, log_names
+from residnet.data.split import log_names
 from residnet.dynamics.store import ModelSpec, load_model, model_names
 from residnet.export import exporter
 from residnet.export.base import place_of, released
@@ -327,12 +327,10 @@ def external_logs(
     own = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
     # a folder may be one log, as a ROS 2 bag is
     files = own.build().logs_among(log_files(paths, isinstance(own, RecordingConfig)))
-    read = [
-        (CanonicalConfig() if Log.recognises(path) else own).build().read(path).replace(name=name)
-        for path, name in log_names(files).items()
-    ]
+    readers = {path: (CanonicalConfig() if Log.recognises(path) else own).build() for path in files}
+    read = [readers[path].read(path).replace(name=name) for path, name in log_names(files).items()]
     logs = [prepare(log, SPLIT, config.signals.columns, config.prepare) for log in read]
-    return list(data_files(files)), read, logs
+    return [part for path in files for part in readers[path].files(path)], read, logs
 
 
 def limit_of(spec: ModelSpec, config: FitConfig) -> np.ndarray:

@@ -7,12 +7,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
 from residnet.core.names import POSE, STATE
 from residnet.core.stretches import stretches
 from residnet.data.channels import beyond_belief, fills, noise_of, spike_cells, usual_interval
 from residnet.data.doctor.findings import Check, Finding, Level, check, share_of, show
 from residnet.data.doctor.statistics import MEASURED, STEERING, Record, resolution_of
+from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers.base import unwrap
 
 
@@ -24,12 +26,22 @@ def channels(log: Record, found: Check) -> Iterator[Finding]:
     yield found(f"{about}: {named}")
 
 
-@check("header", "absent", "note")
+@check("values", "absent", "note")
 def absent(log: Record, found: Check) -> Iterator[Finding]:
-    """Report channels of the state that the log lacks."""
+    """Report what of the motion is not measured, and what is and no model takes."""
     names = [name for name in STATE if name not in log]
     if names:
-        yield found(f"no {', '.join(names)}: free runs cannot be scored on what is not measured")
+        try:
+            whole = complete_motion(log.log, MotionConfig())
+        except ResidnetError as error:
+            yield found(f"it cannot be fitted: {error}", level="will mislead")
+        else:
+            how = "follow from position and heading by a smoother"
+            how = "are integrated from the velocities" if "integrated" in whole.meta else how
+            yield found(f"no {', '.join(names)}: they {how}")
+    if rolling := [name for name in ("phi", "p") if name in log]:
+        text = f"{' and '.join(rolling)} of the roll are measured and not modelled: models are of"
+        yield found(f"{text} surge, sway and yaw", code="roll")
 
 
 # one full circle in rad, and in degrees that were taken for rad
@@ -99,7 +111,9 @@ def repeated_rows(log: Record, found: Check) -> Iterator[Finding]:
     same = np.append(False, (np.diff(log.log.stack(list(log)), axis=0) == 0.0).all(axis=1))
     noisy = any(float((np.diff(log[n]) == 0.0).mean()) < 0.5 for n in log if n in MEASURED)
     share = float(same.mean())
-    if same.any() and (noisy or share > 0.5):
+    # commands alone rest for as long as nobody moves them
+    moved = any(name in MEASURED for name in log)
+    if same.any() and moved and (noisy or share > 0.5):
         text = (
             f"{int(same.sum())} rows ({share_of(share)}) repeat the row before in every channel:"
             " logged twice, or faster than measured"

@@ -223,6 +223,8 @@ class Channels:
             self._settle_axes()
             self._settle_frame()
             self._settle_still()
+        elif "psi" in self._names:
+            self._psi_unit = self._unit("psi")
         self._settle_wind()
         return {name: self._entry(name) for name in self._names}
 

@@ -5,14 +5,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from residnet.core.config import validate
-from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.core.progress import report
@@ -20,11 +23,12 @@ from residnet.data.drafting.channels import READER
 from residnet.data.drafting.physics import Raw, turns_to
 from residnet.data.drafting.questions import Key, Marks
 from residnet.data.drafting.recordings import draft_recordings
-from residnet.data.drafting.tables import draft_tables
+from residnet.data.drafting.tables import draft_tables, named, peek
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.detect import kind_of
+from residnet.data.readers.detect import TO_TABLE, kind_of
 from residnet.data.readers.joined import partners
+from residnet.data.readers.quantities import QUATERNION
 from residnet.data.readers.recording import Recording
 from residnet.data.readers.tables import column_names
 from residnet.data.split import log_names, logs_below
@@ -32,7 +36,6 @@ from residnet.data.split import log_names, logs_below
 INPUTS = ("signals", "inputs")
 """Key of a config's inputs."""
 _TABLES = (".csv", ".parquet")
-_FIXES = ("latitude", "longitude", "qw")
 
 
 def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
@@ -56,7 +59,7 @@ def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
                 found = below
             if not found:
                 what = "log of a format that is known" if folders else "csv or Parquet file"
-                raise UsageError(f"{path}: holds no {what}")
+                raise UsageError(f"{path}: holds no {what}{others_in(path)}")
             files += found
         elif path.is_file():
             files.append(path)
@@ -66,6 +69,15 @@ def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
     for file in files:
         once.setdefault(file.resolve(), file)
     return list(once.values())
+
+
+def others_in(folder: Path) -> str:
+    """Return what a folder without logs holds, and how it can become logs; empty for nothing."""
+    endings = Counter(path.suffix.lower() for path in folder.rglob("*") if path.is_file())
+    held = ", ".join(
+        f"{n} file{'s' * (n > 1)} {end or 'without ending'}" for end, n in endings.items()
+    )
+    return f", but {held[:120]}; {TO_TABLE}" if held else ""
 
 
 @dataclass
@@ -108,8 +120,13 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
         )
     kind, read = kinds[paths[0]], DraftedLogs({"kind": "canonical"}, marks)
     loaded: dict[Path, Recording] = {}
-    if kind == "table" and (trips := partners({path: column_names(path) for path in paths})):
-        read.reader, paths = _draft_joined(trips, marks)
+    if kind == "table" and (trips := trips_of(paths)):
+        alone = set(paths).difference(*trips.values())
+        read.reader, paths, read.left_out = _draft_joined(trips, marks)
+        read.left_out |= {
+            path: DataError(f"{path}: no other file of its trip is beside it; leave it out")
+            for path in sorted(alone)
+        }
     elif kind == "table":
         read.reader, read.left_out = draft_tables(paths, marks)
     elif kind != "canonical":
@@ -135,24 +152,61 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
 
 def _draft_joined(
     trips: Mapping[str, Sequence[Path]], marks: Marks
-) -> tuple[dict[str, Any], list[Path]]:
-    """Return the settings of a reader of files that belong together, and those of the motion."""
+) -> tuple[dict[str, Any], list[Path], dict[Path, ResidnetError]]:
+    """Return the settings of a reader of files that belong together, those of the motion, and which
+    of them are not read.
+    """
     parts: dict[str, dict[str, Any]] = {}
+    left_out: dict[Path, ResidnetError] = {}
     for word, files in trips.items():
         own = Marks()
-        parts[word] = draft_tables(files, own)[0]
+        parts[word], lost = draft_tables(files, own)
+        left_out |= lost
         place = (*READER, "parts", word)
         for told, tell in ((own.guesses, marks.guess), (own.notes, marks.note)):
             for key, text in told:
                 tell((*place, *key[len(READER) :]) if key[: len(READER)] == READER else key, text)
-    known = {word: set(part["channels"]) & {*STATE, *_FIXES} for word, part in parts.items()}
-    order = sorted(parts, key=lambda word: -len(known[word]))
+    order = sorted(parts, key=lambda word: -len(_of_motion(parts[word]["channels"])))
     text = (
         f"files whose names differ in {' and '.join(order)} alone are taken as one trip; where both"
         " have no dates, their clocks are brought together by what the commands explain"
     )
     marks.guess((*READER, "parts"), text)
-    return {"kind": "joined", "parts": {word: parts[word] for word in order}}, [*trips[order[0]]]
+    reader = {"kind": "joined", "parts": {word: parts[word] for word in order}}
+    return reader, [*trips[order[0]]], left_out
+
+
+def trips_of(paths: Sequence[Path]) -> dict[str, list[Path]]:
+    """Return word -> tables, where those that differ in one word of their names are parts of trips.
+
+    Empty where they are not. Two files with a position or a speed each are of two vessels, or of
+    two recorders that each are a log; a compass may be in both.
+    """
+    columns = {path: column_names(path) for path in paths}
+    # lists of names and notes lie beside logs
+    groups: dict[tuple[str, ...], list[Path]] = {}
+    for path, names in columns.items():
+        groups.setdefault(names, []).append(path)
+    logs = {n: files for n, files in groups.items() if len(groups) > 1 and _channels_of(files)}
+    found = partners({path: names for path, names in columns.items() if names in logs})
+    held = [_of_motion(_channels_of(files)) & {*"xyuv"} for files in found.values()]
+    alike = any(one & other for one, other in itertools.combinations(held, 2))
+    return {} if alike else found
+
+
+def _channels_of(files: Sequence[Path]) -> Iterable[str]:
+    """Return the channels that the names of columns tell, of the first table that can be read."""
+    for path in files:
+        with contextlib.suppress(ResidnetError):
+            if found := named([*peek(path, 50).numbers], Marks()):
+                return found
+    return ()
+
+
+def _of_motion(channels: Iterable[str]) -> set[str]:
+    """Return what channels tell of the motion: position, heading, velocities and roll by name."""
+    same = {"latitude": "x", "longitude": "y", **dict.fromkeys(QUATERNION, "psi")}
+    return {same.get(name, name) for name in channels} & {*STATE, "phi", "p"}
 
 
 def read_each(paths: Sequence[Path]) -> list[DraftedLogs]:
@@ -162,7 +216,7 @@ def read_each(paths: Sequence[Path]) -> list[DraftedLogs]:
     """
     alike: dict[tuple[str, ...], list[Path]] = {}
     tables = {path: column_names(path) for path in paths if kind_of(path) == "table"}
-    joined = bool(partners(tables))
+    joined = bool(trips_of([*tables]))
     for path in paths:
         kind = kind_of(path)
         names = tables[path] if kind == "table" and not joined else ()

@@ -27,6 +27,7 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.units import other_dimension, written_unit
 from residnet.data.drafting.words import input_channel, plain, state_channel, words_of
 from residnet.data.readers.base import require_file
+from residnet.data.readers.clocks import steady_clock
 from residnet.data.readers.tables import TABLES, excel_sheet, json_rows, parquet_rows, sheet_names
 from residnet.data.readers.texts import first_rows
 from residnet.data.readers.written import (
@@ -84,10 +85,16 @@ def draft_tables(
         marks.note(CHANNELS, f"not in every file, left out: {', '.join(lost[:12])}")
     clock = clock_of(first)
     if not set(clock.columns) <= set(shared):
-        raise UsageError(f"{first.path}: its time '{clock.columns[0]}' is not in every file")
+        alike = [sheet.path.name for sheet in sheets if sheet.header == first.header]
+        raise UsageError(
+            f"{first.path}: its time '{clock.columns[0]}' is not in every file, so that these are"
+            f" tables of several kinds; give those of one, here {', '.join(alike)[:120]} (parts of"
+            " one trip are files whose names differ in one word, each with other quantities)"
+        )
     if clock.guess:
         marks.guess((*READER, "time"), clock.guess)
-    numeric = [name for name in shared if name in first.numbers and name not in clock.columns]
+    held = {name for sheet in sheets for name in sheet.numbers}
+    numeric = [name for name in shared if name in held and name not in clock.columns]
     attitudes = quaternions(numeric)
     parts = {column for attitude in attitudes for column in attitude.values()}
     names = named([name for name in numeric if name not in parts], marks)
@@ -95,6 +102,11 @@ def draft_tables(
     refuse_written_positions(first, names)
     if "psi" not in names:
         names |= levelled(attitudes, [one.numbers for one in sheets])
+    if not names:
+        raise DataError(
+            f"{first.path}: none of its columns is called as a channel is"
+            f" ({', '.join(numeric[:12])}); name them in a channel map (--config)"
+        )
     logs = _raw(sheets, names, left_out)
     cells = [str(text) for texts in first.texts.values() for text in texts.unique()[:20]]
     channels = drafted_channels(names, logs, marks, [*first.header, *cells])
@@ -366,7 +378,7 @@ def clock_of(sheet: Sheet) -> Clock:
         name
         for name, values in sheet.numbers.items()
         if values.size > 1
-        and bool((np.diff(values[np.isfinite(values)]) > 0.0).all())
+        and bool((np.diff(_going_on(values[np.isfinite(values)])) > 0.0).all())
         # pandas writes the number of each row under no name
         and not name.startswith("Unnamed: ")
     ]
@@ -388,7 +400,23 @@ def clock_of(sheet: Sheet) -> Clock:
         unit, guess = _time_unit(values)
     if chosen not in named:
         guess = f"no column is called time; this one increases as time does. {guess}".strip()
-    return Clock({"column": chosen, "unit": unit}, values * to_si(unit), guess, (chosen,))
+    seconds = _steady(sheet, values * to_si(unit), to_si(unit))
+    return Clock({"column": chosen, "unit": unit}, seconds, guess, (chosen,))
+
+
+def _going_on(values: np.ndarray) -> np.ndarray:
+    """Return whole numbers as a counter of them went on that wrapped."""
+    return steady_clock(values, values[:, None], 1.0)[0]
+
+
+def _steady(sheet: Sheet, t: np.ndarray, tick: float | None = None) -> np.ndarray:
+    """Return the times of a sheet as its reader will mend them."""
+    known = np.isfinite(t)
+    if known.sum() > 1 and sheet.numbers:
+        rows = np.stack([*sheet.numbers.values()], axis=1)
+        t = t.copy()
+        t[known] = steady_clock(t[known], rows[known], tick)[0]
+    return t
 
 
 def _dated(sheet: Sheet, dated: dict[str, pd.Series]) -> Clock:
@@ -414,7 +442,8 @@ def _dated(sheet: Sheet, dated: dict[str, pd.Series]) -> Clock:
         guess = "day and month of the dates can be told apart nowhere in the first rows"
     settings |= {"order": order} if order in ("dmy", "mdy") else {}
     stamps = parse_texts(texts, dates=True)
-    return Clock(settings, stamps.since(int(stamps.ns[0])), guess, (column, *days[: not whole]))
+    seconds = _steady(sheet, stamps.since(int(stamps.ns[0])))
+    return Clock(settings, seconds, guess, (column, *days[: not whole]))
 
 
 def _time_unit(values: np.ndarray) -> tuple[str, str]:

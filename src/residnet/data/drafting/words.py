@@ -15,8 +15,8 @@ from residnet.core.names import ACCELERATION, CHANNEL_UNITS
 # what a name may be about -> parts of words, and whole words behind a bar
 _ABOUT: dict[str, str] = {
     "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻"
-    " 時間 日時 | t time stamp tid sec secs seconds elapsed hora heure uhrzeit datum date"
-    " datetime fecha utc dato",
+    " 時間 日時 micros millis | t time stamp tid sec secs seconds elapsed hora heure uhrzeit datum"
+    " date datetime fecha utc dato",
     "north": "north nord norte noord hochwert 北 | n northing",
     "east": "east ost oste este oost rechtswert ostwert ostkoord ostricht 東 | e easting est",
     "position": "posit posic posisj coordin koordinat coorden coordonn 位置 | pos local utm pose",

@@ -31,6 +31,10 @@ class LogReader(ABC):
         """Return the files that are logs by themselves; others only belong to these."""
         return list(paths)
 
+    def files(self, path: Path) -> list[Path]:
+        """Return the files that a log is made of: itself, those below a folder, those beside it."""
+        return files_of(path)
+
     @abstractmethod
     def read(self, path: Path) -> Log:
         """Return the log in one file, in SI units, psi unwrapped, time strictly increasing.

@@ -35,6 +35,11 @@ _RECORDINGS: tuple[type[RecordingConfig], ...] = (
 )
 LOG_ENDINGS = (*TABLES, *(ending for config in _RECORDINGS for ending in config.endings))
 """Endings of files that may be logs."""
+TO_TABLE = (
+    "write such rows as csv with a line of names, in Python"
+    " pandas.DataFrame(rows, columns=[...]).to_csv('log.csv', index=False)"
+)
+"""How what no reader knows becomes a log."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,7 @@ def kind_of(path: Path) -> str:
         return "canonical"
     recording = format_of(path)
     if recording is None and path.suffix.lower() not in TABLES:
-        raise UsageError(f"{path}: is of no format that residnet knows")
+        raise UsageError(f"{path}: is of no format that residnet knows; {TO_TABLE}")
     return "table" if recording is None else recording.name
 
 

@@ -11,13 +11,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from residnet.core.config import Config, Seconds
-from residnet.core.errors import DataError
+from residnet.core.errors import DataError, ResidnetError
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.align import GridConfig, onto
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers.base import LogReader, digest, require_file
-from residnet.data.readers.recording import Remark, remark
+from residnet.data.readers.recording import Level, Remark, remark
 from residnet.data.readers.tables import (
     TABLES,
     CsvConfig,
@@ -25,6 +25,7 @@ from residnet.data.readers.tables import (
     JsonLinesConfig,
     ParquetConfig,
 )
+from residnet.data.readers.written import unix_unit
 
 _LEAST = 0.5
 """Share of the shorter log that two clocks must have in common while their shift is looked for."""
@@ -53,8 +54,8 @@ class JoinedConfig(Config):
     Attributes:
         parts: word in the file's name -> reader of such files, that of the motion first.
         shift: word -> time in s that is added to the clock of that part; parts without one are
-            joined by their dates, and where they have none by the shift with which their channels
-            explain most of the accelerations.
+            joined by their dates (Unix time among them), and where they have none by the shift with
+            which their channels explain most of the accelerations.
     """
 
     kind: Literal["joined"] = "joined"
@@ -108,7 +109,11 @@ class JoinedReader(LogReader):
             and TABLES.get(path.suffix.lower(), "csv") == kind
         ]
 
-    def files(self, path: Path) -> dict[str, Path]:
+    def files(self, path: Path) -> list[Path]:
+        """Return the files of the trip that a file of the motion is of."""
+        return [*self.parts(path).values()]
+
+    def parts(self, path: Path) -> dict[str, Path]:
         """Return word -> file of the trip that a file of the motion is of.
 
         Raises:
@@ -137,18 +142,25 @@ class JoinedReader(LogReader):
             DataError: where a file of the trip is missing or cannot be read, or their clocks have
                 nothing in common.
         """
-        files = self.files(path)
+        files = self.parts(path)
         logs = {word: self._config.parts[word].build().read(file) for word, file in files.items()}
         first, *others = logs
         log = logs[first]
-        for word in others:
+        # what dates join may be what the shift of the others is found by
+        for word in sorted(others, key=lambda word: _by_dates(log, logs[word]) is None):
             log = self._beside(log, logs[word], word)
-        meta = {**log.meta, "sha256": digest(list(files.values()))}
+        sums = {word: digest([file]) for word, file in files.items()}
+        meta = {**log.meta, "sha256": digest(list(files.values())), "parts": sums}
         return log.replace(meta=meta)
 
     def _beside(self, log: Log, other: Log, word: str) -> Log:
         """Return a log with the channels of another one, on its own clock."""
         new = {n: values for n, values in other.channels.items() if n not in log.channels}
+        if not new:
+            raise DataError(
+                f"log {log.name}: {word} holds {', '.join(other.channels)}, which are there"
+                " already; leave this part out"
+            )
         shift, told = self._shift(log, other.replace(channels=new), word)
         t = other.t + shift
         step = float(np.median(np.diff(log.t)))
@@ -168,24 +180,53 @@ class JoinedReader(LogReader):
         )
 
     def _shift(self, log: Log, other: Log, word: str) -> tuple[float, Remark]:
+        """Return what is added to the other clock, and how sure that is.
+
+        Dates of both join them, unless what the channels explain is sure to say otherwise.
+        """
         given = self._config.shift.get(word)
         if given is not None:
             return given, remark("note", "joined", f"{word}: its clock is moved by {given:g} s")
-        epochs = [one.meta.get("epoch") for one in (log, other)]
-        if None not in epochs:
-            absolute = (float(epochs[1] or 0) - other.t[0]) - (float(epochs[0] or 0) - log.t[0])
-            return absolute, remark("note", "joined", f"{word}: joined by the dates of both")
-        found = clock_shift(log, other)
-        text = (
-            f"{word}: its clock is moved by {found.seconds:+.2f} s, with which its channels explain"
-            f" {100 * found.explained:.0f} % of what the motion alone leaves of the accelerations"
-            f" ({100 * found.other:.0f} % with any shift {_FAR:g} s from it)"
-        )
+        dated, give = _by_dates(log, other), f"give `shift: {{{word}: ...}}`"
+        try:
+            found = clock_shift(log, other)
+        except ResidnetError as error:
+            if dated is not None:
+                return dated, remark("note", "joined", f"{word}: joined by the dates of both")
+            text = f"{word}: its clock cannot be brought to that of the motion ({error}); both are"
+            text += f" taken to begin together: {give}"
+            return float(log.t[0] - other.t[0]), remark("will mislead", "joined", text)
         figures = found._asdict()
-        if 1.0 - found.other < _SURE * (1.0 - found.explained):
-            text += f"; that is not sure, give `shift: {{{word}: ...}}`"
-            return found.seconds, remark("will mislead", "joined", text, **figures)
-        return found.seconds, remark("note", "joined", text, **figures)
+        sure = 1.0 - found.other >= _SURE * (1.0 - found.explained)
+        by = f"with which its channels explain {100 * found.explained:.0f} % of what the motion"
+        by += " alone leaves of the accelerations"
+        if dated is not None and (not sure or abs(found.seconds - dated) < _COARSE):
+            text = f"{word}: joined by the dates of both"
+            return dated, remark("note", "joined", text, **figures)
+        if dated is not None:
+            text = f"{word}: joined by the dates of both, which are {dated - found.seconds:+.2f} s"
+            text += f" from the shift {by}: one of the clocks is wrong, {give}"
+            return dated, remark("will mislead", "joined", text, **figures)
+        text = f"{word}: its clock is moved by {found.seconds:+.2f} s, {by}"
+        text += f" ({100 * found.other:.0f} % with any shift {_FAR:g} s from it)"
+        text += "" if sure else f"; that is not sure, {give}"
+        level: Level = "note" if sure else "will mislead"
+        return found.seconds, remark(level, "joined", text, **figures)
+
+
+def _by_dates(log: Log, other: Log) -> float | None:
+    """Return what brings another clock to that of a log by dates or Unix time that overlap."""
+    begins = []
+    for one in (log, other):
+        epoch = one.meta.get("epoch")
+        epoch = float(one.t[0]) if epoch is None and unix_unit(one.t) == "s" else epoch
+        if epoch is None:
+            return None
+        begins.append(float(epoch))
+    apart = begins[1] - begins[0]
+    if not other.t[0] - other.t[-1] < apart < log.t[-1] - log.t[0]:
+        return None
+    return apart + float(log.t[0] - other.t[0])
 
 
 def clock_shift(log: Log, other: Log) -> Shift:
@@ -207,6 +248,8 @@ def clock_shift(log: Log, other: Log) -> Shift:
     t = whole.t[::every]
     size = max(4, round(_BLOCK / float(np.median(np.diff(t)))))
     begin = np.arange(0, len(t) - size, max(1, size // 4))
+    if not begin.size:
+        raise DataError(f"log {log.name}: {t[-1] - t[0]:.1f} s are too short to tell")
 
     def over(columns: np.ndarray) -> np.ndarray:
         """Return the integrals of columns [T, k] over the blocks [B, k]."""
@@ -222,15 +265,22 @@ def clock_shift(log: Log, other: Log) -> Shift:
     # what the motion explains by itself, which says nothing of the commands
     rest = gained - own @ np.linalg.lstsq(own, gained, rcond=1e-9)[0]
     left_alone = (rest**2).sum(axis=1)
+    total = float(left_alone.sum())
     driving = [values for name, values in other.channels.items() if name not in STATE]
+    # a velocity that the other one measured too gains what this one gains
+    gains = [values for name, values in other.channels.items() if name in ("u", "v", "r")]
     least = _LEAST * min(t[-1] - t[0], other.t[-1] - other.t[0])
 
     def explained(shift: float) -> float:
         at = t - shift
         inside = (at[begin] >= other.t[0]) & (at[begin + size] <= other.t[-1])
-        if inside.sum() < 3 * (own.shape[1] + 3 * len(driving)):
+        if inside.sum() < 3 * (own.shape[1] + 3 * len(driving) + len(gains)) or not total:
             return 0.0
         columns = [own[inside]]
+        for values in gains:
+            there = np.isfinite(values)
+            w = np.interp(at, other.t[there], values[there])
+            columns.append((w[begin + size] - w[begin])[inside, None])
         for values in driving:
             there = np.isfinite(values)
             w = np.interp(at, other.t[there], values[there])
@@ -239,7 +289,7 @@ def clock_shift(log: Log, other: Log) -> Shift:
         x = x / np.maximum(np.abs(x).max(axis=0), 1e-12)
         left = y - x @ np.linalg.lstsq(x, y, rcond=1e-9)[0]
         # blocks that the other log does not reach stay as the motion alone leaves them
-        return float((left_alone[inside].sum() - (left**2).sum()) / left_alone.sum())
+        return float((left_alone[inside].sum() - (left**2).sum()) / total)
 
     low, high = t[0] - other.t[-1] + least, t[-1] - other.t[0] - least
     coarse = np.arange(low, max(high, low + _COARSE), _COARSE)
@@ -255,7 +305,8 @@ def clock_shift(log: Log, other: Log) -> Shift:
 def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
     """Return word -> files, where files come in groups whose names differ in that word alone.
 
-    Empty where they do not: files of one group have the same columns, and every trip one of each.
+    Empty where they do not: files of one group have the same columns, and some trips one of each.
+    Files of trips that lack a part are left out.
 
     Args:
         paths: file -> its columns.
@@ -264,7 +315,7 @@ def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
     for path, columns in paths.items():
         groups.setdefault(columns, []).append(path)
     members = list(groups.values())
-    if not 2 <= len(members) <= 6 or len({len(group) for group in members}) > 1:
+    if not 2 <= len(members) <= 6:
         return {}
     words = [_words(group) for group in members]
     for number, chosen in enumerate(words):
@@ -272,12 +323,13 @@ def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
         words[number] = [word for word in chosen if word not in others]
     if not all(words):
         return {}
-    named = {own[0]: group for own, group in zip(words, members, strict=True)}
-    trips = [
-        {path.with_name(path.name.replace(word, "\0")) for path in group}
-        for word, group in named.items()
-    ]
-    return named if all(trip == trips[0] for trip in trips) else {}
+    trips = {
+        own[0]: {path.with_name(path.name.replace(own[0], "\0")): path for path in group}
+        for own, group in zip(words, members, strict=True)
+    }
+    first, *others = trips.values()
+    whole = [trip for trip in first if all(trip in other for other in others)]
+    return {word: [of[trip] for trip in whole] for word, of in trips.items()} if whole else {}
 
 
 def _words(group: list[Path]) -> list[str]:

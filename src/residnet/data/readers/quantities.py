@@ -141,7 +141,9 @@ def true_headings(psi: np.ndarray) -> np.ndarray:
         even = np.abs(part[1:-1]) >= (1.0 - _EVEN) * slope
         beside = np.append(usual[max(begin - 2, 0) : begin], usual[end : end + 2]).max(initial=0.0)
         across = 2.0 * np.pi - abs(part.sum()) < slope + 2.0 * beside
-        sudden = slope > _SWEPT * beside
+        # the short way round goes on as the vessel turned, and the long way does not
+        short = (2.0 * np.pi - abs(part.sum())) / part.size
+        sudden = slope - beside > abs(short - beside)
         if even.all() and across and sudden:
             made[begin + 1 : end] = True
     if not made.any():

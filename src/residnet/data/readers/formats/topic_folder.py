@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, final
@@ -14,6 +15,7 @@ from residnet.core.names import shown
 from residnet.data.drafting.words import state_channel, words_of
 from residnet.data.readers.base import LARGE, progress, require_file, total_size
 from residnet.data.readers.compose import RecordingConfig
+from residnet.data.readers.joined import partners
 from residnet.data.readers.recording import (
     EVERYTHING,
     Recording,
@@ -24,7 +26,13 @@ from residnet.data.readers.recording import (
     remark,
 )
 from residnet.data.readers.texts import as_utf8, encoding_of_head
-from residnet.data.readers.written import Stamps, parse_numbers, parse_texts, whole_second
+from residnet.data.readers.written import (
+    Stamps,
+    parse_numbers,
+    parse_texts,
+    unix_unit,
+    whole_second,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,21 +46,32 @@ _SECONDS, _NANOSECONDS = ("secs", "sec"), ("nsecs", "nanosec")
 def is_topic_folder(path: Path) -> bool:
     """Return whether a folder's csv files are topics of one recording, and not logs.
 
-    Topics have stamped headers, or headers that differ.
+    Topics have stamped headers, or headers that differ, and times of one kind; the parts of several
+    trips are no topics.
     """
     if not path.is_dir():
         return False
-    heads = []
+    heads: dict[Path, list[str]] = {}
+    begins: list[float] = []
     for file in _files(path)[:200]:
         with file.open("rb") as stream:
             head = stream.read(10_000)
-        lines = head.decode(encoding_of_head(head), errors="replace").splitlines()
-        heads += [lines[0].removeprefix("\ufeff").strip()] if lines else []
-    full = [head.split(",") for head in heads if head]
-    timed = [head for head in full if set(head) & set(_ARRIVAL)]
-    if any(_stamp_columns(head) is not None for head in full):
+        lines = head.decode(encoding_of_head(head), errors="replace").splitlines()[:2]
+        names, *row = [line.removeprefix("\ufeff").strip().split(",") for line in lines] or [[""]]
+        if names != [""]:
+            heads[file] = names
+        for name, cell in zip(names, *row, strict=False) if row else ():
+            if name in _ARRIVAL:
+                with contextlib.suppress(ValueError):
+                    begins.append(float(cell))
+    if any(_stamp_columns(head) is not None for head in heads.values()):
         return True
-    apart = len(timed) > 1 and 2 * len(timed) > len(full) and len(set(map(tuple, timed))) > 1
+    trips = partners({file: tuple(head) for file, head in heads.items()})
+    units = {unix_unit(np.array([begin])) for begin in begins}
+    if any(len(files) > 1 for files in trips.values()) or len(units) > 1:
+        return False
+    timed = [head for head in heads.values() if set(head) & set(_ARRIVAL)]
+    apart = len(timed) > 1 and 2 * len(timed) > len(heads) and len(set(map(tuple, timed))) > 1
     return apart and sum(_is_whole_log(head) for head in timed) < 2
 
 
@@ -62,9 +81,10 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _is_whole_log(columns: list[str]) -> bool:
-    """Return whether a header names position and heading, as a log by itself does."""
+    """Return whether a header names the motion of a vessel, as a log by itself does."""
     named = {state_channel(words_of(column)) for column in columns}
-    return {"x", "y", "psi"} <= named or {"latitude", "longitude", "psi"} <= named
+    whole = ({"x", "y", "psi"}, {"latitude", "longitude", "psi"}, {"u", "v", "r"})
+    return any(each <= named for each in whole)
 
 
 @final

@@ -1,0 +1,306 @@
+"""Writes the inputs of the corpus: trips of a boat of 2 m by equations of its own, as recorders do.
+
+`python tests/corpus/make.py [LAYOUT...]` writes the truth and every layout, each into its folder.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+HERE = Path(__file__).parent
+STEP, EVERY, LENGTH = 0.02, 10, 100.0
+START = pd.Timestamp("2025-06-17 08:30:00")
+COMMANDS = {1: (1, 12.0), 2: (2, 9.0)}
+"""Trip -> seed of its commands, and their longest hold in s."""
+
+
+def trip(number: int) -> pd.DataFrame:
+    """Return the truth of a trip each 0.02 s: pose, velocities, roll, shaft in 1/s, rudder."""
+    seed, longest = COMMANDS[number]
+    random, t = np.random.default_rng(seed), np.arange(0.0, LENGTH, STEP)
+
+    def steps(low: float, high: float) -> np.ndarray:
+        at = np.cumsum(random.uniform(3.0, longest, 60))
+        return random.uniform(low, high, 61)[np.searchsorted(at, t)]
+
+    n, delta = steps(8.0, 25.0), np.radians(steps(-25.0, 25.0))
+    state, rows = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), []
+    for i in range(t.size):
+        rows.append(state)
+        _, _, psi, u, v, r, phi, p = state
+        rate = np.array(
+            [
+                u * np.cos(psi) - v * np.sin(psi),
+                u * np.sin(psi) + v * np.cos(psi),
+                r,
+                0.0022 * n[i] ** 2 - 0.18 * u - 0.22 * u * abs(u) + 0.6 * v * r,
+                -0.55 * u * r - 0.9 * v - 0.5 * v * abs(v) + 0.1 * u**2 * delta[i],
+                0.75 * u**2 * delta[i] - 0.9 * r - 0.6 * r * abs(r) - 0.12 * u * v,
+                p,
+                -6.0 * phi - 1.1 * p - 0.9 * u * r,
+            ]
+        )
+        state = state + STEP * rate
+    names = ("x", "y", "psi", "u", "v", "r", "phi", "p")
+    table = pd.DataFrame(np.array(rows), columns=names)
+    return table.assign(n=n, delta=delta, t=t)
+
+
+def seen(number: int, every: int = EVERY) -> pd.DataFrame:
+    """Return what sensors say each `every` steps, in deg and rpm."""
+    true, random = trip(number)[::every].reset_index(drop=True), np.random.default_rng(70 + number)
+
+    def noisy(name: str, size: float) -> np.ndarray:
+        return np.asarray(true[name] + size * random.normal(size=len(true)))
+
+    return pd.DataFrame(
+        {
+            "t": true.t,
+            **{name: noisy(name, 0.005).round(3) for name in ("x", "y")},
+            "heading": (np.degrees(noisy("psi", 0.001)) % 360.0).round(2),
+            **{name: noisy(name, 0.005).round(3) for name in ("u", "v")},
+            "rate": np.degrees(noisy("r", 0.001)).round(3),
+            "roll": np.degrees(noisy("phi", 0.001)).round(2),
+            "roll rate": np.degrees(noisy("p", 0.001)).round(2),
+            "rudder": np.degrees(true.delta).round(1),
+            "rpm": (60.0 * true.n).round(),
+        }
+    )
+
+
+def csv(folder: Path, number: int, columns: dict[str, object], word: str = "run") -> None:
+    """Write one table."""
+    pd.DataFrame(columns).to_csv(folder / f"{word}{number}.csv", index=False)
+
+
+POSE = {"x": "north [m]", "y": "east [m]", "heading": "heading [deg]"}
+SPEEDS = {"u": "surge [m/s]", "v": "sway [m/s]", "rate": "yaw rate [deg/s]"}
+ACTS = {"rudder": "rudder [deg]", "rpm": "shaft [rpm]"}
+
+
+def renamed(s: pd.DataFrame, *names: dict[str, str]) -> dict[str, object]:
+    """Return columns by what they are called in a file."""
+    return {new: s[old] for part in names for old, new in part.items()}
+
+
+def plain(folder: Path, k: int, s: pd.DataFrame) -> None:
+    csv(folder, k, {"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)})
+
+
+def pandas_index(folder: Path, k: int, s: pd.DataFrame) -> None:
+    columns = {"tvec": s.t, **renamed(s, {n: n for n in ("x", "y", "u", "v", "rudder", "rpm")})}
+    columns |= {"psi": s.heading, "r": s.rate}
+    pd.DataFrame(columns).to_csv(folder / f"run{k}.csv")
+
+
+def heading_interpolated(folder: Path, k: int, s: pd.DataFrame) -> None:
+    between = np.interp(s.t, s.t[::4], s.heading[::4])
+    csv(folder, k, {"time [s]": s.t, **renamed(s.assign(heading=between), POSE, ACTS)})
+
+
+def dead_gyro(folder: Path, k: int, s: pd.DataFrame) -> None:
+    dead = s.assign(rate=2e-5)
+    csv(folder, k, {"time [s]": s.t, **renamed(dead, POSE, SPEEDS, ACTS)})
+
+
+def no_pose(folder: Path, k: int, s: pd.DataFrame) -> None:
+    csv(folder, k, {"time [s]": s.t, **renamed(s, SPEEDS, ACTS)})
+
+
+def surge_alone(folder: Path, k: int, s: pd.DataFrame) -> None:
+    csv(folder, k, {"time [s]": s.t, "speed [m/s]": s.u, "motor [us]": (1100 + s.rpm / 2).round()})
+
+
+def with_roll(folder: Path, k: int, s: pd.DataFrame) -> None:
+    roll = {"roll": "roll [deg]", "roll rate": "roll rate [deg/s]"}
+    csv(folder, k, {"time [s]": s.t, **renamed(s, POSE, SPEEDS, roll, ACTS)})
+
+
+def micros_wrap(folder: Path, k: int, s: pd.DataFrame) -> None:
+    micros = (2**32 - 40_000_000 * k + (1e6 * s.t).round().astype("int64")) % 2**32
+    csv(folder, k, {"micros": micros, **renamed(s, POSE, SPEEDS, ACTS)})
+
+
+def whole_seconds(folder: Path, k: int, s: pd.DataFrame) -> None:
+    stamps = (START + pd.to_timedelta(np.floor(s.t), "s")).dt.strftime("%Y-%m-%d %H:%M:%S")
+    csv(folder, k, {"time": stamps, **renamed(s, POSE, SPEEDS, ACTS)})
+
+
+def summer_hour(folder: Path, k: int, s: pd.DataFrame) -> None:
+    moments = pd.Timestamp("2024-10-27 00:59:20", tz="UTC") + pd.to_timedelta(s.t, "s")
+    local = moments.dt.tz_convert("Europe/Berlin").dt.strftime("%d.%m.%Y %H:%M:%S.%f").str[:-4]
+    csv(folder, k, {"Zeit": local, **renamed(s, POSE, SPEEDS, ACTS)})
+
+
+def magnetic(folder: Path, k: int, s: pd.DataFrame) -> None:
+    pose = {**POSE, "heading": "compass heading [deg]"}
+    csv(folder, k, {"time [s]": s.t, **renamed(s, pose, ACTS)})
+
+
+def bridge(folder: Path, k: int, s: pd.DataFrame) -> None:
+    north, east = np.gradient(s.x, s.t), np.gradient(s.y, s.t)
+    columns = {
+        "UTC": (START + pd.to_timedelta(s.t, "s")).dt.strftime("%Y-%m-%dT%H:%M:%S.%f").str[:-3],
+        "LAT": (54.3 + s.x / 111_315.0).round(7),
+        "LON": (10.15 + s.y / 65_079.0).round(7),
+        "HDT": s.heading,
+        "SOG": (np.hypot(north, east) * 3600 / 1852).round(2),
+        "COG": (np.degrees(np.arctan2(east, north)) % 360.0).round(1),
+        "ROT": (60.0 * s.rate).round(1),
+        "RUDDER": -s.rudder,
+        "RPM": s.rpm,
+    }
+    csv(folder, k, columns)
+
+
+def rostopic(folder: Path, k: int, s: pd.DataFrame) -> None:
+    yaw = np.pi / 2 - np.radians(s.heading)
+    topic, zero = "field.pose.pose.", np.zeros(len(s))
+    stamps = START.value + (1e9 * s.t).round().astype("int64")
+    columns = {"%time": stamps, "field.header.seq": s.index, "field.header.stamp": stamps}
+    columns |= {"field.header.frame_id": ["odom"] * len(s)}
+    columns |= {"field.child_frame_id": ["base_link"] * len(s)}
+    columns |= {f"{topic}position.x": s.y, f"{topic}position.y": s.x, f"{topic}position.z": zero}
+    columns |= {f"{topic}orientation.x": zero, f"{topic}orientation.y": zero}
+    columns |= {f"{topic}orientation.z": np.sin(yaw / 2).round(6)}
+    columns |= {f"{topic}orientation.w": np.cos(yaw / 2).round(6)}
+    twist = "field.twist.twist."
+    columns |= {f"{twist}linear.x": s.u, f"{twist}linear.y": -s.v}
+    columns |= {f"{twist}angular.z": -np.radians(s.rate).round(5)}
+    csv(folder, k, columns, "odom")
+
+
+def moos_alog(folder: Path, k: int, s: pd.DataFrame) -> None:
+    lines = [f"%% LOG FILE:   ./boat_{k}.alog", f"%% LOGSTART {START.timestamp():.2f}", ""]
+    for row in s.itertuples():
+        told = {"NAV_X": row.y, "NAV_Y": row.x, "NAV_HEADING": row.heading, "NAV_SPEED": row.u}
+        lines += [f"{row.t:<10.3f} {name:<12} uNav   {value:.3f}" for name, value in told.items()]
+        lines += [f"{row.t + 0.01:<10.3f} DESIRED_RUDDER pPID {row.rudder:.1f}"]
+        lines += [f"{row.t + 0.01:<10.3f} DESIRED_THRUST pPID {row.rpm / 15.0:.1f}"]
+    (folder / f"boat_{k}.alog").write_text("\n".join(lines) + "\n")
+
+
+def cut(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """One recording in two files."""
+    part = seen(1)[(k - 1) * 250 : k * 250]
+    csv(folder, k, {"time [s]": part.t, **renamed(part, POSE, SPEEDS, ACTS)}, "part_")
+
+
+def two_files(folder: Path, k: int, s: pd.DataFrame) -> None:
+    fix = {"utc_s": START.timestamp() + 3600 * k + s.t, **renamed(s, POSE)}
+    csv(folder, k, fix, "gnss_")
+    fast = seen(k, 2)
+    pulses = {"pwm_motor": (1100 + fast.rpm / 2).round(), "pwm_rudder": 1500 + 14 * fast.rudder}
+    millis = (1e3 * fast.t).round().astype(int) + 4_321 * k
+    csv(folder, k, {"millis": millis, **{n: v.round() for n, v in pulses.items()}}, "motors_")
+
+
+def several_rates(folder: Path, k: int, s: pd.DataFrame) -> None:
+    fast, columns = seen(k, 5), {"time [s]": seen(k, 5).t.round(3)}
+    for name, column in {**POSE, **SPEEDS, **ACTS}.items():
+        rows = {"x": 10, "y": 10, "heading": 2, "rpm": 4}.get(name, 1)
+        columns[column] = fast[name].where(fast.index % rows == 0)
+    csv(folder, k, columns)
+
+
+def excel(folder: Path, k: int, s: pd.DataFrame) -> None:
+    table = pd.DataFrame({"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)})
+    table.to_excel(folder / f"run{k}.xlsx", index=False)
+
+
+def json_lines(folder: Path, k: int, s: pd.DataFrame) -> None:
+    rows = [
+        {"stamp": row.t, "nav": {"north": row.x, "east": row.y, "heading_deg": row.heading}}
+        | {"act": {"rudder_deg": row.rudder, "shaft_rpm": row.rpm}}
+        for row in s.itertuples()
+    ]
+    (folder / f"run{k}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def mat_arrays(folder: Path, k: int, s: pd.DataFrame) -> None:
+    import scipy.io
+
+    names = {"t": "t", "x": "north", "y": "east", "heading": "heading_deg", "rudder": "rudder_deg"}
+    arrays = {new: s[old].to_numpy()[:, None] for old, new in {**names, "rpm": "rpm"}.items()}
+    arrays["t"] = arrays["t"].T
+    scipy.io.savemat(folder / f"run{k}.mat", arrays, do_compression=True)
+
+
+def rows_npy(folder: Path, k: int, s: pd.DataFrame) -> None:
+    np.save(folder / f"run{k}.npy", s.to_numpy()[:100])
+
+
+def bag_topics(folder: Path, k: int, s: pd.DataFrame) -> None:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    pose, number = (
+        store.types[f"{n}"] for n in ("geometry_msgs/msg/Pose2D", "std_msgs/msg/Float64")
+    )
+    with Writer(folder / f"trip_{k}.bag") as bag:
+        names = {"/boat/pose": pose, "/boat/rudder_deg": number, "/boat/shaft_rpm": number}
+        topics = {
+            n: bag.add_connection(n, kind.__msgtype__, typestore=store) for n, kind in names.items()
+        }
+        for row in s.itertuples():
+            stamp = START.value + round(1e9 * row.t)
+            yaw = np.pi / 2 - np.radians(row.heading)
+            told = {
+                "/boat/pose": pose(
+                    x=row.y, y=row.x, theta=float((yaw + np.pi) % (2 * np.pi) - np.pi)
+                ),
+                "/boat/rudder_deg": number(data=row.rudder),
+                "/boat/shaft_rpm": number(data=row.rpm),
+            }
+            for name, message in told.items():
+                raw = store.serialize_ros1(message, topics[name].msgtype)
+                bag.write(topics[name], stamp, raw)
+
+
+def course_alone(folder: Path, k: int, s: pd.DataFrame) -> None:
+    north, east = np.gradient(s.x, s.t), np.gradient(s.y, s.t)
+    columns = {"time [s]": s.t, "north [m]": s.x, "east [m]": s.y}
+    columns |= {"course over ground [deg]": (np.degrees(np.arctan2(east, north)) % 360).round(1)}
+    columns |= {"speed over ground [m/s]": np.hypot(north, east).round(2)}
+    csv(folder, k, {**columns, **renamed(s, ACTS)})
+
+
+def nothing_known(folder: Path, k: int, s: pd.DataFrame) -> None:
+    import scipy.io
+
+    arrays = {"tank": s.u.to_numpy(), "volts": s.v.to_numpy(), "note": "harbour"}
+    scipy.io.savemat(folder / f"run{k}.mat", arrays)
+
+
+def two_boats(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """The same quantities of two boats that sailed together."""
+    csv(folder, k, {"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)}, "alpha_")
+    other = seen(3 - k)
+    calls = {"x": "northing (m)", "y": "easting (m)", "heading": "HDG (deg)"}
+    csv(folder, k, {"t (s)": other.t, **renamed(other, calls, SPEEDS, ACTS)}, "bravo_")
+
+
+LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
+    layout.__name__: layout
+    for layout in (
+        *(plain, pandas_index, heading_interpolated, dead_gyro, no_pose, surge_alone, with_roll),
+        *(micros_wrap, whole_seconds, summer_hour, magnetic, bridge, rostopic, moos_alog, cut),
+        *(two_files, several_rates, excel, json_lines, mat_arrays, rows_npy, bag_topics),
+        *(course_alone, nothing_known, two_boats),
+    )
+}
+
+if __name__ == "__main__":
+    for number in COMMANDS:
+        trip(number)[::5].round(6).to_csv(HERE / f"truth_{number}.csv", index=False)
+    for name in sys.argv[1:] or LAYOUTS:
+        (HERE / name).mkdir(exist_ok=True)
+        for number in COMMANDS:
+            LAYOUTS[name](HERE / name, number, seen(number))

@@ -1,0 +1,97 @@
+"""Layouts as recorders write them, a folder each: what every door of residnet makes of them.
+
+A case is a folder with two trips of the truth in some layout and a `case.yaml`: `channels` with the
+largest error (SI) of nine samples in ten, null where the truth lacks it; `told`, patterns that
+`new` or `inspect` must say, `never`, which they must not; `refused`, how `new` ends; `misled`,
+whether `inspect` warns, null where either will do; `truth`, log -> trip and its first second.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+import residnet
+from residnet.core.errors import ResidnetError
+from residnet.core.log import Log
+from residnet.tasks.drafting import new_config
+from residnet.tasks.inspection import inspect_logs
+from residnet.tasks.registry import finished_task, load_task
+
+HERE = Path(__file__).parent
+FOLDERS = sorted(path.parent.name for path in HERE.glob("*/case.yaml"))
+TRUTH = {trip: pd.read_csv(HERE / f"truth_{trip}.csv") for trip in (1, 2)}
+
+
+def case_in(name: str, folder: Path) -> tuple[dict[str, Any], Path]:
+    """Return a case, and its logs alone in a folder of their own."""
+    case = yaml.safe_load((HERE / name / "case.yaml").read_text())
+    return case, shutil.copytree(HERE / name, folder / name, ignore=lambda *_: ["case.yaml"])
+
+
+def error_of(log: Log, channel: str, trip: int, start: float) -> float:
+    """Return how far nine in ten samples of a channel are from the truth, at most."""
+    true = TRUTH[trip]
+    known = np.isfinite(log[channel])
+    at = log.t[known] - log.t[0] + start
+    apart = log[channel][known] - np.interp(at, true.t, true[channel])
+    if channel == "psi":
+        apart -= 2.0 * np.pi * np.round(np.median(apart) / (2.0 * np.pi))
+    # positions may count from the first fix
+    apart -= np.median(apart) * (channel in "xy")
+    return float(np.quantile(np.abs(apart), 0.9))
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_layout_at_every_door(name: str, tmp_path: Path) -> None:
+    case, folder = case_in(name, tmp_path)
+    config, told, refused = tmp_path / "boat.yaml", list[str](), ""
+    try:
+        told = [*new_config([folder], config, None, overwrite=False), config.read_text()]
+    except ResidnetError as error:
+        refused = str(error)
+    assert ("\n" in refused, bool(refused)) == (False, "refused" in case), refused
+    assert re.search(case.get("refused", ""), refused)
+    if refused and not case["channels"]:
+        return
+    if not refused:
+        load_task(config, []).check()
+    found = inspect_logs([folder], None)
+    assert case.get("misled", False) in (None, found.misled), found.text
+    text = re.sub(r"\s*\n\s*#?\s*", " ", "\n".join([*told, found.text]))
+    for pattern in case.get("told", ()):
+        assert re.search(pattern, text), pattern
+    for pattern in case.get("never", ()):
+        assert not re.search(pattern, text), pattern
+    logs = residnet.read_logs(folder)
+    assert logs
+    for log in logs:
+        assert set(log.channels) == set(case["channels"])
+        trip, start = case.get("truth", {}).get(log.name, (int(log.name[-1]), 0.0))
+        for channel, most in case["channels"].items():
+            assert most is None or error_of(log, channel, trip, start) <= most, (log.name, channel)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_layout_is_fitted_and_judged(name: str, tmp_path: Path) -> None:
+    case, folder = case_in(name, tmp_path)
+    if "refused" in case:
+        pytest.skip("cannot be fitted, as the test of its doors says")
+    new_config([folder], tmp_path / "boat.yaml", None, overwrite=False)
+    task = load_task(tmp_path / "boat.yaml", ["effort=0.02"])
+    run = task.run(out=tmp_path / "run").path
+    ended, task = finished_task(run, "evaluate")
+    task.evaluate_on(ended, [folder], tmp_path / "other")
+    for place in (run, tmp_path / "other"):
+        rows = json.loads((place / "metrics.json").read_text())["rows"]
+        assert rows
+        assert all(np.isfinite(row["nrmse"]["mean"]) for row in rows)
