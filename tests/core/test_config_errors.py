@@ -266,11 +266,11 @@ def test_overrides_set_values(load: Callable[..., Fit]) -> None:
             ),
         ),
         # overrides that cannot be applied
-        (["epochs"], "override 'epochs': expected key=value, for example head.lstm.hidden_size=64"),
-        (["=3"], "override '=3': expected key=value, for example head.lstm.hidden_size=64"),
+        (["epochs"], "override 'epochs': expected key=value, for example heads.lstm.hidden_size=64"),
+        (["=3"], "override '=3': expected key=value, for example heads.lstm.hidden_size=64"),
         (
             ["heads..a=3"],
-            "override 'heads..a=3': expected key=value, for example head.lstm.hidden_size=64",
+            "override 'heads..a=3': expected key=value, for example heads.lstm.hidden_size=64",
         ),
         (["name.first=3"], "override 'name.first=3': name: has no key 'first' (given 'n')"),
         (

@@ -1,6 +1,6 @@
 """Configs: frozen pydantic models that are read from YAML files and overrides.
 
-A run is one YAML file plus overrides (`head.lstm.hidden_size=64`). Values are taken strictly: text
+A run is one YAML file plus overrides (`heads.lstm.hidden_size=64`). Values are taken strictly: text
 is no number, a boolean is no number, `64.0` is no count. Dimensional values are SI numbers or text
 with a unit (`20 deg`). Every error is one line.
 """
@@ -256,7 +256,7 @@ def apply_override(data: dict[str, Any], text: str) -> Override:
     keys = key.strip().split(".")
     if not equals or not all(keys):
         raise ConfigError(
-            f"override '{text}': expected key=value, for example head.lstm.hidden_size=64"
+            f"override '{text}': expected key=value, for example heads.lstm.hidden_size=64"
         )
     where = f"override '{text}'"
     value, _ = parse(value_text, where, located=False)

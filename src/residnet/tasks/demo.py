@@ -68,7 +68,7 @@ _EPOCH = 1_717_000_000
 
 
 def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
-    """Write the logs in several layouts, as MCAP too where rosbags is installed; returns what to say.
+    """Write the logs in several layouts, with rosbags as MCAP too; returns what to say.
 
     Args:
         folder: that a folder for each layout is made in.

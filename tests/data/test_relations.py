@@ -1,0 +1,172 @@
+"""Relations that hold for every vessel: what is read, prepared and fitted follows a change of logs.
+
+Logs that are turned, moved, mirrored, later, in other units, with columns in another order, twice,
+in parts or with a channel more tell of the same vessel, to the digits that arithmetic leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_vessels import KINDS, random_logs
+
+from residnet.baselines.regressors import RegressorsConfig
+from residnet.core.config import validate
+from residnet.core.log import Log
+from residnet.core.samples import Samples
+from residnet.core.units import si_unit, to_si, units
+from residnet.data.prepare import PrepareConfig, prepare, samples
+from residnet.data.readers import ReaderConfig
+from residnet.physics.signals import SignalsConfig
+
+EXACT = 1e-9
+drawn = settings(max_examples=6, deadline=None, derandomize=True)
+vessels = st.tuples(st.sampled_from(KINDS), st.integers(0, 50))
+
+
+@cache
+def logs_of(vessel: tuple[str, int]) -> tuple[Log, ...]:
+    kind, seed = vessel
+    return tuple(random_logs(kind, seed, 1)[0])
+
+
+def inputs_of(log: Log) -> list[str]:
+    return [name for name in log.channels if name not in ("x", "y", "psi", "u", "v", "r")]
+
+
+def prepared(logs: Sequence[Log], inputs: Sequence[str]) -> Samples:
+    """Samples on the clock of the first log, a second or so behind each derivative."""
+    step = float(np.median(np.diff(logs[0].t)))
+    derivative = {"kind": "savitzky_golay", "window": 8 * step, "order": 2}
+    config = validate({"grid": {"step": step}, "derivative": derivative}, PrepareConfig, "test")
+    signals = SignalsConfig(inputs=tuple(inputs)).build()
+    return samples([prepare(log, "train", inputs, config) for log in logs], signals)
+
+
+def fitted(data: Samples) -> np.ndarray:
+    """The accelerations that a linear baseline, found from samples, gives for them [N, 3]."""
+    config = RegressorsConfig()
+    baseline = config.build(data.names)
+    config.fit(baseline, data)
+    return np.asarray(baseline(data.z).numpy())
+
+
+def changed(log: Log, **channels: np.ndarray) -> Log:
+    return log.replace(channels={**log.channels, **channels})
+
+
+def turned(log: Log, angle: float) -> Log:
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = c * log["x"] - s * log["y"], s * log["x"] + c * log["y"]
+    return changed(log, x=x, y=y, psi=log["psi"] + angle)
+
+
+def moved(log: Log, by: float) -> Log:
+    return changed(log, x=log["x"] + 100.0 * by, y=log["y"] - 70.0 * by)
+
+
+def later(log: Log, by: float) -> Log:
+    return log.replace(t=log.t + 64.0 * np.round(8.0 * by))
+
+
+def in_another_order(log: Log, by: float) -> Log:
+    names = [*log.channels][::-1]
+    return log.replace(channels={name: log[name] for name in names})
+
+
+def with_more(log: Log, by: float) -> Log:
+    idle = np.where(np.arange(len(log)) % 3 > 0, np.nan, by)
+    return log.replace(channels={**log.channels, "tank": idle}, units={**log.units, "tank": "-"})
+
+
+SAME: list[Callable[[Log, float], Log]] = [turned, moved, later, in_another_order, with_more]
+
+
+@pytest.mark.parametrize("change", SAME)
+@given(vessel=vessels, by=st.floats(-3.0, 3.0))
+@drawn
+def test_what_changes_nothing_of_the_vessel(
+    change: Callable[[Log, float], Log], vessel: tuple[str, int], by: float
+) -> None:
+    logs = logs_of(vessel)
+    inputs = inputs_of(logs[0])
+    one, other = (prepared(each, inputs) for each in (logs, [change(log, by) for log in logs]))
+    np.testing.assert_allclose(other.z, one.z, rtol=EXACT, atol=EXACT)
+    np.testing.assert_allclose(other.target, one.target, rtol=EXACT, atol=EXACT)
+    np.testing.assert_allclose(fitted(other), fitted(one), rtol=EXACT, atol=EXACT)
+
+
+@given(vessel=vessels)
+@drawn
+def test_a_mirrored_vessel_turns_to_the_other_side(vessel: tuple[str, int]) -> None:
+    logs = logs_of(vessel)
+    inputs = inputs_of(logs[0])
+    turning = [name for name in ("y", "psi", "v", "r", "delta") if name in logs[0].channels]
+    mirrored = []
+    for log in logs:
+        other = {name: -log[name] for name in turning}
+        if "n_port" in log.channels:
+            other |= {"n_port": log["n_stbd"], "n_stbd": log["n_port"]}
+        mirrored.append(changed(log, **other))
+    one, two = prepared(logs, inputs), prepared(mirrored, inputs)
+    side = np.array([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(two.z[:, :3], one.z[:, :3] * side, rtol=EXACT, atol=EXACT)
+    np.testing.assert_allclose(two.target, one.target * side, rtol=EXACT, atol=EXACT)
+    np.testing.assert_allclose(fitted(two), fitted(one) * side, rtol=EXACT, atol=EXACT)
+
+
+@given(vessel=vessels)
+@drawn
+def test_the_same_logs_twice_say_the_same(vessel: tuple[str, int]) -> None:
+    logs = logs_of(vessel)
+    inputs = inputs_of(logs[0])
+    one, two = prepared(logs, inputs), prepared([*logs, *logs], inputs)
+    np.testing.assert_array_equal(two.z[: len(one.z)], one.z)
+    np.testing.assert_allclose(fitted(two)[: len(one.z)], fitted(one), rtol=EXACT, atol=EXACT)
+
+
+@given(vessel=vessels, share=st.floats(0.3, 0.7))
+@drawn
+def test_a_log_in_two_parts_loses_samples_at_the_cut_alone(
+    vessel: tuple[str, int], share: float
+) -> None:
+    log = logs_of(vessel)[1]
+    inputs, at = inputs_of(log), round(share * len(log))
+    whole = prepared([log], inputs)
+    parts = prepared([log.rows(slice(0, at)), log.rows(slice(at, None))], inputs)
+    time = np.where(parts.group == 0, 0.0, log.t[at] - log.t[0]) + parts.time.numpy()
+    there = np.searchsorted(whole.time.numpy() + EXACT, time)
+    assert 0 <= len(whole.z) - len(parts.z) <= 20
+    np.testing.assert_allclose(parts.z, whole.z[there], rtol=EXACT, atol=EXACT)
+    np.testing.assert_allclose(parts.target, whole.target[there], rtol=EXACT, atol=EXACT)
+
+
+@given(vessel=vessels, data=st.data())
+@drawn
+def test_columns_in_any_unit_and_order(vessel: tuple[str, int], data: st.DataObject) -> None:
+    log = logs_of(vessel)[2]
+    table, channels = {"t": log.t - log.t[0]}, {}
+    for name in data.draw(st.permutations([*log.channels])):
+        alike = [unit for unit in units() if si_unit(unit) == log.units[name]]
+        unit = data.draw(st.sampled_from(alike))
+        table[f"the {name}"] = log[name] / to_si(unit, log.units[name])
+        channels[name] = {"column": f"the {name}", "unit": unit}
+    columns = data.draw(st.permutations([*table]))
+    settings = {"kind": "csv", "time": {"column": "t"}, "channels": channels}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        pd.DataFrame(table)[columns].to_csv(path, index=False)
+        read = validate(settings, ReaderConfig, "test").build().read(path)
+    for name in log.channels:
+        apart = read[name] - log[name]
+        apart -= 2.0 * np.pi * np.round(apart / (2.0 * np.pi)) * (name == "psi")
+        size = max(1.0, float(np.abs(log[name]).max()))
+        assert np.abs(apart).max() <= EXACT * size, name

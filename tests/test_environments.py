@@ -1,0 +1,199 @@
+"""Where residnet finds itself: no home, closed streams, full disks, odd clocks, hostile names."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from random_vessels import random_logs
+
+from residnet.tasks.drafting import new_config
+from residnet.tasks.inspection import inspect_logs
+from residnet.tasks.registry import finished_task, load_task
+
+pytestmark = pytest.mark.long
+
+CONFIG: dict[str, Any] = {
+    "task": "fit",
+    "name": "bare",
+    "signals": {"inputs": ["n", "delta"]},
+    "baseline": {"kind": "regressors", "sets": ["linear"]},
+    "evaluation": {"scales": {"u": 1.0, "v": 0.3, "r": 0.1}},
+    "export": {"models": []},
+}
+
+
+def written(folder: Path, names: list[str]) -> Path:
+    """Return a config of a baseline beside logs of a boat in canonical files, one of each name."""
+    source, folder, files = random_logs("boat", 3, 1)[0], folder / "logs", list[str]()
+    folder.mkdir()
+    length = len(source[0]) // -(-len(names) // 3)
+    for number, name in enumerate(names):
+        log = source[number % 3].rows(slice(number // 3 * length, (number // 3 + 1) * length))
+        bare = name.replace("/", "_").replace("\0", "_").encode("utf-8", "surrogateescape")[:200]
+        path = folder / os.fsdecode(b"%03d_%b.parquet" % (number, bare))
+        log.replace(name=name, meta={**log.meta, "manoeuvre": name}).save(path)
+        files.append(path.name)
+    parts = {"train": files[::3], "validation": files[1::3], "test": files[2::3]}
+    data = {"kind": "measured", "reader": {"kind": "canonical"}, "split": {"root": "logs", **parts}}
+    step = float(np.median(np.diff(source[0].t)))
+    config = {**CONFIG, "data": data, "prepare": {"grid": {"step": step}}}
+    config["prepare"]["derivative"] = {"kind": "savitzky_golay", "window": 10 * step, "order": 2}
+    windows = {"kind": "windows", "length": 100 * step, "first": 20 * step}
+    config["evaluation"] = {**CONFIG["evaluation"], "protocols": {"T100": windows}}
+    (folder.parent / "bare.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    return folder.parent / "bare.yaml"
+
+
+HOSTILE = [
+    *("..", ".", "", " ", "-rf", "--help", "~", "*", "?", "[a]", "'", '"', "`id`", ";ls", "a:b"),
+    *(
+        "../../../escape",
+        "/tmp/escape",
+        "a/../../b",
+        "a\\b",
+        "C:\\x",
+        "CON",
+        "nul.txt",
+        "zigzag 10/10",
+    ),
+    *("$", "$x", "a$b$c", "$\\frac{1}{0}$", "\\alpha", "%s%d", "{0}", "{{x}}", "<b>&amp;</b>"),
+    *(
+        "</script><script>alert(1)</script>",
+        "a\0b",
+        "\0",
+        "line\nbreak",
+        "\r",
+        "tab\there",
+        "\x1b[31m",
+    ),
+    *(
+        "Kür ß",
+        "é",
+        "\udce9t\udce9",
+        "日本語",
+        "عربي",
+        "\u202eabc",
+        "🚤",
+        "a\u0300",
+        "\ufeffx",
+        "x" * 300,
+    ),
+]
+
+
+@pytest.mark.parametrize("part", [0, 1, 2])
+def test_hostile_names_of_manoeuvres_logs_and_files(part: int, tmp_path: Path) -> None:
+    """Each name is that of a log, of its manoeuvre and, where it can be, of its file."""
+    names = HOSTILE[part::3]
+    work = tmp_path / "work"
+    work.mkdir()
+    config = written(work, names)
+    before = set(tmp_path.rglob("*"))
+    run = load_task(config, []).run(out=work / "run").path
+    ended, task = finished_task(run, "evaluate")
+    task.evaluate_on(ended, [work / "logs"], work / "run" / "other")
+    inspect_logs([work / "logs"], None)
+    new_config([work / "logs"], work / "run" / "drafted.yaml", None, overwrite=False)
+    made = set(tmp_path.rglob("*")) - before
+    assert [path for path in made if path != run and run not in path.parents] == []
+    assert not Path("/tmp/escape").exists()
+    assert (run / "report.html").is_file()
+
+
+def limited(**limits: int) -> Callable[[], None]:
+    def apply() -> None:
+        for name, most in limits.items():
+            resource.setrlimit(getattr(resource, name), (most, most))
+
+    return apply
+
+
+def closed(*streams: int) -> Callable[[], None]:
+    return lambda: [os.close(stream) for stream in streams] and None
+
+
+def full(stream: int) -> Callable[[], None]:
+    return lambda: os.dup2(os.open("/dev/full", os.O_WRONLY), stream) and None
+
+
+ENVIRONMENTS: dict[str, tuple[dict[str, str | None], Callable[[], None] | None]] = {
+    "no HOME": ({"HOME": None}, None),
+    "HOME that is not there": ({"HOME": "/nowhere/at/all"}, None),
+    "HOME that is a file": ({"HOME": "/etc/passwd"}, None),
+    "no environment": (dict.fromkeys(os.environ), None),
+    "C locale": ({"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, None),
+    "unknown locale": ({"LC_ALL": "xx_YY.UTF-99"}, None),
+    "Turkish": ({"LC_ALL": "tr_TR.UTF-8"}, None),
+    "ASCII streams": ({"PYTHONIOENCODING": "ascii"}, None),
+    "TZ of a quarter": ({"TZ": "Asia/Kathmandu"}, None),
+    "TZ unknown": ({"TZ": "Nowhere/Bad"}, None),
+    "TZ empty": ({"TZ": ""}, None),
+    "no PATH": ({"PATH": ""}, None),
+    "no compiler": ({"CC": "/nowhere/cc", "CXX": "/nowhere/c++"}, None),
+    "no DISPLAY": ({"DISPLAY": None, "MPLBACKEND": None}, None),
+    "a backend with windows": ({"DISPLAY": ":99", "MPLBACKEND": "TkAgg"}, None),
+    "caches that are files": (
+        {"MPLCONFIGDIR": "/etc/passwd", "XDG_CACHE_HOME": "/etc/passwd"},
+        None,
+    ),
+    "no TMPDIR": ({"TMPDIR": "/nowhere"}, None),
+    "a narrow terminal": ({"COLUMNS": "1", "TERM": "dumb"}, None),
+    "no colours": ({"NO_COLOR": "1", "FORCE_COLOR": "1"}, None),
+    "threads that are no number": ({"OMP_NUM_THREADS": "many"}, None),
+    "no such GPU": ({"CUDA_VISIBLE_DEVICES": "99"}, None),
+    "stdin closed": ({}, closed(0)),
+    "stdout closed": ({}, closed(1)),
+    "stderr closed": ({}, closed(2)),
+    "all streams closed": ({}, closed(0, 1, 2)),
+    "stdout full": ({}, full(1)),
+    "stderr full": ({}, full(2)),
+    "no file may grow": ({}, limited(RLIMIT_FSIZE=0)),
+    "files of 20 kB": ({}, limited(RLIMIT_FSIZE=20_000)),
+    "few open files": ({}, limited(RLIMIT_NOFILE=40)),
+    "no core files, no locked memory": ({}, limited(RLIMIT_CORE=0, RLIMIT_MEMLOCK=0)),
+}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("environments"), [f"log {i}" for i in range(6)])
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_no_environment_brings_a_traceback(name: str, logs: Path, tmp_path: Path) -> None:
+    changes, before = ENVIRONMENTS[name]
+    env = {**os.environ, **{key: value for key, value in changes.items() if value is not None}}
+    env = {key: value for key, value in env.items() if changes.get(key, "") is not None}
+    env["PYTHONPATH"] = os.environ.get("PYTHONPATH", "")
+    # where files may not grow a run is what writes most
+    command = ["run", str(logs), "--out", str(tmp_path / "run")]
+    if "grow" not in name and "kB" not in name and "HOME" not in name and "cache" not in name:
+        command = ["new", str(logs.parent / "logs"), "--out", str(tmp_path / "new.yaml")]
+    # standard streams of their own, so that those that are closed are its own
+    with (tmp_path / "out").open("wb") as out, (tmp_path / "err").open("wb") as err:
+        done = subprocess.run(
+            [sys.executable, "-m", "residnet", *command],
+            cwd=tmp_path,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=err,
+            preexec_fn=before,
+            check=False,
+        )
+    said = (tmp_path / "out").read_text() + (tmp_path / "err").read_text()
+    assert done.returncode in (0, 1, 2), said
+    assert "Traceback" not in said
+    assert "this is a defect" not in said
+    made = {path.name for path in tmp_path.iterdir()}
+    assert made <= {"out", "err", "run", "new.yaml"}
+    assert {path.name for path in logs.parent.iterdir()} == {"logs", "bare.yaml"}
