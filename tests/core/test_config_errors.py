@@ -266,7 +266,10 @@ def test_overrides_set_values(load: Callable[..., Fit]) -> None:
             ),
         ),
         # overrides that cannot be applied
-        (["epochs"], "override 'epochs': expected key=value, for example heads.lstm.hidden_size=64"),
+        (
+            ["epochs"],
+            "override 'epochs': expected key=value, for example heads.lstm.hidden_size=64",
+        ),
         (["=3"], "override '=3': expected key=value, for example heads.lstm.hidden_size=64"),
         (
             ["heads..a=3"],

@@ -1,7 +1,8 @@
 """What README and documentation show is valid: YAML is read, commands and files exist, links lead.
 
 Python and shell blocks that a comment `not run: <reason>` precedes or begins are not carried out;
-their commands and options are checked all the same.
+their commands and options are checked all the same. Shell blocks that a comment `run: a test does,
+on the demo's logs` precedes are carried out in the long stage.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import ast
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -29,7 +31,7 @@ from residnet.tasks.registry import TaskConfig, load_task
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FENCE = re.compile(
-    r"(?:<!-- not run: (?P<why>[^>]*) -->\n)?```(?P<kind>\w+)\n(?P<text>.*?)```", re.S
+    r"(?:<!-- (?P<mark>not run|run): (?P<why>[^>]*) -->\n)?```(?P<kind>\w+)\n(?P<text>.*?)```", re.S
 )
 TEXT = "\n".join(page.read_text() for page in PAGES)
 NAMED = sorted(set(re.findall(r"residnet run ((?!configs\b)[a-z_0-9]+)\b(?!\.)", TEXT)))
@@ -44,7 +46,8 @@ class Block:
     number: int
     kind: str
     text: str
-    why_not_run: str | None
+    why: str | None
+    run: bool
 
     def __str__(self) -> str:
         return f"{self.page}:{self.number}"
@@ -57,7 +60,8 @@ def blocks() -> list[Block]:
             first = re.match(r"# not run: (.*)", match["text"])
             why = match["why"] or (first[1] if first else None)
             name = page.relative_to(ROOT).as_posix()
-            found.append(Block(name, number, match["kind"], match["text"], why))
+            run = match["mark"] == "run"
+            found.append(Block(name, number, match["kind"], match["text"], why, run))
     return found
 
 
@@ -182,6 +186,64 @@ def test_the_head_of_contributing_keeps_the_contract(tmp_path: Path) -> None:
         check=False,
     )
     assert run.returncode == 0, run.stderr
+
+
+CARRIED_OUT = sorted({block.page for block in BLOCKS if block.run})
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs of the demo in the folders that the pages name, a config and a finished run of them."""
+    folder = tmp_path_factory.mktemp("pages")
+    assert residnet_in(folder, "demo", "demo") == 0
+    for name in ("trials", "my_logs", "my_logs/zigzag", "more_logs", "new_logs"):
+        (folder / name).mkdir()
+        # six of each kind are enough, and more would take longer
+        kinds = "zigzag_*" if "zigzag" in name else "*"
+        for log in sorted((folder / "demo" / "csv").glob(f"{kinds}.csv"))[:6]:
+            shutil.copy(log, folder / name)
+    assert residnet_in(folder, "new", "trials", "--out", "my_boat.yaml") == 0
+    quicken(folder / "my_boat.yaml")
+    assert residnet_in(folder, "run", "my_boat.yaml") == 0
+    return folder
+
+
+def residnet_in(folder: Path, *words: str) -> int:
+    """Return the exit code of a command; what it says is shown where a test fails."""
+    command = [sys.executable, "-m", "residnet", *words]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    print(shlex.join(words), done.stdout[-800:], done.stderr[-800:])
+    return done.returncode
+
+
+def quicken(config: Path) -> None:
+    """Train for a fiftieth of the usual time."""
+    config.write_text(re.sub(r"^effort: .*$", "effort: 0.02", config.read_text(), flags=re.M))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", CARRIED_OUT)
+def test_commands_of_a_page_run_on_the_logs_of_the_demo(
+    page: str, workspace: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(workspace, tmp_path, dirs_exist_ok=True)
+    shown = [block.text for block in BLOCKS if block.page == page and block.run]
+    runs = "".join(shown)
+    if "residnet new" in runs:
+        (tmp_path / "my_boat.yaml").unlink()
+    if "residnet run" in runs:
+        shutil.rmtree(tmp_path / "runs")
+    for line in "".join(shown).replace("\\\n", " ").splitlines():
+        words = [
+            str(path.relative_to(tmp_path))
+            for word in shlex.split(line, comments=True)
+            for path in (sorted(tmp_path.glob(word)) if "*" in word else [tmp_path / word])
+        ]
+        if words[:2] == ["residnet", "run"]:
+            quicken(tmp_path / "my_boat.yaml")
+        # the doctor and the monitor say with 1 that they found something
+        found = {0, 1} if words[1:2] in (["inspect"], ["monitor"]) else {0}
+        assert not words or residnet_in(tmp_path, *words[1:]) in found, line
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
