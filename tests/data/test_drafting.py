@@ -81,13 +81,6 @@ def test_a_heading_that_is_not_wrapped_may_be_large_in_radians(
     assert (channels["psi"]["unit"], channels["r"]["unit"]) == ("rad", "rad/s")
 
 
-def test_the_number_of_a_row_is_no_time(logs: list[Log], tmp_path: Path) -> None:
-    columns = {"tvec": logs[0].t, **{name: logs[0][name] for name in ("x", "y", "psi", "u")}}
-    pd.DataFrame(columns).to_csv(tmp_path / "turn.csv")
-    content, _ = draft_tables([tmp_path / "turn.csv"], Marks())
-    assert content["time"] == {"column": "tvec", "unit": "s"}
-
-
 def test_letters_of_axes_are_told_by_their_units(logs: list[Log], tmp_path: Path) -> None:
     """`N [m]` is no propeller, and `X [kN]` no place."""
     log = logs[0]

@@ -9,11 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import residnet
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
+from residnet.data.drafting.reading import read_each
 from residnet.data.readers import ReaderConfig
+from residnet.data.readers.base import digest
 from residnet.data.readers.joined import clock_shift, partners
 
 LATE = {0: 12.3, 1: -31.7, 2: 5.05}
@@ -27,20 +28,6 @@ def motion(log: Log) -> Log:
 
 def commands(log: Log) -> Log:
     return log.replace(channels={name: log[name] for name in ("n", "delta")})
-
-
-def write(logs: list[Log], folder: Path) -> Path:
-    """gnss_1.csv at 5 Hz in Unix time beside motors_1.csv at 10 Hz in ms of its own."""
-    folder.mkdir(exist_ok=True)
-    for number, log in enumerate(logs):
-        here = {"when": 1.75e9 + 1e5 * number + log.t, "north [m]": log["x"], "east [m]": log["y"]}
-        here |= {"heading [deg]": np.degrees(log["psi"]) % 360.0}
-        pd.DataFrame(here)[::2].to_csv(folder / f"gnss_{number + 1}.csv", index=False)
-        there = {"ms": np.round(1000 * (log.t + 50.0 - LATE[number]))}
-        there |= {"motor us": np.round(1500 + 10 * log["n"])}
-        there |= {"rudder us": np.round(1500 + 500 * np.degrees(log["delta"]) / 35)}
-        pd.DataFrame(there).to_csv(folder / f"motors_{number + 1}.csv", index=False)
-    return folder
 
 
 @pytest.mark.parametrize("number", [0, 2])
@@ -71,24 +58,68 @@ def test_trips_are_found_by_the_names_of_their_files(tmp_path: Path) -> None:
     assert set(partners(apart)) == {"imu", "cmd"}
 
 
-def test_two_files_a_trip_are_one_log_at_every_door(ship_logs: list[Log], tmp_path: Path) -> None:
-    folder = write(ship_logs, tmp_path / "trips")
-    read = residnet.read_logs(folder)
-    assert [log.name for log in read] == ["gnss_1", "gnss_2", "gnss_3"]
-    for log, true in zip(read, ship_logs, strict=True):
-        assert set(log.channels) == {"x", "y", "psi", "throttle", "delta"}
-        assert len(log) == len(true) // 2 + len(true) % 2
-        inside = np.isfinite(log["delta"])
-        assert inside.mean() > 0.9
-        apart = np.interp(log.t - log.t[0], true.t, true["delta"]) - log["delta"]
-        assert np.median(np.abs(apart[inside])) < np.radians(1.0)
-        assert sum(found["code"] == "joined" for found in log.meta["findings"]) == 1
-    draft = residnet.draft(folder, folder=tmp_path)
-    reader = draft.config["data"]["reader"]
-    assert (reader["kind"], list(reader["parts"])) == ("joined", ["gnss", "motors"])
-    assert reader["parts"]["motors"]["channels"]["throttle"]["offset"] == 1500
-    again = validate(reader, ReaderConfig, "here").build().read(folder / "gnss_2.csv")
-    np.testing.assert_array_equal(again["delta"], read[1]["delta"])
+def tables(log: Log, late: float = 7.0) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return what a receiver writes each .2 s, and what the motors do each .1 s."""
+    pose = {"north [m]": log["x"], "east [m]": log["y"], "heading [deg]": np.degrees(log["psi"])}
+    acts = {"shaft [rpm]": 60.0 * log["n"], "rudder [deg]": np.degrees(log["delta"])}
+    fixes = pd.DataFrame({"utc [s]": 1.75e9 + log.t, **pose})[::2]
+    return fixes, pd.DataFrame({"board [s]": log.t + late, **acts})
+
+
+def found(folder: Path, **files: pd.DataFrame) -> tuple[set[str], list[str], dict[str, str]]:
+    """Return the logs of a folder, what is said of their clocks, and path -> why it is left out."""
+    folder.mkdir()
+    for name, table in files.items():
+        table.to_csv(folder / f"{name}.csv", index=False)
+    read = read_each(sorted(folder.iterdir()))
+    logs = {log.name: log for one in read for log in one.logs.values()}
+    said = [f for log in logs.values() for f in log.meta.get("findings", ())]
+    told = [f"{f['level']}: {f['text']}" for f in said if f["code"] == "joined"]
+    lost = {path.stem: str(why) for one in read for path, why in one.left_out.items()}
+    return set(logs), told, lost
+
+
+def test_what_is_no_trip_or_cannot_be_joined_is_told(ship_logs: list[Log], tmp_path: Path) -> None:
+    fixes, acts = tables(ship_logs[0])
+    others, strange = tables(ship_logs[1])
+    logs, told, _ = found(tmp_path / "good", gnss=fixes, motors=acts)
+    assert logs == {"gnss"}
+    assert told[0].startswith("note: motors: its clock is moved by +1749999993.")
+    # motors of another trip, and none that moves: what cannot be sure is a warning
+    for name, wrong in (("strange", strange), ("rest", acts.assign(**dict.fromkeys(acts, 1.0)))):
+        wrong["board [s]"] = acts["board [s]"]
+        _, told, _ = found(tmp_path / name, gnss=fixes, motors=wrong)
+        assert told[0].startswith("will mislead: "), name
+        assert told[0].endswith("give `shift: {motors: ...}`"), name
+    _, told, _ = found(tmp_path / "short", gnss=fixes[:10], motors=acts[:30])
+    assert "too short to tell); both are taken to begin together" in told[0]
+    # a board whose clock is three seconds wrong, by dates
+    dated = acts.assign(**{"board [s]": 1.75e9 - 3.0 + ship_logs[0].t})
+    _, told, _ = found(tmp_path / "dated", gnss=fixes, motors=dated)
+    assert "will mislead: motors: joined by the dates of both, which are -" in told[0]
+    dated["board [s]"] += 3.0
+    _, told, _ = found(tmp_path / "clock", gnss=fixes, motors=dated)
+    assert told == ["note: motors: joined by the dates of both"]
+    # two boats hold a position each
+    boats = {"anna": fixes.merge(acts, left_index=True, right_index=True), "bea": others}
+    assert found(tmp_path / "boats", **boats)[:2] == ({"anna", "bea"}, [])
+    # a trip that lacks a part, and a list of names beside it
+    names = pd.DataFrame({"who": ["Jan"], "what": ["skipper"]})
+    logs, _, lost = found(tmp_path / "part", gnss_1=fixes, gnss_2=others, motors_1=acts, crew=names)
+    assert logs == {"gnss_1"}
+    assert set(lost) == {"gnss_2", "crew"}
+    assert "no other file of its trip is beside it" in lost["gnss_2"]
+
+
+def test_a_third_recorder_is_joined_by_the_rate_that_it_shares(
+    ship_logs: list[Log], tmp_path: Path
+) -> None:
+    log = ship_logs[0]
+    fixes, acts = tables(log)
+    rate = pd.DataFrame({"t [s]": log.t + 3.0, "yaw rate [deg/s]": np.degrees(log["r"])})
+    _, told, _ = found(tmp_path / "three", gnss=fixes, imu=rate, motors=acts)
+    assert all(text.startswith("note: ") for text in told)
+    assert any("imu: its clock is moved by +1749999997.0" in text for text in told)
 
 
 def reader_of(**more: Any) -> dict[str, Any]:
@@ -107,7 +138,10 @@ def test_a_shift_that_is_given_and_what_is_wrong(tmp_path: Path) -> None:
     pd.DataFrame({"t": t, "x": t, "y": -t}).to_csv(tmp_path / "pos1.csv", index=False)
     pd.DataFrame({"t": t + 7.0, "k": t**2}).to_csv(tmp_path / "cmd1.csv", index=False)
     reader = validate(reader_of(shift={"cmd": -7.0}), ReaderConfig, "here").build()
-    np.testing.assert_array_equal(reader.read(tmp_path / "pos1.csv")["k"], t**2)
+    read, both = reader.read(tmp_path / "pos1.csv"), [tmp_path / "pos1.csv", tmp_path / "cmd1.csv"]
+    np.testing.assert_array_equal(read["k"], t**2)
+    assert reader.files(both[0]) == both
+    assert read.meta["parts"] == {"pos": digest(both[:1]), "cmd": digest(both[1:])}
     assert reader.logs_among(sorted(tmp_path.iterdir())) == [tmp_path / "pos1.csv"]
     with pytest.raises(DataError, match="its name holds no 'pos'"):
         reader.read(tmp_path / "cmd1.csv")

@@ -118,8 +118,12 @@ def test_a_mirrored_vessel_turns_to_the_other_side(vessel: tuple[str, int]) -> N
         mirrored.append(changed(log, **other))
     one, two = prepared(logs, inputs), prepared(mirrored, inputs)
     side = np.array([1.0, -1.0, -1.0])
-    np.testing.assert_allclose(two.z[:, :3], one.z[:, :3] * side, rtol=EXACT, atol=EXACT)
-    np.testing.assert_allclose(two.target, one.target * side, rtol=EXACT, atol=EXACT)
+    np.testing.assert_allclose(
+        two.z[:, :3].numpy(), one.z[:, :3].numpy() * side, rtol=EXACT, atol=EXACT
+    )
+    np.testing.assert_allclose(
+        two.target.numpy(), one.target.numpy() * side, rtol=EXACT, atol=EXACT
+    )
     np.testing.assert_allclose(fitted(two), fitted(one) * side, rtol=EXACT, atol=EXACT)
 
 
@@ -142,8 +146,8 @@ def test_a_log_in_two_parts_loses_samples_at_the_cut_alone(
     inputs, at = inputs_of(log), round(share * len(log))
     whole = prepared([log], inputs)
     parts = prepared([log.rows(slice(0, at)), log.rows(slice(at, None))], inputs)
-    time = np.where(parts.group == 0, 0.0, log.t[at] - log.t[0]) + parts.time.numpy()
-    there = np.searchsorted(whole.time.numpy() + EXACT, time)
+    time = np.where(parts.group == 0, 0.0, log.t[at] - log.t[0]) + parts.t.numpy()
+    there = np.searchsorted(whole.t.numpy() + EXACT, time)
     assert 0 <= len(whole.z) - len(parts.z) <= 20
     np.testing.assert_allclose(parts.z, whole.z[there], rtol=EXACT, atol=EXACT)
     np.testing.assert_allclose(parts.target, whole.target[there], rtol=EXACT, atol=EXACT)
