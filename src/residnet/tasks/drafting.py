@@ -207,7 +207,18 @@ class _Read:
         self.left_out = {path: str(error) for path, error in read.left_out.items()}
         self.logs: dict[Path, Log] = {}
         self.whole: dict[Path, Log] = {}
+        # parts that are not sure to be of one moment would teach a wrong answer
+        unsure = {
+            path: finding["text"]
+            for path, log in read.logs.items()
+            for finding in log.meta.get("findings", ())
+            if finding["code"] == "joined" and finding["level"] == "will mislead"
+        }
+        unsure = unsure if len(unsure) < len(read.logs) else {}
+        self.left_out |= unsure
         for path, log in read.logs.items():
+            if path in unsure:
+                continue
             try:
                 self.whole[path], self.logs[path] = complete_motion(log, MotionConfig()), log
             except ResidnetError as error:

@@ -327,8 +327,8 @@ def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
         own[0]: {path.with_name(path.name.replace(own[0], "\0")): path for path in group}
         for own, group in zip(words, members, strict=True)
     }
-    first, *others = trips.values()
-    whole = [trip for trip in first if all(trip in other for other in others)]
+    first, *rest = trips.values()
+    whole = [trip for trip in first if all(trip in other for other in rest)]
     return {word: [of[trip] for trip in whole] for word, of in trips.items()} if whole else {}
 
 
