@@ -313,7 +313,9 @@ def rudder_sign(log: Record, found: Check) -> Iterator[Finding]:
             text = f"{name} stays on one side and the vessel turns to the other"
             yield found(text, fix=_TURN_AND_CHECK)
             return
-    without, fits = _answers(log, steer, good)
+    # a rudder turns by the square of the speed past it
+    flow = np.abs(log.smooth("u")) if "delta" in name and "u" in log else np.ones(len(log))
+    without, fits = _answers(log, steer, flow, good)
     if not fits:
         return
     zero, best = fits[0], min(fits, key=lambda shift: fits[shift].left)
@@ -323,7 +325,7 @@ def rudder_sign(log: Record, found: Check) -> Iterator[Finding]:
     sure = moved if same and abs(moved) > abs(plain) else plain
     better = zero.left / max(fits[best].left, 1e-300)
     told = without / max(zero.left, 1e-300) > _WORTH and (better < _BETTER or moved < 0.0)
-    effect = float(zero.values[-1])
+    effect = float(zero.values[-1] * np.nanmean(flow**2))
     figures = {"effect": effect, "t": plain, "lag": best * log.step, "better": better}
     if sure < -_SURE and told:
         text = (
@@ -349,11 +351,19 @@ def _steering(log: Record) -> tuple[str, np.ndarray]:
     return "", np.zeros(0)
 
 
-def _answers(log: Record, steer: np.ndarray, good: np.ndarray) -> tuple[float, dict[int, Fit]]:
+def _answers(
+    log: Record, steer: np.ndarray, flow: np.ndarray, good: np.ndarray
+) -> tuple[float, dict[int, Fit]]:
     """Return what a yaw model leaves without steering, and fits with it by shift in samples.
 
-    Over blocks of a second or so: the change of r on the integrals of 1, r, r|r|, v, v|v| and the
-    steering, with the steering shifted in time; nothing where that says nothing.
+    Over blocks of a second or so: the change of r on the integrals of U^2, U r, r|r|, U v, v|v| and
+    U^2 times the steering, with the latter shifted in time; nothing where that says nothing.
+
+    Args:
+        log: with r.
+        steer: what steers [T].
+        flow: the speed U that it acts by [T]; 1 where it acts without any.
+        good: samples that are known [T].
     """
     r, size = log.smooth("r"), max(round(1.0 / log.step), WINDOW)
     low, top = np.nanquantile(log["r"], (0.05, 0.95))
@@ -371,9 +381,9 @@ def _answers(log: Record, steer: np.ndarray, good: np.ndarray) -> tuple[float, d
     blocks = replace(blocks, first=first[blocks.clear_of(gaps)])
     if blocks.first.size < FEWEST or top - low < 4.0 * log.noise("r"):
         return 0.0, {}
-    terms = np.stack((np.ones(r.size), r, r * np.abs(r), v, v * np.abs(v)), axis=-1)
+    terms = np.stack((flow**2, flow * r, r * np.abs(r), flow * v, v * np.abs(v)), axis=-1)
     known, y = blocks.integrals(terms)(0), blocks.change(r)
-    given = blocks.integrals(np.nan_to_num(steer)[:, None])
+    given = blocks.integrals((flow**2 * np.nan_to_num(steer))[:, None])
     shifts = {round(float(shift)) for shift in np.linspace(-reach, reach, 61)}
     fits = {shift: fit(np.column_stack((known, given(shift))), y) for shift in sorted(shifts)}
     return fit(known, y).left, fits
