@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from random_vessels import KINDS, random_logs
 
@@ -27,8 +27,10 @@ from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.readers import ReaderConfig
 from residnet.physics.signals import SignalsConfig
 
-EXACT = 1e-9
-drawn = settings(max_examples=6, deadline=None, derandomize=True)
+EXACT, WINDOW = 1e-9, 8
+# a failing case is one of few, and small already
+GENERATED = (Phase.explicit, Phase.generate)
+drawn = settings(max_examples=6, deadline=None, derandomize=True, phases=GENERATED)
 vessels = st.tuples(st.sampled_from(KINDS), st.integers(0, 50))
 
 
@@ -43,9 +45,9 @@ def inputs_of(log: Log) -> list[str]:
 
 
 def prepared(logs: Sequence[Log], inputs: Sequence[str]) -> Samples:
-    """Samples on the clock of the first log, a second or so behind each derivative."""
+    """Samples on the clock of the first log."""
     step = float(np.median(np.diff(logs[0].t)))
-    derivative = {"kind": "savitzky_golay", "window": 8 * step, "order": 2}
+    derivative = {"kind": "savitzky_golay", "window": WINDOW * step, "order": 2}
     config = validate({"grid": {"step": step}, "derivative": derivative}, PrepareConfig, "test")
     signals = SignalsConfig(inputs=tuple(inputs)).build()
     return samples([prepare(log, "train", inputs, config) for log in logs], signals)
@@ -139,18 +141,19 @@ def test_the_same_logs_twice_say_the_same(vessel: tuple[str, int]) -> None:
 
 @given(vessel=vessels, share=st.floats(0.3, 0.7))
 @drawn
-def test_a_log_in_two_parts_loses_samples_at_the_cut_alone(
+def test_a_log_in_two_parts_is_the_same_but_for_the_cut(
     vessel: tuple[str, int], share: float
 ) -> None:
+    """Within half a window of an end, the derivative is that of the last whole window."""
     log = logs_of(vessel)[1]
     inputs, at = inputs_of(log), round(share * len(log))
     whole = prepared([log], inputs)
     parts = prepared([log.rows(slice(0, at)), log.rows(slice(at, None))], inputs)
-    time = np.where(parts.group == 0, 0.0, log.t[at] - log.t[0]) + parts.t.numpy()
-    there = np.searchsorted(whole.t.numpy() + EXACT, time)
-    assert 0 <= len(whole.z) - len(parts.z) <= 20
-    np.testing.assert_allclose(parts.z, whole.z[there], rtol=EXACT, atol=EXACT)
-    np.testing.assert_allclose(parts.target, whole.target[there], rtol=EXACT, atol=EXACT)
+    assert len(parts.z) == len(whole.z) == len(log)
+    away = np.abs(np.arange(len(log)) - at + 0.5) > WINDOW / 2
+    assert away.sum() == len(log) - WINDOW
+    for one, other in ((parts.z, whole.z), (parts.target, whole.target)):
+        np.testing.assert_allclose(one[away], other[away], rtol=EXACT, atol=EXACT)
 
 
 @given(vessel=vessels, data=st.data())
