@@ -1,7 +1,8 @@
-"""How far `recipe: standard` is from the best of its models in hindsight, and from a plain network.
+"""The mean of the standard recipe beside its members, the selected model, and a plain network.
 
     python scripts/bench/recipe.py [--logs boats|shipped|measured] [--count N] [--seed S]
-        [--minutes M ...] [--vessels NAME ...] [--effort E] [--peer] [--records FILE]
+        [--minutes M ...] [--vessels NAME ...] [--effort E] [--without PART ...] [--peer]
+        [--records FILE]
 
 Nothing is said to `residnet.fit` but the logs: M minutes for training and validation (three to
 one), as long for the test, which takes part in no choice.
@@ -12,9 +13,14 @@ one), as long for the test, which takes part in no choice.
     measured  random stretches of the logs below RESIDNET_DATA: a model tanker (wind not given) and
               a 7 m tanker model
 
+Means of fewer members need no fit of their own and stand beside the recipe's. `--without` fits once
+more for each part of the training that is named, with the same seeds: `mirror` (no mirrored
+windows), `average` (the last weights in place of their average), `members` (one
+network in place of several).
+
 `--peer` adds what an hour of PyTorch gives: a GRU that reads two seconds of the past, and another
 that runs freely from what the first one leaves, the best of its validations kept; it is judged over
-the same windows. A line for each fit; at the end the means over the draws.
+the same windows. A line for each fit; at the end geometric means over the draws.
 """
 
 from __future__ import annotations
@@ -25,8 +31,11 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -42,6 +51,8 @@ from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
 from residnet.data.prepare import Prepared
 from residnet.data.simulated import SimulatedTrials, simulate
+from residnet.identification import settings
+from residnet.judge.freerun import Errors, Prediction
 from residnet.judge.protocol import Window
 
 CHANNELS = {
@@ -237,51 +248,97 @@ class Peer:
         return float(np.mean(out))
 
 
-def judged(splits: Splits, effort: float, peer: bool) -> dict[str, Any]:
+PARTS: dict[str, Callable[[dict[str, Any]], None]] = {
+    "mirror": lambda plan: _each(plan["training"], mirror=False),
+    "average": lambda plan: _each(plan["training"], average=0.0),
+    "members": lambda plan: _each(plan["heads"], members=1),
+}
+
+
+def _each(parts: dict[str, dict[str, Any]], **changes: Any) -> None:
+    for name in parts:
+        parts[name] = {**parts[name], **changes}
+
+
+def fitted(splits: Splits, effort: float, without: str) -> Any:
+    """Fit the recipe, without a part of it where one is named."""
+    whole = settings.portfolio
+
+    def changed(facts: Any, effort: float) -> dict[str, Any]:
+        plan = whole(facts, effort)
+        if without:
+            PARTS[without](plan)
+        return plan
+
+    with mock.patch.object(settings, "portfolio", changed):
+        return residnet.fit(splits, effort=effort, bands=None)
+
+
+def subsets(models: Any) -> dict[str, float]:
+    """Return the test error of the mean of each set of members, by their names."""
+    evaluation = models.data.evaluation
+    found = models.runs["test"].evaluation
+    run = next(run for run in found.runs if run.protocol == evaluation.selection)
+    members = models["mean"].fitted.notes["members"] if "mean" in models else ["hull"]
+    out = {}
+    for count in range(1, len(members) + 1):
+        for names in combinations(members, count):
+            together = zip(*(run.predictions[name] for name in names), strict=True)
+            states = [np.mean([one.states for one in group], axis=0) for group in together]
+            predictions = [Prediction(one, diverged=False) for one in states]
+            errors = Errors.of(run.windows, predictions, found.logs)
+            out[" + ".join(names)] = float((errors.rmse / evaluation.scales.array()).mean())
+    return out
+
+
+def judged(splits: Splits, effort: float, peer: bool, without: Sequence[str]) -> dict[str, Any]:
     """Fit, and return the test errors by the protocol that chooses."""
     began = time.process_time()
-    models = residnet.fit(splits, effort=effort, bands=None)
+    models = fitted(splits, effort, "")
     seconds = time.process_time() - began
     rows = residnet.metrics(models, split="test")
     rows = rows[rows.protocol == models.data.evaluation.selection].set_index("model")
-    single = rows[(rows.kind != "ensemble") & (rows.diverged == 0)]
+    errors = {name: float(row.nrmse_mean) for name, row in rows.iterrows()}
+    errors["selected"] = errors[models.selected]
+    for part in without:
+        other = residnet.metrics(fitted(splits, effort, part), split="test")
+        other = other[other.protocol == models.data.evaluation.selection].set_index("model")
+        errors[f"mean without {part}"] = float(other.nrmse_mean["mean"])
     return {
         "selected": models.selected,
         "seconds": seconds,
-        "test": {name: float(row.nrmse_mean) for name, row in rows.iterrows()},
+        "test": errors | subsets(models),
         "diverged": {name: int(row.diverged) for name, row in rows.iterrows()},
-        "best": float(single.nrmse_mean.min()),
-        "peer": Peer(models.data).error("test") if peer else None,
-    }
+    } | ({"peer": Peer(models.data).error("test")} if peer else {})
 
 
 def line(record: dict[str, Any]) -> str:
     """One fit in a line: errors of all models, the selected one marked."""
     parts = [
         f"{'*' if name == record['selected'] else ''}{name} {error:.3f}"
-        + (f" ({record['diverged'][name]} diverged)" if record["diverged"][name] else "")
+        + (f" ({lost} diverged)" if (lost := record["diverged"].get(name, 0)) else "")
         for name, error in record["test"].items()
     ]
-    parts += [f"GRU {record['peer']:.3f}"] if record["peer"] is not None else []
+    parts += [f"GRU {record['peer']:.3f}"] if "peer" in record else []
     return f"{record['seconds']:.0f} s: " + ", ".join(parts)
 
 
 def summary(records: list[dict[str, Any]]) -> str:
-    """The means over the draws."""
-    own = np.array([record["test"][record["selected"]] for record in records])
-    best = np.array([record["best"] for record in records])
-    lost = sum(record["diverged"][record["selected"]] > 0 for record in records)
-    names = [record["selected"] for record in records]
-    out = [
-        f"{len(records)} fits; selected: "
-        + ", ".join(f"{name} {names.count(name)}" for name in dict.fromkeys(names)),
-        f"test error selected {own.mean():.4f}, best in hindsight {best.mean():.4f}"
-        f" ({100 * (own.mean() / best.mean() - 1):+.1f} %); on average of the draws"
-        f" {100 * (own / best - 1).mean():+.1f} %; selected models that diverged: {lost}",
-    ]
-    if records[0]["peer"] is not None:
-        peer = np.array([record["peer"] for record in records])
-        out.append(f"GRU {peer.mean():.4f}; selected no worse in {int((own <= peer).sum())}")
+    """Ratios of errors to that of the mean: geometric means over the draws."""
+    mean = np.array([record["test"]["mean"] for record in records])
+    out = [f"{len(records)} fits; mean {mean.mean():.3f}; error of others in that of the mean:"]
+    names = [name for name in records[0]["test"] if name != "mean"]
+    columns = {name: [r["test"].get(name, np.nan) for r in records] for name in names}
+    if "peer" in records[0]:
+        columns["GRU"] = [record["peer"] for record in records]
+    for name, errors in columns.items():
+        ratio = np.log(np.array(errors) / mean)
+        spread = np.nanstd(ratio) / np.sqrt(len(ratio))
+        better = int((mean <= np.array(errors)).sum())
+        out.append(
+            f"  {name:40} {np.exp(np.nanmean(ratio)):.3f} +- {spread:.3f}; the mean is no worse in"
+            f" {better}"
+        )
     return "\n".join(out)
 
 
@@ -294,6 +351,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, nargs="+", default=[5.0])
     parser.add_argument("--vessels", nargs="+", help="of the source; all of it otherwise")
     parser.add_argument("--effort", type=float, default=1.0, help="of the recipe's networks")
+    parser.add_argument("--without", nargs="+", default=[], choices=list(PARTS))
     parser.add_argument("--peer", action="store_true", help="train a plain GRU beside")
     parser.add_argument("--records", type=Path, help="file for one line of JSON for each fit")
     given = parser.parse_args()
@@ -306,7 +364,7 @@ def main() -> None:
         minutes = given.minutes[number // len(names) % len(given.minutes)]
         random = np.random.default_rng([given.seed, number])
         logs = source(name, 60.0 * minutes / STRETCHES, given.seed + number // 2, random)
-        records.append(judged(split(logs), given.effort, given.peer))
+        records.append(judged(split(logs), given.effort, given.peer, given.without))
         print(f"{name}, {minutes:g} min, draw {number}, {line(records[-1])}", flush=True)
         if given.records is not None:
             with given.records.open("a", encoding="utf-8") as file:

@@ -361,9 +361,10 @@ def export(
         typer.Option(
             "--model",
             metavar="NAME",
-            help="Name of the model; 'selected' for the one chosen on validation data.",
+            help="Name of the model; 'selected' for the single one chosen on validation data; the"
+            " one that is reported first where not given.",
         ),
-    ] = "selected",
+    ] = "predictor",
     file_format: Annotated[
         str,
         typer.Option("--format", metavar="FORMAT", help="One of `residnet list formats`."),

@@ -42,10 +42,10 @@ def test_the_tutorial_ends_with_the_numbers_that_it_prints(tmp_path: Path) -> No
     assert (tmp_path / "runs" / "boat" / "report.html").is_file()
     assert len(re.findall("# guess", (tmp_path / "boat.yaml").read_text())) == 2
     metrics = json.loads((tmp_path / "runs" / "boat" / "metrics.json").read_text())
-    assert metrics["selected"] == "hull_network"
+    assert metrics["predictor"] == "mean"
     assert all(row["diverged"] == 0 for row in metrics["rows"])
     printed = re.findall(r"^\| (\w+) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", text, re.M)
-    assert [name for name, *_ in printed] == ["zero", "baseline", "hull", "hull_network"]
+    assert [name for name, *_ in printed] == ["zero", "baseline", "hull", "mean"]
     for name, *numbers in printed:
         row = next(
             row

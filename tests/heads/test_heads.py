@@ -90,6 +90,8 @@ def test_rows_do_not_see_each_other(kind: str) -> None:
 
 def test_scriptable_with_the_same_answers(kind: str) -> None:
     head = ready(kind).float()
+    if head.refusal:
+        pytest.skip(f"{kind}: {head.refusal}")
     compiled = torch.jit.script(head)
     z = typical().float()
     a = b = torch.zeros(4, head.n_state)
@@ -160,6 +162,7 @@ def test_a_stored_model_is_the_same_to_the_last_bit(kind: str, tmp_path: Path) -
     spec = spec_of(KINDS[kind]())
     model = spec.build()
     model.head = ready(kind)
+    model.head.set_step(model.dt)
     with torch.no_grad():
         model.baseline.theta.copy_(torch.randn(3, 5, dtype=torch.float64) * 0.1)  # type: ignore[operator, union-attr]
     save_model(tmp_path / "mine", spec, model)
@@ -181,6 +184,7 @@ def test_a_model_stored_in_single_precision_keeps_its_answers(kind: str, tmp_pat
     spec = spec_of(KINDS[kind]())
     model = spec.build()
     model.head = ready(kind)
+    model.head.set_step(model.dt)
     model.float()
     save_model(tmp_path / "mine", spec, model)
     _, again = load_model(tmp_path / "mine")

@@ -1,4 +1,4 @@
-"""The standard recipe: what it fits follows from logs, and what it chooses from folds of them."""
+"""The standard recipe: what it fits follows from logs, and its predictor is a mean."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from random_vessels import small_boat_logs
 
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate
-from residnet.core.errors import ConfigError
+from residnet.core.errors import ConfigError, FitError
 from residnet.core.frames import to_body
 from residnet.core.log import Log
 from residnet.data.prepare import samples
@@ -20,19 +20,17 @@ from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.zero import ZeroHead
 from residnet.identification.fit import Identified, fit
+from residnet.identification.fitter import Fitter
+from residnet.identification.models import NoStore
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.recipe import PARTS, Facts, portfolio
 from residnet.identification.settings import FitSettings
+from residnet.judge.freerun import Candidate, free_run
+from residnet.judge.protocol import all_windows
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import dissipates
 
-NAMES = (
-    "hull",
-    "hull_network",
-    "linear_network",
-    "network",
-    "hull_force",
-)
+NAMES = ("hull", "hull_network", "network", "mean")
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -88,23 +86,45 @@ def test_a_portfolio_stands_in_place_of_the_parts(identified: Identified) -> Non
 
 
 @pytest.mark.long
-def test_networks_are_kept_only_where_they_gain(identified: Identified) -> None:
-    gained, start = identified["hull_network"].notes, identified["hull"].notes
-    assert gained["validation"] <= start["validation"] + 1e-4
-
-
-@pytest.mark.long
-def test_the_selected_model_and_the_tied_ones_are_sound(
+def test_the_mean_is_reported_first_and_a_single_model_is_chosen_beside_it(
     identified: Identified, logs: PreparedSplits
 ) -> None:
     judged = {split: identified.evaluate(logs[split]) for split in ("train", "validation")}
     chosen = identified.select(judged)
-    single = [e for e in chosen.contenders if e.family not in ("zero", "ensemble")]
-    assert next(e for e in single if e.name == chosen.selected).sound
-    assert min((e for e in single if e.sound), key=lambda e: e.score).name in chosen.tied
-    if "tied" in identified:
-        assert identified["tied"].notes["members"] == list(chosen.tied)
-        assert chosen.selected_ensemble == "tied"
+    families = {entry.name: entry.family for entry in chosen.contenders}
+    assert chosen.predictor == chosen.selected_ensemble == "mean"
+    assert families[chosen.selected] != "ensemble"
+    assert families["network"] == families["hull_network"] == families["mean"] == "ensemble"
+    assert identified["mean"].notes["members"] == ["hull", "hull_network", "network"]
+
+
+@pytest.mark.long
+def test_the_mean_is_that_of_the_trajectories_of_its_members(
+    identified: Identified, logs: PreparedSplits
+) -> None:
+    """Free runs of each member by itself, averaged, against those of the one model of them all."""
+    config, step = settings().evaluation, 0.2
+    windows = all_windows(config.protocols["T8"], logs["test"], step, "T8")
+    members = ("hull", "hull_network", "network", "mean")
+    every = [Candidate(name, "", identified[name].model) for name in members]
+    found = free_run(every, windows, logs["test"], step, identified.limit)
+    beside = identified.evaluate(logs["test"]).runs[0].predictions["mean"]
+    for place, mean in enumerate(found["mean"]):
+        states = [found[name][place].states[:, 3:] for name in members[:3]]
+        np.testing.assert_allclose(mean.states[:, 3:], np.mean(states, axis=0), atol=1e-6)
+        np.testing.assert_allclose(mean.states, beside[place].states, atol=1e-6)
+
+
+@pytest.mark.long
+def test_members_that_run_away_are_left_out_of_the_mean(
+    identified: Identified, logs: PreparedSplits
+) -> None:
+    fitter = Fitter(logs, settings(), NoStore())
+    lost = replace(identified["network"], notes={"validation_diverged": 1})
+    members = [identified["hull"], identified["hull_network"], lost]
+    assert fitter.mean("mean", members).notes["members"] == ["hull", "hull_network"]
+    with pytest.raises(FitError, match="fewer than two"):
+        fitter.mean("mean", [identified["hull"], lost])
 
 
 def test_settings_say_the_recipe_and_nothing_of_its_parts() -> None:
@@ -113,7 +133,7 @@ def test_settings_say_the_recipe_and_nothing_of_its_parts() -> None:
     assert written["recipe"] == "standard"
     assert not set(PARTS) & set(written)
     assert validate(written, FitSettings, "again") == own
-    assert own.model_names == ("baseline", *NAMES, "tied")
+    assert own.model_names == ("baseline", *NAMES)
 
 
 @pytest.mark.parametrize(
@@ -136,8 +156,7 @@ def test_terms_follow_from_what_moves() -> None:
     whole = replace(Facts.supposed(names), samples=20_000)
     hull = portfolio(whole)["baselines"]["hull"]["terms"]
     assert {"u|u|", "n|n|", "|n| u", "n|n| delta", "wind_u wind_mag"} <= set(hull)
-    full = portfolio(whole)["baselines"]["full_hull"]["terms"]
-    assert set(hull) | {"u^2 v", "n r", "wind_mag r", "n|n| delta|delta|"} <= set(full)
+    assert {"u^2 v", "n r", "wind_mag r", "n|n| delta|delta|"} <= set(hull)
     assert "n^2" not in hull
     astern = replace(whole, astern=("n",), moving=("n", "delta"))
     hull = portfolio(astern)["baselines"]["hull"]["terms"]
@@ -157,7 +176,7 @@ def test_short_logs_give_each_axis_the_terms_that_a_symmetric_vessel_has() -> No
     rows = portfolio(Facts.supposed(paired))["baselines"]["hull"]["terms"]
     assert {"left", "right|right|", "|left| u"} <= set(rows["r"])
     assert "u|u|" not in rows["r"]
-    assert portfolio(Facts.supposed(paired))["heads"]["network"]["mirror"]
+    assert portfolio(Facts.supposed(paired))["training"]["network"]["mirror"]
 
 
 def test_the_models_of_the_recipe_cannot_run_away() -> None:

@@ -40,7 +40,7 @@ def test_one_column_per_number() -> None:
 
 def test_the_file_marks_the_selected_model_and_leaves_the_rows_as_they_are() -> None:
     rows = [row("a", 1.0), row("b", 0.5)]
-    content = metrics_content("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", rows)
+    content = metrics_content("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", "c", rows)
     assert content["schema"] == "residnet.metrics/1"
     assert (content["selected"], content["selected_ensemble"]) == ("b", "c")
     assert [entry["selected"] for entry in content["rows"]] == [False, True]

@@ -11,6 +11,7 @@ from torch import Tensor
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.core.registry import kinds
 from residnet.core.samples import Samples
+from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Loaded
@@ -27,9 +28,17 @@ FEATURES = ("u", "v", "r", "tau_x", "tau_n", "wind_u", "wind_v", "wind_mag")
 LOW, HIGH = (-0.5, -0.6, -0.4, -10.0, -12.0, 0.0, -3.0), (3.0, 0.6, 0.4, 30.0, 32.0, 9.0, 3.0)
 KINDS: dict[str, type[Any]] = kinds(HeadConfig)
 # smaller than the defaults, for the sake of time
-SIZES: dict[str, dict[str, Any]] = {"mlp": {"hidden": (8,)}, "lstm": {"hidden_size": 6}}
+SIZES: dict[str, dict[str, Any]] = {
+    "mlp": {"hidden": (8,)},
+    "lstm": {"hidden_size": 6},
+    "recurrent": {"hidden_size": 6},
+}
 VARIANTS: dict[str, dict[str, Any]] = {
-    **{kind: {"kind": kind, "features": FEATURES, **SIZES.get(kind, {})} for kind in KINDS},
+    **{
+        kind: {"kind": kind, "features": FEATURES, **SIZES.get(kind, {})}
+        for kind in KINDS
+        if kind != "sklearn"
+    },
     "mlp_mirror": {"kind": "mlp", "hidden": (8,), "mirror": True},
     "lstm_mirror": {
         "kind": "lstm",
@@ -38,6 +47,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "memory": ("tau_x", "tau_n"),
         "mirror": True,
     },
+    "recurrent_members": {"kind": "recurrent", "members": 3, "hidden_size": 4, "step": 0.4},
+    "mean": {},
     "lstm_per_axis": {"kind": "lstm", "hidden_size": 4, "per_axis": True, "activation": "softsign"},
 }
 
@@ -86,10 +97,19 @@ def fill(model: HybridDynamics, seed: int = 0) -> None:
 
 def built(variant: str) -> tuple[ModelSpec, HybridDynamics]:
     torch.manual_seed(0)
+    if variant == "mean":
+        parts = [built(member) for member in ("plsr", "lstm", "recurrent_members")]
+        members = tuple(
+            spec.model_copy(update={"name": f"member_{i}"}) for i, (spec, _) in enumerate(parts)
+        )
+        spec = spec_of(None, role="ensemble", baseline={"kind": "still"})
+        spec = spec.model_copy(update={"members": members, "of": "trajectories"})
+        single = [m.members[0] if isinstance(m, MeanOfTrajectories) else m for _, m in parts]
+        return spec, spec.mean(single)
     spec = spec_of(VARIANTS[variant])
-    model = spec.build()
+    model = spec.single()
     fill(model)
-    return spec, model
+    return spec, spec.as_one(model)
 
 
 class AsTensors:

@@ -250,9 +250,14 @@ class Models(Mapping[str, Model]):
         """Name of the simplest sound model that validation does not tell from the best."""
         return self.selection.selected
 
+    @property
+    def predictor(self) -> str:
+        """Name of the model that is reported first: the recipe's mean, else the selected one."""
+        return self.selection.predictor
+
     @cached_property
     def verdict(self) -> list[str]:
-        """The verdict on the selected model in whole sentences, the most important first.
+        """The verdict on the predictor in whole sentences, the most important first.
 
         It speaks of the test logs where they are judged, else of the validation logs.
         """
@@ -264,7 +269,7 @@ class Models(Mapping[str, Model]):
             if (row["protocol"], row["manoeuvre"]) == (protocol, "all")
         }
         selection, limits = self.selection.content(), judged.limits.get(protocol, {})
-        return verdict(Evidence(self.selected, split, whole, "baseline", selection, limits))
+        return verdict(Evidence(self.predictor, split, whole, "baseline", selection, limits))
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -325,7 +330,7 @@ def fit(
             under `if __name__ == "__main__":`, since each process imports it again.
         progress: is told what is being fitted, and how far it is.
         settings: further keys of a fit, as YAML has them: recipe, effort, base_of, forces,
-            ensembles, gates, training, refit, current, bands, seed, and integrator, which is
+            ensembles, means, training, refit, current, bands, seed, and integrator, which is
             `semi_implicit_euler` for the recipe where it is not given.
 
     Raises:

@@ -229,7 +229,8 @@ def load(folder: PathGiven, name: str | None = None) -> Model:
 
     Args:
         folder: of a model, or of a finished run.
-        name: of the model in the run; `selected` is the one that validation data chose.
+        name: of the model in the run; `selected` is the single one that validation data chose;
+            where not given, the one that is reported first.
 
     Raises:
         UsageError: where there is no such model.
@@ -239,7 +240,7 @@ def load(folder: PathGiven, name: str | None = None) -> Model:
     """
     place = path(folder, "load")
     if name is not None or (not (place / "model.json").is_file() and (place / "models").is_dir()):
-        place = place / "models" / chosen_model(place, name or "selected")
+        place = place / "models" / chosen_model(place, name or "predictor")
     require_sealed(place)
     spec, module = load_model(place)
     # outside of a run there are neither notes nor bands

@@ -269,8 +269,8 @@ class Result:
                 f"{file}: not readable ({error}); restore it or run it again"
             ) from error
 
-    def model(self, name: str = "selected") -> Model:
-        """Return a model of a fit.
+    def model(self, name: str = "predictor") -> Model:
+        """Return a model of a fit, the one that is reported first where none is named.
 
         Raises:
             UsageError: where the run has no such model.

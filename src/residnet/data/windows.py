@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -85,6 +85,41 @@ class WindowStore:
             torch.from_numpy(reach),
             torch.from_numpy(depth),
             torch.from_numpy(np.repeat(np.arange(len(logs)), lengths)),
+        )
+
+    def coarse(self, steps: int, turning: Sequence[int] = ()) -> WindowStore:
+        """Return the same logs in steps so many times as long: once for each sample to begin with.
+
+        States are sampled; inputs over a long step are the mean of those over its short ones.
+
+        Args:
+            steps: short ones in a long one.
+            turning: columns of w that are angles, whose means keep to the circle.
+        """
+        if steps == 1:
+            return self
+        order = torch.cat([torch.arange(k, len(self.y), steps) for k in range(steps)])
+
+        def averaged(values: Tensor) -> Tensor:
+            # the last samples of all have no step behind them
+            padded = torch.cat((values, values[-1:].expand(steps - 1, -1)))
+            blocks = padded.unfold(0, steps, 1)
+            apart = blocks - blocks[..., :1]
+            for column in turning:
+                apart[:, column] = torch.remainder(apart[:, column] + torch.pi, 2 * torch.pi)
+                apart[:, column] -= torch.pi
+            return (blocks[..., 0] + apart.mean(-1))[order]
+
+        rest = {part.name: getattr(self, part.name)[order] for part in fields(self)}
+        return replace(
+            self,
+            **rest
+            | {
+                "w": averaged(self.w),
+                "recorded": averaged(self.recorded),
+                "reach": (self.reach[order] + steps - 1) // steps,
+                "depth": self.depth[order] // steps,
+            },
         )
 
     def to(self, device: torch.device) -> WindowStore:

@@ -64,7 +64,8 @@ class Dynamics(nn.Module, ABC):
     def kinematics(self, x: Tensor) -> Tensor:
         """Return the derivative of the pose [B, 3] of states [B, nx] (document 003 eq. (1))."""
         if not self.positions:
-            return nn.functional.pad(yaw_rate(x).unsqueeze(-1), [2, 0])
+            still = torch.zeros_like(yaw_rate(x))
+            return torch.stack((still, still, yaw_rate(x)), dim=-1)
         north, east = to_earth(surge(x), sway(x), heading(x))
         return torch.stack((north, east, yaw_rate(x)), dim=-1)
 

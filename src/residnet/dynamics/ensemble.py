@@ -1,7 +1,7 @@
-"""Several models as one: the mean of models, and one model with many sets of parameters.
+"""Several models as one: means of models, and one model with many sets of parameters.
 
-Accelerations are averaged inside one free run, so that it steps, warms up and exports like any
-other.
+`mean_of` averages accelerations inside one free run. `MeanOfTrajectories` lets each member run on
+velocities of its own and averages these. Either steps, warms up and exports like any other model.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
-from residnet.core.layout import zero_acceleration
+from residnet.baselines.given import StillConfig
+from residnet.core.layout import PLANAR, pose, velocities, zero_acceleration
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.hybrid import FARTHEST, HybridDynamics
 from residnet.heads.base import ResidualHead
+from residnet.heads.zero import ZeroHead
 
 
 @final
@@ -73,19 +75,9 @@ class MeanHead(ResidualHead):
         residuals, memory = self._each(z, s)
         return residuals.mean(dim=0), memory
 
-    def with_spread(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return mean and standard deviation of the members' residuals [B, 3], and the memory."""
-        residuals, memory = self._each(z, s)
-        mean, deviation = _agreement(residuals)
-        return mean, deviation, memory
-
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, 3] along channels [B, T, nz], from an empty memory."""
         return self._sequences(z).mean(dim=0)
-
-    def sequence_with_spread(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation of the members' residuals [B, T, 3] along z."""
-        return _agreement(self._sequences(z))
 
     def warms_by_steps(self) -> bool:
         """Return whether all members do."""
@@ -108,13 +100,6 @@ class MeanHead(ResidualHead):
         return _parameters(self.members)
 
 
-def _agreement(residuals: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation [..., 3] of members' residuals [K, ..., 3]."""
-    mean = residuals.mean(dim=0)
-    # the root has no slope at zero
-    return mean, torch.sqrt((residuals - mean).square().mean(dim=0) + 1e-18)
-
-
 def _parameters(members: nn.ModuleList) -> list[float]:
     counts = [member.parameter_count() for member in members]  # type: ignore[operator]
     return [sum(axis) for axis in zip(*counts, strict=True)]
@@ -126,6 +111,138 @@ def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
     baselines = [member.head.effective_baseline(member.baseline) for member in members]
     head = MeanHead([member.head for member in members])
     return HybridDynamics(first.signals, MeanBaseline(baselines), head, first.dt, first.integrator)
+
+
+_DOF = PLANAR.dof
+_KNOWN = 1 + _DOF
+"""Entries of a mean's memory before those of its members: whether there is a prediction, and it."""
+_TOLD = 1e-3
+"""Share of a velocity's training range by which a measurement differs from a prediction.
+
+Accelerations change velocities by more in a step, and no rounding of float32 by as much.
+"""
+
+
+@final
+class MeanOfTrajectories(HybridDynamics):
+    """The mean of what several models predict, each on velocities of its own.
+
+    The memory holds what the mean predicted, and for every member how far its own velocities lie
+    from that, with the member's memory. Where the next state is what was predicted, each member
+    goes on from where it was; where it is measured instead, all of them start from it. In between
+    the distances fade with the square of the ratio of what was missed to a small velocity, so that
+    a step has derivatives. Members share the heading and the position that follow from the mean.
+
+    Args:
+        members: with the same signals and step. Each weighs the same, whatever its copies.
+        low: least u, v, r of the training data [3].
+        high: their largest [3].
+    """
+
+    def __init__(
+        self, members: Sequence[HybridDynamics], low: Sequence[float], high: Sequence[float]
+    ) -> None:
+        first = members[0]
+        super().__init__(
+            first.signals,
+            StillConfig().build(first.signals.names),
+            ZeroHead(),
+            first.dt,
+            first.integrator,
+        )
+        self.members: Sequence[HybridDynamics] = nn.ModuleList(members)  # type: ignore[assignment]
+        for member in self.members:
+            # the pose follows from the mean
+            member.positions = False
+        self.copies = [member.head.copies for member in members]
+        self.widths = [_DOF + member.n_state for member in members]
+        self.n_state = _KNOWN + sum(
+            copies * width for copies, width in zip(self.copies, self.widths, strict=True)
+        )
+        small = [_TOLD * max(b - a, 1e-6) for a, b in zip(low, high, strict=True)]
+        self.register_buffer("small", torch.tensor(small, dtype=torch.float64), persistent=False)
+        self.small: Tensor
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state and the memory one step of dt later."""
+        nu, rows = velocities(x), x.shape[0]
+        missed = (nu - s[:, 1:4]) / self.small.to(x.dtype)
+        kept = s[:, :1] / (1.0 + missed.square().sum(dim=-1, keepdim=True))
+        total = torch.zeros_like(nu)
+        own: list[Tensor] = []
+        memory: list[Tensor] = []
+        begin = 4
+        for i, member in enumerate(self.members):
+            copies, width = self.copies[i], self.widths[i]
+            part = s[:, begin : begin + copies * width].reshape(rows, copies, width)
+            begin += copies * width
+            part = part.transpose(0, 1)
+            moved = nu + kept * part[..., :3]
+            at = torch.cat((pose(x).expand(copies, rows, 3), moved), dim=-1)
+            after, kept_memory = member.step(
+                at.reshape(copies * rows, -1),
+                w.expand(copies, rows, w.shape[-1]).reshape(copies * rows, -1),
+                part[..., 3:].reshape(copies * rows, width - 3),
+            )
+            reached = velocities(after).reshape(copies, rows, 3)
+            total = total + reached.mean(dim=0)
+            own.append(reached)
+            memory.append(kept_memory.reshape(copies, rows, width - 3))
+        mean = total / len(self.widths)
+        parts = [torch.ones_like(s[:, :1]), mean]
+        for i in range(len(own)):
+            both = torch.cat((own[i] - mean, memory[i]), dim=-1)
+            parts.append(both.transpose(0, 1).reshape(rows, self.copies[i] * self.widths[i]))
+        # the pose moves with the mean of the velocities at both ends
+        half = 0.5 * (nu + mean)
+        turned = pose(x) + self.dt * self.kinematics(torch.cat((pose(x), half), dim=-1))
+        middle = torch.cat((pose(x)[:, :2], 0.5 * (pose(x) + turned)[:, 2:], half), dim=-1)
+        moved_pose = pose(x) + self.dt * self.kinematics(middle)
+        return torch.cat((moved_pose, mean), dim=-1), torch.cat(parts, dim=-1)
+
+    def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
+        """Return the memory [B, n_state] that a measured past leaves: that of steps along it.
+
+        Args:
+            y_history: measured states [B, T, 6], oldest first; T may be 0.
+            w_history: inputs held over the step that follows each of them [B, T, m].
+        """
+        s = y_history.new_zeros((y_history.shape[0], self.n_state))
+        # nothing is trained through the mean, and a long past would keep all of its steps
+        with torch.no_grad():
+            for k in range(y_history.shape[1]):
+                s = self.step(y_history[:, k], w_history[:, k], s)[1]
+        return s
+
+    def known(self, z: Tensor) -> Tensor:
+        """Return the baselines' mean acceleration [..., 3] at channels z [..., nz]."""
+        total = zero_acceleration(z)
+        for member in self.members:
+            total = total + member.baseline(z)
+        return total / len(self.widths)
+
+    def one_step(self, z: Tensor) -> Tensor:
+        """Return the members' mean nu_dot [B, T, 3] along measured channels [B, T, nz]."""
+        total = zero_acceleration(z)
+        for member in self.members:
+            total = total + member.one_step(z)
+        return total / len(self.widths)
+
+    def acceleration(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
+        """Return the mean change of the velocities [B, 3] over a step, by its length."""
+        return (velocities(self.step(x, w, s)[0]) - velocities(x)) / self.dt
+
+    def memory_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and largest memory [n_state]."""
+        limit = torch.full((_KNOWN,), FARTHEST, dtype=torch.float64)
+        limit[0] = 1.0
+        low, high = [torch.cat((0.0 * limit[:1], -limit[1:]))], [limit]
+        for copies, member in zip(self.copies, self.members, strict=True):
+            least, most = member.memory_range()
+            apart = torch.full((_DOF,), FARTHEST, dtype=torch.float64)
+            low.append(torch.cat((-apart, least.double())).repeat(copies))
+            high.append(torch.cat((apart, most.double())).repeat(copies))
+        return torch.cat(low), torch.cat(high)
 
 
 @final

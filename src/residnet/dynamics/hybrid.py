@@ -26,7 +26,9 @@ from residnet.physics.signals import Signals
 
 SIZE = 7
 """Entries of the memory: whether there is a prediction, the predicted u, v, r, the estimate."""
-_FARTHEST = 100.0
+_PIECE = 20.0
+"""Length in s of pieces of a measurement that run side by side, and of the past of each."""
+FARTHEST = 100.0
 """Largest velocity or acceleration that a memory may hold, SI."""
 
 
@@ -53,10 +55,12 @@ class Disturbance(nn.Module):
     Args:
         config: time constants.
         dt: step in s.
+        body: keep it in body axes, where it is forgotten before the vessel has turned.
     """
 
-    def __init__(self, config: DisturbanceConfig, dt: float) -> None:
+    def __init__(self, config: DisturbanceConfig, dt: float, *, body: bool = False) -> None:
         super().__init__()
+        self.body = body
         self.gain = (1.0 - math.exp(-dt / config.settle)) / dt
         self.keep = 1.0 if config.decay is None else math.exp(-dt / config.decay)
 
@@ -67,10 +71,14 @@ class Disturbance(nn.Module):
             x: states at the step's start, measured or predicted [B, nx].
             s: memory of the step before [B, 7].
         """
-        left = (velocities(x) - s[:, 1:4]) * s[:, :1]
+        known, predicted, before = s.split([1, 3, 3], dim=-1)
+        left = (velocities(x) - predicted) * known
+        if self.body:
+            estimate = self.keep * before + self.gain * left
+            return estimate, estimate
         north, east = to_earth(left[:, 0], left[:, 1], heading(x))
         seen = torch.stack((north, east, left[:, 2]), dim=-1)
-        estimate = self.keep * s[:, 4:7] + self.gain * seen
+        estimate = self.keep * before + self.gain * seen
         ahead, across = to_body(estimate[:, 0], estimate[:, 1], heading(x))
         return torch.stack((ahead, across, estimate[:, 2]), dim=-1), estimate
 
@@ -81,18 +89,18 @@ class Disturbance(nn.Module):
 
 def memory_range() -> tuple[Tensor, Tensor]:
     """Return the least and largest memory [7]."""
-    most = torch.full((SIZE,), _FARTHEST, dtype=torch.float64)
+    most = torch.full((SIZE,), FARTHEST, dtype=torch.float64)
     most[0] = 1.0
     least = -most
     least[0] = 0.0
     return least, most
 
 
-@final
 class HybridDynamics(Dynamics):
     """A hybrid model with the state x [B, 6] = (x, y, psi, u, v, r).
 
-    The head is evaluated once per step and held over the integrator's stages.
+    The head is evaluated once per step and held over the integrator's stages. A head with a
+    `settle` time is shown the estimate of what was predicted wrong, in place of adding it.
     """
 
     def __init__(
@@ -108,6 +116,12 @@ class HybridDynamics(Dynamics):
         self.signals = signals
         self.baseline = baseline
         self.head = head
+        head.set_step(dt)
+        self.shown = head.settle > 0.0
+        if self.shown:
+            # a low-pass: what settles is forgotten as quickly
+            low_pass = DisturbanceConfig(settle=head.settle, decay=head.settle)
+            disturbance = Disturbance(low_pass, dt, body=True)
         self.disturbance = disturbance
         self.width = head.n_state
         self.n_state = head.n_state + (0 if disturbance is None else SIZE)
@@ -137,9 +151,10 @@ class HybridDynamics(Dynamics):
         if self.disturbance is None:
             rho, s = self.head(z, s)
             return self.advanced(x, z, p, rho), s
-        rho, own = self.head(z, s[:, : self.width])
         unknown, estimate = self.disturbance(x, s[:, self.width :])
-        after = self.advanced(x, z, p, rho + unknown)
+        seen = torch.cat((z, unknown), dim=-1) if self.shown else z
+        rho, own = self.head(seen, s[:, : self.width])
+        after = self.advanced(x, z, p, rho if self.shown else rho + unknown)
         return after, torch.cat((own, self.disturbance.remembered(after, estimate)), dim=-1)
 
     def advanced(self, x: Tensor, z: Tensor, p: Tensor, rho: Tensor) -> Tensor:
@@ -165,13 +180,61 @@ class HybridDynamics(Dynamics):
         psi = heading(x) + self.dt * (nu[..., -1] if self.semi_implicit else turned)
         return torch.cat((position(x), psi.unsqueeze(-1), nu), dim=-1)
 
+    def known(self, z: Tensor) -> Tensor:
+        """Return what the baseline says at channels z [..., nz], accelerations [..., 3]."""
+        found: Tensor = self.baseline(z)
+        return found
+
     def one_step(self, z: Tensor) -> Tensor:
         """Return nu_dot [B, T, 3] along measured channels [B, T, nz] (teacher forcing).
 
         The head's memory is empty at first.
         """
-        known, rho = self.baseline(z), self.head.sequence(z)
+        known = self.baseline(z)
+        if self.shown:
+            return self._observed(z, known)
+        rho = self.head.sequence(z)
         return self.head.accelerations(known, rho)
+
+    def _observed(self, z: Tensor, known: Tensor) -> Tensor:
+        """Return nu_dot [B, T, 3] where the head is shown what was predicted wrong.
+
+        Long measurements are cut into pieces that run side by side, each behind as long a past.
+        """
+        rows, steps, copies = z.shape[0], z.shape[1], self.head.copies
+        piece = max(round(_PIECE / self.dt), 1)
+        first = torch.arange(-piece, steps, piece)
+        at = first[:-1, None] if len(first) > 1 else first[:, None]
+        place = at + torch.arange(2 * piece)
+        inside = ((place >= 0) & (place < steps)).to(z.dtype)
+        place = place.clamp(0, steps - 1)
+        z, known = (part[:, place].repeat(copies, 1, 1, 1).flatten(0, 1) for part in (z, known))
+        inside = inside.repeat(copies * rows, 1)
+        x = torch.cat((torch.zeros_like(z[..., :3]), z[..., :3]), dim=-1)
+        s, out = z.new_zeros((len(z), self.n_state)), []
+        assert self.disturbance is not None
+        for k in range(2 * piece):
+            unknown, estimate = self.disturbance(x[:, k], s[:, self.width :])
+            rho, own = self.head(torch.cat((z[:, k], unknown), dim=-1), s[:, : self.width])
+            nu_dot = self.head.accelerations(known[:, k], rho)
+            after = torch.cat((x[:, k, :3], x[:, k, 3:] + self.dt * nu_dot), dim=-1)
+            s = torch.cat((own, self.disturbance.remembered(after, estimate)), dim=-1)
+            s = s * inside[:, k, None]
+            out.append(nu_dot)
+        each = torch.stack(out[piece:], dim=1).reshape(copies, rows, -1, 3)
+        return each.mean(0)[:, :steps]
+
+    def acceleration(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
+        """Return nu_dot [B, 3] of baseline and head at states x [B, 6], inputs w and memory s."""
+        z = self.channels(x, w)
+        if self.shown:
+            assert self.disturbance is not None
+            unknown, _ = self.disturbance(x, s[:, self.width :])
+            rho, _ = self.head(torch.cat((z, unknown), dim=-1), s[:, : self.width])
+        else:
+            rho, _ = self.head(z, s[:, : self.width])
+        found: Tensor = self.head.accelerations(self.baseline(z), rho)
+        return found
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
         """Return the memory [B, n_state] that a measured past leaves.

@@ -20,11 +20,11 @@ from residnet.baselines import BaselineConfig
 from residnet.core.config import Config, validate
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json, whole
+from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.names import VELOCITY, nearest
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
-from residnet.dynamics.ensemble import mean_of
-from residnet.dynamics.gate import GatedHead
+from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.heads import HeadConfig
 from residnet.heads.zero import ZeroHead
@@ -107,9 +107,9 @@ class ModelSpec(Stored):
         high: their largest.
         band: how far free runs may be off; None where none was calibrated.
         disturbance: unknown force that is estimated from the measured past; None for none.
-        members: of an ensemble, whose accelerations are averaged; its own baseline and head are
-            then empty.
-        gated: the residual fades outside the training range.
+        members: of an ensemble; its own baseline and head are then empty.
+        of: what an ensemble averages: accelerations within one free run, or the trajectories of
+            members that run by themselves.
     """
 
     schema_name: Literal["residnet.model/1"] = Field(default="residnet.model/1", alias="schema")
@@ -127,16 +127,24 @@ class ModelSpec(Stored):
     band: BandTable | None = None
     disturbance: DisturbanceConfig | None = None
     members: tuple[ModelSpec, ...] = ()
-    gated: bool = False
+    of: Literal["accelerations", "trajectories"] = "accelerations"
 
     def build(self) -> HybridDynamics:
         """Return the model with its numbers not yet filled in."""
-        model = self._ungated()
-        if self.gated:
-            model.head = GatedHead(model.head, model.signals.count)
-        return model
+        if self.of == "trajectories":
+            return self.mean([member.single() for member in self.members])
+        return self.as_one(self.single())
 
-    def _ungated(self) -> HybridDynamics:
+    def as_one(self, model: HybridDynamics) -> HybridDynamics:
+        """Return the model of `single`, with the mean of its networks' trajectories."""
+        return self.mean([model]) if model.head.copies > 1 else model
+
+    def mean(self, members: Sequence[HybridDynamics]) -> MeanOfTrajectories:
+        """Return the mean of the trajectories of single models as this one."""
+        return MeanOfTrajectories(members, self.low[RANGE_VELOCITIES], self.high[RANGE_VELOCITIES])
+
+    def single(self) -> HybridDynamics:
+        """Return the model in whose rows all networks of its head stand one after the other."""
         if self.members:
             return mean_of([member.build() for member in self.members])
         signals = self.signals.build()
@@ -318,7 +326,9 @@ def model_names(folder: Path) -> Sequence[str]:
 
 
 def chosen_model(run: Path, name: str) -> str:
-    """Return the name of a model in its run; `selected` is the one that validation chose.
+    """Return the name of a model in its run.
+
+    `selected` is the single model that validation chose, `predictor` the one reported first.
 
     Raises:
         UsageError: where there is no such folder or no such model in it.
@@ -329,12 +339,13 @@ def chosen_model(run: Path, name: str) -> str:
             f" CONFIG --out {run})"
         )
     names = model_names(run / "models")
-    if name != "selected" and name in names:
+    meant = name in ("selected", "predictor")
+    if not meant and name in names:
         return name
     metrics = run / "metrics.json"
-    selected = (
-        str(read_json(metrics).get("selected")) if name == "selected" and metrics.is_file() else ""
-    )
+    written = read_json(metrics) if meant and metrics.is_file() else {}
+    # runs of earlier versions name no predictor
+    selected = str(written.get(name, written.get("selected", "")))
     if selected not in names:
         raise UsageError(
             f"{run}: no model"

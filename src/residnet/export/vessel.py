@@ -26,6 +26,7 @@ from residnet.export import base
 from residnet.export.base import Exported, Loaded, Numbers, RoundingError
 from residnet.export.guard import GuardedDynamics
 from residnet.export.torchscript import require_shape, size
+from residnet.heads.base import ResidualHead
 
 PARITY_STEPS = 2000
 PAST = 50
@@ -180,6 +181,9 @@ class ExportedVessel(Exported):
     def __init__(
         self, spec: ModelSpec, model: HybridDynamics, metrics: Sequence[Mapping[str, Any]] = ()
     ) -> None:
+        for part in model.modules():
+            if isinstance(part, ResidualHead) and part.refusal:
+                raise ExportError(f"model {spec.name}: {part.refusal}; export another model")
         self.spec, self.metrics = spec, metrics
         self.model = copy.deepcopy(model).eval().requires_grad_(False)
         self.name, self.what, self.dt = spec.name, f"model {spec.name}", spec.dt
@@ -262,7 +266,6 @@ class ExportedVessel(Exported):
                 member.model_dump(mode="json", include={"name", "baseline", "head"})
                 for member in spec.members
             ],
-            "gated": spec.gated,
             "band": table,
             "metrics": [dict(row) for row in self.metrics],
             "versions": {"residnet": __version__, "torch": torch.__version__},

@@ -24,6 +24,8 @@ else:
                 "genetic": "residnet.heads.genetic:GeneticConfig",
                 "mlp": "residnet.heads.mlp:MlpConfig",
                 "lstm": "residnet.heads.lstm:LstmConfig",
+                "sklearn": "residnet.heads.scikit:SklearnConfig",
+                "recurrent": "residnet.heads.recurrent:RecurrentConfig",
             },
         ),
     ]

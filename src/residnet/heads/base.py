@@ -28,12 +28,25 @@ class ResidualHead(nn.Module, ABC):
 
     It is in m/s^2, m/s^2 and rad/s^2, on top of the baseline.
 
-    A memoryless head has n_state = 0. Every head is scriptable, however its parameters were found.
+    A memoryless head has n_state = 0. Every head is scriptable, however its parameters were found,
+    but those with a `refusal`.
+
+    Attributes:
+        copies: number of networks that it holds; rows are then those of one after the other.
+        settle: time in s over which it wants to know how wrong accelerations were predicted: three
+            channels more, behind the others; 0 for none.
+        refusal: why no format of export can hold it; empty where they can.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.n_state = 0
+        self.copies = 1
+        self.settle = 0.0
+        self.refusal = ""
+
+    def set_step(self, dt: float) -> None:
+        """Take the step of the model in s; most heads need none."""
 
     @abstractmethod
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -48,19 +61,6 @@ class ResidualHead(nn.Module, ABC):
         In other words, teacher forcing.
         """
         return self.forward(z, z[..., :0])[0]
-
-    def with_spread(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return residual [B, 3], how far members of this head disagree [B, 3], and the memory.
-
-        A head without members agrees with itself.
-        """
-        rho, s = self.forward(z, s)
-        return rho, torch.zeros_like(rho), s
-
-    def sequence_with_spread(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `sequence` does [B, T, 3], and how far members disagree [B, T, 3]."""
-        rho = self.sequence(z)
-        return rho, torch.zeros_like(rho)
 
     def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:
         """Return nu_dot [..., 3] from the baseline's `known` and this head's residual, [..., 3]."""

@@ -21,7 +21,7 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.fitter import residual_samples
-from residnet.identification.identified import Identified
+from residnet.identification.identified import Identified, members_of
 from residnet.identification.models import FittedModel, references
 from residnet.judge.band import (
     CHANNELS,
@@ -32,7 +32,7 @@ from residnet.judge.band import (
     quantile,
     run_weights,
 )
-from residnet.judge.bands import RunErrors, calibrate, few, run_errors
+from residnet.judge.bands import RunErrors, calibrate, few, run_errors, usual_spread
 from residnet.judge.freerun import Candidate, free_run
 from residnet.judge.protocol import Window
 from residnet.regression.estimator import Solution
@@ -198,6 +198,50 @@ def calibrate_bands(
     return {name: _banded(entry, out.get(name, {})) for name, entry in identified.items()}
 
 
+def borrowed_bands(
+    last: Identified, chosen: Identified, logs: Sequence[Prepared], config: BandsConfig
+) -> dict[str, FittedModel]:
+    """Return the models of a last fit with the bands of an earlier one that left logs out.
+
+    No log is left that networks and means were not fitted on. They take the band of the hull, which
+    a mean widens where its members lie farther apart than on the logs.
+
+    Args:
+        last: fit of all logs.
+        chosen: fit of the training logs alone, whose bands are calibrated.
+        logs: that show how far members usually lie apart.
+        config: starts of the runs.
+    """
+    best = max((one for one in chosen.values() if one.bands), key=_order, default=None)
+    out = {}
+    for name, entry in last.items():
+        own = chosen.get(name)
+        bands = {} if own is None else own.bands
+        if own is None and best is not None:
+            said = _BORROWED.format(best.name)
+            bands = {k: replace(b, cautions=(said, *b.cautions)) for k, b in best.bands.items()}
+            if members := members_of(entry):
+                models = {one: last[one].model for one in (*members, name)}
+                for k in bands:
+                    seen = _Calibration(last, k, config, {})
+                    seen.add(models, logs, validation=True)
+                    usual = usual_spread(seen.validated.get(name, []), bands[k].steps)
+                    bands[k] = replace(bands[k], usual=usual)
+        out[name] = _banded(entry, bands)
+    return out
+
+
+_BORROWED = (
+    "Short logs leave none that this model was not fitted on: its band is that of {} as it was"
+    " before the last fit."
+)
+
+
+def _order(entry: FittedModel) -> tuple[bool, int]:
+    """Return what puts the baseline with the most parameters last."""
+    return entry.spec.role == "baseline", round(sum(entry.model.baseline.parameter_count()))
+
+
 def _banded(entry: FittedModel, bands: Mapping[str, Band]) -> FittedModel:
     """Return a model with its bands; its description takes the one that reaches furthest."""
     if not bands:
@@ -245,7 +289,10 @@ class _Calibration:
         windows = self._windows(logs)[:: 1 if validation else self.every]
         if not windows or not models:
             return
-        candidates = [Candidate(name, "", model) for name, model in models.items()]
+        candidates = [
+            Candidate(name, "", model, members=members_of(self.identified[name]))
+            for name, model in models.items()
+        ]
         found = free_run(candidates, windows, logs, self.step, self.identified.limit)
         for name, predictions in found.items():
             runs = run_errors(windows, predictions, logs)
@@ -290,9 +337,10 @@ class _Calibration:
             band = calibrate(runs, self.config.level, self.step, unit)
             why = self.failed.get(entry.name, "")
             return replace(band, cautions=(*_alone(logs, why), *few(logs)))
-        other = known[reference]
+        single = known[reference]
+        other = replace(single, usual=usual_spread(runs, single.steps))
         ratio = _level(runs, other, self.config.level) / _level(
-            self.validated[reference], other, self.config.level
+            self.validated[reference], single, self.config.level
         )
         ratio = np.where(np.isfinite(ratio), ratio, 1.0)
         return replace(
@@ -309,7 +357,7 @@ def _level(runs: Sequence[RunErrors], band: Band, level: float) -> np.ndarray:
     """Return the quantile [5] of errors over the half widths of a band."""
     names = [run.log for run in runs]
     weight = run_weights(names)
-    ratios = [run.error / band.half_widths(run.states) for run in runs]
+    ratios = [run.error / run.within(band) for run in runs]
     inside = np.array([np.nanmean(ratio <= 1.0) for ratio in ratios])
     raised = corrected(level, independent(inside, weight, names, level))
     joined = np.concatenate(ratios)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from threading import Event, Thread
@@ -21,11 +22,11 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, restored
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
-from residnet.identification.bands import calibrate_bands
+from residnet.identification.bands import borrowed_bands, calibrate_bands
 from residnet.identification.fitter import Fitter
 from residnet.identification.identified import Identified
 from residnet.identification.models import FitStore, FittedModel, NoStore
-from residnet.identification.recipe import TIED
+from residnet.identification.recipe import LONG
 from residnet.identification.settings import FitSettings
 from residnet.training.config import TrainingConfig
 
@@ -46,14 +47,44 @@ def fit(logs: Logs, settings: FitSettings, *, store: FitStore | None = None) -> 
         FitError: where the data do not determine a part, or a training never ran freely.
         DataError: where a split holds no sample or no window.
     """
-    given, fitter = settings, Fitter(logs, settings, store or NoStore())
+    store = store or NoStore()
+    fitter = Fitter(logs, settings, store)
+    found = fitter.settings
+    if not final_fit(found, logs["train"]):
+        return _fitted(fitter, logs)
+    say("  first without the validation logs, which choose a single model")
+    nothing: dict[str, Any] = {"heads": {}, "base_of": {}, "means": {}, "training": {}}
+    fitter.settings = found.model_copy(update=nothing)
+    chosen = _fitted(fitter, logs)
+    say("  then with them: logs are short, and nothing is chosen any more")
+    whole = {**logs, "train": [*logs["train"], *logs["validation"]]}
+    without = found.model_copy(update={"bands": None})
+    last = _fitted(Fitter(whole, without, store, settle=False), whole)
+    if found.bands is not None:
+        last.models.update(borrowed_bands(last, chosen, logs["validation"], found.bands))
+        for model in last.values():
+            store.keep(model)
+    return replace(last, chosen=chosen)
+
+
+def final_fit(settings: FitSettings, train: Sequence[Prepared]) -> bool:
+    """Return whether the last fit uses the validation logs too: the recipe's does, of short logs.
+
+    A quarter of five minutes tells networks more than it tells a choice.
+    """
+    seconds = sum(len(log) for log in train) * settings.prepare.grid.step
+    return settings.recipe is not None and seconds < LONG
+
+
+def _fitted(fitter: Fitter, logs: Logs) -> Identified:
+    """Fit all parts on the training logs."""
     settings = fitter.settings
     models = {"zero": fitter.zero()}
     for name in settings.all_baselines:
         with _optional(settings, name):
             models[name] = fitter.baseline(name)
             say(f"  {name}: {_said(models[name])}")
-    _fit_heads(fitter, logs, given, models)
+    _fit_heads(fitter, logs, models)
     for name, force in settings.forces.items():
         if force.of in models:
             models[name] = fitter.with_force(name, models[force.of], force)
@@ -61,13 +92,11 @@ def fit(logs: Logs, settings: FitSettings, *, store: FitStore | None = None) -> 
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
         say(f"  {name}: {_said(models[name])}")
-    for name, gate in settings.gates.items():
-        if gate.of in models:
-            models[name] = fitter.gated(name, models[gate.of], gate)
+    for name, members in settings.means.items():
+        with _optional(settings, name):
+            models[name] = fitter.mean(name, [models[one] for one in members if one in models])
             say(f"  {name}: {_said(models[name])}")
     identified = Identified(settings, models, fitter.limit, fitter.train)
-    if settings.recipe is not None:
-        _add_tied(identified, fitter, logs)
     if settings.bands is not None:
         identified.models.update(calibrate_bands(identified, logs["validation"], settings.bands))
         for model in identified.values():
@@ -101,36 +130,12 @@ def _said(fitted: FittedModel) -> str:
     return f"validation free-run error {fitted.notes['validation']:.4f}{lost}"
 
 
-def _add_tied(identified: Identified, fitter: Fitter, logs: Logs) -> None:
-    """Add the mean of the models that validation data cannot tell from the best."""
-    judged = identified.evaluate_splits({split: logs[split] for split in ("train", "validation")})
-    chosen = identified.select(judged)
-    # a training that gained nothing ends where it began, and would count twice in a mean
-    errors = {e.name: e.scores.tobytes() for e in chosen.contenders}
-    first = {errors[name]: name for name in reversed(chosen.tied)}
-    # a mean of accelerations has no place for a force that one member estimates for itself
-    tied = [
-        name
-        for name in chosen.tied
-        if first[errors[name]] == name and identified.models[name].spec.disturbance is None
-    ]
-    if len(tied) < 2:
-        say(f"  {TIED}: no model is as good as the best; there is no mean")
-        return
-    model = fitter.ensemble(TIED, [identified.models[name] for name in tied])
-    identified.models[TIED] = model
-    identified.findings.update(identified.findings_of([model]))
-    say(f"  {TIED}: {_said(model)} (mean of {', '.join(tied)})")
-
-
-def _fit_heads(
-    fitter: Fitter, logs: Logs, given: FitSettings, models: dict[str, FittedModel]
-) -> None:
+def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> None:
     """Fit the heads whose baseline is there, long trainings in processes of their own."""
     settings, threads = fitter.settings, torch.get_num_threads()
     heads = [name for name in settings.heads if settings.baseline_name_of(name) in models]
     places = side_by_side(fitter)
-    begin = (dict(logs), given, fitter.store.training_folder, threads)
+    begin = (dict(logs), settings, fitter.store.training_folder, threads)
     with _heard() if places > 1 else nullcontext() as wire:
         pooled = processes(places, _begin, (*begin, wire)) if places > 1 else nullcontext()
         with pooled as pool:
@@ -213,7 +218,7 @@ def _begin(logs: Logs, settings: FitSettings, folder: Path | None, threads: int,
     def work(name: str, base: _Sent) -> _Sent:
         with listen(wire.put):
             if not made:
-                made.append(Fitter(logs, settings, _Trainings(folder)))
+                made.append(Fitter(logs, settings, _Trainings(folder), settle=False))
             return _sent(made[0].head(name, _opened(base)))
 
     _work = work

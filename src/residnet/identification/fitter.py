@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -20,19 +19,18 @@ from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.layout import VELOCITIES
 from residnet.core.names import VELOCITY
+from residnet.core.progress import say
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, samples
 from residnet.data.windows import WindowStore
-from residnet.dynamics.ensemble import mean_of
-from residnet.dynamics.gate import GatedHead
+from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
-from residnet.heads.base import ClosedFormHead, ResidualHead
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ClosedFormHead
 from residnet.identification.models import FitStore, FittedModel, NoStore
 from residnet.identification.prepared import PreparedSplits, velocity_limit
 from residnet.identification.recipe import Facts
-from residnet.identification.settings import FitSettings, ForceConfig, GateConfig
+from residnet.identification.settings import FitSettings, ForceConfig
 from residnet.judge.freerun import Candidate, Errors, free_run
 from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
 from residnet.regression.estimator import Coefficient, Solution
@@ -173,66 +171,6 @@ def _best_with_neighbours(
     return min((pair for pair in tried if pair[0].neighbours is not None), key=_score, default=None)
 
 
-_BOXES = (0.05, 0.15, 0.25)
-"""Quantiles at whose inner boxes fades are judged: what lies outside stands for the unseen."""
-_KEPT = 0.5
-"""Share of the best fade's gain on the baseline at which one that reaches farther is taken.
-
-Inner boxes are left at small distances. Outside all data the distances are larger, and a fade that
-loses little here loses more there.
-"""
-_LEAST = 1e-9
-
-
-def reach_in_free_runs(
-    model: HybridDynamics,
-    samples: Samples,
-    fades: Sequence[float],
-    validate: Callable[[HybridDynamics], Score],
-) -> dict[str, float]:
-    """Let each axis reach at least as far as free runs beyond inner boxes of the range allow.
-
-    Tried are the fades that the gate has, and for each of `fades` the same with no axis below it.
-    The last of these that keeps half of the best one's gain on the baseline is taken. Where none
-    gains, or where more free runs diverge than of the baseline, all axes fade at once.
-
-    Args:
-        model: with a gate whose fades are set; they are changed.
-        samples: of the logs that `validate` runs over.
-        fades: distances, in half widths of the range, at which half of the residual is left.
-        validate: returns how a model does in free runs.
-
-    Returns:
-        The mean error over the boxes of each fade, in that of the baseline; `inf` where more free
-        runs diverged.
-    """
-    assert isinstance(model.head, GatedHead)
-    own = model.head.fade.clone()
-    lengths = sorted(fades)
-    tried = [torch.full_like(own, lengths[0]), *(own.clamp(min=fade) for fade in lengths)]
-    boxes = [model.head.inner_box(samples.z, quantile) for quantile in _BOXES]
-    none = validate(_with(model, ZeroHead()))
-    error: list[float] = []
-    for i, fade in enumerate(tried):
-        if i > 1 and torch.equal(fade, tried[i - 1]):
-            error.append(error[-1])
-            continue
-        scores = [validate(_with(model, model.head.within(*box, fade))) for box in boxes]
-        sound = max(score.diverged for score in scores) <= none.diverged
-        mean = sum(score.error for score in scores) / len(scores)
-        error.append(mean / none.error if sound else math.inf)
-    best = 1.0 - min(error)
-    worth = [i for i, left in enumerate(error) if 1.0 - left >= _KEPT * best > 0]
-    model.head.fade.copy_(tried[worth[-1] if worth else 0])
-    names = ["at once", *(f"at least {fade:g}" for fade in lengths)]
-    return dict(zip(names, error, strict=True))
-
-
-def _with(model: HybridDynamics, head: ResidualHead) -> HybridDynamics:
-    """Return the model with another head."""
-    return HybridDynamics(model.signals, model.baseline, head, model.dt, model.integrator)
-
-
 def settled(settings: FitSettings, samples: Samples, logs: Sequence[Prepared]) -> FitSettings:
     """Return settings whose parts are those of the recipe for these logs.
 
@@ -256,10 +194,16 @@ class Fitter:
         logs: prepared logs by split; `train` and `validation` are used.
         settings: of the fit.
         store: keeps every model as it is done.
+        settle: whether the recipe's parts are yet to follow from the logs.
     """
 
     def __init__(
-        self, logs: Mapping[str, Sequence[Prepared]], settings: FitSettings, store: FitStore
+        self,
+        logs: Mapping[str, Sequence[Prepared]],
+        settings: FitSettings,
+        store: FitStore,
+        *,
+        settle: bool = True,
     ) -> None:
         self.store = store
         self.train = logs["train"]
@@ -268,7 +212,7 @@ class Fitter:
         self.limit = velocity_limit(self.low, self.high, settings.evaluation.divergence)
         self.samples = samples(self.train, self.signals)
         self.held_back = samples(logs["validation"], self.signals)
-        self.settings = settled(settings, self.samples, self.train)
+        self.settings = settled(settings, self.samples, self.train) if settle else settings
         self.scales = torch.from_numpy(settings.evaluation.scales.array())
         self.validate = ValidationScore(
             logs["validation"],
@@ -367,7 +311,7 @@ class Fitter:
         # seeded by the head's name, so that adding a head changes no other
         seed = self.settings.seed * 1_000 + sum(map(ord, name))
         torch.manual_seed(seed)
-        model = spec.build()
+        model = spec.single()
         model.baseline.load_state_dict(copy.deepcopy(baseline.model.baseline.state_dict()))
         residual = residual_samples(model, self.samples)
         started = time.perf_counter()
@@ -384,9 +328,9 @@ class Fitter:
         notes |= {
             "baseline": self.settings.baseline_name_of(name),
             "seconds": round(time.perf_counter() - started, 1),
-            **self._validated(model),
+            **self._validated(spec.as_one(model)),
         }
-        return self._kept(FittedModel(spec, model, notes))
+        return self._kept(FittedModel(spec, spec.as_one(model), notes))
 
     def with_force(self, name: str, base: FittedModel, config: ForceConfig) -> FittedModel:
         """Return a model with an unknown force, by the observer that validates best.
@@ -412,7 +356,7 @@ class Fitter:
         return self._kept(FittedModel(spec, model, notes))
 
     def ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
-        """Return the mean of fitted models as one model."""
+        """Return the mean acceleration of fitted models as one model."""
         spec = self.spec(name, "ensemble", StillConfig()).model_copy(
             update={"members": tuple(member.spec for member in members)}
         )
@@ -423,33 +367,29 @@ class Fitter:
         }
         return self._kept(FittedModel(spec, model, notes))
 
-    def gated(self, name: str, base: FittedModel, config: GateConfig) -> FittedModel:
-        """Return a model whose residual fades to its baseline outside the training range.
+    def mean(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
+        """Return the mean of what fitted models predict, each running by itself.
 
-        Args:
-            name: of the model.
-            base: fitted model with the residual.
-            config: fades to choose from.
+        Members that diverge on a validation window are left out.
+
+        Raises:
+            FitError: where less than two are left.
         """
-        spec = base.spec.model_copy(update={"name": name, "gated": True})
-        inner = copy.deepcopy(base.model).to(torch.float64)
-        model = HybridDynamics(
-            inner.signals,
-            inner.baseline,
-            GatedHead(inner.head, inner.signals.count),
-            inner.dt,
-            inner.integrator,
+        steady = [one for one in members if not one.notes.get("validation_diverged")]
+        left = [one.name for one in members if one not in steady]
+        if left:
+            say(f"  {name}: {', '.join(left)} diverged on validation logs and is left out")
+        if len(steady) < 2:
+            raise FitError("fewer than two of its members do not diverge on validation logs")
+        spec = self.spec(name, "ensemble", StillConfig()).model_copy(
+            update={"members": tuple(one.spec for one in steady), "of": "trajectories"}
         )
-        assert isinstance(model.head, GatedHead)
-        model.head.calibrate(self.samples)
-        left = model.head.learn_fade(residual_samples(model, self.held_back), config.fades)
-        reached = reach_in_free_runs(model, self.held_back, config.fades, self.validate)
+        parts = [copy.deepcopy(one.model).to(torch.float64) for one in steady]
+        single = [p.members[0] if isinstance(p, MeanOfTrajectories) else p for p in parts]
+        model = spec.mean(single)
         notes: dict[str, Any] = {
-            **{key: base.notes[key] for key in ("baseline", "members") if key in base.notes},
-            "of": base.name,
-            "fade": model.head.fade.tolist(),
-            "fades_tried": left,
-            "reaches_tried": reached,
+            "members": [one.name for one in steady],
+            "left_out": left,
             **self._validated(model),
         }
         return self._kept(FittedModel(spec, model, notes))
@@ -462,9 +402,12 @@ class Fitter:
         settings = self.settings.training.get(name, TrainingConfig())
         dtype = torch.float64 if settings.double else torch.float32
         windows, folder = WindowStore.gather(self.train, dtype), self.store.training_folder
-        return train(
-            name, model, residual, windows, settings, self.scales, self.validate, seed, folder
-        )
+        spec = self.spec(name, "head", self.settings.baseline_of(name))
+
+        def validate(trained: HybridDynamics) -> Score:
+            return self.validate(spec.as_one(trained))
+
+        return train(name, model, residual, windows, settings, self.scales, validate, seed, folder)
 
     def _validated(self, model: HybridDynamics) -> dict[str, Any]:
         """Notes on a model's free runs over the validation logs."""

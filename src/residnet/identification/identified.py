@@ -18,10 +18,12 @@ from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared, channels
 from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
+from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.models import FittedModel, references
+from residnet.identification.recipe import MEAN
 from residnet.identification.settings import FitSettings
 from residnet.judge.band import Bands
 from residnet.judge.freerun import Candidate, FreeRun, free_run
@@ -161,11 +163,17 @@ def candidates(
             reference=compared_with.get(name),
             ranges=entry.spec.ranges,
             bands=entry.bands,
+            members=members_of(entry),
         )
         for name, entry in models.items()
     ]
     truth = _truth(data) if isinstance(data, SimulatedTrials) else None
     return out if truth is None else [*out, truth]
+
+
+def members_of(entry: FittedModel) -> tuple[str, ...]:
+    """Return the models whose trajectories a model is the mean of; empty for any other."""
+    return tuple(one.name for one in entry.spec.members if entry.spec.of == "trajectories")
 
 
 def _truth(data: SimulatedTrials) -> Candidate | None:
@@ -251,6 +259,8 @@ def select(
 
 def family(entry: FittedModel) -> str:
     """Return what a model is, in the words of `residnet.judge.selection.FAMILIES`."""
+    if isinstance(entry.model, MeanOfTrajectories):
+        return "ensemble"
     if entry.spec.role != "head":
         refitted = entry.spec.role == "baseline" and "refit" in entry.notes
         return "refitted baseline" if refitted else str(entry.spec.role)
@@ -259,6 +269,8 @@ def family(entry: FittedModel) -> str:
 
 def parameter_count(model: HybridDynamics) -> int:
     """Return the number of fitted parameters of baseline and head together."""
+    if isinstance(model, MeanOfTrajectories):
+        return sum(map(parameter_count, model.members))
     of_head = (
         sum(model.head.parameter_count())
         if isinstance(model.head, ClosedFormHead)
@@ -278,12 +290,15 @@ class Identified(Mapping[str, FittedModel]):
         models: by name.
         limit: of |u, v, r| [3] beyond which a free run has diverged.
         train: the logs that fitted them.
+        chosen: an earlier fit without the validation logs, which chooses a single model; None where
+            this fit does.
     """
 
     settings: FitSettings
     models: dict[str, FittedModel]
     limit: np.ndarray
     train: Sequence[Prepared]
+    chosen: Identified | None = None
 
     def evaluate(
         self, logs: Sequence[Prepared], data: MeasuredLogs | SimulatedTrials | None = None
@@ -341,13 +356,24 @@ class Identified(Mapping[str, FittedModel]):
         Raises:
             UsageError: where the validation logs have not been judged.
         """
-        return select(
+        found = select(
             self.values(),
             judged,
             self.findings,
             self.settings.evaluation,
             self._overlapping(judged.get("validation")),
         )
+        if self.chosen is not None:
+            before = self.chosen.evaluate_splits(
+                {split: judged[split].logs for split in _CHECKED if split in judged}
+            )
+            first = self.chosen.select(before)
+            reason = f"{first.reason} The last fit uses the validation logs too."
+            found = replace(found, selected=first.selected, reason=reason)
+        if self.settings.recipe is None or MEAN not in self.models:
+            return found
+        # the evidence for a choice among means is smaller than its noise
+        return replace(found, selected_ensemble=MEAN, leading=MEAN)
 
     def _overlapping(self, validation: Evaluation | None) -> FreeRun | None:
         """Return free runs over overlapping windows, by which the recipe's models are chosen."""
@@ -397,7 +423,7 @@ def teacher_forced(model: HybridDynamics, log: Prepared) -> TeacherForced:
     model = model.to(torch.float64)
     z = channels(log, model.signals)
     with torch.no_grad():
-        baseline = model.baseline(z).numpy()
+        baseline = model.known(z).numpy()
         predicted = model.one_step(z[None])[0].numpy()
     return TeacherForced(z, baseline, predicted)
 
@@ -532,6 +558,9 @@ def measured_stretches(log: Prepared) -> list[np.ndarray]:
 
 def _parameter_counts(model: HybridDynamics) -> list[float]:
     """Fitted parameters of each axis, baseline and head together."""
+    if isinstance(model, MeanOfTrajectories):
+        members = map(_parameter_counts, model.members)
+        return [sum(axis) for axis in zip(*members, strict=True)]
     return [
         of_baseline + of_head
         for of_baseline, of_head in zip(

@@ -155,7 +155,7 @@ _WIND = (
 )
 _FURTHER = ("u^2 v", "u^2 r", "v^2", "r^2")
 """Terms that only long logs determine."""
-_LONG = 1200.0
+LONG = 1200.0
 """Length of the training logs in s from which they are taken in."""
 _MANY = 3
 """Propellers from which a rudder is not told by the race of each."""
@@ -196,7 +196,7 @@ def full_hull_terms(facts: Facts) -> list[str]:
 
 def long(facts: Facts) -> bool:
     """Return whether the training logs are long enough for a hull of many terms."""
-    return facts.samples * facts.step >= _LONG
+    return facts.samples * facts.step >= LONG
 
 
 def _acting_terms(facts: Facts) -> tuple[list[str], list[str], list[str]]:
@@ -249,11 +249,14 @@ def _large_angles(name: str, driving: Sequence[str]) -> list[str]:
     ]
 
 
-_LONGEST = 300
-"""Steps of the longest rollouts that a network is trained through."""
+_THROUGH = 100
+"""Steps of the networks in a free run of the protocol's length."""
 _REFIT = 200
 """Steps of the free runs of a refit, where its share of the protocol's length is less."""
-_EPOCH = 25
+_BATCH = 32
+"""Windows in a batch for each network."""
+_STEPS, _STEPS_LONG = 15, 40
+"""Batches in each of twenty epochs, for short logs and for long ones."""
 
 
 def refit_settings(facts: Facts) -> dict[str, Any]:
@@ -267,33 +270,35 @@ def refit_settings(facts: Facts) -> dict[str, Any]:
     }
 
 
-def hidden_size(facts: Facts) -> int:
-    """Return the number of hidden units that so many samples can fill."""
-    return 16 if facts.samples < 8_000 else 24 if facts.samples < 20_000 else 32
-
-
 def training_settings(facts: Facts, effort: float) -> dict[str, Any]:
-    """Return the training of a network in free run, over growing horizons."""
-    longest = min(facts.longest, _LONGEST * facts.step)
+    """Return the training of networks in free run, over growing horizons and of a fixed length."""
     stages = [
-        {"horizon": readable(share * longest), "epochs": epochs, "batch": _batch(facts), **rates}
-        for share, epochs, rates in (
-            (0.25, 2, {"learning_rate": 3e-3}),
-            (0.5, 4, {"learning_rate": 3e-3, "final": 0.5}),
-            (1.0, 8, {"learning_rate": 1.5e-3, "final": 0.05}),
+        {
+            "horizon": readable(max(share * facts.longest, 2.0 * coarse_step(facts))),
+            "epochs": epochs,
+            "batch": _BATCH * members(facts),
+            "learning_rate": rate,
+            "final": final,
+        }
+        # one cosine over all stages, down to a fiftieth
+        for share, epochs, rate, final in (
+            (0.3, 5, 3.0e-3, 0.854),
+            (0.6, 5, 2.56e-3, 0.586),
+            (1.0, 10, 1.5e-3, 0.04),
         )
     ]
     return {
         "history": readable(facts.history),
         "one_step": {"epochs": 0},
         "multi_step": stages,
-        "steps": max(1, round(_EPOCH * effort)),
-        "average": 0.98,
+        "steps": max(1, round((_STEPS_LONG if long(facts) else _STEPS) * effort)),
+        "average": 0.99,
         "start_noise": 0.03,
         "weight_decay": 0.001,
         "robust": 0.05,
-        "from_baseline": True,
-        "patience": 5,
+        "mirror": mirrored_channels(facts.names) is not None,
+        # the length is fixed: the last weights are kept
+        "validate_every": 20,
     }
 
 
@@ -302,72 +307,63 @@ def readable(value: float) -> float:
     return float(f"{value:.3g}")
 
 
-def _batch(facts: Facts) -> int:
-    return 128 if facts.samples < 20_000 else 256
+def coarse_step(facts: Facts) -> float:
+    """Return the step of the networks in s: a free run is trained through in so many."""
+    return facts.step * max(1, round(facts.length / (_THROUGH * facts.step)))
 
 
-PARTS = ("baseline", "baselines", "refit", "heads", "base_of", "forces", "ensembles", "training")
+def members(facts: Facts) -> int:
+    """Return the number of networks in an ensemble."""
+    return 4 if long(facts) else 6
+
+
+PARTS = (
+    "baseline", "baselines", "refit", "heads", "base_of", "forces", "ensembles", "means",
+    "training",
+)  # fmt: skip
 """Keys of a fit that the recipe stands in place of."""
-TIED = "tied"
-"""Name of the mean of the models that are as good as the best, within their standard error."""
-_FULL = "full_hull"
+MEAN = "mean"
+"""Name of the mean of unlike models, which is reported first."""
 
 
 def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     """Return baselines, refits, heads and trainings by the names that the recipe gives them.
 
     `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted; long logs
-    have a `full_hull` of more terms too, on which networks find little. A network stands on the
-    hull, one on the linear model, and one alone. Where the wind
-    is not measured, an unknown force is estimated from the measured past and added to the hull.
+    determine a hull of more terms. Networks stand on the hull and alone, several of each, and the
+    mean of the trajectories of hull and networks is the predictor.
 
     Args:
         facts: of the logs; `Facts.supposed` before they are read.
         effort: how long networks are trained, 1 for usual.
     """
-    network = _network(facts)
-    # a residual needs its past less than a whole model does, and without an encoder every format
-    # of export has a place for it
-    alone = {**network, "encoder": True}
-    heads = {"hull_network": network, "linear_network": network, "network": alone}
-    training = training_settings(facts, effort)
-    hulls = {"hull": _regressors(1e-4, hull_terms(facts))}
-    if long(facts):
-        hulls[_FULL] = _regressors(1e-4, full_hull_terms(facts))
+    network = {
+        "kind": "recurrent",
+        "members": members(facts),
+        "hidden_size": 48 if long(facts) else 32,
+        "step": readable(coarse_step(facts)),
+        "restoring": True,
+        "margin": 0.0,
+    }
+    heads = {"hull_network": network, "network": network}
+    terms = full_hull_terms(facts) if long(facts) else hull_terms(facts)
     return {
         "baseline": _regressors(1e-6, linear_terms(facts)),
-        "baselines": hulls,
-        "refit": dict.fromkeys(("baseline", *hulls), refit_settings(facts)),
+        "baselines": {"hull": _regressors(1e-4, terms)},
+        "refit": dict.fromkeys(("baseline", "hull"), refit_settings(facts)),
         "heads": heads,
-        "base_of": {"hull_network": "hull", "linear_network": "baseline", "network": "zero"},
-        # where the wind is measured it is no unknown force
-        "forces": {} if _knows_wind(facts) else {"hull_force": {"of": [*hulls][-1]}},
+        "base_of": {"hull_network": "hull", "network": "zero"},
+        "forces": {},
         "ensembles": {},
-        "training": dict.fromkeys(heads, training),
+        "means": {MEAN: ("hull", *heads)},
+        "training": dict.fromkeys(heads, training_settings(facts, effort)),
     }
-
-
-def _knows_wind(facts: Facts) -> bool:
-    return any(name in WIND_CHANNELS for name in facts.names)
 
 
 def _regressors(ridge: float, terms: list[str] | dict[str, list[str]]) -> dict[str, Any]:
     """Return a model of regressors that neither feeds itself energy nor runs away."""
     sound = {"dissipative": True, "bounded": True}
     return {"kind": "regressors", "ridge": ridge, "terms": terms, **sound}
-
-
-def _network(facts: Facts) -> dict[str, Any]:
-    """Return a recurrent network that comes back from velocities that no log has."""
-    size = hidden_size(facts)
-    return {
-        "kind": "lstm",
-        "hidden_size": size,
-        "readout": size,
-        "restoring": True,
-        "margin": 0.0,
-        "mirror": mirrored_channels(facts.names) is not None,
-    }
 
 
 _WINDOWS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)

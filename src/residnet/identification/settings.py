@@ -23,8 +23,7 @@ from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import DisturbanceConfig
 from residnet.heads import HeadConfig
-from residnet.heads.force import ForceHead
-from residnet.identification.recipe import PARTS, TIED, Facts, portfolio
+from residnet.identification.recipe import PARTS, Facts, portfolio
 from residnet.judge.band import BandsConfig
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
@@ -61,25 +60,6 @@ class ForceConfig(Config):
         ]
 
 
-class GateConfig(Config):
-    """A model that falls back to physics where its network knows nothing.
-
-    Outside the training range the residual of another model fades to the baseline, and where the
-    members of an ensemble disagree. How quickly it fades is chosen on the validation logs: what
-    lies outside inner boxes of the range stands for what nobody has seen.
-
-    Attributes:
-        of: head or ensemble whose residual fades.
-        fades: distances from the training range, in its half widths, at which half of the residual
-            is left, to choose from for each axis.
-    """
-
-    of: str
-    fades: tuple[Annotated[float, Field(gt=0, le=1e6)], ...] = Field(
-        default=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 100.0), min_length=1
-    )
-
-
 class Parts(Config):
     """The models of a fit.
 
@@ -95,8 +75,8 @@ class Parts(Config):
         forces: models by name that add an unknown force, estimated from the measured past, to
             another one.
         ensembles: models whose mean acceleration makes another model, by its name.
-        gates: models by name that fade the residual of a head or an ensemble to its baseline, where
-            the training data say nothing.
+        means: models by name that are the mean of what several others predict, each running by
+            itself; members that diverge on a validation window are left out.
         training: of network heads by the name of the head; the defaults where absent.
     """
 
@@ -109,7 +89,7 @@ class Parts(Config):
     ensembles: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = Field(
         default_factory=dict
     )
-    gates: dict[str, GateConfig] = Field(default_factory=dict)
+    means: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = Field(default_factory=dict)
     training: dict[str, TrainingConfig] = Field(default_factory=dict)
 
 
@@ -125,11 +105,10 @@ class FitSettings(Parts):
             null for water at rest.
         evaluation: protocols and scales.
         bands: how far free runs may be off, calibrated over logs that were left out; null for none.
-        recipe: `standard` fits a portfolio in place of `baseline`, `baselines`, `refit`, `heads`,
-            `base_of`, `ensembles` and `training`: a linear model and a hull, both refitted, a
-            network on each, and a network alone; their terms,
-            sizes and trainings follow from the logs. The mean of the models that validation data
-            cannot tell from the best is named `tied`. Null for parts of your own.
+        recipe: `standard` stands in place of the parts: a line, a hull, networks on the hull,
+            networks alone, and the mean of hull and networks, named `mean`, which is reported first
+            and exported where no model is named. Terms, sizes and trainings follow from the logs.
+            Null for parts of your own.
         effort: how long the recipe trains its networks: 1 for usual, less for a quick look.
     """
 
@@ -174,8 +153,9 @@ class FitSettings(Parts):
     def _combination(self) -> FitSettings:
         baselines = self.all_baselines
         single = (*baselines, *self.heads)
-        models = (*single, *self.forces, *self.ensembles, *self.gates)
-        for name in (*self.baselines, *self.heads, *self.forces, *self.ensembles, *self.gates):
+        further = (*self.forces, *self.ensembles, *self.means)
+        models = (*single, *further)
+        for name in (*self.baselines, *self.heads, *further):
             if (
                 name in _RESERVED
                 or models.count(name) > 1
@@ -192,8 +172,8 @@ class FitSettings(Parts):
         require_known("forces", (force.of for force in self.forces.values()), single, "model")
         members = (name for names in self.ensembles.values() for name in names)
         require_known("ensembles", members, single, "model")
-        residuals = (*self.heads, *self.ensembles)
-        require_known("gates", (gate.of for gate in self.gates.values()), residuals, "residual")
+        members = (name for names in self.means.values() for name in names)
+        require_known("means", members, (*single, *self.forces), "model")
         self._parts_fit_together()
         return self
 
@@ -212,13 +192,13 @@ class FitSettings(Parts):
                 head.set_mass(baseline.mass())
             except ConfigError as error:
                 raise ValueError(f"heads.{key}: {error}") from None
-        for name, gate in self.gates.items():
-            built = self.heads[gate.of].build(names) if gate.of in self.heads else None
-            if isinstance(built, ForceHead):
-                raise ValueError(
-                    f"gates.{name}.of: '{gate.of}' is in force space and changes the mass, which"
-                    " cannot fade; name a head in acceleration space"
-                )
+        for ensemble, members in self.ensembles.items():
+            for name in members:
+                if name in self.heads and self.heads[name].build(names).settle > 0.0:
+                    raise ValueError(
+                        f"ensembles.{ensemble}: '{name}' runs on states of its own, whose"
+                        " accelerations have no mean; name the ensemble under `means`"
+                    )
         for name in self.refit:
             if not isinstance(self.all_baselines[name].build(names), ParametricBaseline):
                 raise ValueError(
@@ -242,15 +222,8 @@ class FitSettings(Parts):
     @property
     def model_names(self) -> tuple[str, ...]:
         """Names of all models but `zero`: baselines, heads, ensembles."""
-        tied = () if self.recipe is None else (TIED,)
-        return (
-            *self.all_baselines,
-            *self.heads,
-            *self.forces,
-            *self.ensembles,
-            *self.gates,
-            *tied,
-        )
+        further = (*self.forces, *self.ensembles, *self.means)
+        return (*self.all_baselines, *self.heads, *further)
 
     def baseline_name_of(self, head: str) -> str:
         """Return the name of the baseline that a head stands on."""

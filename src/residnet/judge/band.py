@@ -193,6 +193,8 @@ class Band:
         logs: number of logs that calibrated it.
         number: of independent scores among them.
         cautions: whole sentences about what the band does not promise.
+        usual: root mean square [G, 5] over the runs that calibrated it of how far the members of a
+            mean lie apart; None for a single model.
     """
 
     level: float
@@ -208,14 +210,31 @@ class Band:
     logs: int
     number: float
     cautions: tuple[str, ...] = ()
+    usual: np.ndarray | None = None
 
-    def half_widths(self, states: np.ndarray) -> np.ndarray:
+    def half_widths(self, states: np.ndarray, spread: np.ndarray | None = None) -> np.ndarray:
         """Return half widths [L, 5] along a run with predicted states [L + 1, 6].
 
-        Beyond the longest calibrated horizon they grow in proportion to time.
+        Beyond the longest calibrated horizon they grow in proportion to time. Where the members of
+        a mean lie farther apart than they usually do, they grow in proportion to that.
+
+        Args:
+            states: predicted.
+            spread: standard deviation between the members [L, 5]; None for a single model.
         """
         z = self.activity.of_run(states, self.step)
-        return np.asarray(self.tabled(self.width, len(z)) * factor(z, self.slope))
+        out = self.tabled(self.width, len(z)) * factor(z, self.slope)
+        return np.asarray(out if spread is None else out * self.wider(spread))
+
+    def wider(self, spread: np.ndarray) -> np.ndarray:
+        """Return the factors [L, 1], 1 or more, by which a spread [L, 5] widens the band.
+
+        A few members tell each channel's spread badly: its root mean square over all is taken.
+        """
+        if self.usual is None:
+            return np.ones((len(spread), 1))
+        ratio = spread / np.maximum(self.tabled(self.usual, len(spread)), 1e-300)
+        return np.asarray(np.maximum(np.sqrt(np.mean(ratio**2, axis=1, keepdims=True)), 1.0))
 
     def tabled(self, table: np.ndarray, count: int) -> np.ndarray:
         """Return a table [G, 5] at steps 1 to `count`, [count, 5]."""
@@ -272,6 +291,7 @@ class Band:
                 "spread": self.activity.spread.tolist(),
                 "slope": named(self.slope),
             },
+            "usual_spread": None if self.usual is None else named(self.usual),
         }
 
     @classmethod
@@ -299,6 +319,8 @@ class Band:
             int(content["logs"]),
             float(content["independent_scores"]),
             tuple(content["cautions"]),
+            # files of earlier versions hold none
+            table("usual_spread") if content.get("usual_spread") else None,
         )
 
 

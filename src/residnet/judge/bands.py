@@ -26,7 +26,7 @@ from residnet.judge.band import (
     run_weights,
     worst,
 )
-from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction
+from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction, spread_of
 from residnet.judge.protocol import Window
 
 _MASKED = tuple(CHANNELS.index(name) for name in ("u", "v", "position"))
@@ -42,12 +42,18 @@ class RunErrors:
         manoeuvre: its kind.
         error: absolute errors [L, 5] by channel, NaN where they are not scored.
         states: predicted [L + 1, 6], from the initial state on.
+        spread: standard deviation between the members of a mean [L, 5]; None for a single model.
     """
 
     log: str
     manoeuvre: str
     error: np.ndarray
     states: np.ndarray
+    spread: np.ndarray | None = None
+
+    def within(self, band: Band) -> np.ndarray:
+        """Return the half widths [L, 5] that a band gives the run."""
+        return band.half_widths(self.states, self.spread)
 
     def __len__(self) -> int:
         return len(self.error)
@@ -71,7 +77,7 @@ def run_errors(
     channels[np.ix_(~found.usable, np.array(_MASKED))] = np.nan
     parts = np.split(channels, found.begins[1:])
     return [
-        RunErrors(log.log.name, log.log.manoeuvre, error[1:], prediction.states)
+        RunErrors(log.log.name, log.log.manoeuvre, error[1:], prediction.states, prediction.spread)
         for log, error, prediction in zip(
             (logs[window.log] for window in windows), parts, predictions, strict=True
         )
@@ -155,7 +161,7 @@ def _counted(
     runs: Sequence[RunErrors], band: Band, spreads: Sequence[np.ndarray] | None
 ) -> BandCounts:
     errors = [own.error for own in runs]
-    widths = [band.half_widths(own.states) for own in runs]
+    widths = [own.within(band) for own in runs]
     largest = worst(errors, widths)
 
     def scores(given: Sequence[np.ndarray]) -> np.ndarray:
@@ -189,17 +195,31 @@ def _reach(level: float) -> tuple[float, float]:
 
 
 def _spreads(run: FreeRun, models: Sequence[str]) -> list[np.ndarray]:
-    """Return the standard deviation [L, 5] between models along each window.
+    """Return the standard deviation [L, 5] between models along each window."""
+    return [
+        spread_of([run.predictions[model][i].states for model in models])
+        for i in range(len(run.windows))
+    ]
 
-    That of the position is per axis, mean over both.
+
+def usual_spread(runs: Sequence[RunErrors], steps: np.ndarray) -> np.ndarray | None:
+    """Return the root mean square [G, 5] over runs of how far members lie apart.
+
+    None where they are the runs of a single model.
+
+    Args:
+        runs: that calibrate a band.
+        steps: its horizons [G].
     """
-    out = []
-    for i in range(len(run.windows)):
-        states = np.stack([run.predictions[model][i].states[1:] for model in models])
-        spread = states.std(axis=0, ddof=1)
-        position = np.sqrt(0.5 * (spread[:, POSITION] ** 2).sum(axis=1))
-        out.append(np.column_stack((spread[:, VELOCITIES], spread[:, HEADING], position)))
-    return out
+    squares = np.full((len(runs), len(steps), len(CHANNELS)), np.nan)
+    for i, run in enumerate(runs):
+        if run.spread is None:
+            return None
+        reached = steps[steps <= len(run)] - 1
+        squares[i, : len(reached)] = run.spread[reached] ** 2
+    weight = np.where(np.isfinite(squares), run_weights([r.log for r in runs])[:, None, None], 0.0)
+    mean = (weight * np.nan_to_num(squares)).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+    return np.asarray(np.sqrt(_smooth(mean, steps)))
 
 
 def limits(states: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -45,6 +45,7 @@ class Candidate:
         ranges: smallest and largest training value of each velocity and input; empty where they
             are not known.
         bands: of its free runs by protocol; empty where there are none.
+        members: models beside it whose free runs it is the mean of; empty for none.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Candidate:
     reference: str | None = None
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     bands: Mapping[str, Band] = field(default_factory=dict)
+    members: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -63,11 +65,13 @@ class Prediction:
     """A prediction of one model for one window.
 
     States [L, 6] hold the model's velocities and the pose integrated from them; `diverged` says
-    whether the free run ran away.
+    whether the free run ran away. `spread` [L - 1, 5] is the standard deviation of u, v, r, heading
+    and position between the members of a mean, from the first step on; None for a single model.
     """
 
     states: np.ndarray
     diverged: bool
+    spread: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -182,10 +186,35 @@ def free_run(
     what the vessel itself did in it, has diverged and holds the prediction of `zero`, velocities
     held, instead. Beyond a negative limit everything has diverged.
     """
-    return {
+    names = {candidate.name for candidate in candidates}
+    means = [one for one in candidates if one.members and set(one.members) <= names]
+    out = {
         candidate.name: _run(candidate, windows, logs, step, limit, dtype)
         for candidate in candidates
+        if candidate not in means
     }
+    for mean in means:
+        beside = [*zip(*(out[name] for name in mean.members), strict=True)]
+        # where a member was replaced, what it really did is in nobody's prediction
+        alone = [i for i, each in enumerate(beside) if any(one.diverged for one in each)]
+        found = iter(_run(mean, [windows[i] for i in alone], logs, step, limit, dtype))
+        out[mean.name] = []
+        for i, each in enumerate(beside):
+            states = [one.states for one in each]
+            nu = np.mean(states, axis=0)[:, VELOCITIES]
+            own = next(found) if i in alone else _prediction(windows[i], nu, logs, step, limit)
+            out[mean.name].append(replace(own, spread=spread_of(states)))
+    return {candidate.name: out[candidate.name] for candidate in candidates}
+
+
+def spread_of(states: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the standard deviation [L, 5] between models' states [L + 1, 6] after the first.
+
+    Its columns are u, v, r, heading and position; that of the position is per axis, mean over both.
+    """
+    spread = np.stack([one[1:] for one in states]).std(axis=0, ddof=1)
+    position = np.sqrt(0.5 * (spread[:, POSITION] ** 2).sum(axis=1))
+    return np.column_stack((spread[:, VELOCITIES], spread[:, HEADING], position))
 
 
 def _run(

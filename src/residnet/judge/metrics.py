@@ -490,6 +490,7 @@ def metrics_content(
     scales: Mapping[str, float],
     selected: str,
     selected_ensemble: str | None,
+    predictor: str,
     rows: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Return the contents of metrics.json.
@@ -500,6 +501,7 @@ def metrics_content(
         scales: what nrmse divides by.
         selected: name of the single model that the validation data chose.
         selected_ensemble: name of the best ensemble; None where there is none.
+        predictor: name of the model that is reported first and exported where none is named.
         rows: of all splits, without `selected`.
     """
     marked = [{**row, "selected": row["model"] == selected} for row in rows]
@@ -510,6 +512,7 @@ def metrics_content(
         "scales": dict(scales),
         "selected": selected,
         "selected_ensemble": selected_ensemble,
+        "predictor": predictor,
         "rows": marked,
     }
 

@@ -102,4 +102,4 @@ def _limits(
     if band is None:
         unknown = np.full_like(prediction.states, np.nan)
         return unknown, unknown
-    return limits(prediction.states, band.half_widths(prediction.states))
+    return limits(prediction.states, band.half_widths(prediction.states, prediction.spread))

@@ -125,6 +125,7 @@ class Selection:
         reason: one sentence on why the single model was chosen.
         contenders: all models, in the order that they were given.
         blocks: over which errors were paired.
+        leading: name of a mean that is reported first whatever was chosen; None for none.
     """
 
     selected: str
@@ -132,19 +133,12 @@ class Selection:
     reason: str
     contenders: tuple[Contender, ...]
     blocks: Blocks
+    leading: str | None = None
 
     @property
-    def tied(self) -> tuple[str, ...]:
-        """Names of the sound single models that are as good as the best, `zero` aside."""
-        single = [e for e in self.contenders if e.family not in ("ensemble", "zero") and e.sound]
-        best = min(single, key=lambda entry: entry.score, default=None)
-        return tuple(
-            entry.name for entry in single if best is not None and self._within(entry, best)
-        )
-
-    def _within(self, entry: Contender, best: Contender) -> bool:
-        apart, spread = difference(entry, best, self.blocks)
-        return apart <= self.blocks.alike * spread
+    def predictor(self) -> str:
+        """Name of the model that is reported first and exported where none is named."""
+        return self.selected if self.leading is None else self.leading
 
     def content(self) -> dict[str, Any]:
         """Return the contents of selection.json."""
@@ -153,6 +147,7 @@ class Selection:
             "schema": SCHEMA,
             "selected": self.selected,
             "selected_ensemble": self.selected_ensemble,
+            "predictor": self.predictor,
             "reason": self.reason,
             "blocks": {"of": self.blocks.of, "count": self.blocks.count},
             "models": [

@@ -232,7 +232,7 @@ class VelocityBound(nn.Module):
     def __init__(self, margin: float = 0.0, channels: int = PLANAR.dof) -> None:
         super().__init__()
         self.margin = margin
-        self.channels = channels
+        self.channels, self.dof = channels, PLANAR.dof
         for name, count in (("low", channels), ("high", channels), ("rate", PLANAR.dof)):
             self.register_buffer(name, torch.zeros(count, dtype=torch.float64))
         self.low: Tensor
@@ -272,4 +272,7 @@ class VelocityBound(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz]."""
-        return self.back(self.held(z), z)
+        near = z[..., : self.dof]
+        low, high = self.low[: self.dof].to(z.dtype), self.high[: self.dof].to(z.dtype)
+        held = torch.where(near > high, high, torch.where(near < low, low, near))
+        return self.rate.to(z.dtype) * (held - near)

@@ -184,6 +184,11 @@ class RunFiles:
         return self.metrics.get("selected") or (chosen[0] if chosen else None)
 
     @cached_property
+    def predictor(self) -> str | None:
+        """The model that is reported first; the selected one where no other is named."""
+        return self.metrics.get("predictor") or self.selected
+
+    @cached_property
     def baseline(self) -> str | None:
         """The model that reductions refer to."""
         return next((model for model, kind in self.kinds.items() if kind == "baseline"), None)
@@ -195,16 +200,16 @@ class RunFiles:
 
     @cached_property
     def heads(self) -> list[str]:
-        """The models that are neither zero, baseline nor truth, the selected one first."""
+        """The models that are neither zero, baseline nor truth, the predictor first."""
         heads = [
             model for model, kind in self.kinds.items() if kind not in ("zero", "baseline", "truth")
         ]
-        return sorted(heads, key=lambda model: model != self.selected)
+        return sorted(heads, key=lambda model: (model != self.predictor, model != self.selected))
 
     @cached_property
     def lead(self) -> str:
-        """The model that a report is on: the selected one, else the first head or the baseline."""
-        names = [self.selected, *self.heads, self.baseline, *self.kinds]
+        """The model that a report is on: the predictor, else the first head or the baseline."""
+        names = [self.predictor, *self.heads, self.baseline, *self.kinds]
         return next(name for name in names if name is not None and name in self.kinds)
 
     @cached_property
@@ -284,6 +289,8 @@ class RunFiles:
         """Return the name of a model in tables, with its role where it has a special one."""
         if self.kinds.get(model) == "truth":
             return f"{model} (plant)"
+        if model == self.predictor != self.selected:
+            return f"{model} (predictor)"
         return f"{model} (selected)" if model == self.selected else model
 
     def unit(self, channel: str) -> tuple[str, float]:

@@ -337,12 +337,12 @@ class AutopilotConfig(ComputingTask):
 
 
 def named_export(run: RunFolder, name: str, names: Collection[str]) -> str:
-    """Return the export of that name; `selected` is the only one there is.
+    """Return the export of that name; `predictor` and `selected` are the only one there is.
 
     Raises:
-        UsageError: where there is no such export, or `selected` leaves open which.
+        UsageError: where there is no such export, or none is named of several.
     """
-    if name == "selected" and len(names) == 1:
+    if name in ("predictor", "selected") and len(names) == 1:
         return next(iter(names))
     if name not in names:
         known = nearest(name, names) or f"; give one with --model: {', '.join(names)}"

@@ -26,10 +26,11 @@ class ExportConfig(Config):
     """Models that are exported as TorchScript when the run ends.
 
     Attributes:
-        models: their names; `selected` is the one chosen on validation data.
+        models: their names; `predictor` is the one that is reported first, `selected` the single
+            one chosen on validation data.
     """
 
-    models: tuple[str, ...] = ("selected",)
+    models: tuple[str, ...] = ("predictor",)
 
 
 @final
@@ -65,7 +66,8 @@ class FitConfig(FitSettings, ComputingTask):
                     f"study: {self.study} shows the models {', '.join(STUDY_MODELS[self.study])};"
                     f" '{absent[0]}' is absent; give it, or leave the study out (study=null)"
                 )
-        require_known("export.models", self.export.models, ("selected", *self.model_names), "model")
+        known = ("predictor", "selected", *self.model_names)
+        require_known("export.models", self.export.models, known, "model")
         if isinstance(self.data, SimulatedTrials):
             self.data.splits(self.data.draw())
             if abs(self.data.step - self.prepare.grid.step) > 1e-9:
@@ -212,7 +214,7 @@ class FitConfig(FitSettings, ComputingTask):
         *,
         anyway: bool = False,
     ) -> Path:
-        """Export one model, `selected` for the one chosen on validation data; returns the file.
+        """Export a model, `predictor` for the one reported first; returns the file.
 
         Raises:
             WithheldError: where the model is worse than zero or the baseline, but for `anyway`.

@@ -57,6 +57,8 @@ from residnet.runs.task import Exports, Finished, MainFigure, Outcome
 from residnet.tasks.booklet import write_booklet
 from residnet.tasks.fit import FitConfig
 
+_CHOSEN = ("predictor", "selected")
+"""What stands for a model's name: the one reported first, and the single one chosen."""
 SPLIT = "external"
 """Name of the split of logs that no fit has seen."""
 
@@ -86,10 +88,12 @@ def run_fit(config: FitConfig, folder: RunFolder) -> Outcome:
     held = {str(split): logs[split] for split in config.evaluation.splits}
     judged = identified.evaluate_splits(held, config.data)
     chosen = identified.select(judged)
-    say(f"  selected: {chosen.selected}")
+    told = "" if chosen.leading is None else f"; predictor: {chosen.leading}"
+    say(f"  selected: {chosen.selected}{told}")
     folder.write_json(folder.selection, chosen.content())
     folder.write_json(folder.sanity, sanity_content(identified.findings))
-    write_judged(folder, config, judged, chosen.selected, chosen.selected_ensemble, logs)
+    names = (chosen.selected, chosen.selected_ensemble, chosen.predictor)
+    write_judged(folder, config, judged, names, logs)
     for place, found in {
         folder.residuals: residual_table(fitted, logs["test"]),
         folder.path / "terms.parquet": term_table(fitted, logs["test"]),
@@ -136,8 +140,7 @@ def write_judged(
     folder: RunFolder,
     config: FitConfig,
     judged: Mapping[str, Evaluation],
-    selected: str,
-    selected_ensemble: str | None,
+    names: tuple[str, str | None, str],
     logs: Mapping[str, Sequence[Prepared]],
 ) -> None:
     """Write what free runs show: rollouts, metrics.json, limits.json and data_quality.json.
@@ -146,8 +149,7 @@ def write_judged(
         folder: of the run, or of an evaluation.
         config: of the fit.
         judged: free runs by split.
-        selected: name of the selected model.
-        selected_ensemble: name of the selected mean of models.
+        names: of the selected model, of the selected mean of models, and of the predictor.
         logs: by split, those that were not judged too.
     """
     for split, part in judged.items():
@@ -159,7 +161,7 @@ def write_judged(
     rows = [row for part in judged.values() for row in part.rows]
     folder.write_json(
         folder.metrics,
-        metrics_content(config.name, units, scales, selected, selected_ensemble, rows),
+        metrics_content(config.name, units, scales, *names, rows),
     )
     commands, step = len(config.signals.inputs), config.prepare.grid.step
     seen = [log for part in judged.values() for log in part.logs]
@@ -209,7 +211,7 @@ def fit_outcome(
         failure: a line where a result fails a check.
     """
     files = RunFiles(folder.path)
-    row = files.row(files.selected, split, files.protocols[0])
+    row = files.row(files.lead, split, files.protocols[0])
     figures: dict[str, MainFigure] = {}
     if row is not None:
         figures = {
@@ -238,7 +240,8 @@ def export_model(
 
     Args:
         run: of the fit.
-        name: of the model; `selected` for the one chosen on validation data.
+        name: of the model; `predictor` for the one that is reported first, `selected` for the
+            single one chosen on validation data.
         out: file to write; exports/<model> with the format's suffix where not given.
         file_format: one of `residnet list formats`.
         anyway: whether a model is wanted that is worse than doing without it.
@@ -250,10 +253,10 @@ def export_model(
         ExportError: where the exported model does not agree with the one that it came from.
     """
     chosen_format, metrics = exporter(file_format), run.read_metrics()
-    chosen = str(metrics["selected"]) if name == "selected" else name
+    chosen = str(metrics.get(name, metrics["selected"])) if name in _CHOSEN else name
     known = model_names(run.models)
     if chosen not in known:
-        raise UsageError(f"{run.path}: no model '{name}'{nearest(name, ['selected', *known])}")
+        raise UsageError(f"{run.path}: no model '{name}'{nearest(name, [*_CHOSEN, *known])}")
     spec, model = load_model(run.models / chosen)
     rows = [row for row in metrics["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"]
     usual = run.exports / f"{chosen}{chosen_format.suffix}"
@@ -304,10 +307,10 @@ def evaluate_on(
             if own.is_file():
                 folder.write(copy, own.read_text(encoding="utf-8"))
         chosen = run.read_metrics()
-        ensemble = chosen.get("selected_ensemble")
-        write_judged(
-            folder, config, {SPLIT: judged}, str(chosen["selected"]), ensemble, {SPLIT: logs}
-        )
+        selected = str(chosen["selected"])
+        predictor = str(chosen.get("predictor", selected))
+        names = (selected, chosen.get("selected_ensemble"), predictor)
+        write_judged(folder, config, {SPLIT: judged}, names, {SPLIT: logs})
         return fit_outcome(folder, SPLIT)
 
     return config.conduct(folder, made_from, judge)

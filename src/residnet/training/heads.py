@@ -11,12 +11,18 @@ from typing import Any, final
 import torch
 from torch import Tensor, nn
 
+from residnet.baselines.given import GivenBaseline
 from residnet.core.layout import POSE, VELOCITIES, velocities
+from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
 from residnet.data.module import Windows, WindowsDataModule
 from residnet.data.windows import WindowStore
+from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import MANY, FreeRun, Rollout, scripted
+from residnet.heads.recurrent import RecurrentHead
+from residnet.physics.signals import Signals
+from residnet.physics.symmetry import mirrored_channels
 from residnet.training.config import TrainingConfig
 from residnet.training.trainer import EpochTraining, Shown, run_epochs
 
@@ -118,6 +124,63 @@ class Score:
 Validate = Callable[[HybridDynamics], Score]
 
 
+@dataclass(frozen=True)
+class Mirror:
+    """How states [..., 6] and inputs [..., m] look in the mirror.
+
+    Attributes:
+        state: signs of the states [6].
+        index: column that each input is taken from [m].
+        sign: and its sign [m].
+    """
+
+    state: Tensor
+    index: Tensor
+    sign: Tensor
+
+    @classmethod
+    def of(cls, signals: Signals) -> Mirror | None:
+        """Return that of the channels of a model; None where it is not known for one of them."""
+        found = mirrored_channels(signals.names)
+        if found is None:
+            return None
+        index, sign = (part[len(VELOCITY) : len(VELOCITY) + signals.inputs] for part in found)
+        index = [place - len(VELOCITY) for place in index]
+        if signals.wind:
+            # where an earth-fixed wind comes from is mirrored as headings are
+            index = [*index, signals.speed_column, signals.direction_column]
+            sign = [*sign, 1.0, -1.0]
+            order = [*range(signals.inputs), signals.speed_column, signals.direction_column]
+            index = [index[order.index(place)] for place in range(len(order))]
+            sign = [sign[order.index(place)] for place in range(len(order))]
+        return cls(
+            torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, -1.0]),
+            torch.tensor(index, dtype=torch.long),
+            torch.tensor(sign),
+        )
+
+    def every_other(self, windows: Windows) -> Windows:
+        """Return windows of which every other one is seen in the mirror."""
+        rows = torch.arange(len(windows.y)) % 2 == 1
+
+        def seen(values: Tensor, other: Tensor) -> Tensor:
+            return torch.where(rows[:, None, None], other, values)
+
+        state, sign = self.state.to(windows.y), self.sign.to(windows.w)
+        return windows._replace(
+            **{
+                name: seen(values, values * state)
+                for name in ("y", "smooth", "past_y")
+                if (values := getattr(windows, name)) is not None
+            },
+            **{
+                name: seen(values, values[..., self.index] * sign)
+                for name in ("w", "past_w")
+                if (values := getattr(windows, name)) is not None
+            },
+        )
+
+
 @final
 class HeadTraining(EpochTraining):
     """A training of `model.head` that keeps the weights which validate best in free run."""
@@ -139,6 +202,7 @@ class HeadTraining(EpochTraining):
         self.validate = validate
         self.stages = config.windows(model.dt)
         self.rank, self.world = 0, 1
+        self.mirror = Mirror.of(model.signals) if config.mirror else None
 
     def data(self, store: WindowStore) -> WindowsDataModule:
         """Return the windows of each epoch's stage.
@@ -215,6 +279,8 @@ class HeadTraining(EpochTraining):
 
     def _multi_step(self, windows: Sequence[Windows], stage: int) -> Tensor:
         begins, memories = [], []
+        if self.mirror is not None:
+            windows = [self.mirror.every_other(part) for part in windows]
         for number, part in enumerate(windows):
             memories.append(self.model.warmup(part.past_y, part.past_w))
             x0 = part.smooth[:, 0]
@@ -312,6 +378,8 @@ def train(
     model.head.calibrate(samples)
     if config.from_baseline:
         model.head.silence()
+    if isinstance(model.head, RecurrentHead):
+        return _train_coarse(name, model, store, config, scales, validate, seed, folder)
     dtype = torch.float64 if config.double else torch.float32
     scale = scales.to(dtype)
     # losses and scores are those of velocities
@@ -322,3 +390,49 @@ def train(
     finally:
         model.to(torch.float32)
         model.positions = True
+
+
+def _train_coarse(
+    name: str,
+    model: HybridDynamics,
+    store: WindowStore,
+    config: TrainingConfig,
+    scales: torch.Tensor,
+    validate: Validate,
+    seed: int,
+    folder: Path | None,
+) -> dict[str, Any]:
+    """Train networks in the coarse steps that their gates belong to; see `train`.
+
+    Every batch holds as many windows for each network, and no network sees those of another.
+    """
+    head = model.head
+    assert isinstance(head, RecurrentHead)
+    steps = max(round(head.coarse / model.dt), 1)
+    signals = model.signals
+    turning = [signals.direction_column] if signals.wind else []
+    # a baseline in steps so long asks for a scheme of second order; a residual alone is held
+    alone = isinstance(model.baseline, GivenBaseline) and not model.baseline.library.count
+    scheme: Integrator = "euler" if alone else "heun"
+    coarse = HybridDynamics(signals, model.baseline, head, steps * model.dt, scheme)
+    coarse.positions = False
+
+    def fine(trained: HybridDynamics) -> HybridDynamics:
+        return HybridDynamics(
+            trained.signals, trained.baseline, trained.head, model.dt, model.integrator
+        )
+
+    def validated(trained: HybridDynamics) -> Score:
+        try:
+            return validate(fine(trained))
+        finally:
+            trained.head.set_step(coarse.dt)
+
+    dtype = torch.float64 if config.double else torch.float32
+    try:
+        module = HeadTraining(coarse.to(dtype), config, scales.to(dtype), validated, seed)
+        data = module.data(store.coarse(steps, turning))
+        return run_epochs(name, module, data, coarse, head, folder, config)
+    finally:
+        head.set_step(model.dt)
+        model.to(torch.float32)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from residnet.judge.band import Band, corrected, covered, independent, quantile, run_weights, worst
-from residnet.judge.bands import RunErrors, calibrate
+from residnet.judge.bands import RunErrors, calibrate, usual_spread
 
 STEP = 0.5
 LENGTH = 60
@@ -111,3 +113,35 @@ def test_a_weighted_quantile_is_the_smallest_score_that_suffices() -> None:
     assert quantile(scores, weight, 0.5) == 1.0
     assert quantile(scores, weight, 0.6) == 2.0
     assert quantile(scores, weight, 1.0) == 3.0
+
+
+def of_members(logs: int, size: float, seed: int) -> list[RunErrors]:
+    """Runs of a mean of three members, whose own errors are independent and of one size."""
+    random, out = np.random.default_rng(seed), []
+    grown = np.sqrt(STEP * np.arange(1, LENGTH + 1))[:, None, None]
+    for number in range(logs):
+        apart = size * grown * random.normal(size=(1, 5, 3))
+        states = np.zeros((LENGTH + 1, 6))
+        states[:, 3] = 1.0
+        spread = apart.std(axis=2, ddof=1)
+        out.append(RunErrors(f"log{number}", "", np.abs(apart.mean(axis=2)), states, spread))
+    return out
+
+
+def test_a_band_widens_where_members_lie_farther_apart_than_usual() -> None:
+    """Off the data that calibrate, members err three times as much and disagree as much more."""
+    known = of_members(400, 0.1, 0)
+    plain = calibrate(known, 0.9, STEP, np.ones(5))
+    usual = usual_spread(known, plain.steps)
+    assert usual is not None
+    band = replace(plain, usual=usual)
+
+    def share(band: Band, given: list[RunErrors]) -> float:
+        return float(np.mean([covered(run.error, run.within(band)) for run in given]))
+
+    beyond = of_members(400, 0.3, 1)
+    assert share(plain, beyond) < 0.5
+    assert 0.8 < share(band, beyond) < 0.97
+    assert 0.9 <= share(band, of_members(400, 0.1, 2)) < 0.97
+    again = Band.read(band.content())
+    np.testing.assert_allclose(beyond[0].within(again), beyond[0].within(band))

@@ -127,9 +127,9 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
 
 
 def cautions(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
-    """Return what speaks against using the selected model, None where nothing does."""
+    """Return what speaks against using the model reported first, None where nothing does."""
     out = []
-    lead = run.selected
+    lead = run.predictor
     for protocol in run.protocols:
         row, base = run.row(lead, run.focus, protocol), run.row(run.baseline, run.focus, protocol)
         seen = run.row(lead, "train", protocol)
