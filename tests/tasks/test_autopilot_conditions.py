@@ -15,6 +15,7 @@ from tiny import call
 
 from residnet.control.heading.controllers import PtosConfig
 from residnet.core.config import load_config
+from residnet.judge.autopilots import objections
 from residnet.report.sections.autopilot import cost_verdict
 from residnet.tasks.autopilot import AutopilotConfig, tuned_before
 from residnet.tasks.autopilot_run import stored_policy
@@ -162,3 +163,10 @@ def test_the_verdict_begins_with_the_cheapest_policy() -> None:
     first, second = cost_verdict(rows)
     assert first.startswith("Under the stated conditions 'b' costs 6.100 s a change, 4.7 % below")
     assert "'a' costs 6.300 s" in second
+    assert objections("b", rows) == []
+    rows += [{**row, "protocol": "beyond_waves", "cost": {"mean": 9.0}} for row in rows[1:]]
+    rows[-1]["cost"]["mean"] = 8.0
+    costly = "Do not use 'b' there: under 'waves' a flight costs 9 s, with law 8 s."
+    assert cost_verdict(rows)[1] == costly
+    rows[2]["cost"]["mean"] = 6.0
+    assert objections("b", rows) == ["under its conditions a flight costs 6.1 s, with law 6 s"]

@@ -58,15 +58,33 @@ def distribution(values: Tensor) -> dict[str, float]:
 
 def objections(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return what rows of metrics.json say against using a policy rather than a tuned law."""
-    judged = {row["model"]: row for row in rows if row["protocol"] == "conditions"}
-    if model not in judged:
+    return _cheaper(model, rows, "conditions", "under its conditions")
+
+
+def not_for(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return under which conditions beyond its own a tuned law costs less than a policy."""
+    beyond = dict.fromkeys(row["protocol"] for row in rows if row["protocol"].startswith("beyond_"))
+    return [
+        sentence
+        for protocol in beyond
+        for sentence in _cheaper(model, rows, protocol, f"under '{protocol[7:]}'")
+    ]
+
+
+def _cheaper(model: str, rows: Sequence[Mapping[str, Any]], protocol: str, what: str) -> list[str]:
+    """Return in a sentence what the cheapest tuned law costs, where a policy costs more."""
+    judged = {
+        row["model"]: (row["kind"], row["cost"]["mean"])
+        for row in rows
+        if row["protocol"] == protocol and "cost" in row
+    }
+    laws = {name: cost for name, (kind, cost) in judged.items() if kind == "classical"}
+    if model not in judged or not laws:
         return []
-    own = judged[model]["cost"]["mean"]
-    laws = {name: row["cost"]["mean"] for name, row in judged.items() if row["kind"] == "classical"}
-    best = min(laws, key=laws.__getitem__, default=model)
-    if best == model or own <= laws[best]:
+    own, best = judged[model][1], min(laws, key=laws.__getitem__)
+    if own <= laws[best]:
         return []
-    return [f"under its conditions a flight costs {own:.4g} s, with {best} {laws[best]:.4g} s"]
+    return [f"{what} a flight costs {own:.4g} s, with {best} {laws[best]:.4g} s"]
 
 
 def step_row(

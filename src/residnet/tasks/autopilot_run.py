@@ -42,6 +42,7 @@ from residnet.judge.autopilots import (
     drawn,
     judged,
     measure,
+    not_for,
     objections,
     random_variations,
     sea_flights,
@@ -383,6 +384,7 @@ def export_policy(
     about = {"vessel": config.vessel, "conditions": _stated(flown).model_dump(mode="json")}
     learned = config.policies[name].learned
     about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
+    about |= {"not_for": not_for(name, rows)}
     exported = ExportedHeading(
         name,
         stored_policy(config, run.models, name, flown.test.dt),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from residnet.control.courses.course_check import Asked, Protocol, first_fault
 from residnet.control.courses.fitting import Fit, Fitted
-from residnet.control.courses.outline import Circle, Outlines
+from residnet.control.courses.outline import Circle, Outlines, Room
 from residnet.control.courses.route import LEG, Bend, Route, Sketch
 from residnet.control.courses.turn_table import (
     POINTS,
@@ -29,7 +29,6 @@ from residnet.control.courses.turn_table import (
     state_behind,
 )
 from residnet.control.courses.turns import Array, TurnMaker
-from residnet.control.courses.words import Room
 from residnet.core.errors import ConfigError
 from residnet.core.progress import report
 

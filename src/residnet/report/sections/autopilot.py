@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from residnet.control.heading.conditions import quiet_after
+from residnet.judge.autopilots import not_for
 from residnet.report.blocks import Block, Code, Column, Section, Table, Text, bad_where, table_of
 from residnet.report.figure import (
     ZERO,
@@ -394,6 +395,8 @@ def cost_verdict(rows: Sequence[Content]) -> list[str]:
             f" {100 * abs(cost / other - 1):.1f} % {'below' if cost < other else 'above'}"
             f" '{best['model']}', the best classical law, with {other:.3f} s{without}."
         )
+        if worse := not_for(name, rows):
+            sentences.append(f"Do not use '{name}' there: {'; '.join(worse)}.")
     return sentences
 
 
