@@ -71,15 +71,15 @@ def level(run: RunFiles) -> str:
 def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     """Return the rest of the first screen: a run of median error beside the models' errors.
 
-    The rows: what was selected, the baseline, zero, what the measurements themselves leave, then
-    the others, the nearest first. None where there is no free run.
+    The rows: what predicts, what was selected, the baseline, zero, what the measurements themselves
+    leave, then the others, the nearest first. None where there is no free run.
     """
     rows = {one: row for one in run.kinds if (row := run.row(one, run.focus, run.main))}
     if run.lead not in rows or "position_error_end" not in rows[run.lead]:
         return None
     known = {entry["model"]: entry for entry in run.json("selection.json").get("models") or []}
     limits = (run.limits.get("splits") or {}).get(run.focus, {}).get(run.main, {})
-    first = [run.lead, run.metrics.get("selected_ensemble"), run.baseline, "zero"]
+    first = [run.lead, run.selected, run.baseline, "zero"]
     table: list[Content] = [rows[one] for one in dict.fromkeys(first) if one in rows]
     if floor := limits.get("kinematics"):
         ends = {f"{of}_error_end": floor[f"{of}_mean"] for of in ("position", "heading")}
@@ -121,7 +121,7 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
             ("sound", sound),
         ],
         groups=[(f"error {run.horizon}", 2)],
-        selected=lambda row: row["model"] == run.selected,
+        selected=lambda row: row["model"] == run.lead,
     )
     return Section("", [*figures, shown, Text(" ".join(filter(None, told)), quiet=True)])
 
