@@ -533,6 +533,8 @@ def list_names(
 
 def show(finished: Finished) -> None:
     """Print the verdict and table of a run, its exported files and its report."""
+    if finished.outcome.level:
+        print(f"{finished.outcome.level.capitalize()}:")
     for sentence in finished.outcome.verdict:
         print(sentence)
     if finished.outcome.table:

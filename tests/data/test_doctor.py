@@ -172,7 +172,7 @@ def test_what_is_wrong_is_named_and_measured(
 
 def test_every_check_above_a_note_has_a_fault() -> None:
     # groups of causes are named one by one
-    named = {"follows", "position_causes", "yaw_causes", "unit_between", "extrapolation"}
+    named = {"follows", "position_causes", "yaw_causes", "contradicts", "extrapolation"}
     named |= {code for fault in FAULTS for code in fault.codes} | {row[1] for row in TOLD}
     assert {check.code for check in CHECKS if check.level != "note"} <= named
     assert {check.stage for check in CHECKS} == STAGES.keys()

@@ -68,20 +68,57 @@ def run(logs: list[Prepared]) -> FreeRun:
     return out
 
 
-def test_the_horizon_ends_where_errors_are_no_longer_smaller(
+def test_errors_of_the_pose_are_told_after_the_times_that_matter(
     run: FreeRun, logs: list[Prepared]
 ) -> None:
-    entries = Judged(run, CANDIDATES, logs, SCALES).trust(STEP)["mlp"]["horizons"]
-    assert [entry["windows"] for entry in entries] == [12] * 8
-    better = [entry["high"] for entry in entries if entry["difference"]["nrmse_mean"] < 0]
-    assert max(better) == pytest.approx(12.5, abs=1.3)
-    assert all(entry["difference"]["excludes_zero"] for entry in entries[:3])
+    """Windows of 20 s; the model's position is put 3 m and its heading 200 deg off after 10 s."""
+    for prediction in run.predictions["mlp"]:
+        prediction.states[20, :2] += np.array([3.0, 4.0])
+        prediction.states[20, 2] += np.radians(200.0)
+    entries = Judged(run, CANDIDATES, logs, SCALES).horizons(STEP)
+    for prediction in run.predictions["mlp"]:
+        prediction.states[20, :2] -= np.array([3.0, 4.0])
+        prediction.states[20, 2] -= np.radians(200.0)
+    assert [entry["seconds"] for entry in entries] == [10.0, 20.0]
+    first = entries[0]
+    assert (first["windows"], first["logs"]) == (12, 6)
+    assert first["slowest"] == pytest.approx(0.6)
+    assert first["sailed"] == pytest.approx(1.35 * 10.5)
+    own = first["models"]["mlp"]
+    assert own["position"] == pytest.approx(5.0)
+    # a turn too many is no error
+    assert np.degrees(own["heading"]) == pytest.approx(160.0)
+    low, high = own["intervals"]["position"]
+    assert low <= 5.0 <= high
+    # velocities were made from the positions
+    assert first["floor"]["position"] == pytest.approx(0.0, abs=1e-9)
+    assert first["models"]["zero"]["position"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_speeds_are_bands_of_at_least_five_windows(run: FreeRun, logs: list[Prepared]) -> None:
-    entries = Judged(run, CANDIDATES, logs, SCALES).trust(STEP)["baseline"]["speeds"]
-    assert [round(entry["low"], 1) for entry in entries] == [0.6, 1.5]
-    assert all(entry["difference"]["nrmse_mean"] < 0 for entry in entries)
+def test_intervals_hold_the_mean_over_as_many_new_windows(logs: list[Prepared]) -> None:
+    """Ten sets of windows are judged, and ten others fall into the intervals as often as told."""
+    random, hits = np.random.default_rng(0), 0
+    protocol = Windows(length=20.0, first=0.0, history=0.0)
+    windows = [w for i, prepared in enumerate(logs) for w in protocol.windows(prepared, i, STEP)]
+
+    def drawn() -> FreeRun:
+        out = FreeRun("T20", "test", windows)
+        by_log = random.gamma(2.0, 1.0, len(logs))
+        out.predictions["mlp"] = []
+        for window in windows:
+            states = logs[window.log].y[window.start : window.stop].copy()
+            states[:, 0] += by_log[window.log] * random.gamma(4.0, 0.25)
+            out.predictions["mlp"].append(Prediction(states, False))
+        return out
+
+    trials = 40
+    for _ in range(trials):
+        seen, new = (
+            Judged(drawn(), [CANDIDATES[2]], logs, SCALES).horizons(STEP) for _ in range(2)
+        )
+        low, high = seen[-1]["models"]["mlp"]["intervals"]["position"]
+        hits += low <= new[-1]["models"]["mlp"]["position"] <= high
+    assert hits >= 0.85 * trials
 
 
 def test_every_model_is_compared_with_zero_and_the_first_baseline(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 
-from residnet.judge.verdict import Evidence, diverged_note, objections, verdict
+from residnet.judge.verdict import Evidence, diverged_note, level, objections, verdict
 
 
 def row(error: float, diverged: int = 0) -> dict[str, Any]:
@@ -19,11 +20,25 @@ def difference(value: float, half: float | None) -> dict[str, Any]:
     return {"nrmse_mean": value, "ci95": interval, "excludes_zero": excludes}
 
 
-def horizons(*differences: tuple[float, float | None]) -> list[dict[str, Any]]:
-    return [
-        {"low": 5.0 * place, "high": 5.0 * (place + 1), "difference": difference(*given)}
-        for place, given in enumerate(differences)
-    ]
+def errors(position: float, degrees: float, half: float | None = 0.1) -> dict[str, Any]:
+    """Errors of one model; `half` is the half width of the intervals as a share."""
+    heading = math.radians(degrees)
+    ends = {"position": position, "heading": heading}
+    return ends | {
+        "intervals": {
+            of: None if half is None else [value * (1.0 - half), value * (1.0 + half)]
+            for of, value in ends.items()
+        }
+    }
+
+
+def horizon(
+    seconds: float, mlp: dict[str, Any], windows: int = 12, best: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """One entry of limits.json: 2 m/s are sailed, zero is far off."""
+    models = {"mlp": mlp, "zero": errors(seconds, 40.0), "baseline": best or errors(seconds, 30.0)}
+    about = {"seconds": seconds, "windows": windows, "logs": 4, "slowest": 1.5, "fastest": 2.5}
+    return {**about, "sailed": 2.0 * seconds, "floor": errors(0.1, 0.2), "models": models}
 
 
 def evidence(error: float = 0.2, **change: Any) -> Evidence:
@@ -78,27 +93,66 @@ def test_unsound_models_and_divergences_are_named() -> None:
     assert said[1] == (
         "It is UNSOUND: its damping has the wrong sign; 7 of its 12 test windows diverged."
     )
-    assert verdict(evidence())[1].startswith("It is sound")
+    assert verdict(evidence())[1].startswith("No window diverged")
     assert (diverged_note(row(0.2)), diverged_note(row(0.2, 3))) == ("", "3/12 diverged")
 
 
 @pytest.mark.parametrize(
-    ("entries", "said"),
+    ("entries", "expected", "said"),
     [
-        (((-0.2, 0.1), (-0.2, 0.1), (-0.2, 0.1)), "trusted up to 15 s ahead, as far as the runs"),
-        (((-0.2, 0.1), (-0.2, 0.1), (0.2, 0.1)), "trusted up to 10 s ahead, but"),
-        (((-0.01, 0.1), (-0.2, 0.1), (-0.2, 0.1)), "trusted from 5 up to 15 s ahead"),
-        (((-0.01, 0.1), (0.2, 0.1), (-0.05, 0.1)), "cannot be trusted at any horizon"),
-        (((-0.2, None), (-0.2, None)), "but there are too few logs for an interval"),
+        (
+            [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))],
+            "good",
+            "Up to 30 s ahead: there",
+        ),
+        (
+            [horizon(10, errors(0.5, 2.0)), horizon(30, errors(9.0, 5.0))],
+            "good",
+            "Up to 10 s ahead",
+        ),
+        # a tenth of the way is no use where the bow points elsewhere
+        ([horizon(30, errors(3.0, 67.0))], "limited", "30 s ahead mlp is off by 3 m"),
+        # the upper end of the interval counts, and where there is none nothing is good
+        ([horizon(30, errors(5.0, 5.0, half=0.5))], "limited", "Good would be"),
+        ([horizon(30, errors(3.0, 5.0, half=None))], "limited", "from too few logs"),
+        # nor is a model that errs far more than another one of the run
+        ([horizon(30, errors(3.0, 5.0), best=errors(1.0, 4.0))], "limited", "Good would be"),
+        (
+            [horizon(60, errors(35.0, 160.0), windows=1)],
+            "too few windows",
+            "1 window on test data cannot say",
+        ),
+        # as near as the sensors tell is good, however short the way
+        ([horizon(0.5, errors(0.15, 0.3))], "good", "Up to 0.5 s ahead"),
     ],
 )
-def test_trust_reaches_as_far_as_errors_are_smaller_than_those_of_zero(
-    entries: tuple[tuple[float, float | None], ...], said: str
+def test_a_model_is_good_in_metres_and_degrees(
+    entries: list[dict[str, Any]], expected: str, said: str
 ) -> None:
-    speeds = horizons((0.1, 0.01))
-    limits = {"trust": {"mlp": {"horizons": horizons(*entries), "speeds": speeds}}}
-    (sentence,) = [text for text in verdict(evidence(limits=limits)) if "trusted" in text]
-    assert said in sentence
+    given = evidence(limits={"horizons": entries})
+    assert level(given) == expected
+    assert said in verdict(given)[0]
+
+
+def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
+    entries = [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))]
+    said = verdict(evidence(limits={"horizons": entries}))
+    assert said[0].endswith(
+        "is off by 3 m (2.7 to 3.3, 5 % of the 60 m sailed) and 5 deg (4.5 to 5.5)."
+    )
+    assert said[1].startswith("Beside it: zero 30 m (27 to 33) and 40 deg (36 to 44); the baseline")
+    assert said[1].endswith("the noise floor (measured velocities, integrated) 0.1 m and 0.2 deg.")
+    assert said[2] == "At other times: 0.5 m and 2 deg after 10 s."
+    assert said[3] == "It holds for 12 windows of 4 logs at mean speeds of 1.5 to 2.5 m/s."
+
+
+def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
+    limits = {"horizons": [horizon(30, errors(1.0, 1.0))]}
+    rows = {"zero": row(0.5), "baseline": row(0.25), "mlp": row(0.2, diverged=1)}
+    assert level(evidence(limits=limits, rows=rows)) == "limited"
+    assert level(evidence(error=0.6, limits=limits)) == "do not use"
+    assert level(evidence(selected="zero", limits=limits)) == "do not use"
+    assert level(evidence(selected="unknown")) == ""
 
 
 def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:

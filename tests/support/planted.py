@@ -225,7 +225,7 @@ for _name, _codes, _damage in _SIMPLE:
 fault("rudder in deg", "unit", ships=("patrol", "mariner"), hosts=_RUDDER)(
     lambda s, log, g: scaled(log, ["delta"], 180.0 / np.pi)
 )
-fault("propeller in rpm", "unit", "unit_between", ships=())(
+fault("propeller in rpm", "unit", "contradicts_scale", ships=())(
     lambda s, log, g: scaled(log, _PROPELLERS, 60.0)
 )
 fault("propeller reversed", "propeller_sign", ships=())(
@@ -425,7 +425,7 @@ _one_cell("absurd value", lambda g, here, span: 10.0 ** g.uniform(6, 30) * sign(
 def _inputs_late(name: str, inputs: Sequence[str], hosts: tuple[str, ...]) -> None:
     """Register late inputs, where a fit to the log would be the worse for it by a tenth."""
 
-    @fault(name, "acausal", "timing", ships=(), hosts=hosts)
+    @fault(name, "acausal", "contradicts_late", ships=(), hosts=hosts)
     def damage(ship: Ship, log: Log, random: Random) -> Log:
         out = late(log, ship.lag[0], *(n for n in inputs if n in log.channels))
         before, after = (OneStep(Record(one, driving(one))) for one in (log, out))

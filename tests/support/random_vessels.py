@@ -77,9 +77,9 @@ def random_logs(kind: str, seed: int, count: int) -> list[list[Log]]:
     unit = vessels.length / vessels.speed
     step = np.array([0.05, 0.1, 0.2, 0.5, 1.0])
     step = step[np.argmin(np.abs(step[:, None] - unit / 15.0), axis=0)]
-    flights = [_fly(vessels, kind, what, step, random) for what in range(3)]
+    flights = [fly(vessels, kind, what, step, random) for what in range(3)]
     return [
-        [_log(vessels, kind, flight, step, i, k, random) for k, flight in enumerate(flights)]
+        [log_of(vessels, kind, flight, step, i, k, random) for k, flight in enumerate(flights)]
         for i in range(count)
     ]
 
@@ -103,9 +103,9 @@ def small_boat_logs(kind: str, seed: int, flights: int, seconds: float) -> list[
     samples = round(seconds / float(step[0]))
     noise = float(np.exp(random.uniform(0.0, np.log(8.0))))
     return [
-        _log(vessels, kind, flight, step, 0, k, random, noise)
+        log_of(vessels, kind, flight, step, 0, k, random, noise)
         for k, flight in enumerate(
-            _fly(vessels, kind, (3, 0, 3, 1, 3, 2)[k % 6], step, random, samples)
+            fly(vessels, kind, (3, 0, 3, 1, 3, 2)[k % 6], step, random, samples)
             for k in range(flights)
         )
     ]
@@ -122,7 +122,7 @@ def ship_of(kind: str, log: Log) -> Ship:
     return Ship(kind, kind, "0 s", "0 s", {}, lag, arm, bias, (names[0],), names[1], names[2])
 
 
-def _fly(
+def fly(
     vessels: Vessels,
     kind: str,
     what: int,
@@ -196,7 +196,7 @@ def _fly(
     return out
 
 
-def _log(
+def log_of(
     vessels: Vessels,
     kind: str,
     flight: dict[str, np.ndarray],

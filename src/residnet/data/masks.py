@@ -31,6 +31,8 @@ from residnet.data.readers.base import unwrap
 
 HARD = "hard:"
 RATE = "rate:"
+DEAD_COMMANDS = f"{HARD}dead_commands"
+"""Reason of what no recorded input explains while all inputs rest (see `PrepareConfig`)."""
 
 
 class Mask(Config, ABC):

@@ -44,6 +44,9 @@ class PrepareConfig(Config):
             sample itself, exact for a command that changes on the grid. `mean`: the mean of the
             samples at both ends of the step, for a measured quantity that moves on during the step,
             such as shaft revolutions; held from the start it would lag by half a step.
+        dead_commands: what is done with stretches in which all inputs rest while the vessel moves
+            as a model of the other logs does not explain: somebody took over by hand, or the record
+            stopped. `mask` splits the log there, `keep` takes them as they are.
     """
 
     grid: GridConfig
@@ -52,6 +55,7 @@ class PrepareConfig(Config):
     motion: MotionConfig = MotionConfig()
     trim: Seconds = Field(default=0.0, ge=0)
     hold: Literal["start", "mean"] = "start"
+    dead_commands: Literal["mask", "keep"] = "mask"
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from residnet.core.errors import DataError
 from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.log import Log
 from residnet.core.progress import say
+from residnet.data.masks import DEAD_COMMANDS
 from residnet.data.prepare import Prepared, prepare
 from residnet.identification.settings import FitSettings
 from residnet.training.current import estimate_currents, through_water
@@ -33,6 +34,8 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
     Raises:
         DataError: where a log has nothing to learn from or to predict.
     """
+    if settings.prepare.dead_commands == "mask":
+        splits = _without_dead_commands(splits, settings.signals.columns)
     prepared = {
         split: paged.OneByOne(
             prepare(part, split, settings.signals.columns, settings.prepare)
@@ -47,6 +50,36 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
     _tell_smoothed([log for logs in prepared.values() for log in logs])
     _tell_spikes([log for logs in prepared.values() for log in logs])
     return prepared
+
+
+def _without_dead_commands(
+    splits: Mapping[str, Sequence[Log]], columns: Sequence[str]
+) -> Mapping[str, Sequence[Log]]:
+    """Return the logs split where motion is explained by no input while all inputs rest.
+
+    What explains motion is learned from training and validation logs.
+    """
+    # a config is checked without what only data need
+    from residnet.data.doctor.others import dead_commands
+    from residnet.data.doctor.statistics import Record
+
+    seen = {split: [Record(log, columns) for log in logs] for split, logs in splits.items()}
+    learned = [log for split in ("train", "validation") for log in seen.get(split, ())]
+    further = [log for split in seen.keys() - {"train", "validation"} for log in seen[split]]
+    found = dead_commands(learned, further, columns)
+
+    def masked(log: Log) -> Log:
+        bad = np.zeros(len(log), dtype=bool)
+        for start, stop in found.get(log.name, ()):
+            bad[start : stop + 1] = True
+            say(
+                f"  {log.name}: t = {log.t[start]:.1f} to {log.t[stop]:.1f} s is left out: all"
+                " inputs rest, and the other logs do not explain the motion"
+                " (prepare.dead_commands: keep would keep it)"
+            )
+        return log.replace(masks={**log.masks, DEAD_COMMANDS: bad}) if bad.any() else log
+
+    return {split: [masked(log) for log in logs] for split, logs in splits.items()}
 
 
 def shortened(log: Log) -> list[Log]:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -157,13 +156,12 @@ def difference(
 SCHEMA = "residnet.metrics/1"
 LIMITS_SCHEMA = "residnet.limits/1"
 ZERO = "zero"
-_PARTS = 8
 _WORST = 3
 _BANDS = 3
-_OF_A_BAND = 5
-"""Windows that a band of speeds has where there are so many: fewer logs have no interval."""
 _LEAST = 3
 _WIND = "wind_speed"
+_HORIZONS = (10.0, 30.0, 100.0)
+"""Times in s after which errors of the pose are told."""
 
 
 class Judged:
@@ -282,8 +280,78 @@ class Judged:
             "worst": {name: self.worst(name) for name in self.found},
             "compared": self.compared(),
             "outside": self.outside(),
-            "trust": self.trust(step),
+            "horizons": self.horizons(step),
         }
+
+    def horizons(self, step: float) -> list[dict[str, Any]]:
+        """Return how far models are off after some times that matter, in metres and radians.
+
+        Returns:
+            One entry for 10, 30 and 100 s, as far as the windows go, and for the end of the longest
+            window: `seconds`; `windows` and `logs` that last so long, `slowest` and `fastest` of
+            them (mean speeds, m/s) and the mean way `sailed` in m; `floor` (position and heading):
+            what integrated measured velocities are off; and by model `position` and `heading`: the
+            mean over the windows, with `interval`s that hold the mean over as many new windows in
+            95 % of cases, None where there are too few blocks.
+        """
+        counts, speeds = (
+            np.array([part.stop - part.start for _, part in self.parts]),
+            self._speeds(),
+        )
+        longest = int(counts.max()) - 1
+        after = [round(seconds / step) for seconds in _HORIZONS]
+        out = []
+        for k in [*(k for k in after if 0 < k < longest), longest]:
+            there = counts > k
+            ends = np.array([self.parts[i][1].start + k for i in np.flatnonzero(there)])
+            logs = [self.parts[i][0] for i in np.flatnonzero(there)]
+            there[there] = [bool(log.usable[end]) for log, end in zip(logs, ends, strict=True)]
+            if not there.any():
+                continue
+            drawn = blocks(self.numbers[there])
+
+            def off(error: np.ndarray, drawn: Blocks | None = drawn) -> dict[str, Any]:
+                """Return means and intervals of errors of the pose [W, 3]."""
+                values = np.column_stack((np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])))
+                means = values.mean(0)
+                new: list[list[float] | None] = []
+                for mean, found in zip(means, intervals(values, drawn), strict=True):
+                    # the mean of new windows scatters as much as that of those seen
+                    wide = None if found is None else mean + np.sqrt(2.0) * (np.array(found) - mean)
+                    new.append(None if wide is None else np.maximum(wide, 0.0).tolist())
+                return {
+                    "position": float(means[0]),
+                    "heading": float(means[1]),
+                    "intervals": {"position": new[0], "heading": new[1]},
+                }
+
+            measured = [
+                log.y[part.start : part.start + k + 1]
+                for (log, part), taken in zip(self.parts, there, strict=True)
+                if taken
+            ]
+            drift = [
+                integrate(y[0, POSE], y[:, VELOCITIES], step)[-1] - y[-1, POSE] for y in measured
+            ]
+            floor = np.array(drift)
+            floor[:, 2] = wrap_array(floor[:, 2])
+            sailed = [float(np.hypot(*y[:, VELOCITIES][:, :2].T).sum()) * step for y in measured]
+            out.append(
+                {
+                    "seconds": k * step,
+                    "windows": int(there.sum()),
+                    "logs": len(set(self.numbers[there].tolist())),
+                    "slowest": float(speeds[there].min()),
+                    "fastest": float(speeds[there].max()),
+                    "sailed": float(np.mean(sailed)),
+                    "floor": off(floor),
+                    "models": {
+                        name: off(found.error[(found.begins + k)[there]][:, POSE])
+                        for name, found in self.found.items()
+                    },
+                }
+            )
+        return out
 
     def kinematics(self, step: float) -> dict[str, float]:
         """Return how far integrated measured velocities end from the measured pose.
@@ -398,68 +466,6 @@ class Judged:
             "share": float(beyond.any(1).mean()),
             "channels": {name: share for name, share in shares.items() if share > 0},
         }
-
-    def trust(self, step: float) -> dict[str, dict[str, Any]]:
-        """Return by model at which horizons and speeds its errors are smaller than `zero`'s.
-
-        Returns:
-            By model `horizons` and `speeds`, each a list of entries with `low` and `high` (s after
-            the start, or m/s), `windows`, and `difference` to `zero` as in metrics.json. Horizons
-            are eighths of the longest window, speeds up to three equal parts of the windows by
-            mean speed. Parts of fewer than three windows are left out.
-        """
-        if ZERO not in self.found:
-            return {}
-        longest = int(self.found[ZERO].counts.max())
-        edges = np.unique(np.linspace(1, longest, _PARTS + 1).round().astype(int))
-        by_part = {name: self._by_part(found, edges) for name, found in self.found.items()}
-        whole = {name: np.nanmean(values, axis=1) for name, values in by_part.items()}
-        speeds = self._speeds()
-        count = min(max(len(speeds) // _OF_A_BAND, 1), _BANDS)
-        bands = [part for part in _equal_parts(speeds, count) if part.any()]
-
-        def entry(
-            name: str, values: Mapping[str, np.ndarray], there: np.ndarray, low: float, high: float
-        ) -> list[dict[str, Any]]:
-            if there.sum() < min(_LEAST, len(there)):
-                return []
-            apart = self.difference(name, ZERO, there, values)
-            return [{"low": low, "high": high, "windows": int(there.sum()), "difference": apart}]
-
-        out = {}
-        for name in self.found:
-            horizons, by_speed = [], []
-            for part, (begin, end) in enumerate(pairwise(edges.tolist())):
-                own = {key: values[:, part] for key, values in by_part.items()}
-                there = np.isfinite(own[name])
-                horizons += entry(name, own, there, begin * step, end * step)
-            for there in bands:
-                ends = float(speeds[there].min()), float(speeds[there].max())
-                by_speed += entry(name, whole, there, *ends)
-            if name != ZERO:
-                out[name] = {"horizons": horizons, "speeds": by_speed}
-        return out
-
-    def _by_part(self, found: Errors, edges: np.ndarray) -> np.ndarray:
-        """Normalised root mean square errors by window and part of its time, [W, parts]; NaN where
-        a window does not reach so far or has no usable sample there.
-        """
-        parts, windows = len(edges) - 1, len(found.counts)
-        part = np.searchsorted(edges, found.place, side="right") - 1
-        there = (part >= 0) & (part < parts)
-        bins = (np.repeat(np.arange(windows), found.counts) * parts + part)[there]
-
-        def sums(values: np.ndarray) -> np.ndarray:
-            columns = [np.bincount(bins, column[there], windows * parts) for column in values.T]
-            return np.stack(columns, axis=1)
-
-        count = sums(found.scored.astype(float))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            out = (np.sqrt(sums(found.velocities**2) / count) / self.scale).mean(1)
-        out[count[:, 0] == 0] = np.nan
-        out = out.reshape(-1, parts)
-        out[edges[1:] > found.counts[:, None]] = np.nan
-        return np.asarray(out)
 
 
 def _equal_parts(values: np.ndarray, count: int) -> list[np.ndarray]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,23 +38,142 @@ class Evidence:
     doctor: str = ""
 
 
+GOOD, LIMITED, USELESS, UNKNOWN = LEVELS = ("good", "limited", "do not use", "too few windows")
+"""How far the selected model may be used, the best first; the last says that nobody can know."""
+_FEWEST = 5
+"""Windows below which nothing is said of how good a model is."""
+_SHARE, _TURN = 0.10, math.radians(10.0)
+"""What a good model is off at most: this share of the way sailed and so many radians of heading,
+at the upper end of the interval, or twice the noise floor. It is residnet's choice, and stands in
+the verdict, so that a reader with other needs can choose another."""
+_OF_BEST = 1.5
+"""A good model errs at most so many times as much as the best one of the run, floor aside."""
+
+
 def verdict(evidence: Evidence) -> list[str]:
     """Return the verdict sentence by sentence, the most important first.
 
-    It says whether the selected model is better than `zero` and than the baseline, whether it is
-    sound and why it was selected, for which horizon and speed it can be trusted, how much of the
-    data lies outside the training range, and what the doctor found. What the files do not hold is
-    left out.
+    It says how far off the selected model is in metres and degrees after the times that matter,
+    beside `zero`, the baseline and the noise floor, for how many windows and which speeds that
+    holds, how its velocities compare, what speaks against it and why it was selected, how much of
+    the data lies outside the training range, and what the doctor found. What the files do not hold
+    is left out.
     """
+    lost = useless(evidence)
     sentences = [
-        lead(evidence),
+        *([compared(evidence)] if lost else ahead(evidence)),
+        *([] if lost else [compared(evidence)]),
         soundness(evidence),
         str(evidence.selection.get("reason", "")),
-        *([] if useless(evidence) else trusted(evidence)),
         outside(evidence),
         evidence.doctor,
     ]
     return [sentence for sentence in sentences if sentence]
+
+
+def level(evidence: Evidence) -> str:
+    """Return one of `LEVELS`; empty where the selected model has no free runs."""
+    if useless(evidence):
+        return USELESS
+    if evidence.selected not in evidence.rows:
+        return ""
+    entries = _horizons(evidence)
+    if entries and all(entry["windows"] < _FEWEST for entry in entries):
+        return UNKNOWN
+    return GOOD if _good_until(evidence) else LIMITED
+
+
+def _horizons(evidence: Evidence) -> list[Content]:
+    """Return the horizons at which the errors of the selected model are known."""
+    found = evidence.limits.get("horizons") or []
+    return [entry for entry in found if evidence.selected in entry["models"]]
+
+
+def _good_until(evidence: Evidence) -> float:
+    """Return the time in s up to which the selected model is good; 0 where it never is."""
+    row, until = evidence.rows[evidence.selected], 0.0
+    if row.get("diverged") and evidence.split in UNSEEN:
+        return 0.0
+    for entry in _horizons(evidence):
+        models, floor = entry["models"], entry["floor"]
+        own, ends = models[evidence.selected], models[evidence.selected]["intervals"]
+        for of, least in (("position", _SHARE * entry["sailed"]), ("heading", _TURN)):
+            others = [one[of] for name, one in models.items() if name != evidence.selected]
+            twice = 2.0 * floor[of]
+            known = ends[of] is not None and entry["windows"] >= _FEWEST
+            near = own[of] <= max(twice, _OF_BEST * min(others, default=own[of]))
+            beats = ZERO not in models or own[of] <= max(twice, models[ZERO][of])
+            if not (known and near and beats and ends[of][1] <= max(least, twice)):
+                return until
+        until = float(entry["seconds"])
+    return until
+
+
+def ahead(evidence: Evidence) -> list[str]:
+    """Return how far off the selected model is after the times that matter."""
+    entries = _horizons(evidence)
+    if not entries:
+        return []
+    enough = [entry for entry in entries if entry["windows"] >= _FEWEST]
+    until = _good_until(evidence) if enough else 0.0
+    chosen = next((e for e in entries if e["seconds"] == until), (enough or entries)[-1])
+    off = _off(chosen, evidence.selected, chosen["sailed"])
+    after = f"{chosen['seconds']:.4g} s ahead"
+    if not enough:
+        most = max(entry["windows"] for entry in entries)
+        start = (
+            f"{most} window{'' if most == 1 else 's'} on {evidence.split} data cannot say how good"
+            f" {evidence.selected} is ({_FEWEST} are needed); {after} it is off by {off}."
+        )
+    elif until:
+        start = f"Up to {after}: there {evidence.selected} is off by {off}."
+    else:
+        start = (
+            f"{after[0].upper()}{after[1:]} {evidence.selected} is off by {off}. Good would be"
+            f" within {100.0 * _SHARE:.0f} % of the way and {math.degrees(_TURN):.0f} deg, or twice"
+            " the noise floor, without a diverged window and near the best model of the run."
+        )
+    named = {ZERO: ZERO, evidence.baseline: "the baseline"}
+    beside = [
+        f"{word} {_off(chosen, name)}"
+        for name, word in named.items()
+        if name in chosen["models"] and name != evidence.selected
+    ]
+    floor = f"the noise floor (measured velocities, integrated) {_pair(chosen['floor'])}"
+    rest = [
+        f"{_pair(entry['models'][evidence.selected])} after {entry['seconds']:.4g} s"
+        for entry in entries
+        if entry is not chosen
+    ]
+    logs = f"{chosen['logs']} log{'' if chosen['logs'] == 1 else 's'}"
+    holds = (
+        f"It holds for {chosen['windows']} windows of {logs} at mean speeds of"
+        f" {chosen['slowest']:.2g} to {chosen['fastest']:.2g} m/s."
+    )
+    return [
+        start,
+        f"Beside it: {'; '.join([*beside, floor])}.",
+        *([f"At other times: {'; '.join(rest)}."] if rest else []),
+        holds,
+    ]
+
+
+def _pair(errors: Content) -> str:
+    return f"{errors['position']:.2g} m and {math.degrees(errors['heading']):.2g} deg"
+
+
+def _off(entry: Content, name: str, sailed: float = 0.0) -> str:
+    """Return errors of position and heading with their intervals as text."""
+    own, out = entry["models"][name], []
+    for of, factor, unit in (("position", 1.0, "m"), ("heading", math.degrees(1.0), "deg")):
+        ends = own["intervals"][of]
+        text = f"{factor * own[of]:.2g} {unit}"
+        details = [f"{factor * ends[0]:.2g} to {factor * ends[1]:.2g}"] if ends else []
+        if of == "position" and sailed > 0.0:
+            details.append(f"{100.0 * own[of] / sailed:.2g} % of the {sailed:.3g} m sailed")
+        out.append(text + (f" ({', '.join(details)})" if details else ""))
+    known = all(own["intervals"].values()) or sailed == 0.0
+    return " and ".join(out) + ("" if known else ", from too few logs for an interval")
 
 
 def objections(evidence: Evidence) -> list[str]:
@@ -80,8 +200,8 @@ def useless(evidence: Evidence) -> bool:
     return own is not None and zero is not None and _nrmse(own) >= _nrmse(zero)
 
 
-def lead(evidence: Evidence) -> str:
-    """Return the first sentence: the selected model against `zero` and the baseline."""
+def compared(evidence: Evidence) -> str:
+    """Return how the velocities of the selected model compare with `zero` and the baseline."""
     name, split = evidence.selected, evidence.split
     if name == ZERO:
         return (
@@ -96,7 +216,7 @@ def lead(evidence: Evidence) -> str:
         return (
             f"WORSE THAN ZERO: on {split} data the selected model {name} has an NRMSE of"
             f" {error:.3g}{_lost(own)}, and zero, which only holds the velocities that a run starts"
-            f" from, {_nrmse(zero):.3g}{_paired(evidence, ZERO)}. Do not use it for prediction."
+            f" from, {_nrmse(zero):.3g}{_paired(evidence, ZERO)}. DO NOT USE it for prediction."
         )
     parts = []
     for other, row in ((ZERO, zero), (evidence.baseline, evidence.rows.get(evidence.baseline))):
@@ -123,34 +243,7 @@ def soundness(evidence: Evidence) -> str:
         faults.append(f"{lost} of its {row['windows']} {evidence.split} windows diverged")
     if faults:
         return f"It is UNSOUND: {'; '.join(faults)}."
-    return (
-        "It is sound: no window diverged, it does not run away where the logs have been, and its"
-        " damping has the right sign there."
-    )
-
-
-def trusted(evidence: Evidence) -> list[str]:
-    """Return up to which horizon and at which speeds the selected model can be trusted."""
-    found = (evidence.limits.get("trust") or {}).get(evidence.selected)
-    if not found:
-        return []
-    horizon, speeds = (_reach(found[key]) for key in ("horizons", "speeds"))
-    sure = _measured(found["horizons"])
-    spread = "by the 95 % interval" if sure else "but there are too few logs for an interval"
-    criterion = f"smaller than those of zero, {spread}"
-    if horizon is None:
-        return ["It cannot be trusted at any horizon: at none its errors are smaller than zero's."]
-    ends = [entry["high"] for entry in found["horizons"]]
-    late = horizon[0] > min(entry["low"] for entry in found["horizons"])
-    text = f"It can be trusted {f'from {horizon[0]:.3g} ' if late else ''}up to {horizon[1]:.3g} s"
-    text += " ahead, as far as the runs go" if horizon[1] >= max(ends) else " ahead"
-    if found["speeds"]:
-        text += (
-            f", and at mean speeds of {speeds[0]:.2g} to {speeds[1]:.2g} m/s"
-            if speeds is not None
-            else ", but in no band of speeds alone"
-        )
-    return [f"{text}: there its errors are {criterion}."]
+    return "No window diverged, and no check of its physics speaks against it."
 
 
 def outside(evidence: Evidence) -> str:
@@ -194,26 +287,6 @@ def _paired(evidence: Evidence, other: str) -> str:
     low, high = found["ci95"]
     doubt = "" if found["excludes_zero"] else ", which holds zero: the data cannot tell them apart"
     return f" (paired 95 % interval of the difference {low:+.3g} to {high:+.3g}{doubt})"
-
-
-def _measured(entries: Sequence[Content]) -> bool:
-    return any(entry["difference"]["ci95"] is not None for entry in entries)
-
-
-def _reach(entries: Sequence[Content]) -> tuple[float, float] | None:
-    """Ends of the longest run of entries whose errors are smaller than those of zero, None where
-    there is none; the interval must say so where there is one.
-    """
-    sure = _measured(entries)
-    best: list[Content] = []
-    run: list[Content] = []
-    for entry in entries:
-        apart = entry["difference"]
-        holds = apart["nrmse_mean"] < 0 and (apart["excludes_zero"] or not sure)
-        run = [*run, entry] if holds else []
-        if len(run) > len(best):
-            best = run
-    return (float(best[0]["low"]), float(best[-1]["high"])) if best else None
 
 
 def _percent(share: float) -> str:

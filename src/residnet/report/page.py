@@ -33,7 +33,12 @@ _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (
 _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
 
 
-LEVELS = {"good": "✓ Good", "limited": "! Limited", "do not use": "✗ Do not use"}
+LEVELS = {
+    "good": "✓ Good",
+    "limited": "! Limited",
+    "do not use": "✗ Do not use",
+    "too few windows": "? Too few windows to say",
+}
 """Levels of a verdict in words; what they look like stands in the page's styles."""
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """The space between a number and its unit."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.stretches import stretches
 from residnet.data.channels import noise_of
-from residnet.data.doctor.actuators import EARLY, delays, neutral_angle, propellers
 from residnet.data.doctor.clock import EPOCH
 from residnet.data.doctor.excitation import conditioning, in_brackets
 from residnet.data.doctor.findings import (
@@ -23,9 +23,9 @@ from residnet.data.doctor.findings import (
     check,
     share_of,
     show,
-    slip_in_words,
 )
-from residnet.data.doctor.statistics import MEASURED, Record, apart_from_others, averaged, high
+from residnet.data.doctor.others import Fleet, causes, nothing_steers
+from residnet.data.doctor.statistics import MEASURED, Record, averaged, high
 from residnet.data.split import row_hashes, sampled_hashes, sampling
 
 # so many rows in a row that two logs share are no chance
@@ -51,6 +51,12 @@ class Together:
         self.inputs = [name for name in given if name in common and name not in MEASURED]
         self.logs = [Record(log, self.inputs) for log in logs]
         self.splits = splits
+
+    @cached_property
+    def fleet(self) -> Fleet | None:
+        """The logs, each predicted by a model of the others; None where that cannot be."""
+        moving = any(name in self for name in VELOCITY)
+        return Fleet(self.logs, self.inputs) if moving and self.inputs else None
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
@@ -301,58 +307,64 @@ def excitation(logs: Together, found: Check) -> Iterator[Finding]:
         yield found(text, {"condition": number}, code="condition", level="note", fix="")
 
 
-@check("between", "unit_between", fix="correct its unit in the channel map", needs=("u",))
-def units_between(logs: Together, found: Check) -> Iterator[Finding]:
-    """Report logs whose revolutions are out of proportion to those of the others."""
-    for name in logs.inputs:
-        if all(name in log.of(propellers) for log in logs.logs):
-            turns = [
-                math.log(max(high(log[name], 0.9), 1e-9) / max(high(log["u"], 0.9), 1e-12))
-                for log in logs.logs
-            ]
-            # beyond what the logs of one vessel differ by in the ratio of speed to revolutions
-            for i, apart, _ in apart_from_others(turns, [0.0] * len(turns), math.log(8.0)):
-                ratio = math.exp(apart)
-                text = (
-                    f"{logs.logs[i].name}: {name} is {ratio:.3g} times as large for its speed as in"
-                    f" the other logs{slip_in_words(ratio)}"
-                )
-                yield found(text, {"ratio": ratio})
-
-
-@check("between", "rudder_bias", fix="take the offset off this log's rudder", needs=("delta",))
-def neutrals_between(logs: Together, found: Check) -> Iterator[Finding]:
-    """Report logs whose neutral rudder angle differs from that of the others."""
-    known = [(log, log.of(neutral_angle)) for log in logs.logs if "delta" in logs.inputs]
-    told = [(log, neutral) for log, neutral in known if neutral is not None]
-    angles, errors = [one.angle for _, one in told], [one.error for _, one in told]
-    for i, apart, error in apart_from_others(angles, errors, math.radians(2.0)):
+@check("between", "contradicts", fix="")
+def contradictions(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report logs that a model of the others does not explain, and what would explain them."""
+    fleet = logs.fleet
+    if fleet is None:
+        return
+    for name in (told := nothing_steers(fleet))[0]:
         text = (
-            f"{told[i][0].name}: the vessel goes straight at {math.degrees(apart):+.1f} deg of"
-            f" delta more than in {len(told) - 1} other logs"
+            f"{name} rests in every log, and {share_of(told[1])} of how the yaw rate changes is"
+            " explained by nothing that was recorded: its record is dead"
         )
-        yield found(text, {"angle": apart, "error": error})
+        fix = "find the channel that holds the steering"
+        yield found(text, {"unexplained": told[1]}, code="contradicts_dead", fix=fix)
+    if told[0]:
+        # without the steering no log explains another
+        return
+    count = len(fleet.core)
+    for i in fleet.apart:
+        log, likely = fleet.logs[i], causes(fleet, i)[0]
+        split = logs.splits.get(log.name, "")
+        left = float(np.nanmax(fleet.scores(fleet.core, [i])[i].left))
+        text = (
+            f"{log.name}{f' ({split})' if split else ''}: a model of {count} other logs does not"
+            f" explain its motion ({left:.2g} times what it leaves of them); {likely.text}"
+        )
+        if not fleet.agreed:
+            text += "; no more than half of the logs agree, so that it may be the others"
+        figures = {"left": left, "size": likely.size, "effect": fleet.harm(i)}
+        yield found(text, figures, code=f"contradicts_{likely.kind}", fix=_ADVICE[likely.kind])
+
+
+_ADVICE = {
+    "dead": "leave this log out, or restore the record",
+    "scale": "correct its unit or scale in this log",
+    "sign": "correct its sign in this log",
+    "offset": "take the offset off in this log",
+    "late": "shift the clock of the inputs in this log",
+    "current": "leave it out, give the current as an input, or let the fit estimate it",
+    "vessel": "leave it out, or fit it alone",
+}
+"""What explains a log -> what to do."""
 
 
 @check(
     "between",
-    "timing",
-    fix="the clocks of inputs and motion differ in this log: shift one of them",
+    "dead_commands",
+    "note",
+    fix="a fit leaves these stretches out (prepare.dead_commands: keep would keep them)",
 )
-def delays_between(logs: Together, found: Check) -> Iterator[Finding]:
-    """Report logs in which the motion answers at another delay than in the others."""
-    told: dict[str, list[tuple[Record, float, float]]] = {}
-    # the delays of two logs alone say nothing
-    for log in logs.logs if len(logs.logs) > 2 else ():
-        for (channels, _), (_, delay) in log.of(delays).items():
-            if delay.error < max(0.3, 0.5 * log.step) and delay.sharp > 1.1:
-                told.setdefault(channels, []).append((log, delay.seconds, delay.error))
-    for channels, members in told.items():
-        records, seconds, errors = zip(*members, strict=True)
-        least = max(EARLY, 1.5 * max(log.step for log in records))
-        for i, apart, error in apart_from_others(seconds, errors, least, sure=3.0):
-            text = (
-                f"{records[i].name}: the motion answers {channels} {apart:+.2f} s later than in"
-                f" {len(members) - 1} other logs"
-            )
-            yield found(text, {"lag": apart, "error": error})
+def unexplained_stretches(logs: Together, found: Check) -> Iterator[Finding]:
+    """Report motion that no recorded input explains while all of them rest."""
+    fleet = logs.fleet
+    found_at = [(i, *rest) for i in fleet.told for rest in fleet.rests(i)] if fleet else []
+    for i, start, stop in found_at:
+        log = logs.logs[i]
+        text = (
+            f"{log.name}: from t = {log.t[start]:.1f} to {log.t[stop]:.1f} s all inputs rest and"
+            " the vessel moves as none of the other logs explains: a hand on the wheel, or a dead"
+            " record"
+        )
+        yield found(text, {"t": log.t[start], "seconds": log.t[stop] - log.t[start]})

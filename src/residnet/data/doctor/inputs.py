@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.signal import find_peaks
+import scipy
 
 from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import (
@@ -219,7 +219,9 @@ def idle(log: Record, found: Check) -> Iterator[Finding]:
         still &= np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * high(log[name], 1.0)
     for start, stop in zip(*stretches(still), strict=True):
         run = psi[start : stop + 1]
-        turns = sum(find_peaks(side, prominence=_SWING)[0].size for side in (run, -run))
+        turns = sum(
+            scipy.signal.find_peaks(side, prominence=_SWING)[0].size for side in (run, -run)
+        )
         if turns >= 2:
             at = np.zeros(len(log), dtype=bool)
             at[start : stop + 1] = True

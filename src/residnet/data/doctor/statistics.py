@@ -15,7 +15,7 @@ import scipy
 
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
-from residnet.data.channels import SIGMA_OF_MAD, noise_of, spikes
+from residnet.data.channels import noise_of, spikes
 
 MEASURED = ("x", "y", "psi", "u", "v", "r", "phi", "p", "u_dot", "v_dot", "r_dot")
 """Channels that a sensor or filter measures; all others drive the vessel."""
@@ -315,22 +315,3 @@ def agreement(reference: np.ndarray, measured: np.ndarray, step: float) -> Agree
         shift = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
     gain = float(a @ measured[at + lags[best]] / (a @ a))
     return Agreement(float(values[best]), gain, (best - reach + shift) * step, spread)
-
-
-def apart_from_others(
-    values: Sequence[float], errors: Sequence[float], least: float, sure: float = 6.0
-) -> Iterator[tuple[int, float, float]]:
-    """Return the logs whose value is not that of the others: number, distance, standard error.
-
-    Each of at least three is compared with the median of the others, by more than `least`, four
-    times their robust scatter, and `sure` standard errors.
-    """
-    for i, (value, error) in enumerate(zip(values, errors, strict=True)):
-        others = np.delete(np.asarray(values), i)
-        if others.size < 2:
-            return
-        apart = float(value - np.median(others))
-        scatter = SIGMA_OF_MAD * float(np.median(np.abs(others - np.median(others))))
-        whole = float(np.hypot(error, np.median(np.delete(np.asarray(errors), i))))
-        if abs(apart) > max(least, 4.0 * scatter, sure * whole):
-            yield i, apart, whole

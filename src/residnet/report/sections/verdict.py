@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from residnet.data.doctor import summary
 from residnet.judge.soundness import CHECKS, Finding
-from residnet.judge.verdict import UNSEEN, Evidence, diverged_note, soundness, useless
+from residnet.judge.verdict import UNSEEN, Evidence, diverged_note
+from residnet.judge.verdict import level as judged_level
 from residnet.judge.verdict import verdict as judged
 from residnet.report.blocks import Bullets, Cell, Facts, Section, Text, table_of
 from residnet.report.figure import Figure
@@ -58,14 +59,7 @@ def evidence(run: RunFiles, selected: str) -> Evidence:
 
 def level(run: RunFiles) -> str:
     """Return the level of the verdict on the selected model, empty where it has no free runs."""
-    given = evidence(run, run.lead)
-    if run.lead not in given.rows:
-        return ""
-    if useless(given):
-        return "do not use"
-    row, base = given.rows[run.lead], given.rows.get(given.baseline)
-    worse = base is not None and row["nrmse"]["mean"] > 1.05 * base["nrmse"]["mean"]
-    return "limited" if worse or "UNSOUND" in soundness(given) or row["windows"] < 5 else "good"
+    return judged_level(evidence(run, run.lead))
 
 
 def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:

@@ -1,0 +1,709 @@
+"""Every log is predicted by a model of the others: which logs contradict them, and why.
+
+The model is a least-squares fit of one step: the change of each velocity over a few seconds, from
+a polynomial that knows no vessel. Two things tell a log apart from those that the others predict:
+what the others' model leaves of it, and how much larger or smaller the parts of that model (hull,
+each input) would have to be in it. Both are compared with their spread over the logs that agree,
+so that noise, gusts and the polynomial's own faults, which all logs have, accuse none.
+
+A log that stands apart is then predicted with one change after the other: a dead record, another
+scale, sign, offset or delay of a channel, a current, another vessel. The likeliest is named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from residnet.core.arrays.paged import LARGE
+from residnet.core.names import VELOCITY
+from residnet.core.stretches import stretches
+from residnet.data.channels import SIGMA_OF_MAD
+from residnet.data.doctor.findings import show, slip_in_words
+from residnet.data.doctor.statistics import FEWEST, STEERING, Record, blocks_of
+
+_RIDGE = 1e-6
+_MOST_ROWS = 1500
+"""Blocks of a log that are looked at: more of them only overlap more."""
+_OVERLAP = 4.0
+"""Blocks that overlap each sample; so many of their residuals count as one."""
+_FEWEST = 12
+"""Blocks below which a log tells nothing."""
+_SIMPLER = 0.95
+"""Share of the error below which the richer form is taken."""
+# Chosen on 80 drawn fleets so that 3 clean ones are accused (scripts/bench/fleets.py --seed 1, 2).
+_PARTS, _LEFT, _SCATTERS = 4.8, 1.8, 5.5
+_STRETCHES = 4
+"""Parts of a log that are predicted from each other where there are too few logs."""
+_USUAL_PARTS = 1.3
+"""Root mean square of the score test over the parts, for the worst of three velocities, where the
+model is right: the mean of the largest of three chi variables over their size."""
+_LEAST_SCATTER = 0.1
+"""Scatter of the logarithm of what is left that logs of one vessel have at least."""
+_SUSPECTS, _SUSPICIOUS = 8, 0.5
+"""Logs that are left out in turn, so that the time grows with the number of logs only, and how
+much a log must stand apart before it is."""
+_MATERIAL = 0.15
+"""Share of what there is to predict that must be wrong: smaller differences mislead no fit."""
+_WIND = ("wind_speed", "wind_dir")
+
+
+class Sampled:
+    """The channels of a log at the samples of its blocks, [K, samples of a block] each."""
+
+    def __init__(self, log: Record, at: np.ndarray) -> None:
+        self._log, self._at, self.units = log, at, log.units
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._log
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return np.asarray(self._log[name][self._at])
+
+
+def _wind(log: Sampled, names: Sequence[str]) -> list[np.ndarray]:
+    """Return the wind's load along and across the vessel; nothing without a wind."""
+    if not (set(_WIND) <= set(names) and "psi" in log):
+        return []
+    pressure = log["wind_speed"] * np.abs(log["wind_speed"])
+    side = log["wind_dir"] - log["psi"]
+    return [pressure * np.cos(side), pressure * np.sin(side), pressure * np.sin(2.0 * side)]
+
+
+def _quadratic(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> list[np.ndarray]:
+    """Return forces of second degree in velocities and revolutions, as a hull in water has.
+
+    They stay right at speeds that the others have not run. Angles have no degree.
+    """
+    states = [log[name] for name in moving]
+    ahead = states[0]
+    out = [state * np.abs(state) for state in states]
+    out += [a * b for i, a in enumerate(states) for b in states[i + 1 :]]
+    out += [np.abs(ahead) * state for state in states[1:]]
+    angles = [log[name] for name in driving if log.units[name] == "rad"]
+    turns = [log[name] for name in driving if log.units[name] != "rad"]
+    for turn in turns:
+        out += [turn * np.abs(turn), ahead * turn]
+        out += [np.abs(turn) * state for state in states[1:]] if len(turns) <= 4 else []
+    if len(turns) <= 4:
+        out += [a * b for i, a in enumerate(turns) for b in turns[i + 1 :]]
+    for flow in (ahead, *turns[:4]):
+        out += [flow * np.abs(flow) * part for angle in angles for part in (angle, angle**2)]
+    return out
+
+
+def _polynomial(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> list[np.ndarray]:
+    """Return a polynomial in velocities and inputs with constants and linear terms."""
+    states, given = [log[name] for name in moving], [log[name] for name in driving]
+    ahead = states[0]
+    out = [np.ones_like(ahead), *states, *(state * np.abs(state) for state in states)]
+    out += [a * b for i, a in enumerate(states) for b in states[i + 1 :]]
+    out += given
+    # beyond four inputs each enters linearly only
+    for i, a in enumerate(given if len(given) <= 4 else ()):
+        out += [a * np.abs(a), ahead * a, ahead * np.abs(ahead) * a]
+        out += [b * np.abs(b) * a for j, b in enumerate(given) if j != i]
+    return out
+
+
+_Form = Callable[[Sampled, Sequence[str], Sequence[str]], list[np.ndarray]]
+
+
+@dataclass
+class Rows:
+    """The rows of a one-step fit to a log, scaled by the fleet: x [K, k], y [K, n].
+
+    `first` [K] are the samples at which their blocks of `size` samples begin, `noise` [n] is the
+    variance that the noise of the velocities gives y, and `known` is false of a log that is too
+    short to tell anything.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    first: np.ndarray
+    size: int
+    noise: np.ndarray
+
+    @property
+    def known(self) -> bool:
+        """Whether there are enough of them."""
+        return len(self.y) >= _FEWEST
+
+    @cached_property
+    def gram(self) -> np.ndarray:
+        """x' x."""
+        return np.asarray(self.x.T @ self.x)
+
+    @cached_property
+    def moments(self) -> np.ndarray:
+        """x' y."""
+        return np.asarray(self.x.T @ self.y)
+
+
+_SUMS = ("gram", "moments")
+
+
+@dataclass(frozen=True)
+class Score:
+    """How a log stands to the others.
+
+    Attributes:
+        parts: by how many standard errors the parts of the others' model differ in it, at most,
+            over what they usually differ by where that is more than one.
+        left: what the others' model leaves of it, over what is usual [n].
+        scatters: `left` in the scatter of the agreeing logs, at most.
+        wrong: share of what there is to predict that the others' model predicts wrongly, at most.
+    """
+
+    parts: float
+    left: np.ndarray
+    scatters: float
+    wrong: float
+
+    @property
+    def size(self) -> float:
+        """Beyond 1 the log contradicts the others."""
+        if self.wrong < _MATERIAL:
+            return 0.0
+        most = float(np.nanmax(self.left, initial=0.0))
+        return max(self.parts / _PARTS, min(most / _LEFT, self.scatters / _SCATTERS))
+
+
+class Model:
+    """The fit to some logs: coefficients [k, n], their uncertainty, what is usually left [n]."""
+
+    def __init__(
+        self, gram: np.ndarray, moments: np.ndarray, usual: np.ndarray | None = None
+    ) -> None:
+        gram = gram + _RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
+        self.inverse = np.linalg.inv(gram)
+        self.theta = self.inverse @ moments
+        self.usual = np.ones(self.theta.shape[1]) if usual is None else usual
+
+    @classmethod
+    def of(cls, rows: Sequence[Rows], usual: np.ndarray | None = None) -> Model:
+        """Return the fit to the rows of some logs."""
+        gram, moments = (np.sum([getattr(r, of) for r in rows], axis=0) for of in _SUMS)
+        return cls(gram, moments, usual)
+
+    def unsure(self, rows: Rows) -> np.ndarray:
+        """Return how much the coefficients' uncertainty adds to the variance [K], as a share."""
+        return np.asarray(np.einsum("ij,jk,ik->i", rows.x, self.inverse, rows.x))
+
+    def rest(self, rows: Rows) -> np.ndarray:
+        """Return what the model leaves of y [K, n], in standard deviations of what is usual."""
+        spread = np.sqrt((self.usual + rows.noise) * (1.0 + self.unsure(rows))[:, None])
+        return np.asarray((rows.y - rows.x @ self.theta) / spread)
+
+    def surprise(self, rows: Rows) -> float:
+        """Return minus twice the mean logarithm of the likelihood of a row, constants left out."""
+        spread = self.usual.size * np.log1p(self.unsure(rows)).mean()
+        return float((self.rest(rows) ** 2).sum(1).mean() + spread)
+
+
+class Fleet:
+    """Logs of one vessel, as they claim, each predicted by a model of the others.
+
+    Args:
+        logs: each with an increasing clock, and the same channels.
+        inputs: channels that drive the vessel.
+
+    Attributes:
+        core: numbers of the logs that agree.
+        apart: numbers of those that do not, the worst first.
+    """
+
+    def __init__(self, logs: Sequence[Record], inputs: Sequence[str]) -> None:
+        self.logs, self.inputs = list(logs), tuple(inputs)
+        self.moving = [name for name in VELOCITY if all(name in log for log in logs)]
+        self.driving = [name for name in inputs if not name.startswith(("wind", "current"))]
+        seconds = [
+            blocks_of(log, *self.moving).size * log.step for log in logs if len(log) >= FEWEST
+        ]
+        self.seconds = float(np.median(seconds)) if seconds else 1.0
+        self.form: _Form = _quadratic
+        errors: dict[_Form, float] = {}
+        for form in (_quadratic, _polynomial):
+            self._take(form)
+            if len(self.told) > 1:
+                models = self._others(self.told, self.told)
+                left = np.stack([self._left(i, models[i]) for i in self.told])
+                errors[form] = float(np.median(np.sqrt(left).sum(1)))
+        simple = errors.get(_quadratic, 0.0)
+        self._take(
+            _polynomial if errors.get(_polynomial, simple) < _SIMPLER * simple else _quadratic
+        )
+        self.apart: list[int] = []
+        self._rests: dict[int, list[tuple[int, int]]] = {}
+        self._settle(list(self.told))
+        if len(self.told) > 1:
+            self._separate()
+
+    def _take(self, form: _Form) -> None:
+        """Make the rows of all logs in one form."""
+        self.form = form
+        plain = [self._rows(log) for log in self.logs]
+        self.told = [i for i, one in enumerate(plain) if one.known]
+        own = [plain[i] for i in self.told]
+        ones = np.ones(1)
+        self.scale = np.sqrt(np.mean([np.mean(r.x**2, 0) for r in own], 0)) if own else ones
+        self.scale[self.scale == 0.0] = 1.0
+        self.spread = np.sqrt(np.mean([np.mean(r.y**2, 0) for r in own], 0)) if own else ones
+        self.spread[self.spread == 0.0] = 1.0
+        self.rows = [self._scaled(one) for one in plain]
+
+    def _rows(self, log: Record) -> Rows:
+        size = max(round(self.seconds / log.step), 4) if len(log) >= FEWEST else len(log)
+        stride = max(size // int(_OVERLAP), (len(log) - size) // _MOST_ROWS, 1)
+        first = np.arange(0, max(len(log) - size, 0), stride)
+        at = first[:, None] + np.arange(size + 1)
+        seen, dt = Sampled(log, at), np.diff(log.t[at], axis=1)
+        columns = [*self.form(seen, self.moving, self.driving), *_wind(seen, self.inputs)]
+        x = np.stack([0.5 * ((c[:, 1:] + c[:, :-1]) * dt).sum(1) for c in columns], axis=-1)
+        y = np.stack([log[n][first + size] - log[n][first] for n in self.moving], axis=-1)
+        known = np.isfinite(x).all(1) & np.isfinite(y).all(1)
+        known &= dt.sum(1) <= (size + 3.0) * log.step
+        noise = np.array([2.0 * log.noise(name) ** 2 for name in self.moving])
+        return Rows(x[known], y[known], first[known], size, noise)
+
+    def _scaled(self, rows: Rows) -> Rows:
+        return Rows(
+            rows.x / self.scale,
+            rows.y / self.spread,
+            rows.first,
+            rows.size,
+            rows.noise / self.spread**2,
+        )
+
+    def of(self, log: Record) -> Rows:
+        """Return the rows of a log, or of a changed one, in the scales of the fleet."""
+        return self._scaled(self._rows(log))
+
+    def _others(self, core: Sequence[int], of: Sequence[int]) -> dict[int, Model]:
+        """Return for each log the model of the others of a core."""
+        gram, moments = (np.sum([getattr(self.rows[j], s) for j in core], axis=0) for s in _SUMS)
+        out = {}
+        for i in of:
+            own = self.rows[i] if i in core else None
+            out[i] = (
+                Model(gram, moments)
+                if own is None
+                else Model(gram - own.gram, moments - own.moments)
+            )
+        return out
+
+    def _left(self, i: int, model: Model) -> np.ndarray:
+        """Return the mean square [n] that a model leaves of a log."""
+        rest = self.rows[i].y - self.rows[i].x @ model.theta
+        return np.asarray((rest**2 / (1.0 + model.unsure(self.rows[i]))[:, None]).mean(0))
+
+    def _beyond_noise(
+        self, core: Sequence[int], models: Mapping[int, Model]
+    ) -> dict[int, np.ndarray]:
+        """Return the mean squares [n] beyond noise that are left of the logs of a core.
+
+        Each is predicted by the others, or, where these are fewer than three, stretch by stretch
+        from its own remainder.
+        """
+        if len(core) > 3:
+            left = {i: self._left(i, models[i]) for i in core}
+        else:
+            left = {i: self._by_stretches(self.rows[i]) for i in core}
+        return {i: np.maximum(left[i] - self.rows[i].noise, 0.0) for i in core}
+
+    @staticmethod
+    def _by_stretches(rows: Rows) -> np.ndarray:
+        """Return the mean square [n] left of a log's quarters by models of its other quarters."""
+        parts = np.array_split(np.arange(len(rows.y)), _STRETCHES)
+        pieces = [Rows(rows.x[p], rows.y[p], rows.first[p], rows.size, rows.noise) for p in parts]
+        out = []
+        for k, piece in enumerate(pieces):
+            model = Model.of([other for j, other in enumerate(pieces) if j != k])
+            rest = piece.y - piece.x @ model.theta
+            out.append((rest**2 / (1.0 + model.unsure(piece))[:, None]).mean(0))
+        return np.asarray(np.mean(out, axis=0))
+
+    def scores(self, core: Sequence[int], of: Sequence[int]) -> dict[int, Score]:
+        """Return how logs stand to the others of the core."""
+        every = [i for i in dict.fromkeys((*core, *of)) if len(core) > (i in core)]
+        models = self._others(core, every)
+        left = {i: self._left(i, models[i]) for i in every}
+        known = self._beyond_noise(core, models)
+        together, own = np.median([*known.values()], axis=0), np.stack([known[j] for j in core])
+        usual = {
+            i: np.median(np.delete(own, core.index(i), 0), 0) if i in core else together
+            for i in every
+        }
+        beyond = {i: usual[i] + self.rows[i].noise for i in every}
+        ratio = {i: np.sqrt(left[i] / beyond[i]) for i in every}
+        parts = {i: self._parts(i, models[i], beyond[i]) for i in every}
+        inside = [i for i in core if i in ratio]
+        differ = np.array([parts[i][0] for i in inside])
+        logs = np.log(np.maximum([ratio[i] for i in inside], 1e-6))
+        out = {}
+        for i in of:
+            scatters = 0.0
+            # few logs have no scatter to speak of
+            if len(inside) > 4:
+                middle = np.median(logs, axis=0)
+                scatter = SIGMA_OF_MAD * np.median(np.abs(logs - middle), axis=0)
+                over = (np.log(np.maximum(ratio[i], 1e-6)) - middle) / np.hypot(
+                    scatter, _LEAST_SCATTER
+                )
+                scatters = float(over.max())
+            apart, moved = parts[i]
+            # a polynomial that does not fit the vessel differs from log to log by itself
+            if len(inside) > 2:
+                apart /= max(1.0, float(np.median(differ)) / _USUAL_PARTS)
+            excess = float(np.sqrt(np.maximum(left[i] - beyond[i], 0.0)).max())
+            out[i] = Score(apart, ratio[i], scatters, max(moved, excess))
+        return out
+
+    @cached_property
+    def _groups(self) -> list[np.ndarray]:
+        """Columns [k] bool that hold no input, and those that hold each."""
+        log = self.logs[self.told[0]]
+        plain = self._rows(log).x
+        groups = []
+        for name in self.driving:
+            other = self._rows(changed(log, {name: 1.7 * log[name] + 0.1}))
+            size = min(len(other.x), len(plain))
+            groups.append((np.abs(other.x[:size] - plain[:size]) > 0.0).any(0))
+        free = ~np.logical_or.reduce(groups) if groups else np.ones(plain.shape[1], dtype=bool)
+        return [free, *groups]
+
+    def _by_parts(self, i: int, model: Model, axis: int) -> np.ndarray:
+        """Return what each part of a model contributes to the change of a velocity [K, parts]."""
+        rows = self.rows[i]
+        parts = [rows.x[:, group] @ model.theta[group, axis] for group in self._groups]
+        table = np.stack(parts, axis=1)
+        return table[:, np.abs(table).max(0) > 1e-9]
+
+    def _parts(self, i: int, model: Model, beyond: np.ndarray) -> tuple[float, float]:
+        """Return by how many standard errors parts of the others' model differ in a log.
+
+        It is the score test of one factor on each part (Rao 1948), root mean square over the parts,
+        for the worst velocity; and the share of what there is to predict that such factors change.
+        `beyond` is the mean square [n] that is usually left.
+        """
+        rows = self.rows[i]
+        rest, most, moved = rows.y - rows.x @ model.theta, 0.0, 0.0
+        for axis in range(len(self.moving)):
+            table = self._by_parts(i, model, axis)
+            score, seen = table.T @ rest[:, axis], table.T @ rows.x
+            spread = table.T @ table + seen @ model.inverse @ seen.T
+            spread = _OVERLAP * max(float(beyond[axis]), 1e-12) * spread
+            inverse = np.linalg.pinv(spread, rcond=1e-9, hermitian=True)
+            most = max(most, math.sqrt(max(score @ inverse @ score, 0.0) / max(len(score), 1)))
+            factors = np.linalg.pinv(table.T @ table, rcond=1e-6, hermitian=True) @ score
+            moved = max(moved, float(np.sqrt(np.mean((table @ factors) ** 2))))
+        return most, moved
+
+    def _separate(self) -> None:
+        """Take the logs apart that contradict the others, one after the other, the worst first."""
+        while len(self.core) > max(1, len(self.told) // 2):
+            first = self.scores(self.core, self.core)
+            # a wrong log spoils the models of all others: the likeliest are left out in turn
+            likely = sorted(first, key=lambda i: -first[i].size)[:_SUSPECTS]
+            likely = [i for i in likely if first[i].size > _SUSPICIOUS]
+            if not likely:
+                break
+            second = {i: self.scores([j for j in self.core if j != i], [i])[i].size for i in likely}
+            worst = max(second, key=lambda i: second[i])
+            if second[worst] <= 1.0:
+                break
+            self.core.remove(worst)
+        self._settle(self.core)
+        gone = [i for i in self.told if i not in self.core]
+        whole = {i: self.rows[i] for i in gone}
+        for i in gone:
+            # a hand on the wheel for some seconds does not make it another vessel
+            kept = self._without(i, self.rests(i))
+            self.rows[i] = kept if kept.known else self.rows[i]
+        scores = self.scores(self.core, gone) if gone else {}
+        again = [i for i in gone if scores[i].size <= 1.0]
+        self.apart = sorted(set(gone) - set(again), key=lambda i: -scores[i].size)
+        self.rows = [whole[i] if i in self.apart else one for i, one in enumerate(self.rows)]
+        self._settle(sorted((*self.core, *again)))
+
+    def _settle(self, core: list[int]) -> None:
+        """Take logs for those that agree, and what is usually left of them."""
+        models = self._others(core, core) if len(core) > 1 else {}
+        self.core, self._usually = core, self._beyond_noise(core, models)
+
+    def unexplained_rests(self, log: Record, rows: Rows, model: Model) -> list[tuple[int, int]]:
+        """Return first and last samples of rests of all inputs whose motion nothing explains.
+
+        Where they take up more than a fifth of the log there are none: the log is a wrong one.
+        """
+        out: list[tuple[int, int]] = []
+        same = (np.diff(log.log.stack(self.driving), axis=0) == 0.0).all(1)
+        starts, stops = stretches(np.append(same, False))
+        long = stops - starts >= rows.size
+        rest = model.rest(rows) if long.any() else np.zeros(0)
+        for start, stop in zip(starts[long].tolist(), stops[long].tolist(), strict=True):
+            inside = (rows.first >= start) & (rows.first + rows.size <= stop)
+            if inside.sum() > 1:
+                left = np.sqrt(np.mean(rest[inside] ** 2, axis=0))
+                size = np.sqrt(np.mean(rows.y[inside] ** 2, axis=0))
+                if ((left > _UNEXPLAINED) & (size > _MATERIAL)).any():
+                    out.append((start, stop))
+        return out if sum(b - a for a, b in out) <= _RESTS * len(log) else []
+
+    def rests(self, i: int) -> list[tuple[int, int]]:
+        """Return the unexplained rests of one of the logs, first and last samples."""
+        if i not in self._rests:
+            told = i in self.told and len(self.core) > 1 and bool(self.driving)
+            log, rows = self.logs[i], self.rows[i]
+            self._rests[i] = (
+                self.unexplained_rests(log, rows, self.model(without=i)) if told else []
+            )
+        return self._rests[i]
+
+    def _without(self, i: int, rests: Sequence[tuple[int, int]]) -> Rows:
+        """Return the rows of a log that touch none of some stretches."""
+        rows = self.rows[i]
+        clear = np.ones(len(rows.first), dtype=bool)
+        for start, stop in rests:
+            clear &= (rows.first + rows.size <= start) | (rows.first >= stop)
+        return Rows(rows.x[clear], rows.y[clear], rows.first[clear], rows.size, rows.noise)
+
+    @cached_property
+    def agreed(self) -> bool:
+        """Whether most logs agree, so that the others can be told from them."""
+        return len(self.core) > len(self.told) / 2.0 and len(self.core) > 1
+
+    def model(self, without: int | None = None) -> Model:
+        """Return the model of the logs that agree, one of them left out."""
+        kept = [i for i in self.core if i != without]
+        usual = np.median([self._usually[i] for i in kept], axis=0)
+        return Model.of([self.rows[i] for i in kept], np.maximum(usual, 1e-12))
+
+    def harm(self, i: int) -> float:
+        """Return by how much a log changes the predictions of a fit to all, as a share of them."""
+        kept = [self.rows[j] for j in self.core if j != i]
+        alone, with_it = Model.of(kept), Model.of([*kept, self.rows[i]])
+        moved = [one.x @ (alone.theta - with_it.theta) for one in kept]
+        return float(np.sqrt(np.mean(np.concatenate(moved) ** 2, axis=0)).max())
+
+    def unexplained(self) -> np.ndarray:
+        """Return which share of the change of each velocity [n] the others' model leaves."""
+        return np.asarray(np.sqrt(np.median([*self._usually.values()], axis=0)))
+
+
+def changed(log: Record, channels: Mapping[str, np.ndarray]) -> Record:
+    """Return a record with some channels changed."""
+    whole = {**log.log.channels, **channels}
+    return Record(log.log.replace(channels=whole), log.inputs)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One change under which the others' model explains a log.
+
+    Attributes:
+        kind: dead, scale, sign, offset, late, current or vessel.
+        channel: concerned; empty where there is none.
+        size: factor, offset (SI), delay in s, or speed of the current in m/s.
+        surprise: of the log, so changed; the least is the likeliest.
+        text: in words.
+    """
+
+    kind: str
+    channel: str
+    size: float
+    surprise: float
+    text: str
+
+
+_FACTORS = (0.2, 0.33, 0.5, 0.67, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0)
+_UNITS = (math.pi / 180.0, 180.0 / math.pi, 60.0, 1.0 / 60.0, 0.5144, 1.944, 3.6, 1.0 / 3.6)
+# a change of three numbers for each velocity explains more by chance than one of a single number
+_OF_MANY = 2.0
+_STEPS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)
+_STILL = 1e-3
+
+
+def resting(fleet: Fleet, i: int, name: str) -> bool:
+    """Return whether an input rests in a log though it moves in others."""
+    own = fleet.logs[i][name]
+    among = [float(np.nanstd(fleet.logs[j][name])) for j in range(len(fleet.logs)) if j != i]
+    return float(np.nanstd(own)) <= _STILL * max(float(np.median(among)), 1e-12)
+
+
+def _with_change(kind: str, values: np.ndarray, t: np.ndarray, size: float) -> np.ndarray:
+    """Return a channel [T] of another sign, scale, clock or zero."""
+    if kind == "late":
+        return np.asarray(np.interp(t - size, t, values))
+    return np.asarray(values + size if kind == "offset" else values * size)
+
+
+def _in_words(kind: str, name: str, unit: str, size: float) -> str:
+    would = f"{name} would have to"
+    if kind == "sign":
+        return f"{would} have the opposite sign"
+    if kind == "scale":
+        return f"{would} be {size:.3g} times as large{slip_in_words(1.0 / size)}"
+    if kind == "late":
+        word = "later" if size > 0.0 else "earlier"
+        return f"{would} act {abs(size):.2g} s {word}: the clocks differ"
+    return f"{would} be larger by {show(size, unit)}"
+
+
+def causes(fleet: Fleet, i: int) -> list[Cause]:
+    """Return what would explain a log by the others' model, the likeliest first."""
+    log, model, rows = fleet.logs[i], fleet.model(without=i), fleet.rows[i]
+    unsure = model.surprise(rows) - float((model.rest(rows) ** 2).sum(1).mean())
+    out: list[Cause] = []
+    for name in (*fleet.driving, *fleet.moving):
+        drives = name in fleet.driving
+        spread = float(np.nanmedian([np.nanstd(fleet.logs[j][name]) for j in fleet.core])) or 1.0
+        if drives and resting(fleet, i, name):
+            surprise = _freed(fleet, model, i, name, 0.01 * spread) + unsure
+            text = f"the record of {name} is dead: it rests while the vessel answers to it"
+            out.append(Cause("dead", name, 0.0, surprise, text))
+            continue
+        sizes = {"sign": [-1.0], "scale": [*_UNITS]}
+        if drives:
+            sizes["scale"] += _FACTORS
+            sizes["late"] = [step * fleet.seconds for step in _STEPS]
+            sizes["offset"] = [step * spread for step in _STEPS]
+        for kind, tried in sizes.items():
+            found = []
+            for size in tried:
+                values = _with_change(kind, log[name], log.t, size)
+                surprise = model.surprise(fleet.of(changed(log, {name: values})))
+                # what is predicted has another density where it is scaled
+                found.append((surprise - (0.0 if drives else 2.0 * math.log(abs(size))), size))
+            surprise, size = min(found)
+            text = _in_words(kind, name, log.units[name], size)
+            out.append(Cause(kind, name, size, surprise, text))
+    if "psi" in log and {"u", "v"} <= set(fleet.moving):
+        out.append(_current(fleet, model, log))
+    out.append(_vessel(fleet, model, i, unsure))
+    return sorted(out, key=lambda one: one.surprise)
+
+
+def _freed(fleet: Fleet, model: Model, i: int, name: str, step: float) -> float:
+    """Return what is left of a log where an input may be anything at any time."""
+    log, rows = fleet.logs[i], fleet.rows[i]
+    more, less = (fleet.of(changed(log, {name: log[name] + s})) for s in (step, -step))
+    along = (more.x - less.x) @ model.theta / np.sqrt(model.usual + rows.noise)
+    along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+    rest = model.rest(rows)
+    rest = rest - (rest * along).sum(1, keepdims=True) * along
+    free = rest.shape[1] - 1
+    # one of so many velocities was given away at each block
+    return float((rest**2).sum(1).mean()) * (rest.shape[1] / free if free else 1.0)
+
+
+def _current(fleet: Fleet, model: Model, log: Record) -> Cause:
+    """Return the current that would explain velocities over ground, by search on a grid."""
+    usual = float(np.nanmedian([fleet.logs[j].speed for j in fleet.core]))
+
+    def surprise(current: complex) -> float:
+        water = (log["u"] + 1j * log["v"]) - current * np.exp(-1j * log["psi"])
+        return model.surprise(fleet.of(changed(log, {"u": water.real, "v": water.imag})))
+
+    ways = np.exp(0.25j * np.pi * np.arange(8))
+    grid = [share * usual * way for share in (0.1, 0.2, 0.3, 0.4, 0.5) for way in ways]
+    least, best = min(((surprise(one), k) for k, one in enumerate(grid)))
+    found, step = complex(grid[best]), 0.05 * usual
+    while step > 0.01 * usual:
+        near = [found + step * way for way in ways]
+        lower, k = min((surprise(one), k) for k, one in enumerate(near))
+        if lower < least:
+            least, found = lower, complex(near[k])
+        else:
+            step *= 0.5
+    way = math.degrees(math.atan2(found.imag, found.real)) % 360.0
+    text = (
+        f"it ran in a current of {abs(found):.2g} m/s towards {way:.0f} deg, and u and v are over"
+        " ground"
+    )
+    return Cause("current", "", abs(found), least, text)
+
+
+def _vessel(fleet: Fleet, model: Model, i: int, unsure: float) -> Cause:
+    """Return what is left of a log if every part of the model had a size of its own in it."""
+    rest, rows, left = model.rest(fleet.rows[i]), fleet.rows[i], 0.0
+    spread = np.sqrt((model.usual + rows.noise) * (1.0 + model.unsure(rows))[:, None])
+    for axis in range(len(fleet.moving)):
+        table = fleet._by_parts(i, model, axis) / spread[:, [axis]]
+        sizes = np.linalg.lstsq(table, rest[:, axis], rcond=1e-6)[0]
+        left += float(np.mean((rest[:, axis] - table @ sizes) ** 2))
+    text = "it is another vessel or another loading: no single change of a channel explains it"
+    return Cause("vessel", "", 0.0, _OF_MANY * left + unsure, text)
+
+
+# Of 92 stretches of KVLCC2's logs none reaches 3.2, of 311 of the tanker's six do, among them all
+# three in which the ship accelerates with propeller and rudder at exactly 0.
+_UNEXPLAINED, _RESTS = 5.5, 0.2
+"""Times what is usual that the others' model must leave of a stretch (root mean square), and the
+share of a log up to which such stretches are a hand on the wheel, and not a wrong log."""
+
+
+def dead_commands(
+    learned: Sequence[Record], further: Sequence[Record], inputs: Sequence[str]
+) -> dict[str, list[tuple[int, int]]]:
+    """Return stretches of motion that no recorded input explains while all inputs rest.
+
+    Somebody took over by hand, say, or the record stopped.
+
+    Args:
+        learned: logs that the models are made of; each is predicted by a model of the others.
+        further: logs that are predicted by the model of those.
+        inputs: channels that drive the vessel.
+
+    Returns:
+        Name of a log -> first and last samples.
+    """
+    fit = [log for log in learned if _usable(log, inputs)]
+    if not fit or not any(all(name in log for log in fit) for name in VELOCITY):
+        return {}
+    fleet = Fleet(fit, inputs)
+    out = {log.name: fleet.rests(i) for i, log in enumerate(fit)}
+    for log in further if len(fleet.core) > 1 and fleet.driving else ():
+        if _usable(log, inputs) and set(fleet.moving) <= set(log):
+            out[log.name] = fleet.unexplained_rests(log, fleet.of(log), fleet.model())
+    return {name: found for name, found in out.items() if found}
+
+
+def _usable(log: Record, inputs: Sequence[str]) -> bool:
+    """Return whether a log has a clock and all inputs, and is not too long to be looked at."""
+    return (
+        1 < len(log) <= LARGE
+        and bool((np.diff(log.t) > 0.0).all())
+        and all(name in log for name in inputs)
+    )
+
+
+def nothing_steers(fleet: Fleet) -> tuple[list[str], float]:
+    """Return steering records that rest in every log, and the share of yaw left unexplained.
+
+    No name where one of them moves, or what moves explains the yaw. Of one side's propeller and
+    the other's, either steers.
+    """
+    if "r" not in fleet.moving or len(fleet.core) < 2:
+        return [], 0.0
+    sides = [name for name in fleet.driving if name.endswith(("port", "stbd", "left", "right"))]
+    steering = [name for name in fleet.driving if name in STEERING] or sides
+    dead = [
+        name
+        for name in steering
+        if all(
+            float(np.nanstd(log[name])) <= _STILL * max(float(np.nanmax(np.abs(log[name]))), 1e-12)
+            for log in fleet.logs
+        )
+    ]
+    left = float(fleet.unexplained()[fleet.moving.index("r")])
+    return (dead, left) if left > _UNSTEERED else ([], left)
+
+
+# with all records alive .02 to .31 of the change of r is left, with the steering dead .30 to .71
+# (40 fleets of scripts/bench/fleets.py)
+_UNSTEERED = 0.3

@@ -1,0 +1,108 @@
+"""Logs that contradict each other are named with their cause, good ones are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fleets import CONTRADICTIONS, Fleet, drawn
+
+from residnet.core.log import Log
+from residnet.data.doctor import Finding, inspect_together
+from residnet.data.doctor.others import dead_commands
+from residnet.data.doctor.statistics import Record
+
+# fleets that no limit was chosen on
+_SEED, _COUNT = 11, 3
+
+
+@pytest.fixture(scope="module", params=["boat", "twin"])
+def fleets(request: pytest.FixtureRequest) -> list[Fleet]:
+    return drawn(request.param, _SEED, _COUNT)
+
+
+def found(logs: list[Log], fleet: Fleet) -> list[Finding]:
+    findings = inspect_together(logs, fleet.inputs).findings
+    return [one for one in findings if one.code.startswith("contradicts")]
+
+
+def test_clean_fleets_hold_no_contradiction(fleets: list[Fleet]) -> None:
+    assert [one.text for fleet in fleets for one in found(fleet.logs, fleet)] == []
+
+
+@pytest.mark.parametrize("what", CONTRADICTIONS)
+def test_a_contradiction_is_named_with_its_cause(fleets: list[Fleet], what: str) -> None:
+    hits = 0
+    for number, fleet in enumerate(fleets):
+        random = np.random.default_rng([_SEED, number])
+        logs, at, cause = CONTRADICTIONS[what](fleet, random)
+        logs = [log.replace(name=f"log_{i:02d}") for i, log in enumerate(logs)]
+        name = fleet.steering if at is None else f"log_{at:02d}"
+        named = [one for one in found(logs, fleet) if one.text.startswith(name)]
+        hits += any(cause in one.code for one in named)
+    # scripts/bench/fleets.py tells how often, over many more of them
+    assert hits >= _COUNT - 1
+
+
+def test_a_sign_an_offset_and_a_scale_are_told_apart(fleets: list[Fleet]) -> None:
+    fleet = fleets[0]
+    name = fleet.steering
+    changes = {"sign": lambda x: -x, "scale": lambda x: 3.0 * x}
+    for cause, change in changes.items():
+        log = fleet.logs[2]
+        channels = {**log.channels, name: change(log[name])}
+        logs = [*fleet.logs[:2], log.replace(channels=channels), *fleet.logs[3:]]
+        (one,) = [one for one in found(logs, fleet) if one.text.startswith(log.name)]
+        assert one.code == f"contradicts_{cause}"
+        assert name in one.text
+
+
+def _hand_on_the_wheel(fleet: Fleet) -> tuple[list[Log], slice]:
+    """Replace the inputs of a stretch of the first log by their rest at zero."""
+    log = fleet.logs[0]
+    rows = slice(len(log) // 2, len(log) // 2 + round(0.15 * len(log)))
+    channels = {name: values.copy() for name, values in log.channels.items()}
+    for name in fleet.inputs:
+        channels[name][rows] = 0.0
+    return [log.replace(channels=channels), *fleet.logs[1:]], rows
+
+
+def test_motion_without_a_command_is_found_where_it_is(fleets: list[Fleet]) -> None:
+    fleet = fleets[0]
+    records = [Record(log, fleet.inputs) for log in fleet.logs]
+    assert dead_commands(records, [], fleet.inputs) == {}
+    logs, rows = _hand_on_the_wheel(fleet)
+    records = [Record(log, fleet.inputs) for log in logs]
+    for learned, further in ((records, []), (records[1:], records[:1])):
+        ((start, stop),) = dead_commands(learned, further, fleet.inputs)[logs[0].name]
+        assert abs(start - rows.start) <= 1
+        assert abs(stop - rows.stop) <= 1
+    (told,) = inspect_together(logs, fleet.inputs).find("dead_commands")
+    assert told.text.startswith(logs[0].name)
+
+
+def test_two_logs_that_contradict_each_other_are_named() -> None:
+    (fleet,) = drawn("boat", _SEED, 1)
+    log = fleet.logs[1]
+    channels = {**log.channels, fleet.steering: -log[fleet.steering]}
+    assert found(fleet.logs[:2], fleet) == []
+    (one,) = found([fleet.logs[0], log.replace(channels=channels)], fleet)
+    assert "no more than half of the logs agree" in one.text
+
+
+def test_logs_of_a_surge_alone_are_looked_at_too() -> None:
+    random = np.random.default_rng(3)
+    t = np.arange(0.0, 120.0, 0.2)
+
+    def surge(number: int, gain: float) -> Log:
+        n = np.repeat(random.uniform(2.0, 8.0, t.size // 50), 50)
+        u = np.zeros(t.size)
+        for k in range(t.size - 1):
+            u[k + 1] = u[k] + 0.2 * (0.02 * gain * n[k] ** 2 - 0.3 * u[k] * abs(u[k]))
+        u += 0.01 * random.standard_normal(t.size)
+        return Log(f"run_{number}", t, {"u": u, "n": n})
+
+    logs = [surge(number, 1.0) for number in range(6)]
+    fleet = Fleet("lake", logs, [], ("n",), "n")
+    assert found(logs, fleet) == []
+    (one,) = found([*logs, surge(6, 0.3)], fleet)
+    assert one.text.startswith("run_6")
