@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import time
 from abc import abstractmethod
@@ -9,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
 
 from pydantic import Field
 
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from residnet.report.blocks import Section
     from residnet.report.browser import Drawn
 
+PartName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+"""Of a part of a run: a model, a controller, a variant."""
 Exports = Mapping[str, Callable[[], Path]]
 """What writes each export and returns its file, by the name of the model."""
 
@@ -131,13 +134,20 @@ class Task(Config):
             ResidnetError: where the input does not allow it.
         """
 
+    page: ClassVar[str]
+    """Module of `residnet.report.sections` that a run's page is from."""
+
     @classmethod
-    @abstractmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Draw the figures of a finished run and return the sections of its report.
 
         Everything is taken from the folder alone; verdict, provenance and configuration are added.
         """
+        from residnet.report.run_reader import RunFiles
+
+        module = importlib.import_module(f"residnet.report.sections.{cls.page}")
+        found: Sequence[Section] = module.sections(RunFiles(run.path))
+        return found
 
     def check(self) -> None:
         """Check what reading the config does not show, without running.

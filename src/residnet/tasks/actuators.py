@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -16,17 +16,12 @@ from residnet.core.names import nearest, to_si
 from residnet.data.readers.texts import as_utf8
 from residnet.physics.actuators.identify import (
     Estimate,
-    StepAnswer,
-    ThrottleMap,
-    ThrustFit,
     fit_step,
     fit_throttle,
     fit_thrust,
 )
-from residnet.report.blocks import Section
 from residnet.report.figure import write_figures
-from residnet.report.run_reader import RunFiles
-from residnet.report.sections.actuators import actuator_tests, sections
+from residnet.report.sections.actuators import actuator_tests
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 
@@ -148,6 +143,8 @@ class ActuatorsTaskConfig(Task):
         bollard: test of the thrust curves; null for none.
     """
 
+    page: ClassVar[str] = "actuators"
+
     task: Literal["actuators"]
     throttle: ThrottleTest | None = None
     step: StepTest | None = None
@@ -179,103 +176,73 @@ class ActuatorsTaskConfig(Task):
     def carry_out(self, folder: RunFolder) -> Outcome:
         """Identify the actuators, and write actuators.yaml, actuators.json and a figure.
 
+        The lines for the section `actuators` of a vessel file have intervals as comments.
+
         Raises:
             ResidnetError: where the logs cannot be used or do not determine the actuators.
         """
-        throttle = step = thrust = drawn_throttle = drawn_step = drawn_pull = None
-        figures: dict[str, MainFigure] = {}
-        tests = []
+        throttle = step = pull = None
+        tests, figures = [], dict[str, MainFigure]()
+        numbers: dict[str, Any] = {"schema": "residnet.actuators/1"}
+        files = ", ".join(path.name for path in self.input_files())
+        lines = [f"# from {files}; intervals are 95 %"]
         if self.throttle is not None:
             share, n = self.throttle.together()
-            throttle = fit_throttle(share, n)
-            drawn_throttle = (share, n, throttle)
-            figures["n_max"] = MainFigure(throttle.n_max.value, "1/s")
+            curve = fit_throttle(share, n)
+            throttle, slope, most = (share, n, curve), curve.slope, curve.n_max
+            figures["n_max"] = MainFigure(most.value, "1/s")
+            numbers["throttle"] = {
+                name: part._asdict() if isinstance(part, Estimate) else part
+                for name, part in curve._asdict().items()
+            }
+            largest = "largest measured: nothing saturated"
+            lines += [
+                f"# n = {slope.value * 60:.6g} rpm * throttle {curve.offset.value * 60:+.4g} rpm"
+                f" (slope {_ends(slope, 60, 6)})",
+                f"n_max: {most.value * 60:.5g} rpm "
+                f" # {_ends(most, 60, 5) if curve.saturated else largest}",
+            ]
             tests.append("throttle map")
         if self.step is not None:
             runs = [(t, command, n) for t, command, n in self.step.read()]
-            step = fit_step(runs)
-            drawn_step = (runs, step)
-            figures["n_rate"] = MainFigure(step.rate.value, "1/s^2")
-            figures["dead_time"] = MainFigure(step.dead_time.value, "s")
+            answer = fit_step(runs)
+            step, rate, dead = (runs, answer), answer.rate, answer.dead_time
+            figures["n_rate"] = MainFigure(rate.value, "1/s^2")
+            figures["dead_time"] = MainFigure(dead.value, "s")
+            numbers["step"] = {name: part._asdict() for name, part in answer._asdict().items()}
+            lines += [
+                f"n_rate: {rate.value * 60:.5g} rpm/s  # {_ends(rate, 60, 5)}",
+                f"# dead_time: {dead.value:.3g} s  ({_ends(dead, 1, 3)})",
+            ]
             tests.append("step response")
         if self.bollard is not None:
-            n, pull = self.bollard.together()
-            thrust = fit_thrust(n, pull, self.bollard.thrusters)
-            drawn_pull = (n, pull / self.bollard.thrusters, thrust)
+            n, force = self.bollard.together()
+            thrust = fit_thrust(n, force, self.bollard.thrusters)
+            pull = (n, force / self.bollard.thrusters, thrust)
+            for name, fit in zip(("forward", "reverse"), thrust, strict=True):
+                curves = {f"c{i}": c for i, c in enumerate(fit.coefficients)}
+                entries = {key: c._asdict() for key, c in curves.items()}
+                numbers[name] = entries | {"low": fit.low, "high": fit.high, "rms": fit.rms}
+                values = ", ".join(f"{c.value:.6g}" for c in fit.coefficients)
+                lines.append(f"{name}: [{values}]  # rms residual {fit.rms:.3g} N per thruster")
+                lines += [f"#   {key}: {_ends(c, 1, 6)} {c.unit}" for key, c in curves.items()]
+            low, high = thrust[1].low * 60, thrust[0].high * 60
+            lines.append(f"curve_range: [{low:.5g} rpm, {high:.5g} rpm]")
             tests.append("thrust curves")
-        text = self._lines(throttle, step, thrust)
+        lines.append(f"source: {json.dumps(f'identified by residnet, run {self.name}')}")
+        text = "\n".join(lines) + "\n"
         folder.write(folder.path / "actuators.yaml", text)
-        folder.write_json(folder.path / "actuators.json", _numbers(throttle, step, thrust))
-        drawing = actuator_tests(self.name, drawn_throttle, drawn_step, drawn_pull)
-        write_figures(folder.figures, [drawing])
+        folder.write_json(folder.path / "actuators.json", numbers)
+        write_figures(folder.figures, [actuator_tests(self.name, throttle, step, pull)])
         sentence = (
             f"The tests gave {' and '.join(tests)}; actuators.yaml holds the lines for a vessel"
             " file."
         )
         return Outcome([sentence], figures, text)
 
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Return parameters and lines for a vessel file; the figure is that of the run."""
-        return sections(RunFiles(run.path))
-
-    def _lines(
-        self,
-        throttle: ThrottleMap | None,
-        step: StepAnswer | None,
-        thrust: tuple[ThrustFit, ThrustFit] | None,
-    ) -> str:
-        """Return lines for the section `actuators` of a vessel file, intervals as comments."""
-        files = ", ".join(path.name for path in self.input_files())
-        lines = [f"# from {files}; intervals are 95 %"]
-        if throttle is not None:
-            slope, m = throttle.slope, throttle.n_max
-            lines.append(
-                f"# n = {slope.value * 60:.6g} rpm * throttle {throttle.offset.value * 60:+.4g} rpm"
-                f" (slope {_ends(slope, 60, 6)})"
-            )
-            largest = "largest measured: nothing saturated"
-            about = _ends(m, 60, 5) if throttle.saturated else largest
-            lines.append(f"n_max: {m.value * 60:.5g} rpm  # {about}")
-        if step is not None:
-            rate, dead = step.rate, step.dead_time
-            lines.append(f"n_rate: {rate.value * 60:.5g} rpm/s  # {_ends(rate, 60, 5)}")
-            lines.append(f"# dead_time: {dead.value:.3g} s  ({_ends(dead, 1, 3)})")
-        for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):
-            values = ", ".join(f"{c.value:.6g}" for c in fit.coefficients)
-            lines.append(f"{name}: [{values}]  # rms residual {fit.rms:.3g} N per thruster")
-            lines += [
-                f"#   c{i}: {_ends(c, 1, 6)} {c.unit}" for i, c in enumerate(fit.coefficients)
-            ]
-        if thrust is not None:
-            low, high = thrust[1].low * 60, thrust[0].high * 60
-            lines.append(f"curve_range: [{low:.5g} rpm, {high:.5g} rpm]")
-        lines.append(f"source: {json.dumps(f'identified by residnet, run {self.name}')}")
-        return "\n".join(lines) + "\n"
-
 
 def _ends(estimate: Estimate, factor: float, digits: int) -> str:
     return f"{estimate.low * factor:.{digits}g} .. {estimate.high * factor:.{digits}g}"
-
-
-def _numbers(
-    throttle: ThrottleMap | None,
-    step: StepAnswer | None,
-    thrust: tuple[ThrustFit, ThrustFit] | None,
-) -> dict[str, Any]:
-    """Return the identified actuators as the content of actuators.json."""
-    out: dict[str, Any] = {"schema": "residnet.actuators/1"}
-    if throttle is not None:
-        out["throttle"] = {
-            name: part._asdict() if isinstance(part, Estimate) else part
-            for name, part in throttle._asdict().items()
-        }
-    if step is not None:
-        out["step"] = {name: part._asdict() for name, part in step._asdict().items()}
-    for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):
-        entries = {f"c{i}": c._asdict() for i, c in enumerate(fit.coefficients)}
-        out[name] = entries | {"low": fit.low, "high": fit.high, "rms": fit.rms}
-    return out
 
 
 def _read(path: Path, columns: Sequence[Column]) -> tuple[np.ndarray, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, final
 
@@ -40,13 +40,10 @@ from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.store import chosen_model, load_model
 from residnet.physics.environment import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
-from residnet.report.blocks import Section
-from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, Outcome
+from residnet.runs.task import ComputingTask, Outcome, PartName
 from residnet.training.policies.config import PolicyTraining
 
-_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]
 
 
@@ -75,7 +72,7 @@ class PolicyConfig(Config):
         training: how it is trained.
     """
 
-    start: _Name | None
+    start: PartName | None
     units: int = Field(default=16, ge=0, le=10_000)
     learned: LearnedConfig | None = None
     training: PolicyTraining = PolicyTraining()
@@ -115,7 +112,7 @@ class JudgedConditions(Config):
 
     stated: ConditionsConfig = ConditionsConfig()
     flights: int = Field(default=1500, ge=2, le=1_000_000)
-    beyond: dict[_Name, ConditionsConfig] = Field(default_factory=dict)
+    beyond: dict[PartName, ConditionsConfig] = Field(default_factory=dict)
     evolution: TuningConfig = TuningConfig()
     tuned_in: Path | None = None
 
@@ -193,13 +190,14 @@ class AutopilotConfig(ComputingTask):
     pace: Literal["vessel"] | Annotated[float, Field(gt=0, le=1_000)] = 1.0
     test: StepTestConfig
     conditions: JudgedConditions | None = None
-    policies: dict[_Name, PolicyConfig] = Field(default_factory=dict)
-    predictive: dict[_Name, PredictiveConfig] = Field(default_factory=dict)
-    peers: dict[_Name, AnyController] = Field(default_factory=dict)
-    floor: _Name | None = None
+    policies: dict[PartName, PolicyConfig] = Field(default_factory=dict)
+    predictive: dict[PartName, PredictiveConfig] = Field(default_factory=dict)
+    peers: dict[PartName, AnyController] = Field(default_factory=dict)
+    floor: PartName | None = None
     safe: Literal["hold", "amidships"] = "amidships"
 
     verbs: ClassVar[tuple[str, ...]] = ("report", "export")
+    page: ClassVar[str] = "autopilot"
 
     @model_validator(mode="after")
     def _names(self) -> Self:
@@ -305,15 +303,6 @@ class AutopilotConfig(ComputingTask):
         from residnet.tasks.autopilot_run import run_autopilot
 
         return run_autopilot(self, folder)
-
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Draw the figures and return the comparison of the controllers."""
-        from residnet.report.sections.autopilot import draw, sections
-
-        files = RunFiles(run.path)
-        draw(files)
-        return sections(files)
 
     def export_model(
         self,

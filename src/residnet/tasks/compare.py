@@ -12,8 +12,9 @@ import numpy as np
 from residnet.core.errors import UsageError
 from residnet.core.names import VELOCITY
 from residnet.judge.metrics import blocks, difference
-from residnet.report.blocks import Block, Cell, Section, Table
+from residnet.report.blocks import Block, Cell, Section, Table, table_of
 from residnet.report.figure import Case, Figure, Panel, family, write_figure
+from residnet.report.format import DEG
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
@@ -133,47 +134,66 @@ def paired(runs: Sequence[JudgedRun]) -> dict[str, dict[str, Any]]:
 
 
 def _metrics_table(runs: Sequence[JudgedRun]) -> Table:
-    table = Table(
-        ["run", "model", "protocol", "u [m/s]", "v [m/s]", "r [deg/s]", "NRMSE [-]", "diverged"],
+    rows = [
+        {**row, "run": run.name, "chosen": row["model"] == run.model}
+        for run in runs
+        for row in run.rows
+        if (row["split"], row["manoeuvre"]) == (run.split, "all")
+    ]
+    return table_of(
+        rows,
+        [
+            ("run", "run"),
+            ("model", lambda row: f"{row['model']}{' (selected)' if row['chosen'] else ''}"),
+            ("protocol", "protocol"),
+            ("u [m/s]", "rmse.u", "{:.3g}".format),
+            ("v [m/s]", "rmse.v", "{:.3g}".format),
+            ("r [deg/s]", "rmse.r", "{:.3g}".format, DEG),
+            ("NRMSE [-]", "nrmse.mean", "{:.3g}".format),
+            ("diverged", lambda row: Cell(f"{row['diverged']}/{row['windows']}")),
+        ],
         caption="Errors in free run on the test split of each run, by that run's own scales.",
+        selected=lambda row: row["chosen"],
+        rule=lambda row: row["run"],
     )
-    for run in runs:
-        rows = [r for r in run.rows if (r["split"], r["manoeuvre"]) == (run.split, "all")]
-        for number, row in enumerate(rows):
-            selected, rmse = row["model"] == run.model, row["rmse"]
-            texts = [f"{row['model']}{' (selected)' if selected else ''}", str(row["protocol"])]
-            numbers = [rmse["u"], rmse["v"], np.degrees(rmse["r"]), row["nrmse"]["mean"]]
-            cells = [Cell(text, mark="text") for text in texts]
-            cells += [Cell(f"{value:.3g}") for value in numbers]
-            cells.append(Cell(f"{row['diverged']}/{row['windows']}"))
-            table.add(run.name, cells, rule=number == 0, selected=selected)
-    return table
 
 
 def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> Table:
-    table = Table(
-        ["run", "model", "protocol", "windows", "NRMSE [-]", "difference", "95 % interval"],
-        caption=(
-            "Selected models over the windows that all runs were judged on, by the scales of"
-            f" {runs[0].name}; differences to {runs[0].name}, negative where the run is better."
-        ),
+    first = runs[0].name
+    rows = [
+        {**entries[run.name], "run": run.name, "model": run.model, "protocol": protocol}
+        for protocol, entries in pairs.items()
+        for run in runs
+    ]
+    least = {
+        protocol: min(entry["mean"] for entry in entries.values())
+        for protocol, entries in pairs.items()
+    }
+
+    def apart(row: Mapping[str, Any]) -> Cell:
+        return Cell("" if row["run"] == first else f"{row['nrmse_mean']:+.3f}")
+
+    def interval(row: Mapping[str, Any]) -> Cell:
+        ends = row["ci95"]
+        text = f"{ends[0]:+.3f} to {ends[1]:+.3f}" if ends else "too few logs"
+        return Cell("" if row["run"] == first else text)
+
+    return table_of(
+        rows,
+        [
+            ("run", "run"),
+            ("model", "model"),
+            ("protocol", "protocol"),
+            ("windows", "windows", str),
+            ("NRMSE [-]", "mean", "{:.3g}".format),
+            ("difference", apart),
+            ("95 % interval", interval),
+        ],
+        caption="Selected models over the windows that all runs were judged on, by the scales of"
+        f" {first}; differences to {first}, negative where the run is better.",
+        selected=lambda row: row["mean"] == least[row["protocol"]],
+        rule=lambda row: row["protocol"],
     )
-    for protocol, entries in pairs.items():
-        for run in runs:
-            entry, told = entries[run.name], ("", "")
-            if run is not runs[0]:
-                ends = entry["ci95"]
-                interval = f"{ends[0]:+.3f} to {ends[1]:+.3f}" if ends else "too few logs"
-                told = (f"{entry['nrmse_mean']:+.3f}", interval)
-            cells = [Cell(run.model, mark="text"), Cell(protocol, mark="text")]
-            texts = (str(entry["windows"]), f"{entry['mean']:.3g}", *told)
-            table.add(
-                run.name,
-                [*cells, *map(Cell, texts)],
-                rule=run is runs[0],
-                selected=entry["mean"] == min(one["mean"] for one in entries.values()),
-            )
-    return table
 
 
 def _config_table(runs: Sequence[JudgedRun]) -> Table:
@@ -182,13 +202,14 @@ def _config_table(runs: Sequence[JudgedRun]) -> Table:
     found = [pair for pair in found if pair[0] not in ("name", "description")]
     more = f" The first {_MOST} of {len(found)} stand here." if len(found) > _MOST else ""
     told = f"What the runs were asked to do differently; what is alike is left out.{more}"
-    table = Table(
-        ["setting", *(run.name for run in runs)],
+    return table_of(
+        found[:_MOST],
+        [
+            ("setting", lambda pair: pair[0]),
+            *((run.name, lambda pair, i=i: pair[1][i]) for i, run in enumerate(runs)),
+        ],
         caption=told if found else "The runs were asked to do the same.",
     )
-    for key, texts in found[:_MOST]:
-        table.add(key, [Cell(text, mark="text") for text in texts])
-    return table
 
 
 def _differing(values: Sequence[Any], path: str) -> list[tuple[str, list[str]]]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple, Self, final
+from typing import ClassVar, Literal, NamedTuple, Self, final
 
 import numpy as np
 import torch
@@ -28,13 +27,9 @@ from residnet.core.config import (
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import nearest
 from residnet.dynamics.simulated import check_steps
-from residnet.report.blocks import Section
-from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, Outcome
+from residnet.runs.task import ComputingTask, Outcome, PartName
 from residnet.tasks.autopilot import AnyController, AutopilotConfig, named_export
-
-_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
 class Vessels(NamedTuple):
@@ -132,9 +127,9 @@ class CourseTaskConfig(ComputingTask):
 
     task: Literal["course"]
     autopilot: ExistingPath
-    policy: _Name = "policy"
-    peers: tuple[_Name, ...] = ("pid",)
-    others: dict[_Name, AnyController] = Field(default_factory=dict)
+    policy: PartName = "policy"
+    peers: tuple[PartName, ...] = ("pid",)
+    others: dict[PartName, AnyController] = Field(default_factory=dict)
     course: BuoyCourseConfig
     protocols: tuple[Protocol, ...] = Field(default=("enter", "sides"), min_length=1)
     integral: MetresPerSecond | None = Field(default=None, gt=0)
@@ -158,6 +153,7 @@ class CourseTaskConfig(ComputingTask):
         return self.spread.seed if self.spread else 0
 
     verbs: ClassVar[tuple[str, ...]] = ("report", "export")
+    page: ClassVar[str] = "course"
 
     def autopilot_config(self) -> AutopilotConfig:
         """Return the config of the autopilot, from its run folder or its file.
@@ -210,15 +206,6 @@ class CourseTaskConfig(ComputingTask):
         from residnet.tasks.course_run import run_course
 
         return run_course(self, folder)
-
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Draw the figures and return the comparison of the flights."""
-        from residnet.report.sections.course import draw, sections
-
-        files = RunFiles(run.path)
-        draw(files)
-        return sections(files)
 
     def export_model(
         self,

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -16,9 +15,6 @@ from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.base import files_of
 from residnet.data.split import log_names
-from residnet.report.blocks import Section
-from residnet.report.run_reader import RunFiles
-from residnet.report.sections.import_logs import sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 
@@ -34,6 +30,8 @@ class ImportConfig(Task):
         root: folder that `logs` start from; the current folder where not given.
         logs: files, folders (for readers of folders) or patterns such as `raw_*`.
     """
+
+    page: ClassVar[str] = "import_logs"
 
     task: Literal["import"]
     reader: ReaderConfig
@@ -100,11 +98,6 @@ class ImportConfig(Task):
         )
         figures = {"logs": MainFigure(len(paths)), "logs_with_findings": MainFigure(loud)}
         return Outcome([sentence], figures, "\n".join(lines))
-
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Return what was read, and what was noticed on the way in."""
-        return sections(RunFiles(run.path))
 
     def _paths(self) -> list[Path]:
         root = self.root or Path.cwd()

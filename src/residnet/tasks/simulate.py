@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -40,10 +40,8 @@ from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.replay import Replay
 from residnet.physics.vessel import load_vessel
-from residnet.report.blocks import Section
 from residnet.report.figure import write_figures
-from residnet.report.run_reader import RunFiles
-from residnet.report.sections.manoeuvres import flight_figures, indices_text, sections
+from residnet.report.sections.manoeuvres import flight_figures, indices_text
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome
 
@@ -270,6 +268,8 @@ class SimulateConfig(ComputingTask):
         data: trials as the task `fit` draws and splits them: logs/<split>/<log>.parquet.
     """
 
+    page: ClassVar[str] = "manoeuvres"
+
     task: Literal["simulate"]
     programme: Programme | None = None
     data: SimulatedTrials | None = None
@@ -372,8 +372,3 @@ class SimulateConfig(ComputingTask):
             indices_text(content) if len(rows) <= _SHOWN else "",
             failure or "",
         )
-
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Return the tables of manoeuvring indices; the figures are those of the run."""
-        return sections(RunFiles(run.path))

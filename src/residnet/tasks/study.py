@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,21 +17,15 @@ from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.core.processes import processes
 from residnet.core.progress import report
-from residnet.report.blocks import Section
-from residnet.report.run_reader import RunFiles
 from residnet.report.sections.study import (
     Variant,
-    draw,
-    sections,
     table,
     variants_table,
     window_nrmse,
 )
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure, Outcome, Task
+from residnet.runs.task import MainFigure, Outcome, PartName, Task
 from residnet.tasks.fit import FitConfig
-
-_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
 class StudyConfig(Task):
@@ -50,10 +44,12 @@ class StudyConfig(Task):
         workers: runs at a time, one process each.
     """
 
+    page: ClassVar[str] = "study"
+
     task: Literal["study"]
     base: BaseConfig
     common: tuple[str, ...] = ()
-    variants: dict[_Name, tuple[str, ...]] = Field(min_length=2)
+    variants: dict[PartName, tuple[str, ...]] = Field(min_length=2)
     reference: str
     model: str = "selected"
     split: Literal["validation", "test"] = "test"
@@ -158,13 +154,6 @@ class StudyConfig(Task):
         }
         text = variants_table(rows, self.reference).text()
         return Outcome(_verdict(rows, self.reference), figures, text)
-
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Draw the figure and return the table of the variants with their differences."""
-        files = RunFiles(run.path)
-        draw(files)
-        return sections(files)
 
 
 def _verdict(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:

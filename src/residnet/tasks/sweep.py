@@ -10,11 +10,11 @@ import itertools
 import json
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, final
 
 import numpy as np
 from pydantic import Field, JsonValue, model_validator
@@ -31,9 +31,8 @@ from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.core.processes import ThisProcess, processes, spread
 from residnet.core.progress import Progress, listen, report, say
-from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.sweep import draw, sections, trials_table
+from residnet.report.sections.sweep import trials_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 from residnet.tasks.registry import SweepableConfig
@@ -433,6 +432,8 @@ class SweepConfig(Task):
         runner: where trials run.
     """
 
+    page: ClassVar[str] = "sweep"
+
     task: Literal["sweep"]
     base: BaseConfig
     common: tuple[str, ...] = ()
@@ -532,13 +533,6 @@ class SweepConfig(Task):
                 # in the order of their numbers, so that nothing hangs on chance
                 for future in sorted(done, key=lambda one: running[one].number):
                     trials.tell(running.pop(future), future.result())
-
-    @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Draw the figures and return the tables of the trials."""
-        files = RunFiles(run.path)
-        draw(files)
-        return sections(files)
 
 
 def open_study(config: SweepConfig, folder: Path) -> optuna.Study:

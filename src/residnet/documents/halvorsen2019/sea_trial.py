@@ -300,9 +300,10 @@ class SeaTrialTaskConfig(Study, ComputingTask):
         return next(iter(self.trials.values())).seed
 
     def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        found = {name: study(self, trial) for name, trial in self.trials.items()}
-        figures = [figure for name, one in found.items() for figure in _drawings(name, one)]
-        trials = {name: _content(self, one) for name, one in found.items()}
+        trials, figures = {}, []
+        for name in self.trials:
+            trials[name], drawn = study(self, name)
+            figures += drawn
         return {"schema": "residnet.sea_trial/1", "run": self.name, "trials": trials}, figures
 
     def verdict(self, results: Results) -> list[str]:
@@ -488,27 +489,10 @@ class Fitted(NamedTuple):
     equations: Mapping[str, str]
 
 
-@dataclass(frozen=True)
-class PhaseStudy:
-    """What was found on one trial.
-
-    Attributes:
-        trial: the samples.
-        standard: fits of the standard model by set of samples.
-        truth: true parameters of the vessel, as far as the standard model has them.
-        models: models by name and by the set that they were fitted to.
-        rows: goodness of fit on the validation stretches, by set.
-    """
-
-    trial: Trial
-    standard: Mapping[str, StandardFit]
-    truth: Mapping[str, float]
-    models: Mapping[tuple[str, str], Fitted]
-    rows: Mapping[str, list[dict[str, Any]]]
-
-
-def study(settings: SeaTrialTaskConfig, config: SeaTrialConfig) -> PhaseStudy:
+def study(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], list[Figure]]:
     """Simulate one trial, and fit and judge every model on every set of samples.
+
+    Returns what was found and its figures: 7.1, 7.2 (one) and 7.8 to 7.14.
 
     Beside the models that are fitted to one set stands for each one that consists of those of the
     single phases.
@@ -516,24 +500,25 @@ def study(settings: SeaTrialTaskConfig, config: SeaTrialConfig) -> PhaseStudy:
     Raises:
         ResidnetError: where the trial cannot be sailed or a model is not determined.
     """
+    config, mass = settings.trials[name], settings.standard.mass
     trial = sail(config)
     sets: dict[str, np.ndarray] = {
         phase: trial.phase == place for place, phase in enumerate(PHASES)
     }
     sets[ALL] = np.ones(len(trial.phase), dtype=bool)
     sets = {
-        name: keep
-        for name, keep in sets.items()
+        where: keep
+        for where, keep in sets.items()
         if min((keep & ~trial.validates).sum(), (keep & trial.validates).sum()) >= _LEAST_SAMPLES
     }
     z, a = trial.samples.z.numpy(), trial.samples.target.numpy()
     nu, tau = z[:, RANGE_VELOCITIES], z[:, 5:]
     standard: dict[str, StandardFit] = {}
     models: dict[tuple[str, str], Fitted] = {}
-    for name, keep in sets.items():
+    for where, keep in sets.items():
         train = keep & ~trial.validates
-        standard[name] = found = fit(nu[train], tau[train], a[train], settings.standard)
-        models[STANDARD, name] = Fitted(found.accelerations(nu, tau), _STANDARD_PARAMETERS, {})
+        standard[where] = found = fit(nu[train], tau[train], a[train], settings.standard)
+        models[STANDARD, where] = Fitted(found.accelerations(nu, tau), _STANDARD_PARAMETERS, {})
         samples = trial.samples.where(torch.from_numpy(train))
         for equation, equation_config in settings.equations.items():
             head = equation_config.build()
@@ -541,7 +526,7 @@ def study(settings: SeaTrialTaskConfig, config: SeaTrialConfig) -> PhaseStudy:
             texts = {axis: of["text"] for axis, of in head.solve(samples)["equations"].items()}
             with torch.no_grad():
                 predicted = head(trial.samples.z, trial.samples.z[:, :0])[0].numpy()
-            models[equation, name] = Fitted(predicted, tuple(head.parameter_count()), texts)
+            models[equation, where] = Fitted(predicted, tuple(head.parameter_count()), texts)
     for model in (STANDARD, *settings.equations):
         # where a phase has no model, the one of all phases takes its place
         predicted, count = models[model, ALL].predicted.copy(), np.zeros(3)
@@ -551,8 +536,32 @@ def study(settings: SeaTrialTaskConfig, config: SeaTrialConfig) -> PhaseStudy:
                 count += models[model, phase].parameter_count
         models[model, SEPARATE] = Fitted(predicted, tuple(count), {})
     vessel = odin(config.vessel)
-    known = truth(vessel, settings.standard.mass)
-    return PhaseStudy(trial, standard, known, models, _judged(vessel, trial, sets, models))
+    known, spread = truth(vessel, mass), a.std(axis=0)
+    content = {
+        "samples": len(trial.phase),
+        "seconds": len(trial.phase) * trial.step,
+        "step": trial.step,
+        "logs": int(trial.log.max()) + 1,
+        "validation_share": float(trial.validates.mean()),
+        "acceleration_std": dict(zip(ACCELERATION, spread.tolist(), strict=True)),
+        "phases": {
+            phase: float((trial.phase == place).mean()) for place, phase in enumerate(PHASES)
+        },
+        "truth": known,
+        "true_sums": {
+            sum_of: sign * known[first] - known[second] if second else mass + sign * known[first]
+            for sum_of, (first, sign, second) in SUMS.items()
+        },
+        "standard": {where: found.as_json() for where, found in standard.items()},
+        "equations": {
+            f"{model} on {on}": fitted.equations
+            for (model, on), fitted in models.items()
+            if fitted.equations
+        },
+        "rows": _judged(vessel, trial, sets, models),
+    }
+    figures = [_sailed(name, trial), _parameters_figure(name, standard, known)]
+    return content, figures + [_excerpt(name, trial, models, where) for where in standard]
 
 
 def _judged(
@@ -592,37 +601,7 @@ def _judged(
     return out
 
 
-def _content(settings: SeaTrialTaskConfig, study: PhaseStudy) -> dict[str, Any]:
-    trial, known, mass = study.trial, study.truth, settings.standard.mass
-    spread = trial.samples.target.numpy().std(axis=0)
-    return {
-        "samples": len(trial.phase),
-        "seconds": len(trial.phase) * trial.step,
-        "step": trial.step,
-        "logs": int(trial.log.max()) + 1,
-        "validation_share": float(trial.validates.mean()),
-        "acceleration_std": dict(zip(ACCELERATION, spread.tolist(), strict=True)),
-        "phases": {
-            phase: float((trial.phase == place).mean()) for place, phase in enumerate(PHASES)
-        },
-        "truth": dict(known),
-        "true_sums": {
-            name: sign * known[first] - known[second] if second else mass + sign * known[first]
-            for name, (first, sign, second) in SUMS.items()
-        },
-        "standard": {where: found.as_json() for where, found in study.standard.items()},
-        "equations": {
-            f"{model} on {on}": dict(fitted.equations)
-            for (model, on), fitted in study.models.items()
-            if fitted.equations
-        },
-        "rows": dict(study.rows),
-    }
-
-
-def _drawings(name: str, study: PhaseStudy) -> list[Figure]:
-    """Return Figures 7.1, 7.2 (one) and 7.8 to 7.14, and the parameters beside the true ones."""
-    trial = study.trial
+def _sailed(name: str, trial: Trial) -> Figure:
     z = trial.samples.z.numpy()
     t = np.arange(len(z)) * trial.step / 60
     rows = {
@@ -634,7 +613,7 @@ def _drawings(name: str, study: PhaseStudy) -> list[Figure]:
     }
     starts, stops = stretches(trial.validates)
     words = "Zigzags and steps of speed; stretches that validate are grey."
-    sailed = histories(
+    return histories(
         f"trial_{name}",
         ("Simulated sea trial", words),
         {
@@ -648,20 +627,20 @@ def _drawings(name: str, study: PhaseStudy) -> list[Figure]:
         x_label="time, logs end to end [min]",
         shared={"validation": (t[starts], t[stops - 1])},
     )
-    excerpts = [_excerpt(name, study, where) for where in study.standard]
-    return [sailed, _parameters_figure(name, study), *excerpts]
 
 
-def _parameters_figure(name: str, study: PhaseStudy) -> Figure:
-    undetermined = next(iter(study.standard.values())).undetermined
+def _parameters_figure(
+    name: str, fits: Mapping[str, StandardFit], truth: Mapping[str, float]
+) -> Figure:
+    undetermined = next(iter(fits.values())).undetermined
     shown = [i for i, name in enumerate(NAMES) if name not in undetermined]
     scale = np.array([PARAMETERS[NAMES[i]].scale for i in shown])
-    known = np.array([study.truth[NAMES[i]] for i in shown])
+    known = np.array([truth[NAMES[i]] for i in shown])
     looks = {"zero": ZERO}
     curves: dict[str, Curve] = {"zero": (np.zeros(1), np.zeros(1))}
-    for place, (where, found) in enumerate(study.standard.items()):
+    for place, (where, found) in enumerate(fits.items()):
         error, spread = (found.values[shown] - known) / scale, 2 * found.errors[shown] / scale
-        at = np.arange(len(shown)) + 0.16 * (place - (len(study.standard) - 1) / 2)
+        at = np.arange(len(shown)) + 0.16 * (place - (len(fits) - 1) / 2)
         looks[where] = Look(SET_NAMES[where], COLORS[place], kind="points", size=3)
         looks[f"{where} errors"] = Look("", COLORS[place], width=1)
         curves[where] = (at, error)
@@ -682,8 +661,9 @@ def _parameters_figure(name: str, study: PhaseStudy) -> Figure:
     )
 
 
-def _excerpt(name: str, study: PhaseStudy, where: str) -> Figure:
-    trial = study.trial
+def _excerpt(
+    name: str, trial: Trial, models: Mapping[tuple[str, str], Fitted], where: str
+) -> Figure:
     keep = (
         trial.validates if where == ALL else trial.validates & (trial.phase == PHASES.index(where))
     )
@@ -693,12 +673,12 @@ def _excerpt(name: str, study: PhaseStudy, where: str) -> Figure:
     piece = piece[: round(_EXCERPT / trial.step)]
     t, paths = np.arange(len(piece)) * trial.step, {"measured": trial.samples.target.numpy()[piece]}
     looks = {"measured": MEASURED}
-    other = next((key for key in study.models if key[0] != STANDARD and key[1] == where), None)
+    other = next((key for key in models if key[0] != STANDARD and key[1] == where), None)
     for key, look in (((STANDARD, where), DASHED), (other, SOLID)):
         if key is not None:
             label = f"{key[0]}, fitted on {SET_NAMES[where]}"
             looks[label] = replace(look, label=label)
-            paths[label] = study.models[key].predicted[piece]
+            paths[label] = models[key].predicted[piece]
     units = (("u' [m/s²]", 1.0), ("v' [m/s²]", 1.0), ("r' [deg/s²]", DEG))
     words = "Accelerations measured and predicted from measured velocities and inputs."
     title = f"Validation, {SET_NAMES[where]}"

@@ -50,7 +50,6 @@ from residnet.data.simulated import SimulatedTrials, fly_trials
 from residnet.documents.jervan2020.residual import (
     AXES,
     FittedModel,
-    Name,
     Record,
     ResidualModelConfig,
     as_baseline_yaml,
@@ -70,7 +69,7 @@ from residnet.export.base import place_of, released
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.heads.zero import ZeroHead
 from residnet.judge.courses import Tracking, mse, tracking
-from residnet.judge.still_fits import StillFitsConfig, Verdict, still_fits
+from residnet.judge.still_fits import StillFitsConfig, still_fits
 from residnet.manoeuvres import FamilyConfig
 from residnet.manoeuvres.closed_loop import ZigzagFamily
 from residnet.physics.actuators import ForceActuators
@@ -83,7 +82,7 @@ from residnet.report.blocks import Block, Cell, Section, Table, table_of
 from residnet.report.figure import DASHED, SOLID, Case, Figure, Panel, family
 from residnet.report.format import DEG, number
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, Exports, MainFigure
+from residnet.runs.task import ComputingTask, Exports, MainFigure, PartName
 
 _BELIEVED = "believed"
 _FARTHEST = 3.0
@@ -282,7 +281,7 @@ class FerryStudyConfig(Study, ComputingTask):
     disturbance: Disturbance = Disturbance()
     feed_forward_alone: bool = False
     forward: ForwardRunsConfig = ForwardRunsConfig()
-    models: dict[Name, FerryModelConfig] = Field(min_length=1)
+    models: dict[PartName, FerryModelConfig] = Field(min_length=1)
     published: Published = Published()
     later: str | None = None
     check_fit: StillFitsConfig = StillFitsConfig()
@@ -614,22 +613,6 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Fitt
 
 
 @dataclass(frozen=True)
-class Update:
-    """A model on a vessel that has changed since it was identified.
-
-    Attributes:
-        verdict: whether the model still fits.
-        before: the course of the changed vessel with the model.
-        after: the course with the model that was identified again from that log; the same flight
-            where the model still fits.
-    """
-
-    verdict: Verdict
-    before: Flight
-    after: Flight
-
-
-@dataclass(frozen=True)
 class Flown:
     """Everything that was flown and fitted.
 
@@ -642,7 +625,8 @@ class Flown:
         courses: the course by model, `believed` first.
         crossings: the crossing by model, `believed` first.
         alone: the course without feedback, by model.
-        later: each model that flies, on the vessel as it is later.
+        later: each model that flies, on the vessel as it is later: whether it still fits, and how
+            the course is followed before and after it was identified again where it does not.
     """
 
     first: Flight
@@ -652,7 +636,7 @@ class Flown:
     courses: dict[str, Flight]
     crossings: dict[str, Flight]
     alone: dict[str, Flight]
-    later: dict[str, Update]
+    later: dict[str, dict[str, Any]]
 
 
 def record_of(flight: Flight, interval: float, noise: MotionNoise | None) -> Record:
@@ -705,7 +689,7 @@ def study(config: FerryStudyConfig) -> Flown:
             return {}
         return dict(zip(feeds, craft.fly(path, list(feeds.values()), **how), strict=True))
 
-    later: dict[str, Update] = {}
+    later: dict[str, dict[str, Any]] = {}
     if config.later is not None:
         changed = Ferry(config, config.later)
         for name, flight in flown(changed, config.course, flying).items():
@@ -718,7 +702,12 @@ def study(config: FerryStudyConfig) -> Flown:
             if not verdict.fits:
                 again = identify(config.models[name], log, believed)
                 after = changed.fly(config.course, [(again.force, again.lag)])[0]
-            later[name] = Update(verdict, flight, after)
+            later[name] = {
+                "verdict": asdict(verdict),
+                "text": verdict.text(),
+                "before": flight.tracking.row(),
+                "after": after.tracking.row(),
+            }
     return Flown(
         first,
         record,
@@ -836,15 +825,7 @@ def written(
             kind: {name: flight.tracking.row() for name, flight in flown.items()}
             for kind, flown in flights.items()
         },
-        "later": {
-            name: {
-                "verdict": asdict(update.verdict),
-                "text": update.verdict.text(),
-                "before": update.before.tracking.row(),
-                "after": update.after.tracking.row(),
-            }
-            for name, update in found.later.items()
-        },
+        "later": found.later,
         "forward": forward,
     }
     return content, figures

@@ -26,7 +26,6 @@ from residnet.data.split import check_leaks, log_names, matches
 from residnet.documents.jervan2020.residual import (
     AXES,
     Fit,
-    Name,
     Record,
     ResidualModelConfig,
     SurfaceRegression,
@@ -67,7 +66,7 @@ from residnet.report.figure import (
 )
 from residnet.report.format import fixed, interval, number, plural, signed
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, MainFigure
+from residnet.runs.task import ComputingTask, MainFigure, PartName
 from residnet.training.lag import fit_lag, followed
 
 _Channels = tuple[str, str, str]
@@ -204,7 +203,7 @@ class ForceResidualConfig(Study, ComputingTask):
     channels: ForceChannels
     acceleration: Literal["velocity", "measured"] = "velocity"
     validation: FoldsConfig = FoldsConfig()
-    models: dict[Name, MeasuredModelConfig] = Field(min_length=1)
+    models: dict[PartName, MeasuredModelConfig] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _combination(self) -> ForceResidualConfig:
@@ -318,30 +317,25 @@ class Measured:
         names: names of the logs.
         record: motion and commanded force, smoothed as `prepare` says; NaN where masked. Its folds
             are the segments.
-        actual: forces that acted [N, 3].
+        forces: `commanded` and `actual` forces [N, 3].
         good: samples that models may be fitted to and judged on [N] bool.
         part: number of the fold of the outer cross-validation [N].
         parts: what a fold consists of: `logs` or `stretches`.
         masked: share of the samples that each mask excludes, by log and mask.
-        derived: derivatives of the velocities [N, 3].
-        sensed: measured accelerations as logged [N, 3]; None where there are none.
+        accelerations: as measured and as derived from the velocities [N, 3], by what they are;
+            empty where none were measured.
         acceleration: comparison of the two by axis; empty where no acceleration was measured.
     """
 
     names: tuple[str, ...]
     record: Record
-    actual: Tensor
+    forces: dict[str, Tensor]
     good: Tensor
     part: Tensor
     parts: str
     masked: dict[str, dict[str, float]]
-    derived: Tensor
-    sensed: Tensor | None
+    accelerations: dict[str, Tensor]
     acceleration: dict[str, Any]
-
-    def force(self, which: str) -> Tensor:
-        """Return the force [N, 3], `actual` or `commanded`."""
-        return self.actual if which == "actual" else self.record.command
 
     def split(self, part: int, gap: float) -> tuple[Record, Tensor]:
         """Return the record without a fold for training, and the samples [N] of the fold.
@@ -441,17 +435,17 @@ def read_measured(config: ForceResidualConfig) -> Measured:
         torch.from_numpy(np.concatenate([getattr(log, what) for log in logs]))
         for what in ("smooth", "nu_dot", "recorded", "good")
     )
-    fold, derived, sensed = torch.cat(segments), nu_dot, None
+    fold = torch.cat(segments)
+    accelerations: dict[str, Tensor] = {}
     acceleration: dict[str, Any] = {}
     if channels.acceleration is not None:
-        sensed = measured[:, ACCELERATIONS]
+        derived, sensed = nu_dot, measured[:, ACCELERATIONS]
+        accelerations = {"measured acceleration": sensed, "derivative of velocity": derived}
         acceleration = compare_accelerations(derived[good], sensed[good], fold[good])
-    if sensed is not None and config.acceleration == "measured":
-        # less their mean offset, log by log
-        parts_of_logs = (part.split(lengths) for part in (sensed, derived, good))
-        nu_dot = torch.cat(
-            [s - (s - d)[kept].mean(0) for s, d, kept in zip(*parts_of_logs, strict=True)]
-        )
+        if config.acceleration == "measured":
+            # less their mean offset, log by log
+            by_log = zip(*(part.split(lengths) for part in (sensed, derived, good)), strict=True)
+            nu_dot = torch.cat([s - (s - d)[kept].mean(0) for s, d, kept in by_log])
     command = torch.cat(commands)
     record = Record(
         step * torch.arange(len(fold), dtype=torch.float64),
@@ -468,13 +462,12 @@ def read_measured(config: ForceResidualConfig) -> Measured:
     return Measured(
         tuple(names),
         record,
-        measured[:, VELOCITIES],
+        {"commanded": command, "actual": measured[:, VELOCITIES]},
         good,
         torch.cat(parts),
         "logs" if of_logs else "stretches",
         masked,
-        derived,
-        sensed,
+        accelerations,
         acceleration,
     )
 
@@ -520,7 +513,7 @@ def compare_forces(measured: Measured) -> dict[str, Any]:
     try:
         lag = fit_lag(
             record.command,
-            torch.nan_to_num(measured.actual),
+            torch.nan_to_num(measured.forces["actual"]),
             torch.zeros_like(record.command),
             record.dt,
             good,
@@ -530,7 +523,7 @@ def compare_forces(measured: Measured) -> dict[str, Any]:
         after = followed(record.command, lag, record.dt, record.runs)
     except FitError as error:
         out["lag"], after = str(error), record.command
-    actual, commanded, late = measured.actual[good], record.command[good], after[good]
+    actual, commanded, late = measured.forces["actual"][good], record.command[good], after[good]
     total = (actual - actual.mean(0)).square().mean(0)
     unexplained, unexplained_late = (
         (actual - force).square().mean(0) / total for force in (commanded, late)
@@ -606,8 +599,7 @@ def force_study(config: ForceResidualConfig) -> Found:
     record = measured.record
     motion = record.nu_dot, record.nu, record.pose[:, HEADING]
     unmodelled = {
-        force: believed.residual(measured.force(force), *motion)
-        for force in ("actual", "commanded")
+        which: believed.residual(force, *motion) for which, force in measured.forces.items()
     }
     rows = _rows(config, measured, models, unmodelled)
     return Found(measured, models, failed, rows, compare_forces(measured), unmodelled)
@@ -625,7 +617,7 @@ def _judged(
     Raises:
         FitError: where the training samples do not determine the model.
     """
-    target, command = measured.force(of_model.judged_on), measured.force(of_model.force)
+    target, command = measured.forces[of_model.judged_on], measured.forces[of_model.force]
     error, folds = torch.full_like(target, torch.nan), []
     for part in range(int(measured.part.max()) + 1):
         record, test = measured.split(part, config.validation.gap)
@@ -660,7 +652,7 @@ def _rows(
     segments, parts = measured.segments(), measured.blocks()
     rows: list[dict[str, Any]] = []
     for force, names in groups.items():
-        left = {"zero": measured.force(force), "believed": unmodelled[force]}
+        left = {"zero": measured.forces[force], "believed": unmodelled[force]}
         left |= {name: models[name].error for name in names}
         errors = {
             name: np.stack([error[segment].square().mean(0).numpy() for segment in segments])
@@ -768,15 +760,10 @@ def _log_figures(found: Found, name: str, inside: slice) -> list[Figure]:
         shared = {"masked": masked}
         return histories(f"{kind}_{name}", (title, caption), looks, t, paths, units, shared=shared)
 
-    both = {"commanded": measured.record.command, "actual": measured.actual}
-    out = [pair("forces", "Commanded and actual force", both, _FORCE_UNITS)]
-    if measured.sensed is not None:
+    out = [pair("forces", "Commanded and actual force", measured.forces, _FORCE_UNITS)]
+    if measured.accelerations:
         title = "Measured acceleration and derivative of velocity"
-        both = {
-            "measured acceleration": measured.sensed,
-            "derivative of velocity": measured.derived,
-        }
-        out.append(pair("accelerations", title, both, _ACCELERATION_UNITS))
+        out.append(pair("accelerations", title, measured.accelerations, _ACCELERATION_UNITS))
     # of the models of the actual force, the one with the least cross-validated error
     of_actual = {
         row["model"]: row["minus_believed"]["mean"][3]

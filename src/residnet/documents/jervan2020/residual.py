@@ -61,8 +61,6 @@ from residnet.report.format import number
 from residnet.training.lag import fit_lag, followed
 
 AXES = ("surge", "sway", "yaw")
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
-"""Of a model."""
 _FORCES = ("surge force", "sway force", "yaw moment")
 _PENALTIES = tuple(10.0**k for k in range(-10, 1))
 """Ridge penalties tried where none is given, in units of a standardised column's energy."""

@@ -48,11 +48,6 @@ _KINDS = {
 }
 
 
-def draw(run: RunFiles) -> list[Figure]:
-    """Write the figures of an autopilot run from its folder alone; returns them."""
-    return write_figures(run.path / "figures", _figures(run))
-
-
 def _figures(run: RunFiles) -> Iterator[Figure]:
     kinds = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "conditions"}
     flown = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "nominal"}
@@ -234,6 +229,7 @@ def sections(run: RunFiles) -> list[Section]:
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
+    write_figures(run.path / "figures", _figures(run))
     test = run.resolved["test"]
     compared = settling_table(run.rows, run.metrics.get("floor"))
     out = [

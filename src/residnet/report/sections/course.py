@@ -53,11 +53,6 @@ _PANELS = (
 )
 
 
-def draw(run: RunFiles) -> list[Figure]:
-    """Write the figures of a course run from its folder alone; returns them."""
-    return write_figures(run.path / "figures", _figures(run))
-
-
 def _figures(run: RunFiles) -> Iterator[Figure]:
     flown, plans, every = run.frame(TRACKS), run.frame(COURSES), run.frame(SPREAD)
     looks = _looks(flown, "controller")
@@ -208,6 +203,7 @@ def sections(run: RunFiles) -> list[Section]:
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
+    write_figures(run.path / "figures", _figures(run))
     out: list[Section] = []
     for protocol, (nominal, drawn) in _by_protocol(run.rows).items():
         blocks: list[Block] = [Text(_rule(nominal)), nominal_table(nominal)]

@@ -139,13 +139,6 @@ def table(
     return out
 
 
-def draw(run: RunFiles) -> list[Figure]:
-    """Write the figure of a study from its folder alone; returns it."""
-    content = run.json("study.json")
-    figure = differences(content["rows"], content["reference"])
-    return write_figures(run.path / "figures", [figure])
-
-
 def differences(rows: Sequence[Content], reference: str) -> Figure:
     """Draw the differences to the reference with their intervals, a panel for each protocol.
 
@@ -198,6 +191,7 @@ def sections(run: RunFiles) -> list[Section]:
     """Return the variants with their errors, and the figure that stands in the folder."""
     content = run.json("study.json")
     rows = content["rows"]
+    write_figures(run.path / "figures", [differences(rows, content["reference"])])
     about = [
         f"Free-run NRMSE of model {content['model']} on {content['split']} data, mean over the"
         f" windows and {plural(rows[0]['seeds'], 'seed')}.",

@@ -41,17 +41,6 @@ _GROUPS = (
 """Groups of trials by their rank: from which share of them, to which, and how they are drawn."""
 
 
-def draw(run: RunFiles) -> list[Figure]:
-    """Write the figures of a sweep from its folder alone; returns them."""
-    content = run.json("sweep.json")
-    figures = []
-    if content["best"] is not None:
-        figures = [parallel_coordinates(content), _course(content)]
-    if content["best"] is not None and content["importance"]:
-        figures.append(_shares(content))
-    return write_figures(run.path / "figures", figures)
-
-
 def parallel_coordinates(content: Mapping[str, Any]) -> Figure:
     """Draw each finished trial of sweep.json as a line over its keys to its value."""
     rows = [row for row in content["trials"] if row["value"] is not None]
@@ -177,7 +166,12 @@ def _lines(key: str) -> str:
 
 def sections(run: RunFiles) -> list[Section]:
     """Return the best trials, the figures that stand in the folder, and all trials."""
-    content = run.json("sweep.json")
+    content, figures = run.json("sweep.json"), []
+    if content["best"] is not None:
+        figures = [parallel_coordinates(content), _course(content)]
+        if content["importance"]:
+            figures.append(_shares(content))
+    write_figures(run.path / "figures", figures)
     about = [
         f"Each trial is a run of its own below trials/; sought is the"
         f" {'least' if content['minimized'] else 'greatest'} {objective(content)}.",
