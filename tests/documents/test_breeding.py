@@ -13,14 +13,8 @@ from read_page import plain
 from scipy.integrate import solve_ivp
 from tiny import call
 
-from residnet.core.config import load_config
-from residnet.documents.halvorsen2019.breeding import (
-    BreedingTaskConfig,
-    NoiseConfig,
-    RecordConfig,
-)
+from residnet.documents.halvorsen2019.breeding import NoiseConfig, RecordConfig
 
-STUDIES = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019"
 SMALL: dict[str, Any] = {
     "task": "breeding",
     "name": "small",
@@ -90,38 +84,6 @@ def test_a_grid_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "of the 30 runs of the same table" in " ".join(summary["verdict"])
     assert "published 3; " in plain(tmp_path / "run" / "report.html")
     assert (tmp_path / "run" / "figures" / "study.png").stat().st_size > 1000
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            {"rows": {"key": "head.evolution.populaton", "values": [1, 2]}},
-            "no key 'head.evolution.populaton'",
-        ),
-        ({"rows": {"key": "head.evolution.crossover", "values": [0.1, 0.9]}}, "together at most 1"),
-        ({"published": [[1, 2]]}, "expected 2 rows of 2 numbers"),
-    ],
-)
-def test_impossible_grids(
-    change: dict[str, Any],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    (tmp_path / "c.yaml").write_text(yaml.safe_dump(SMALL | change))
-    assert call(monkeypatch, "check", tmp_path / "c.yaml") == 2
-    assert message in capsys.readouterr().err
-
-
-TABLES = [file for file in sorted(STUDIES.glob("*.yaml")) if "task: breeding" in file.read_text()]
-
-
-@pytest.mark.parametrize("file", TABLES, ids=lambda file: file.stem)
-def test_published_studies_are_valid(file: Path) -> None:
-    config = load_config(file, [], BreedingTaskConfig)
-    assert config.repeats == 10
 
 
 def test_a_late_force_and_its_correction() -> None:

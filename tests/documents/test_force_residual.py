@@ -275,31 +275,12 @@ def test_data_that_determine_nothing_are_clear_errors(tmp_path: Path) -> None:
         force_study(config(tmp_path))
 
 
-@pytest.mark.parametrize(
-    ("override", "said"),
-    [
-        ("models.ridge.lag=true", "set force to 'commanded'"),
-        ("models.ridge.fit={kind: surface, choose: test}", "judge a model choose it"),
-        ("models.ridge.terms=[u_dott]", "u_dott"),
-        ("models.zero={fit: {kind: ols}}", "cannot name a model"),
-        ("believed=nomoto_mariner", "a believed hull needs"),
-        ("~channels.acceleration", "needs channels.acceleration"),
-        ("validation.gap=0", "at least one step"),
-        ("prepare.hold=mean", "leave it out"),
-    ],
-)
-def test_refused_configs(tmp_path: Path, override: str, said: str) -> None:
-    overrides = [override, "acceleration=measured"] if override.startswith("~") else [override]
-    with pytest.raises(ConfigError, match=said):
-        config(tmp_path, *overrides)
-    with pytest.raises(ConfigError, match="matches no file"):
-        config(tmp_path, "data.logs=[none_*.csv]").data.files()
-
-
-def test_a_missing_channel_is_named(tmp_path: Path) -> None:
+def test_a_missing_channel_or_log_is_named(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0)
     with pytest.raises(UsageError, match="no channel 'acting_tau'"):
         read_measured(config(tmp_path, "channels.actual=[acting_tau, acting_tau_y, acting_tau_n]"))
+    with pytest.raises(ConfigError, match="matches no file"):
+        config(tmp_path, "data.logs=[none_*.csv]").data.files()
 
 
 def test_comparison_of_accelerations_without_segments_has_no_interval() -> None:

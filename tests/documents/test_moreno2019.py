@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from made_run import stored
 
-from residnet.core.config import load_config
-from residnet.core.errors import ConfigError, UsageError
+from residnet.core.errors import UsageError
 from residnet.documents import study_sections
 from residnet.documents.moreno2019 import curves, errors_of_grid
 from residnet.report.blocks import Cell, Table, Text
 from residnet.report.figure import Figure
-from residnet.tasks.fit import FitConfig
 
 MODELS = (
     "zero",
@@ -43,24 +42,11 @@ def write(run: Path, split: str, models: tuple[str, ...]) -> None:
     for number, model in enumerate(models, start=1):
         sign = np.where(np.sin(0.3 * t + number) > 0, 1.0, -1.0)
         off = {name: number * (1e-3 if name == "r" else 1e-2) * sign for name in COLUMNS}
-        predicted = {f"{name}_hat": measured[name] + off[name] for name in COLUMNS}
+        predicted = {name: measured[name] + off[name] for name in COLUMNS}
         # off by 5 m/s where it is not to be scored
         usable = t > 20.0
-        predicted["u_hat"] = np.where(usable, predicted["u_hat"], 5.0)
-        parts.append(
-            pd.DataFrame(
-                {
-                    "protocol": "record",
-                    "model": model,
-                    "window": 0,
-                    "t": t,
-                    "usable": usable,
-                    "diverged": False,
-                    **measured,
-                    **predicted,
-                }
-            )
-        )
+        predicted["u"] = np.where(usable, predicted["u"], 5.0)
+        parts.append(stored("record", model, t, measured, predicted, usable))
     folder = run / "rollouts" / split
     folder.mkdir(parents=True)
     pd.concat(parts).to_parquet(folder / f"{split}_1.parquet")
@@ -141,21 +127,6 @@ def test_the_curves_are_what_the_search_tried() -> None:
 def test_a_run_without_a_model_of_the_study_says_which(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=f"'{MODELS[-2]}' is absent"):
         study_sections("moreno2019", made(tmp_path, MODELS[:-2]))
-
-
-@pytest.mark.parametrize(
-    ("config", "absent"), [("moreno2019/moreno2019", "p2_each"), ("woo2018/woo2018", "lstm_rate")]
-)
-def test_a_study_without_one_of_its_models_is_refused_before_any_work(
-    config: str, absent: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
-    path = Path(__file__).resolve().parents[2] / "configs" / "studies" / f"{config}.yaml"
-    over = [f"~heads.{absent}"]
-    over.append(f"~base_of.{absent}" if config.startswith("moreno") else f"~training.{absent}")
-    with pytest.raises(ConfigError, match=f"'{absent}' is absent; give it, or leave the study out"):
-        load_config(path, over, FitConfig)
-    assert load_config(path, [*over, "study=null"], FitConfig).study is None
 
 
 def test_a_run_without_the_optional_package_says_what_it_lacks(tmp_path: Path) -> None:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import yaml
-from pydantic import ValidationError
 from read_page import plain
 from scipy.signal import butter, filtfilt
 
@@ -20,9 +17,7 @@ from residnet.documents import published
 from residnet.documents.halvorsen2019.sea_trial import (
     CHANNELS,
     SET_NAMES,
-    EquationConfig,
     PreparationConfig,
-    SeaTrialTaskConfig,
     odin,
     prepared,
 )
@@ -152,17 +147,6 @@ def test_too_few_samples() -> None:
         fit(nu, tau, nu, StandardFitConfig(thin=1))
 
 
-@pytest.mark.parametrize(
-    ("bad", "said"),
-    [
-        ({"weights": [1, 1, 0]}, "positive"),
-    ],
-)
-def test_wrong_settings_of_the_fit(bad: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValidationError, match=said):
-        StandardFitConfig.model_validate(bad)
-
-
 def test_preparation_is_the_documents() -> None:
     """Where no sample of the grid is missing the velocities are SciPy's zero-phase filter and the
     accelerations its differences.
@@ -190,20 +174,6 @@ def test_preparation_is_the_documents() -> None:
         trial.validates, (trial.samples.t.numpy() // 10).astype(int) % 3 == 2
     )
     assert all((np.diff(piece) == 1).all() for piece in trial.pieces(trial.validates))
-
-
-def test_equations_see_forces_or_controls() -> None:
-    with pytest.raises(ValidationError, match="give `inputs` instead"):
-        EquationConfig.model_validate(
-            {"inputs": "forces", "head": {"kind": "symbolic", "features": ["u"]}}
-        )
-    settings = yaml.safe_load(CONFIG.read_text())
-    settings["equations"]["force"]["head"]["candidates"]["coupling"] = ["cmd_n"]
-    with pytest.raises(ValidationError, match="'cmd_n' is not a channel"):
-        SeaTrialTaskConfig.model_validate(settings)
-    settings["trials"]["calm"]["vessel"] = "odin_forces"
-    with pytest.raises(ValidationError, match="needs a vessel of kind 'odin' with water jets"):
-        SeaTrialTaskConfig.model_validate(settings)
 
 
 def test_a_short_trial_runs(tmp_path: Path) -> None:

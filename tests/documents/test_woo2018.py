@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from made_run import stored
 
 from residnet.core.errors import UsageError
 from residnet.documents import study_sections, woo2018
@@ -66,19 +67,9 @@ def rollouts(folder: Path, log: str, size: float) -> None:
     }
     parts = []
     for place, model in enumerate(reversed(MODELS), start=1):
-        predicted = {
-            f"{name}_hat": measured[name] + size * place * 0.02 * np.sin(3 * t + place)
-            for name in COLUMNS
-        }
-        about = {
-            "protocol": "manoeuvre",
-            "model": model,
-            "window": 0,
-            "t": t,
-            "usable": True,
-            "diverged": False,
-        }
-        parts.append(pd.DataFrame({**about, **measured, **predicted}))
+        wave = size * place * 0.02 * np.sin(3 * t + place)
+        predicted = {name: measured[name] + wave for name in COLUMNS}
+        parts.append(stored("manoeuvre", model, t, measured, predicted))
     folder.mkdir(parents=True, exist_ok=True)
     pd.concat(parts).to_parquet(folder / f"{log}.parquet")
 

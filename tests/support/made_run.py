@@ -103,6 +103,20 @@ def write_json(path: Path, content: Any) -> None:
     path.write_text(json.dumps(content))
 
 
+def stored(
+    protocol: str,
+    model: str,
+    t: np.ndarray,
+    measured: dict[str, np.ndarray],
+    predicted: dict[str, np.ndarray],
+    usable: Any = True,
+) -> pd.DataFrame:
+    """One free run of one window as a rollout file holds it."""
+    about = {"protocol": protocol, "model": model, "window": 0, "t": t, "usable": usable}
+    hats = {f"{name}_hat": values for name, values in predicted.items()}
+    return pd.DataFrame({**about, "diverged": False, **measured, **hats})
+
+
 def write_rollout(folder: Path, log: str, models: tuple[str, ...], size: float) -> None:
     """One log of 6 s under two protocols; errors are `size` times the levels, constant in time,
     samples 20..29 masked and off by 9 m/s.
@@ -112,38 +126,15 @@ def write_rollout(folder: Path, log: str, models: tuple[str, ...], size: float) 
     u, v, r = 1.0 + 0 * t, 0.1 * np.sin(t), 0.2 * np.cos(t)
     psi = 0.2 * np.sin(t)
     x, y = np.cumsum(0.1 * u * np.cos(psi)), np.cumsum(0.1 * u * np.sin(psi))
+    own = {"u": u, "v": v, "r": r, "psi": psi, "x": x, "y": y}
+    measured = own | {"u": np.where(usable, u, u + 9)}
     parts = []
     for protocol in ("T30", "whole"):
         for model in models:
             eu, ev, er = (size * level for level in LEVEL[model])
-            parts.append(
-                pd.DataFrame(
-                    {
-                        "protocol": protocol,
-                        "model": model,
-                        "window": 0,
-                        "t": t,
-                        "usable": usable,
-                        "diverged": False,
-                        **{
-                            "u": np.where(usable, u, u + 9),
-                            "v": v,
-                            "r": r,
-                            "psi": psi,
-                            "x": x,
-                            "y": y,
-                        },
-                        **{
-                            "u_hat": u + eu,
-                            "v_hat": v + ev,
-                            "r_hat": r + er,
-                            "psi_hat": psi + er * t,
-                            "x_hat": x + eu * t,
-                            "y_hat": y + ev * t,
-                        },
-                    }
-                )
-            )
+            off = {"u": eu, "v": ev, "r": er, "psi": er * t, "x": eu * t, "y": ev * t}
+            predicted = {name: values + off[name] for name, values in own.items()}
+            parts.append(stored(protocol, model, t, measured, predicted, usable))
     folder.mkdir(parents=True, exist_ok=True)
     pd.concat(parts).to_parquet(folder / f"{log}.parquet")
 

@@ -1,0 +1,90 @@
+"""What the configs of the documents' studies refuse before any work, one row for each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from residnet.core.errors import ConfigError
+from residnet.tasks.registry import load_task
+
+STUDIES = Path(__file__).parents[2] / "configs" / "studies"
+ACCELERATION = ("~channels.acceleration", "acceleration=measured")
+REFUSED = (
+    ("jervan2020/operation", ("true=wam_v_cal",), "actuators push in surge, sway and yaw"),
+    ("jervan2020/operation", ("models.lag_ridge.on=nothing",), "no model before it"),
+    ("jervan2020/operation", ("models.lag_ridge.terms=[u_dott]",), "u_dott"),
+    ("jervan2020/operation", ("course.interval=0.05",), "whole number of steps"),
+    ("jervan2020/measured", ("models.ridge.lag=true",), "set force to 'commanded'"),
+    (
+        "jervan2020/measured",
+        ("models.ridge.fit={kind: surface, choose: test}",),
+        "judge a model choose it",
+    ),
+    ("jervan2020/measured", ("models.ridge.terms=[u_dott]",), "u_dott"),
+    ("jervan2020/measured", ("models.zero={fit: {kind: ols}}",), "cannot name a model"),
+    ("jervan2020/measured", ("believed=nomoto_mariner",), "a believed hull needs"),
+    ("jervan2020/measured", ACCELERATION, "needs channels.acceleration"),
+    ("jervan2020/measured", ("validation.gap=0",), "at least one step"),
+    ("jervan2020/measured", ("prepare.hold=mean",), "leave it out"),
+    ("halvorsen2019/table_5_2", ("rows.key=head.evolution.populaton",), "no key 'head.evol"),
+    (
+        "halvorsen2019/table_5_2",
+        (
+            "rows={key: head.evolution.crossover, values: [0.1, 0.9]}",
+            "~published",
+            "~published_error",
+        ),
+        "together at most 1",
+    ),
+    ("halvorsen2019/table_5_2", ("published=[[1, 2]]",), "expected . rows of . numbers"),
+    ("halvorsen2019/standard_model", ("standard.weights=[1, 1, 0]",), "positive"),
+    (
+        "halvorsen2019/standard_model",
+        ("equations.force.head.features=[u]",),
+        "give `inputs` instead",
+    ),
+    (
+        "halvorsen2019/standard_model",
+        ("equations.force.head.candidates.coupling=[cmd_n]",),
+        "'cmd_n' is not a channel",
+    ),
+    (
+        "halvorsen2019/standard_model",
+        ("trials.calm.vessel=odin_forces",),
+        "needs a vessel of kind 'odin' with water jets",
+    ),
+    (
+        "moreno2019/moreno2019",
+        ("~heads.p2_each", "~base_of.p2_each"),
+        "'p2_each' is absent; give it, or leave the study out",
+    ),
+    (
+        "woo2018/woo2018",
+        ("~heads.lstm_rate", "~training.lstm_rate"),
+        "'lstm_rate' is absent; give it, or leave the study out",
+    ),
+)
+
+
+@pytest.mark.parametrize(("study", "overrides", "said"), REFUSED, ids=lambda value: str(value)[:60])
+def test_a_study_that_cannot_be_is_refused_in_one_line(
+    study: str,
+    overrides: tuple[str, ...],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
+    with pytest.raises(ConfigError, match=said) as caught:
+        load_task(STUDIES / f"{study}.yaml", list(overrides))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_study_may_be_left_out_with_its_models(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
+    over = ["~heads.lstm_rate", "~training.lstm_rate", "study=null"]
+    assert load_task(STUDIES / "woo2018" / "woo2018.yaml", over).name
