@@ -25,7 +25,7 @@ CONFIG: dict[str, Any] = {
     "task": "fit",
     "name": "bare",
     "signals": {"inputs": ["n", "delta"]},
-    "baseline": {"kind": "regressors", "sets": ["linear"]},
+    "baseline": {"kind": "regressors", "sets": ["linear"], "ridge": 0.01},
     "evaluation": {"scales": {"u": 1.0, "v": 0.3, "r": 0.1}},
     "export": {"models": []},
 }
@@ -48,7 +48,11 @@ def written(folder: Path, names: list[str]) -> Path:
     config = {**CONFIG, "data": data, "prepare": {"grid": {"step": step}}}
     config["prepare"]["derivative"] = {"kind": "savitzky_golay", "window": 10 * step, "order": 2}
     windows = {"kind": "windows", "length": 100 * step, "first": 20 * step}
-    config["evaluation"] = {**CONFIG["evaluation"], "protocols": {"T100": windows}}
+    config["evaluation"] = {
+        **CONFIG["evaluation"],
+        "protocols": {"T100": windows},
+        "selection": "T100",
+    }
     (folder.parent / "bare.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     return folder.parent / "bare.yaml"
 
@@ -98,7 +102,8 @@ def test_hostile_names_of_manoeuvres_logs_and_files(part: int, tmp_path: Path) -
     work.mkdir()
     config = written(work, names)
     before = set(tmp_path.rglob("*"))
-    run = load_task(config, []).run(out=work / "run").path
+    run = work / "run"
+    load_task(config, []).run(out=run)
     ended, task = finished_task(run, "evaluate")
     task.evaluate_on(ended, [work / "logs"], work / "run" / "other")
     inspect_logs([work / "logs"], None)

@@ -87,8 +87,8 @@ def test_a_layout_is_fitted_and_judged(name: str, tmp_path: Path) -> None:
     if "refused" in case:
         pytest.skip("cannot be fitted, as the test of its doors says")
     new_config([folder], tmp_path / "boat.yaml", None, overwrite=False)
-    task = load_task(tmp_path / "boat.yaml", ["effort=0.02"])
-    run = task.run(out=tmp_path / "run").path
+    run = tmp_path / "run"
+    load_task(tmp_path / "boat.yaml", ["effort=0.02"]).run(out=run)
     ended, task = finished_task(run, "evaluate")
     task.evaluate_on(ended, [folder], tmp_path / "other")
     for place in (run, tmp_path / "other"):
