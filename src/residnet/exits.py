@@ -84,9 +84,9 @@ def enter(command: Callable[[], object]) -> None:
     """
     signals = _Signals()
     # a service may start a command with closed streams
-    for name in ("stdout", "stderr"):
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            stream = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 (to the end)
+            stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 (to the end)
             setattr(sys, name, stream)
     try:
         with signals.heard():

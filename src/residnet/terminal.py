@@ -88,7 +88,7 @@ class _Lines:
     def __init__(self) -> None:
         self._complete: set[str] = set()
         self._ended = threading.Event()
-        self._doing, self._since, self._told = "", 0.0, 0.0
+        self._doing, self._since, self._told = "", time.monotonic(), time.monotonic()
 
     def __enter__(self) -> _Lines:
         threading.Thread(target=self._watch, daemon=True).start()

@@ -40,7 +40,7 @@ def test_the_tutorial_ends_with_the_numbers_that_it_prints(tmp_path: Path) -> No
         said = done.stdout
     assert "finished" in said
     assert (tmp_path / "runs" / "boat" / "report.html").is_file()
-    assert len(re.findall("# guess", (tmp_path / "boat.yaml").read_text())) == 2
+    assert len(re.findall("# guess", (tmp_path / "boat.yaml").read_text())) == 6
     metrics = json.loads((tmp_path / "runs" / "boat" / "metrics.json").read_text())
     assert metrics["predictor"] == "mean"
     assert all(row["diverged"] == 0 for row in metrics["rows"])
