@@ -203,8 +203,8 @@ def borrowed_bands(
 ) -> dict[str, FittedModel]:
     """Return the models of a last fit with the bands of an earlier one that left logs out.
 
-    No log is left that networks and means were not fitted on. They take the band of the hull, which
-    a mean widens where its members lie farther apart than on the logs.
+    No log is left that networks and means were not fitted on. A mean takes the band of the hull,
+    and widens it where its members lie farther apart than on the logs; networks have none.
 
     Args:
         last: fit of all logs.
@@ -217,16 +217,15 @@ def borrowed_bands(
     for name, entry in last.items():
         own = chosen.get(name)
         bands = {} if own is None else own.bands
-        if own is None and best is not None:
+        if own is None and best is not None and (members := members_of(entry)):
             said = _BORROWED.format(best.name)
             bands = {k: replace(b, cautions=(said, *b.cautions)) for k, b in best.bands.items()}
-            if members := members_of(entry):
-                models = {one: last[one].model for one in (*members, name)}
-                for k in bands:
-                    seen = _Calibration(last, k, config, {})
-                    seen.add(models, logs, validation=True)
-                    usual = usual_spread(seen.validated.get(name, []), bands[k].steps)
-                    bands[k] = replace(bands[k], usual=usual)
+            models = {one: last[one].model for one in (*members, name)}
+            for k in bands:
+                seen = _Calibration(last, k, config, {})
+                seen.add(models, logs, validation=True)
+                usual = usual_spread(seen.validated.get(name, []), bands[k].steps)
+                bands[k] = replace(bands[k], usual=usual)
         out[name] = _banded(entry, bands)
     return out
 
