@@ -38,7 +38,8 @@ def written(folder: Path, names: list[str]) -> Path:
     length = len(source[0]) // -(-len(names) // 3)
     for number, name in enumerate(names):
         log = source[number % 3].rows(slice(number // 3 * length, (number // 3 + 1) * length))
-        bare = name.replace("/", "_").replace("\0", "_").encode("utf-8", "surrogateescape")[:200]
+        # pyarrow opens no file whose name is not UTF-8
+        bare = name.replace("/", "_").replace("\0", "_").encode("utf-8", "replace")[:200]
         path = folder / os.fsdecode(b"%03d_%b.parquet" % (number, bare))
         log.replace(name=name, meta={**log.meta, "manoeuvre": name}).save(path)
         files.append(path.name)
