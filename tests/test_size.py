@@ -20,12 +20,12 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (793, 117),
     "control": (3289, 365),
     "core": (1312, 186),
-    "data": (8833, 799),
+    "data": (8821, 798),
     "documents": (2457, 227),
     "dynamics": (856, 114),
     "export": (2268, 269),
     "heads": (1137, 177),
-    "identification": (2149, 223),
+    "identification": (2148, 223),
     "judge": (1944, 215),
     "manoeuvres": (897, 136),
     "physics": (1990, 249),
@@ -36,7 +36,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "tasks": (3073, 257),
     "testing": (484, 33),
     "training": (1366, 163),
-    "": (447, 54),
+    "": (449, 54),
 }
 
 

@@ -113,6 +113,8 @@ class _Lines:
             self._doing, self._since = progress.message.strip(), self._told
         if progress.done is None or progress.total is None:
             return
+        if progress.stage != self._stage:
+            self._stage, self._since = progress.stage, time.monotonic()
         if progress.done < progress.total:
             self._complete.discard(progress.stage)
             self._doing = f"{progress.stage}, {progress.done:g} of {progress.total:g}"

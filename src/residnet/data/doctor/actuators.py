@@ -219,26 +219,6 @@ def rudder_bias(log: Record, found: Check) -> Iterator[Finding]:
 _WIDER = "log with a wider range, or leave these parts out"
 
 
-@check("actuators", "clipping", fix=_WIDER, needs=("delta",))
-def rudder_ends(log: Record, found: Check) -> Iterator[Finding]:
-    """Report a rudder that rests exactly at both ends although it never rests elsewhere."""
-    values = log["delta"]
-    low, most = float(np.nanmin(values)), float(np.nanmax(values))
-    if "delta" not in log.inputs or most <= low or log.noise("delta") <= 1e-6 * (most - low):
-        return
-    ends = (values == low) | (values == most)
-    share = float(ends[np.isfinite(values)].mean())
-    same = np.append(False, np.diff(values) == 0.0)
-    elsewhere = float(same[~ends].mean()) if (~ends).any() else 1.0
-    count = max(int((values == low).sum()), int((values == most).sum()))
-    if count >= 5 and share > 0.01 and elsewhere < 0.05:
-        text = (
-            f"delta rests exactly at {math.degrees(low):.1f} and {math.degrees(most):.1f} deg in"
-            f" {100.0 * share:.0f} % of the samples and nowhere else: its record is cut off"
-        )
-        yield found(text, {"low": low, "high": most, "share": share})
-
-
 # share of the time at one end, and how much harder the vessel then turns
 _AT_END, _HARDER, _SURE_AT_END = 0.03, 1.3, 4.5
 

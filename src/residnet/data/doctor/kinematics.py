@@ -52,6 +52,11 @@ class Cause:
         return bool((np.abs(self.values) > _SURE * self.errors).any())
 
 
+# standard deviations of a heading's noise by which it has to move before the scale of r is told:
+# smoothing leaves .4 of them
+_TURNED = 3.0
+
+
 def yaw_causes(log: Record) -> dict[str, Cause]:
     """Return what makes the increments of psi differ from the integral of r.
 
@@ -64,7 +69,8 @@ def yaw_causes(log: Record) -> dict[str, Cause]:
     smooth = _around(r)
     time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
     columns = {"bias": [-dt], "ramp": [-dt, -dt * time]}
-    if _stands_out(log, "r"):
+    # where the heading does not move, a bias of r would be all gain
+    if _stands_out(log, "r") and float(np.nanstd(_around(psi))) > _TURNED * log.noise("psi"):
         columns = {"gain": [-_area(dt, smooth)], "lag": [np.diff(smooth)], **columns}
     rate = np.full(dt.size, log.noise("r"))
     return _explained(psi, _area(dt, r), dt, log.noise("psi"), rate, columns)
