@@ -26,7 +26,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "export": (2268, 269),
     "heads": (1137, 177),
     "identification": (2148, 223),
-    "judge": (1944, 215),
+    "judge": (1947, 215),
     "manoeuvres": (897, 136),
     "physics": (1990, 249),
     "regression": (1864, 207),
@@ -36,7 +36,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "tasks": (3073, 257),
     "testing": (484, 33),
     "training": (1366, 163),
-    "": (449, 54),
+    "": (450, 54),
 }
 
 

@@ -88,7 +88,8 @@ class _Lines:
     def __init__(self) -> None:
         self._complete: set[str] = set()
         self._ended = threading.Event()
-        self._doing, self._since, self._told = "", time.monotonic(), time.monotonic()
+        self._doing = self._stage = ""
+        self._since = self._told = time.monotonic()
 
     def __enter__(self) -> _Lines:
         threading.Thread(target=self._watch, daemon=True).start()

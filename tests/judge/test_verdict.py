@@ -146,6 +146,15 @@ def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     assert said[3] == "It holds for 12 windows of 4 logs at mean speeds of 1.5 to 2.5 m/s."
 
 
+def test_a_model_as_near_as_the_plant_itself_is_good() -> None:
+    """Another model is twice as near by chance: within twice what the plant leaves that is noise."""
+    entry = horizon(10, errors(0.5, 1.0), best=errors(0.2, 1.0))
+    assert level(evidence(limits={"horizons": [entry]})) == "limited"
+    entry["models"]["truth"] = errors(0.4, 0.9)
+    rows = {"zero": row(0.5), "mlp": row(0.2), "truth": row(0.1) | {"kind": "truth"}}
+    assert level(evidence(limits={"horizons": [entry]}, rows=rows)) == "good"
+
+
 def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
     limits = {"horizons": [horizon(30, errors(1.0, 1.0))]}
     rows = {"zero": row(0.5), "baseline": row(0.25), "mlp": row(0.2, diverged=1)}

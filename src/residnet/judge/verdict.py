@@ -94,12 +94,16 @@ def _good_until(evidence: Evidence) -> float:
     row, until = evidence.rows[evidence.selected], 0.0
     if row.get("diverged") and evidence.split in UNSEEN:
         return 0.0
+    plants = {name for name, row in evidence.rows.items() if row.get("kind") == "truth"}
     for entry in _horizons(evidence):
-        models, floor = entry["models"], entry["floor"]
+        models = entry["models"]
         own, ends = models[evidence.selected], models[evidence.selected]["intervals"]
+        # what the plant itself leaves, started from measured states, is noise too
+        floors = [entry["floor"], *(models[name] for name in plants & set(models))]
+        rivals = set(models) - {evidence.selected} - plants
         for of, least in (("position", _SHARE * entry["sailed"]), ("heading", _TURN)):
-            others = [one[of] for name, one in models.items() if name != evidence.selected]
-            twice = 2.0 * floor[of]
+            others = [models[name][of] for name in rivals]
+            twice = 2.0 * max(floor[of] for floor in floors)
             known = ends[of] is not None and entry["windows"] >= _FEWEST
             near = own[of] <= max(twice, _OF_BEST * min(others, default=own[of]))
             beats = ZERO not in models or own[of] <= max(twice, models[ZERO][of])
