@@ -147,7 +147,7 @@ def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
 
 
 def test_a_model_as_near_as_the_plant_itself_is_good() -> None:
-    """Another model is twice as near by chance: within twice what the plant leaves that is noise."""
+    """Another model is nearer, but within twice what the plant leaves all are alike."""
     entry = horizon(10, errors(0.5, 1.0), best=errors(0.2, 1.0))
     assert level(evidence(limits={"horizons": [entry]})) == "limited"
     entry["models"]["truth"] = errors(0.4, 0.9)
