@@ -29,21 +29,20 @@ from residnet.report.sections import actuators, autopilot, course, import_logs, 
 
 @dataclass(frozen=True)
 class Reported:
-    """A task's made-up folder, its sections, and what draws its figures, if something does."""
+    """A task's made-up folder, and its sections."""
 
     make: Callable[[Path], Path]
     sections: Callable[[RunFiles], Sequence[Section]]
-    draw: Callable[[RunFiles], object] | None = None
 
 
 TASKS = {
     "actuators": Reported(made_actuators, actuators.sections),
-    "autopilot": Reported(made_autopilot, autopilot.sections, autopilot.draw),
-    "course": Reported(made_course, course.sections, course.draw),
+    "autopilot": Reported(made_autopilot, autopilot.sections),
+    "course": Reported(made_course, course.sections),
     "fit": Reported(made_run, fit_sections),
     "import": Reported(made_import, import_logs.sections),
     "simulate": Reported(made_simulate, manoeuvres.sections),
-    "study": Reported(made_study, study.sections, study.draw),
+    "study": Reported(made_study, study.sections),
 }
 
 
@@ -51,8 +50,6 @@ def page_of(task: str, folder: Path) -> Path:
     """Write the page of a made-up run of that task."""
     reported = TASKS[task]
     run = RunFiles(reported.make(folder))
-    if reported.draw is not None:
-        reported.draw(run)
     return write_page(run.path, run.title, "Made by hand.", ["Done."], reported.sections(run))
 
 

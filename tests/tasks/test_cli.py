@@ -162,7 +162,9 @@ def test_folders_hold_tables_recordings_or_other_logs(tmp_path: Path) -> None:
     box = written_logs.mcap(log, boxes)
     shutil.rmtree(boxes / "whole")
     assert log_files([boxes], folders=True) == [box]
-    with pytest.raises(UsageError, match=r"holds no csv or Parquet file$"):
+    with pytest.raises(
+        UsageError, match=r"holds no csv or Parquet file, but 1 file \.mcap; write such rows as csv"
+    ):
         log_files([boxes])
     (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match="holds no log of a format"):

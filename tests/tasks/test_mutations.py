@@ -64,7 +64,7 @@ def test_damaged_run_folders_are_refused_in_one_line(tiny_run: Path, tmp_path: P
     """What nothing reads back as a result may be damaged."""
     draw, run, refused = random.Random(0), tmp_path / "run", 0
     harmless = ("figures", "exports", "tensorboard", "checkpoints", "report.html")
-    for number in range(50):
+    for number in range(60):
         shutil.rmtree(run, ignore_errors=True)
         shutil.copytree(tiny_run, run)
         told = mutated_folder(run, [], draw)

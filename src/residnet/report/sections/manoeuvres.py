@@ -96,9 +96,9 @@ def _flights(content: Content) -> Table:
     """Return a row for each flight: how it ended, and the first of its indices."""
 
     def first(row: Content) -> str:
-        for name, value in row["indices"].items():
+        for name in _single([row]):
             unit, factor = shown_unit(str(content["units"].get(name, "-")))
-            return f"{index_title(name)} {number(_times(factor, value))} {unit}"
+            return f"{index_title(name)} {number(_times(factor, row['indices'][name]))} {unit}"
         return DASH
 
     rows = sorted(content["rows"], key=lambda row: not row["fault"])
