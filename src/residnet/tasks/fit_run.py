@@ -19,7 +19,6 @@ from residnet.data.drafting.reading import log_files
 from residnet.data.masks import Spike
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.readers.canonical import CanonicalConfig
-from residnet.data.readers.compose import RecordingConfig
 from residnet.data.simulated import SimulatedTrials
 from residnet.data.split import log_names
 from residnet.dynamics.store import ModelSpec, load_model, model_names
@@ -316,6 +315,9 @@ def evaluate_on(
     return config.conduct(folder, made_from, judge)
 
 
+_PLAIN_TABLES = ("csv", "parquet", "canonical")
+
+
 def external_logs(
     config: FitConfig, paths: Sequence[Path]
 ) -> tuple[list[Path], list[Log], list[Prepared]]:
@@ -328,8 +330,8 @@ def external_logs(
     """
     data = config.data
     own = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
-    # a folder may be one log, as a ROS 2 bag is
-    files = own.build().logs_among(log_files(paths, isinstance(own, RecordingConfig)))
+    # a folder may be one log, as a ROS 2 bag is, or hold sheets and lines of JSON
+    files = own.build().logs_among(log_files(paths, own.kind not in _PLAIN_TABLES))
     readers = {path: (CanonicalConfig() if Log.recognises(path) else own).build() for path in files}
     read = [readers[path].read(path).replace(name=name) for path, name in log_names(files).items()]
     logs = [prepare(log, SPLIT, config.signals.columns, config.prepare) for log in read]
