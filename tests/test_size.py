@@ -16,7 +16,7 @@ import residnet
 
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
-    "api": (709, 82),
+    "api": (706, 82),
     "baselines": (793, 117),
     "control": (3289, 365),
     "core": (1312, 186),
@@ -33,10 +33,10 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2836, 317),
     "runs": (372, 48),
     "simulators": (355, 44),
-    "tasks": (3073, 257),
+    "tasks": (3070, 257),
     "testing": (484, 33),
     "training": (1366, 163),
-    "": (450, 54),
+    "": (447, 54),
 }
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -49,12 +48,6 @@ def _common(
     # small products are thirty times slower where several libraries fight for the cores
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-
-
-class Recipe(StrEnum):
-    """Recipes that a config may be drafted with."""
-
-    standard = "standard"
 
 
 Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress, the result only.")]
@@ -141,12 +134,6 @@ def new(
     defaults: Annotated[
         bool, typer.Option("--defaults", help="Ask nothing: take and mark every default.")
     ] = False,
-    recipe: Annotated[
-        Recipe | None,
-        typer.Option(
-            help="Fit the portfolio of the standard recipe: minutes more than a few models."
-        ),
-    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Draft a complete config from logs: `residnet run` takes it as it is.
@@ -158,7 +145,7 @@ def new(
 
     with drawn_progress(quiet=quiet):
         ask, file = None if defaults else asked(), out or Path("my_boat.yaml")
-        lines = new_config(logs, file, ask, overwrite=overwrite, standard=recipe is not None)
+        lines = new_config(logs, file, ask, overwrite=overwrite)
     print("\n".join(lines))
 
 

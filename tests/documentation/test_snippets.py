@@ -217,8 +217,8 @@ def residnet_in(folder: Path, *words: str) -> int:
 
 
 def quicken(config: Path) -> None:
-    """Train for a fiftieth of the usual time."""
-    config.write_text(re.sub(r"^effort: .*$", "effort: 0.02", config.read_text(), flags=re.M))
+    """Train for a third of the usual time: a mean that is worse than zero would not be exported."""
+    config.write_text(f"{config.read_text()}\neffort: 0.3\n")
 
 
 @pytest.mark.long

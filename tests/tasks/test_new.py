@@ -68,7 +68,8 @@ def test_a_config_from_logs_alone(folder: Path) -> None:
     assert (channels["r"]["unit"], channels["u"]["unit"]) == ("deg/min", "kn")
     assert channels["delta"]["sign"] == -1
     assert content["signals"]["inputs"] == ["delta", "n"]
-    assert (content["recipe"], content["effort"]) == ("standard", 0.3)
+    assert content["recipe"] == "standard"
+    assert not {"baseline", "baselines", "heads", "training", "effort"} & set(content)
     assert {name: len(content["data"]["split"][name]) for name in ("train", "test")} == {
         "train": 4,
         "test": 1,
@@ -83,15 +84,6 @@ def test_the_same_from_python(folder: Path) -> None:
     draft = residnet.draft(folder / "trials", name="boat", folder=folder)
     assert draft.config == yaml.safe_load((folder / "boat.yaml").read_text())
     assert "data.split" in dict(draft.guesses)
-
-
-def test_the_standard_recipe_where_it_is_asked_for(folder: Path) -> None:
-    draft = residnet.draft(folder / "trials", name="boat", folder=folder, recipe="standard")
-    assert draft.config["recipe"] == "standard"
-    assert not {"baseline", "baselines", "heads", "training", "effort"} & set(draft.config)
-    load_task(draft.save(folder / "standard.yaml")).check()
-    with pytest.raises(UsageError, match="no recipe 'standart'; did you mean 'standard'"):
-        residnet.draft(folder / "trials", recipe="standart")
 
 
 def test_a_file_is_not_replaced_unasked(folder: Path) -> None:

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 LogsGiven = PathGiven | Log | Sequence[PathGiven] | Sequence[Log]
 """Logs that were read, or where to read them."""
-RECIPES = ("standard",)
 """Recipes by name."""
 
 
@@ -186,7 +185,6 @@ def draft(
     name: str = "my_boat",
     folder: PathGiven = ".",
     answer: Callable[[Question], str] | None = None,
-    recipe: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> Draft:
     """Draft a complete config of a fit from logs of any format.
@@ -201,8 +199,6 @@ def draft(
         folder: where the config will lie; its paths start from there.
         answer: is given each question that the logs leave open, and returns its answer; None takes
             the defaults.
-        recipe: `standard` trains the networks of the recipe at full length, in place of a quick
-            look.
         progress: is told how far the reading is.
 
     Returns:
@@ -219,11 +215,9 @@ def draft(
     given = list(logs) if isinstance(logs, list | tuple) else [logs]
     if not given:
         raise UsageError("draft: no log is given; name files, folders or bags")
-    if recipe not in (None, *RECIPES):
-        raise UsageError(f"draft: no recipe '{recipe}'{nearest(str(recipe), RECIPES)}")
     with hearing(progress):
         paths = [path(one, "draft") for one in given]
-        return drafted(paths, Path(folder), name, answer, standard=recipe is not None)
+        return drafted(paths, Path(folder), name, answer)
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,6 @@ _INSPECTED = 12
 _SHOWN = 12
 """Guesses that the terminal shows."""
 _WIDTH = 96
-QUICK = 0.3
-"""Effort of a first draft: on the logs of `residnet demo` the selected network errs by .072 (NRMSE)
-after 160 s of processor time, the hull that it stands on by .108.
-"""
 Comments = Callable[[tuple[str, ...]], list[str]]
 """Path of a key -> lines about it."""
 
@@ -81,7 +77,6 @@ def new_config(
     answer: Answer | None,
     *,
     overwrite: bool,
-    standard: bool = False,
 ) -> list[str]:
     """Write a config for logs; returns what the terminal shows.
 
@@ -90,7 +85,6 @@ def new_config(
         out: file to write.
         answer: asks the user; None takes every default.
         overwrite: replace the file.
-        standard: train the networks of the standard recipe at full length.
 
     Raises:
         UsageError: where the file exists already, or a path does not.
@@ -101,7 +95,7 @@ def new_config(
     if out.exists() and not overwrite:
         raise UsageError(f"--out {out}: exists; give --overwrite, or another name")
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", out.stem).strip("_.-") or "my_boat"
-    draft = drafted(logs, out.parent, name, answer, standard=standard)
+    draft = drafted(logs, out.parent, name, answer)
     file, count = draft.save(out), len(draft.guesses)
     lines = [f"{key}: {why}" for key, why in draft.guesses[:_SHOWN]]
     if count > _SHOWN:
@@ -118,8 +112,6 @@ def drafted(
     folder: Path,
     name: str,
     answer: Answer | None = None,
-    *,
-    standard: bool = False,
 ) -> Draft:
     """Return a config for logs that the task `fit` runs as it is.
 
@@ -128,7 +120,6 @@ def drafted(
         folder: where the config will lie; its paths start from there.
         name: of the run.
         answer: answers questions; None takes every default and marks it.
-        standard: train the networks of the standard recipe at full length.
 
     Raises:
         UsageError: where a path does not exist, or nothing drives the vessel in the logs.
@@ -168,8 +159,6 @@ def drafted(
     )
     marks.note(("evaluation", "scales"), "standard deviations over training and validation logs")
     marks.note(("recipe",), "a portfolio of models, whose terms and sizes follow from the logs")
-    if not standard:
-        marks.note(("effort",), "a quick look; 1, or --recipe standard, trains the networks longer")
     config = {
         "task": "fit",
         "name": name,
@@ -179,7 +168,6 @@ def drafted(
         "signals": signals,
         "integrator": "semi_implicit_euler",
         "recipe": "standard",
-        **({} if standard else {"effort": QUICK}),
         "export": {"models": []},
         "evaluation": judging(splits, length),
     }
