@@ -198,9 +198,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert residnet_in(folder, "demo", "demo") == 0
     for name in ("trials", "my_logs", "my_logs/zigzag", "more_logs", "new_logs"):
         (folder / name).mkdir()
-        # six of each kind are enough, and more would take longer
-        kinds = "zigzag_*" if "zigzag" in name else "*"
-        for log in sorted((folder / "demo" / "csv").glob(f"{kinds}.csv"))[:6]:
+        # of runs at constant commands nothing is learned, and holding the velocities beats all
+        for log in sorted((folder / "demo" / "csv").glob("zigzag_*.csv")):
             shutil.copy(log, folder / name)
     assert residnet_in(folder, "new", "trials", "--out", "my_boat.yaml") == 0
     quicken(folder / "my_boat.yaml")
