@@ -50,7 +50,6 @@ class GivenBaseline(Baseline):
         self.theta: Tensor
 
     def forward(self, z: Tensor) -> Tensor:
-        """Return nu_dot [..., 3] at channels z [..., nz]."""
         if self.library.count == 0:
             return zero_acceleration(z)
         phi: Tensor = self.library(z)
@@ -141,12 +140,6 @@ class EquationsConfig(GivenConfig):
         return value
 
     def build(self, names: Sequence[str]) -> GivenBaseline:
-        """Return the module with its numbers in SI, for channels `names`.
-
-        Raises:
-            ConfigError: where a term names a channel that the model lacks, or a function of one
-                that is not in SI.
-        """
         rows = [
             {term: self._in_si(axis, term, value, names) for term, value in row.items()}
             for axis, row in zip(VELOCITY, (self.u, self.v, self.r), strict=True)
@@ -230,7 +223,6 @@ class BelievedConfig(GivenConfig):
         return self.model_copy(update={"vessel": self.equations()})
 
     def build(self, names: Sequence[str]) -> GivenBaseline:
-        """Return the module with its numbers, for channels `names`."""
         require(names, (*VELOCITY, *FORCE_CHANNELS), "baseline 'believed'")
         # M, C and D times one factor: only the forces act differently
         scales = dict.fromkeys(FORCE_CHANNELS, self.scale)

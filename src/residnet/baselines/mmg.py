@@ -292,7 +292,6 @@ class MMGBaseline(ParametricBaseline):
         self.forces, self.mean, self.sd = forces, list(mean), list(sd)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Return nu_dot [..., 3] at channels z [..., nz]."""
         nu_dot: Tensor = self.forces(z, self.theta.to(z.dtype))
         return nu_dot
 
@@ -342,7 +341,6 @@ class MMGBaseline(ParametricBaseline):
         return torch.einsum("bip,biq,i->pq", slopes, slopes, 1.0 / variance) / len(part)
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Return the mean and precision [P] that the config gives."""
         free = self.free_indices()
         return (
             torch.tensor(self.mean, dtype=torch.float64)[free],
@@ -355,7 +353,6 @@ class MMGBaseline(ParametricBaseline):
         return torch.zeros(count, count, dtype=torch.float64)
 
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
-        """Return every parameter as it is now."""
         known = dict(zip(self.free_indices().tolist(), errors.tolist(), strict=True))
         return [
             Coefficient(axis_of(name), name, float(self.theta[i]), known.get(i, 0.0))
@@ -421,11 +418,6 @@ class MMGConfig(IdentifiedConfig):
         return MMGBaseline(MMGForces(self.hull, self.propeller, self.rudder, columns), priors)
 
     def require_samples(self, samples: Samples) -> None:
-        """Check that there are manoeuvres to fit on.
-
-        Raises:
-            FitError: where there are none of the kinds that are asked for.
-        """
         of_manoeuvres(samples, self.manoeuvres)
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:

@@ -65,7 +65,6 @@ class RegressorBaseline(ParametricBaseline):
         self.bound: VelocityBound | None = VelocityBound(_BEYOND, len(names)) if bounded else None
 
     def forward(self, z: Tensor) -> Tensor:
-        """Return nu_dot [..., 3] at channels z [..., nz]."""
         weights = (self.theta * self.allowed).to(z.dtype)
         if self.bound is not None:
             held: Tensor = self.bound.held(z)
@@ -84,14 +83,12 @@ class RegressorBaseline(ParametricBaseline):
         return [j for j in range(self.library.count) if bool(self.allowed[axis, j] > 0)]
 
     def free_indices(self) -> Tensor:
-        """Return the places [P] in theta, flattened, of coefficients that a refit may move."""
         free = self.allowed > 0
         for axis, column in self.held:
             free[axis, column] = False
         return torch.nonzero(free.flatten()).squeeze(1)
 
     def free_names(self) -> list[tuple[str, str]]:
-        """Return (axis, term) of each free coefficient [P]."""
         terms = self.library.terms
         return [
             (ACCELERATION[i // len(terms)], terms[i % len(terms)])
@@ -108,7 +105,6 @@ class RegressorBaseline(ParametricBaseline):
         return out
 
     def along(self, z: Tensor, ahead: Tensor) -> Tensor:
-        """Return the derivatives of nu_dot [D, B, 3] at z [B, nz] along directions [D, B, nz]."""
         weights = self.theta * self.allowed
         if self.bound is None:
             return self.library.along(z, ahead) @ weights.T
@@ -130,7 +126,6 @@ class RegressorBaseline(ParametricBaseline):
         return whole[free][:, free]
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Return zeros: nothing is known before."""
         none = torch.zeros(self.free_indices().numel(), dtype=torch.float64)
         return none, none
 
@@ -181,7 +176,6 @@ class RegressorBaseline(ParametricBaseline):
         return [free.index(place) for place in places if place in free]
 
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
-        """Return coefficients and ratios as theta is now; a ratio keeps its error."""
         terms = self.library.terms
         rows = {
             f"{name}_dot": dict(zip(terms, self.theta[axis].tolist(), strict=True))
@@ -314,25 +308,14 @@ class RegressorsConfig(IdentifiedConfig):
         return [row or ("1", *names) for row in given] if self.terms == () else given
 
     def build(self, names: Sequence[str]) -> RegressorBaseline:
-        """Return the module, coefficients zero, for channels `names`."""
         return RegressorBaseline(
             self.rows(names), names, dissipative=self.dissipative, bounded=self.bounded
         )
 
     def require_samples(self, samples: Samples) -> None:
-        """Check that there are manoeuvres to fit on.
-
-        Raises:
-            FitError: where there are none of the kinds that are asked for.
-        """
         of_manoeuvres(samples, self.manoeuvres)
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Return one solution for each penalty.
-
-        Raises:
-            FitError: where the data do not determine a coefficient.
-        """
         assert isinstance(baseline, RegressorBaseline)
         picked = of_manoeuvres(samples, self.manoeuvres)
         estimator = LeastSquares(self.ridge if isinstance(self.ridge, tuple) else (self.ridge,))

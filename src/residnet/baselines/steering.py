@@ -42,7 +42,6 @@ class SteeredConfig(IdentifiedConfig, ABC):
 
     @final
     def build(self, names: Sequence[str]) -> RegressorBaseline:
-        """Return the module, coefficients zero, for channels `names`."""
         require(names, (*VELOCITY, self.drive, self.steer), f"baseline '{self.kind}'")
         rows = self.rows()
         return RegressorBaseline(rows, names, ((1, "v"),) if rows[1] == ("v",) else ())
@@ -73,16 +72,10 @@ class _NomotoConfig(SteeredConfig, ABC):
 
     @final
     def rows(self) -> tuple[tuple[str, ...], ...]:
-        """Return the terms of each axis; the first is the rate that settles."""
         return ("u", self.drive, "1"), self.sway, ("r", self.steer, "1")
 
     @final
     def require_samples(self, samples: Samples) -> None:
-        """Check that there are manoeuvres to fit on.
-
-        Raises:
-            FitError: where there are none of the kinds that are asked for.
-        """
         of_manoeuvres(samples, self.manoeuvres)
 
     @final
@@ -224,7 +217,6 @@ class LinearSteadyConfig(SteeredConfig):
     steering: tuple[str, ...] = ("zigzag", "three_two_one_one")
 
     def rows(self) -> tuple[tuple[str, ...], ...]:
-        """Return the terms of each axis."""
         rows: dict[str, tuple[str, ...]] = {"v": ("v",)}
         for block in self._blocks():
             rows |= dict.fromkeys(block.states, (*block.states, block.drive, "1"))

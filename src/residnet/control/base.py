@@ -79,7 +79,6 @@ class GivenReference(Reference):
         self.values = values
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the row k of the values."""
         return self.values[:, min(k, self.values.shape[1] - 1)].to(x.dtype), s
 
 

@@ -63,7 +63,6 @@ class PlantActuators(Actuators):
         self.dynamics = TracedPlantDynamics(plant, dt, substeps) if self.columns else None
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., c] of the plant."""
         return self.plant.demand(drive, steer)
 
     def move(self, a: Tensor, w: Tensor) -> Tensor:
@@ -78,7 +77,6 @@ class PlantActuators(Actuators):
         return self.dynamics.step(x, w, x[:, :0])[0][:, self.columns]
 
     def approach(self, rows: int) -> Tensor:
-        """Return the state that the plant's trials start from."""
         x = self.plant.approach(rows)
         return x[:, [*map(self.plant.state.index, STATE), *self.columns]]
 
@@ -220,11 +218,9 @@ class ActuatedDynamics(Dynamics):
             self.take.append(names.index(found))
 
     def initial_state(self, batch: int) -> Tensor:
-        """Return the memory [batch, n_state] without a past."""
         return self.model.initial_state(batch)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step later."""
         a = layout.actuators(x)
         moved = self.actuators.move(a, w)
         given = torch.cat((a, w), dim=-1)[:, self.take]

@@ -30,7 +30,6 @@ class MeanBaseline(Baseline):
         self.members = nn.ModuleList(members)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Return nu_dot [..., 3] at channels z [..., nz]."""
         total = zero_acceleration(z)
         for member in self.members:
             total = total + member(z)
@@ -71,27 +70,22 @@ class MeanHead(ResidualHead):
         return torch.stack(residuals)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] at channels z [B, nz] and the memory for the next step."""
         residuals, memory = self._each(z, s)
         return residuals.mean(dim=0), memory
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Return residuals [B, T, 3] along channels [B, T, nz], from an empty memory."""
         return self._sequences(z).mean(dim=0)
 
     def warms_by_steps(self) -> bool:
-        """Return whether all members do."""
         return all(member.warms_by_steps() for member in self.members)  # type: ignore[operator]
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         memory: list[Tensor] = []
         for member in self.members:
             memory.append(member.warmup(z))  # type: ignore[operator]
         return torch.cat(memory, dim=-1)
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [n_state], that of all members side by side."""
         low, high = zip(*(member.memory_range() for member in self.members), strict=True)  # type: ignore[operator]
         return torch.cat(low), torch.cat(high)
 
@@ -164,7 +158,6 @@ class MeanOfTrajectories(HybridDynamics):
         self.small: Tensor
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step of dt later."""
         nu, rows = velocities(x), x.shape[0]
         missed = (nu - s[:, 1:4]) / self.small.to(x.dtype)
         kept = s[:, :1] / (1.0 + missed.square().sum(dim=-1, keepdim=True))
@@ -201,12 +194,6 @@ class MeanOfTrajectories(HybridDynamics):
         return torch.cat((moved_pose, mean), dim=-1), torch.cat(parts, dim=-1)
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
-        """Return the memory [B, n_state] that a measured past leaves: that of steps along it.
-
-        Args:
-            y_history: measured states [B, T, 6], oldest first; T may be 0.
-            w_history: inputs held over the step that follows each of them [B, T, m].
-        """
         s = y_history.new_zeros((y_history.shape[0], self.n_state))
         # nothing is trained through the mean, and a long past would keep all of its steps
         with torch.no_grad():
@@ -215,14 +202,12 @@ class MeanOfTrajectories(HybridDynamics):
         return s
 
     def known(self, z: Tensor) -> Tensor:
-        """Return the baselines' mean acceleration [..., 3] at channels z [..., nz]."""
         total = zero_acceleration(z)
         for member in self.members:
             total = total + member.baseline(z)
         return total / len(self.widths)
 
     def one_step(self, z: Tensor) -> Tensor:
-        """Return the members' mean nu_dot [B, T, 3] along measured channels [B, T, nz]."""
         total = zero_acceleration(z)
         for member in self.members:
             total = total + member.one_step(z)
@@ -233,7 +218,6 @@ class MeanOfTrajectories(HybridDynamics):
         return (velocities(self.step(x, w, s)[0]) - velocities(x)) / self.dt
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [n_state]."""
         limit = torch.full((_KNOWN,), FARTHEST, dtype=torch.float64)
         limit[0] = 1.0
         low, high = [torch.cat((0.0 * limit[:1], -limit[1:]))], [limit]

@@ -145,7 +145,6 @@ class HybridDynamics(Dynamics):
         return z
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step of dt later."""
         p = self.signals.prepare(w)
         z: Tensor = self.signals(x, p)
         if self.disturbance is None:

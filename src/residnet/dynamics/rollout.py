@@ -46,7 +46,6 @@ class Playback(Source):
     """A source that gives the inputs back as they are."""
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs w [B, m], unchanged."""
         return w, memory
 
 

@@ -178,7 +178,6 @@ class InAmbientCurrent(Dynamics):
         self.places: Tensor
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step later."""
         moved, memory = self.model.step(x, w, s[:, 2:])
         return moved + self.dt * s[:, :2] @ self.places.to(x.dtype), torch.cat(
             (s[:, :2], memory), dim=-1

@@ -59,7 +59,6 @@ class VariedPlant(Dynamics):
         self.moving = self.rudder >= 0 and bool(plant.rate(x, w)[0, self.rudder] != 0)
 
     def initial_state(self, batch: int) -> Tensor:
-        """Return the plant itself, [batch, 3]."""
         return torch.tensor([1.0, 1.0, 0.0]).expand(batch, 3)
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
@@ -141,14 +140,12 @@ class VariedModel(Dynamics):
         self.travel = None if rate is None else rate * dt
 
     def initial_state(self, batch: int) -> Tensor:
-        """Return the model itself, without a past, [batch, 3 + k]."""
         return torch.tensor([1.0, 1.0] + [0.0] * (self.n_state - 2)).expand(batch, -1)
 
     def _of(self, x: Tensor) -> HybridDynamics:
         return self.models[1 if x.dtype == torch.float64 else 0]
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step later under the commands w [B, m]."""
         command, angle = w[:, :1], actuators(x)
         if self.travel is None:
             angle_before = angle_after = command

@@ -130,7 +130,6 @@ class ModelSpec(Stored):
     of: Literal["accelerations", "trajectories"] = "accelerations"
 
     def build(self) -> HybridDynamics:
-        """Return the model with its numbers not yet filled in."""
         if self.of == "trajectories":
             return self.mean([member.single() for member in self.members])
         return self.as_one(self.single())

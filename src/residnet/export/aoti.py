@@ -31,7 +31,6 @@ class AotiModel(Loaded):
         self.dtype = dtype
 
     def step(self, *given: Numbers) -> tuple[Any, ...]:
-        """Return the results of one step."""
         # the package takes numbers as they lie in memory, whatever a tensor's strides say
         rows = [torch.from_numpy(np.ascontiguousarray(part)).to(self.dtype)[None] for part in given]
         return tuple(part[0].numpy() for part in self.package(*rows))

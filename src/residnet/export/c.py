@@ -210,7 +210,6 @@ class CompiledModel(Loaded):
         )  # fmt: skip
 
     def step(self, *given: Numbers) -> tuple[Any, ...]:
-        """Return the results of one step."""
         flags = self.exported.flags
         out = {
             name: np.zeros(size, np.int32 if name in flags else self.real)
@@ -225,7 +224,6 @@ class CompiledModel(Loaded):
         )
 
     def memory(self, *past: Numbers) -> Numbers | None:
-        """Return the memory that a past leaves."""
         s = np.zeros(self.exported.arguments[-1][1], self.real)
         rows = [np.ascontiguousarray(part, dtype=self.real) for part in past]
         if len(rows) > 1:

@@ -21,7 +21,6 @@ class CasadiModel(Loaded):
         self.function: Any = ca.Function.load(str(file))
 
     def step(self, *given: Numbers) -> tuple[Any, ...]:
-        """Return the results of one step."""
         return tuple(part.full().reshape(-1) for part in self.function(*given))
 
 
@@ -34,7 +33,6 @@ class CasadiExporter(Exporter):
     about: ClassVar[str] = "The model's step as a CasADi function with exact derivatives, for MPC."
 
     def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
-        """Write the function, and its card beside it."""
         exported.require_numbers()
         step = lowered(
             exported.graph(torch.float64), exported.arguments, exported.results, exported.what

@@ -222,11 +222,9 @@ class ExportedForce(Exported):
         self.inner, self.ranges, self.lag = model.eval(), ranges, lag
 
     def module(self, dtype: torch.dtype) -> nn.Module:
-        """Return the force with its guard."""
         return GuardedForce(self.inner, self.ranges).eval()
 
     def graph(self, dtype: torch.dtype) -> nn.Module:
-        """Return the force with its guard."""
         return self.module(dtype)
 
     def check(
@@ -304,7 +302,6 @@ class FeedForwardExporter(Exporter):
     )
 
     def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
-        """Write the feed-forward of a model and return its card."""
         if not isinstance(exported, ExportedVessel):
             raise UsageError(f"{exported.what}: a feed-forward is made of a vessel model alone")
         force, ranges = required_force(exported.spec, exported.at(torch.float64))

@@ -236,7 +236,6 @@ class Fmu3Exporter(FmuExporter):
     version: ClassVar[Literal["2.0", "3.0"]] = "3.0"
 
     def platform(self) -> str:
-        """Return machine and system."""
         system = {"win32": "windows", "darwin": "darwin"}.get(sys.platform, "linux")
         return f"{_machine()}-{system}"
 
@@ -250,5 +249,4 @@ class Fmu2Exporter(FmuExporter):
     version: ClassVar[Literal["2.0", "3.0"]] = "2.0"
 
     def platform(self) -> str:
-        """Return system and bits."""
         return {"win32": "win64", "darwin": "darwin64"}.get(sys.platform, "linux64")

@@ -161,7 +161,6 @@ class GuardedDynamics(Dynamics):
         return after, s, outside | left
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state with its flag [B, 7] and the memory one step later."""
         after, s, outside = self.flagged_step(motion(x), w, s)
         return torch.cat((after, outside.to(x.dtype).unsqueeze(-1)), dim=-1), s
 

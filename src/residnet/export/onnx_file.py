@@ -70,11 +70,9 @@ class OnnxModel(Loaded):
         self.exported = exported
 
     def step(self, *given: Numbers) -> tuple[Any, ...]:
-        """Return the results of one step."""
         return tuple(part[0] for part in self.rows(*(part[None] for part in given)))
 
     def rows(self, *given: Numbers) -> tuple[Any, ...]:
-        """Return the results of one step of many rows."""
         exported = self.exported
         whole_ = zip(exported.arguments, given, strict=True)
         fed = {name: np.asarray(part, self.dtype) for (name, count), part in whole_ if count}

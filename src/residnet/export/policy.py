@@ -322,11 +322,9 @@ class ExportedController(Exported):
         """Return what the card says of this kind of policy."""
 
     def module(self, dtype: torch.dtype) -> nn.Module:
-        """Return the module of the TorchScript file."""
         return self.controller(dtype)
 
     def graph(self, dtype: torch.dtype) -> nn.Module:
-        """Return the step without checks of shapes."""
         return _Answer(self.controller(dtype)).eval()
 
     def contents(self) -> dict[str, Any]:
@@ -421,7 +419,6 @@ class ExportedHeading(ExportedController):
         return (("reference", 1),)
 
     def controller(self, dtype: torch.dtype) -> ExportedPolicy:
-        """Return the policy with its checks."""
         return for_export(self.policy, self.safe, dtype)
 
     def drive(self, module: Any) -> Sequence[Tensor]:
@@ -433,7 +430,6 @@ class ExportedHeading(ExportedController):
         return y, 0.5 * torch.sign(torch.sin(0.004 * steps)).unsqueeze(-1)
 
     def described(self, module: Any) -> dict[str, Any]:
-        """Return reference and memory."""
         return {
             "reference": [{"name": "heading", "unit": "rad"}],
             "memory": [*module.policy.memory_ranges(1.0, 1.0), "last_command"],
@@ -471,7 +467,6 @@ class ExportedCoursePolicy(ExportedController):
         super().__init__(name, policy, safe=safe, about=about, metrics=metrics)
 
     def controller(self, dtype: torch.dtype) -> ExportedCourse:
-        """Return policy and guidance with their checks."""
         return ExportedCourse(self.policy, self.guidance, self.safe).eval()
 
     def drive(self, module: Any) -> Sequence[Tensor]:

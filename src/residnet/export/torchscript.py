@@ -79,19 +79,16 @@ class ScriptedModel(Loaded):
         return [torch.as_tensor(part).to(self.dtype).unsqueeze(0) for part in given]
 
     def step(self, *given: Numbers) -> tuple[Any, ...]:
-        """Return the results of one step."""
         with torch.no_grad():
             return tuple(part[0].numpy() for part in self.module(*self._given(given)))
 
     def memory(self, *past: Numbers) -> Numbers | None:
-        """Return the memory that a past leaves."""
         begin = self.module.warmup if len(past) > 1 else self.module.initial_state
         with torch.no_grad():
             found: Numbers = begin(*self._given(past))[0].numpy()
         return found
 
     def rollout(self, *given: Numbers) -> Numbers | None:
-        """Return the states of a free run."""
         with torch.no_grad():
             found: Numbers = self.module.rollout(*self._given(given))[0][0].numpy()
         return found
@@ -106,7 +103,6 @@ class TorchScriptExporter(Exporter):
     about: ClassVar[str] = "The model as TorchScript, which Python and C++ run with torch alone."
 
     def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
-        """Write the module in its first precision and return its card."""
         exported.require_numbers()
         dtype = exported.precisions[0]
         module = exported.module(dtype)

@@ -199,19 +199,12 @@ class ExportedVessel(Exported):
         return GuardedDynamics(self.at(dtype), self.spec).to(dtype).eval()
 
     def module(self, dtype: torch.dtype) -> nn.Module:
-        """Return the module of the TorchScript file."""
         return ExportedModel(self.at(dtype), self.spec).eval()
 
     def graph(self, dtype: torch.dtype) -> nn.Module:
-        """Return the guarded step."""
         return _Step(self.at(dtype), self.spec).to(dtype).eval()
 
     def require_numbers(self) -> None:
-        """Refuse a model whose numbers are not all finite.
-
-        Raises:
-            ExportError: that names the first such number.
-        """
         # limits of what has no limits are infinite from the start
         fresh = self.spec.build().state_dict()
         for name, value in self.model.state_dict().items():

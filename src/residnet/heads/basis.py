@@ -87,7 +87,6 @@ class BasisHead(ClosedFormHead):
         self.intercept: Tensor
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges of the features from the samples."""
         self.features.calibrate(samples)
 
     def basis(self, z: Tensor) -> Tensor:
@@ -99,7 +98,6 @@ class BasisHead(ClosedFormHead):
         return values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.basis(z) @ self.coefficients.to(z.dtype) + self.intercept.to(z.dtype), s
 
     @abstractmethod
@@ -107,15 +105,9 @@ class BasisHead(ClosedFormHead):
         """Return the estimator of the coefficients, cross-validated over so many folds."""
 
     def require_samples(self, samples: Samples) -> None:
-        """Check that there are as many manoeuvres as folds.
-
-        Raises:
-            FitError: where there are fewer.
-        """
         fold_numbers(samples.group, self.folds or usual_folds(samples.group))
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Return the solutions of the estimator; see `ClosedFormHead.solutions`."""
         columns = [samples.names.index(name) for name in self.features.names]
         for rows in row_pieces(len(samples)):
             chosen = samples.z[rows][:, columns]

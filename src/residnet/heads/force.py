@@ -71,11 +71,6 @@ class ForceHead(ClosedFormHead):
         self.highest: Tensor
 
     def set_mass(self, mass: Tensor | None) -> None:
-        """Take the believed mass [3, 3].
-
-        Raises:
-            ConfigError: where the baseline has none.
-        """
         if mass is None:
             raise ConfigError(
                 "space: force needs a baseline that knows its mass and the forces on it; set its"
@@ -118,11 +113,6 @@ class ForceHead(ClosedFormHead):
                 )
 
     def require_samples(self, samples: Samples) -> None:
-        """Check that there are as many manoeuvres as folds.
-
-        Raises:
-            FitError: where there are fewer.
-        """
         self.inner.require_samples(samples)
 
     def solutions(self, samples: Samples) -> list[Solution]:
@@ -181,11 +171,9 @@ class ForceHead(ClosedFormHead):
         return out
 
     def effective_baseline(self, baseline: nn.Module) -> nn.Module:
-        """Return the baseline with the mass that this head gives it."""
         return AugmentedMassBaseline(baseline, self.gain)
 
     def parameter_count(self) -> list[float]:
-        """Return the number of fitted parameters of each axis."""
         return self.inner.parameter_count()
 
 

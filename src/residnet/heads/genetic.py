@@ -52,19 +52,15 @@ class GeneticHead(EquationHead):
         self.weights = Weights()
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the ranges of the features from the samples."""
         self.features.calibrate(samples)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.library(self.features.guarded(z)) @ self.weights.values.to(z.dtype), s
 
     def parameter_count(self) -> list[float]:
-        """Return the number of coefficients of each axis that are not zero."""
         return [float(count) for count in (self.weights.values != 0).sum(0)]
 
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Return each term of an axis times its coefficient [T], along channels z [T, nz]."""
         with torch.no_grad():
             values = (
                 self.library(self.features.guarded(z)) * self.weights.values[:, axis].to(z.dtype)

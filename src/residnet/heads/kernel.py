@@ -112,13 +112,11 @@ class KernelHead(ClosedFormHead):
         self.effective: Tensor
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges of the features from the samples."""
         self.features.calibrate(samples)
         if self.terms.count:
             self.terms.calibrate(self.features.guarded(samples.z))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.kernel(self.columns(z)), s
 
     def columns(self, z: Tensor) -> Tensor:
@@ -135,20 +133,9 @@ class KernelHead(ClosedFormHead):
         return [float(count) for count in self.effective]
 
     def require_samples(self, samples: Samples) -> None:
-        """Check that there are as many manoeuvres as folds.
-
-        Raises:
-            FitError: where there are fewer.
-        """
         fold_numbers(samples.group, self.folds or usual_folds(samples.group))
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Return the solution of the least error of each axis, then what free runs may prefer.
-
-        Raises:
-            FitError: with fewer manoeuvres than folds, or where a recursion finds no samples that
-                follow each other.
-        """
         recursion = _recursion(samples) if self.by_recursion else None
         estimator = KernelRidge(
             self.kernel,

@@ -242,7 +242,6 @@ class LstmHead(ResidualHead):
         self.restoring: VelocityBound | None = VelocityBound() if config.restoring else None
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the scales of features and residual from the samples."""
         if self.restoring is not None:
             self.restoring.calibrate(samples)
         for network in self.networks:
@@ -255,11 +254,9 @@ class LstmHead(ResidualHead):
             network.silence()
 
     def residual_std(self) -> Tensor:
-        """Return the standard deviation of the residual on the training samples, [3]."""
         return self.scale.spread
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] at channels z [B, nz], and the memory for the next step."""
         out: list[Tensor] = []
         memory: list[Tensor] = []
         for i, network in enumerate(self.networks):
@@ -273,7 +270,6 @@ class LstmHead(ResidualHead):
         return rho, memory[0] if len(memory) == 1 else torch.cat(memory, dim=-1)
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
         scaled = torch.cat([network.sequence(z)[0] for network in self.networks], dim=-1)
         rho: Tensor = self.scale(scaled)
         if self.restoring is not None:
@@ -281,14 +277,11 @@ class LstmHead(ResidualHead):
         return rho
 
     def warms_by_steps(self) -> bool:
-        """Return whether there is no encoder."""
         return all(network.encoder is None for network in self.networks)
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         return torch.cat([network.memory_after(z) for network in self.networks], dim=-1)
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [n_state] that the networks can have."""
         ranges = [network.core.memory_range() for network in self.networks]
         return torch.cat([low for low, _ in ranges]), torch.cat([high for _, high in ranges])

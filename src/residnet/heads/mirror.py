@@ -90,11 +90,9 @@ class MirroredHead(ResidualHead):
         self.inner.calibrate(both)
 
     def silence(self) -> None:
-        """Set the residual to zero."""
         self.inner.silence()
 
     def residual_std(self) -> Tensor:
-        """Return the standard deviation of the residual on the training samples, [3]."""
         return self.inner.residual_std()
 
     def both(self, z: Tensor) -> Tensor:
@@ -107,7 +105,6 @@ class MirroredHead(ResidualHead):
         return 0.5 * (rho[:half] + rho[half:] * self.turned.to(rho.dtype))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] at channels z [B, nz], and the memory for the next step."""
         rho, after = self.inner(
             self.both(z), torch.cat((s[:, : self.width], s[:, self.width :]), dim=0)
         )
@@ -115,7 +112,6 @@ class MirroredHead(ResidualHead):
         return self.mean(rho), torch.cat((after[:half], after[half:]), dim=-1)
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
         return self.mean(self.inner.sequence(self.both(z)))
 
     def warms_by_steps(self) -> bool:
@@ -123,7 +119,6 @@ class MirroredHead(ResidualHead):
         return self.inner.warms_by_steps()
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         s = self.inner.warmup(self.both(z))
         half = z.shape[0]
         return torch.cat((s[:half], s[half:]), dim=-1)

@@ -70,19 +70,15 @@ class MlpHead(ResidualHead):
         self.net = nn.Sequential(*layers, out)
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the scales of features and residual from the samples."""
         self.features.calibrate(samples)
         self.scale.calibrate(samples)
 
     def silence(self) -> None:
-        """Set the residual to zero: the last layer."""
         for parameter in self.net[-1].parameters():
             nn.init.zeros_(parameter)
 
     def residual_std(self) -> Tensor:
-        """Return the standard deviation of the residual on the training samples, [3]."""
         return self.scale.spread
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.scale(self.net(self.features(z))), s

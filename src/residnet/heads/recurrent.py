@@ -83,18 +83,15 @@ class RecurrentHead(ResidualHead):
                 weight.mul_(0.1)
 
     def set_step(self, dt: float) -> None:
-        """Take the step of the model in s."""
         self.share = dt / self.coarse
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the scales of features and residual from the samples."""
         if self.restoring is not None:
             self.restoring.calibrate(samples)
         self.features.calibrate(samples)
         self.scale.calibrate(samples)
 
     def residual_std(self) -> Tensor:
-        """Return the standard deviation of the residual on the training samples, [3]."""
         return self.scale.spread
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:

@@ -122,12 +122,10 @@ class SklearnHead(ClosedFormHead):
         self.fitted = _Fitted()
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the scales of features and residual from the samples."""
         self.features.calibrate(samples)
         self.scale.calibrate(samples)
 
     def residual_std(self) -> Tensor:
-        """Return the standard deviation of the residual on the training samples, [3]."""
         return self.scale.spread
 
     def solutions(self, samples: Samples) -> list[Solution]:
@@ -171,7 +169,6 @@ class SklearnHead(ClosedFormHead):
         self.learned, self.fitted.axes = learned, axes
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [..., 3] at channels z [..., nz]; the memory is empty."""
         found: Tensor = _Asked.apply(self.features(z), self.fitted)  # type: ignore[no-untyped-call]
         return self.scale(found), s
 

@@ -265,7 +265,6 @@ class SymbolicHead(EquationHead):
         self.coefficients: Tensor
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the ranges of the features from the samples."""
         self.features.calibrate(samples)
 
     def basis(self, chosen: Tensor) -> Tensor:
@@ -282,12 +281,10 @@ class SymbolicHead(EquationHead):
         return self.basis(chosen) @ self.coefficients.to(z.dtype), s
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Return residuals [..., T, 3] along channels [..., T, nz], from an empty memory."""
         chosen = self.line.sequence(self.features.guarded(z))
         return self.basis(chosen) @ self.coefficients.to(z.dtype)
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Return the memory [B, n_state] that past channels [B, T, nz], oldest first, leave."""
         return self.line.warmup(self.features.guarded(z))
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
@@ -295,7 +292,6 @@ class SymbolicHead(EquationHead):
         return self.line.memory_range(self.features.low, self.features.high)
 
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Return each term of an axis times its coefficient [T], along channels z [T, nz]."""
         with torch.no_grad():
             values = (
                 self.basis(self.line.sequence(z.index_select(-1, self.features.index)))

@@ -15,5 +15,4 @@ class ZeroHead(ResidualHead):
     """A head without a residual, rho = 0: the baseline alone."""
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return zeros [..., 3]."""
         return zero_acceleration(z), s

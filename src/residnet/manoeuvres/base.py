@@ -104,7 +104,6 @@ class ScheduleSource(Source):
         self.commands = demand(drive, steer)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m] with the scheduled commands."""
         return commanded(self.commands[:, k].to(w.dtype), w), memory
 
 
@@ -135,7 +134,6 @@ class LawSource(Source):
         self.may_stop = any(manoeuvre.goal is not None for manoeuvre in manoeuvres)
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the memory [B, k] at the start."""
         return self.kind.memory(*self._seen(x))
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,12 +208,10 @@ class Watched(Source):
         self.stopped = torch.full((rows,), -1)
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the memory of the source inside."""
         self.stopped = torch.full((x.shape[0],), -1)
         return self.source.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m] of the source inside."""
         out: tuple[Tensor, Tensor] = self.source(x, w, k, memory)
         return out
 
@@ -300,7 +296,6 @@ class Scheduled(Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Return the playback of the demands."""
         pairs = [
             manoeuvre.demands(t) for manoeuvre in manoeuvres if isinstance(manoeuvre, Scheduled)
         ]
@@ -341,7 +336,6 @@ class ClosedLoop(Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Return the closed loop of all rows."""
         return LawSource([m for m in manoeuvres if isinstance(m, ClosedLoop)], helm, t)
 
 

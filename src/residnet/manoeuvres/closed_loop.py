@@ -63,7 +63,6 @@ class Zigzag(RudderSteering, ClosedLoop):
         return self.side if self.first == "starboard" else -self.side
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return the overshoots, times and distances; see `indices.zigzag`."""
         return indices.zigzag(log, self.start, self.begins, self.heading, length)
 
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
@@ -137,7 +136,6 @@ class ZigzagFamily(Family):
     start: Seconds = 5.0
 
     def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        """Draw a manoeuvre with a random generator."""
         heading = float(random.choice(self.heading))
         steer, drive = drawn(random, self.steer), drawn(random, self.drive)
         first: Literal["starboard", "port"] = "starboard" if random.random() < 0.5 else "port"
@@ -283,7 +281,6 @@ class TurningCircleFamily(Family):
     until: Radians = Field(default=3.0 * math.pi, gt=0)
 
     def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        """Draw a manoeuvre with a random generator."""
         side = 1.0 if random.random() < 0.5 else -1.0
         steer, drive = side * drawn(random, self.steer), drawn(random, self.drive)
         return TurningCircle(steer=steer, drive=drive, start=self.start, until=self.until)
@@ -308,7 +305,6 @@ class Stopping(ClosedLoop):
 
     @property
     def goal(self) -> str:
-        """The end of the manoeuvre: rest."""
         return "a surge velocity of zero"
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
@@ -325,7 +321,6 @@ class Stopping(ClosedLoop):
 
     @classmethod
     def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
-        """Return nothing, [B, 0]."""
         return seen["u"].new_zeros(len(seen["u"]), 0)
 
     @classmethod
@@ -421,7 +416,6 @@ class Spiral(ClosedLoop):
 
     @classmethod
     def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
-        """Return the memory [B, 4] at the first angle."""
         return torch.cat((torch.zeros_like(seen["r"])[:, None], steady_at(seen["r"])), dim=-1)
 
     @classmethod

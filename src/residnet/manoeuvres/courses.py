@@ -61,7 +61,6 @@ class Waypoints(Manoeuvre):
 
     @property
     def goal(self) -> str:
-        """The end of the manoeuvre: the last way-point."""
         return f"the last of {len(self.points)} way-points"
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
@@ -99,11 +98,9 @@ class WaypointSource(Source):
         self.may_stop = True
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the memory [B, 3] of the guidance."""
         return self.guidance.initial_state(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m] and the memory one step later."""
         heading, memory = self.guidance(x, k, memory)
         steer, _ = self.autopilot(x, heading, x[:, :0])
         command = self.demand(torch.full_like(steer[:, 0], self.drive), steer[:, 0])
@@ -205,7 +202,6 @@ class FourCornerSource(Source):
         return torch.cat((self.reference.initial_state(x), self.policy.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m] and the memory one step later."""
         n = self.reference.n_state
         target, guided = self.reference(x, k, memory[:, :n])
         tau, s = self.policy(x, target, memory[:, n:])

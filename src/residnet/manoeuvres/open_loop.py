@@ -43,7 +43,6 @@ class ConstantInput(Scheduled):
     steer: float = Field(ge=-1, le=1)
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Return constant drive and steer [T]."""
         return torch.full_like(t, self.drive), torch.full_like(t, self.steer)
 
 
@@ -106,7 +105,6 @@ class AccelerationDecelerationFamily(Family):
     hold: tuple[Seconds, Seconds] = (6.0, 12.0)
 
     def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        """Draw a manoeuvre with a random generator."""
         number = np.arange(int(duration / self.hold[0]) + 2)
         high, low = drawn(random, self.high), drawn(random, self.low)
         holds = random.uniform(*self.hold, size=number.size)
@@ -143,7 +141,6 @@ class ThreeTwoOneOne(Scheduled):
     repeat: bool = True
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Return constant drive and patterned steer [T]."""
         # times on the grid must not fall short of their unit by rounding
         units = torch.floor((t - self.start) / self.unit + 1e-9).long()
         pattern = torch.tensor(_PATTERN, dtype=t.dtype)
@@ -170,7 +167,6 @@ class ThreeTwoOneOneFamily(Family):
     start: Seconds = 5.0
 
     def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        """Draw a manoeuvre with a random generator."""
         unit, steer, drive = (drawn(random, span) for span in (self.unit, self.steer, self.drive))
         return ThreeTwoOneOne(unit=unit, steer=steer, drive=drive, start=self.start)
 
@@ -221,7 +217,6 @@ class Excitation(Scheduled, ABC):
         return torch.where(t >= self.start - 1e-9, wave, torch.zeros_like(t))
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Return drive and steer [T], clipped to +-1."""
         drive = self.drive + self.drive_amplitude * self._after_start(t, _DRIVE)
         return drive.clamp(-1.0, 1.0), self.steer_amplitude * self._after_start(t, _STEER)
 
@@ -340,7 +335,6 @@ class RandomStepsFamily(ExcitationFamily):
     kind: Literal["random_steps"] = "random_steps"
 
     def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        """Draw a manoeuvre with a random generator."""
         return RandomSteps.model_validate(self._common(random))
 
 
@@ -355,5 +349,4 @@ class MultiSineFamily(ExcitationFamily):
     tones: int = Field(default=8, ge=2, le=200)
 
     def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        """Draw a manoeuvre with a random generator."""
         return MultiSine.model_validate(self._common(random) | {"tones": self.tones})

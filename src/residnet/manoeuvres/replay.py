@@ -165,6 +165,5 @@ class RecordedSource(Source):
         self.values = values
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m] of step k."""
         given = self.values[:, k].to(w.dtype)
         return torch.where(torch.isnan(given), w, given), memory

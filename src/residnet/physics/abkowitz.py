@@ -213,7 +213,6 @@ class SeriesForces(Actuators):
         return both.clamp(-1.0, 1.0) * self.limits.to(drive.dtype)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [..., 3] of the whole series at velocities through the water nu [..., 3]."""
         position = self.positions(a, command)
         u, v, r, delta = nu[..., 0], nu[..., 1], nu[..., 2], self.sign * position[..., 0]
         dn = position[..., 1] - self.n_0 if self.turns else torch.zeros_like(u)

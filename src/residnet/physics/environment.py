@@ -199,7 +199,6 @@ class IttcSpectrum(Spectrum):
     kind: Literal["ittc"] = "ittc"
 
     def peakedness(self, ratio: np.ndarray) -> np.ndarray:
-        """Return ones in the shape of `ratio`."""
         return np.ones_like(ratio)
 
 

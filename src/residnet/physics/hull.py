@@ -148,11 +148,6 @@ class HullVessel(VesselFile, ABC):
 
     @final
     def build(self) -> HullPlant:
-        """Build the plant of this vessel.
-
-        Raises:
-            ConfigError: where the mass matrix is not positive definite or is singular.
-        """
         return HullPlant(self.hull(), self.actuators.build(), self.wind, self.start())
 
 

@@ -74,7 +74,6 @@ class SteeringConfig(VesselFile, ABC):
 
     @final
     def build(self) -> SteeringVessel:
-        """Build the plant of this vessel."""
         return SteeringVessel(self)
 
 
@@ -209,7 +208,6 @@ class SteeringVessel(Plant):
         return self.servo.value(x[:, self.rudder_columns], w[:, :1])[:, 0]
 
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return x_dot [B, nx] under inputs w [B, 1]."""
         z, rudder = x[:, self.turning_columns], x[:, self.rudder_columns]
         turning = z @ self.a.to(x.dtype).T + self.delta(x, w).unsqueeze(-1) * self.b.to(x.dtype)
         north, east = to_earth(surge(x), sway(x), heading(x))
@@ -217,7 +215,6 @@ class SteeringVessel(Plant):
         return torch.cat((pose, turning, self.servo.rate(rudder, w[:, :1])), dim=-1)
 
     def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        """Return the state [B, nx] with the rudder moved on by a step of dt seconds."""
         rudder = self.servo.advance(x[:, self.rudder_columns], w[:, :1], dt)
         return torch.cat((x[:, : self.rudder_columns.start], rudder), dim=-1)
 

@@ -205,7 +205,6 @@ class HullPlant(Plant):
         self.start = {self.state.index(n): v for n, v in (start or {}).items() if n in self.state}
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
         return self.actuators.demand(drive, steer)
 
     def in_calm_water(self) -> Self:
@@ -218,7 +217,6 @@ class HullPlant(Plant):
         return self
 
     def approach(self, rows: int) -> Tensor:
-        """Return the state [rows, nx] that trials start from, float64."""
         x = super().approach(rows)
         for column, value in self.start.items():
             x[:, column] = value
@@ -239,11 +237,9 @@ class HullPlant(Plant):
         return torch.cat((w[:, :c], force, w[:, c + n :]), dim=-1)
 
     def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
-        """Return x_dot [B, nx] within a step, from p = prepare(x, w)."""
         return self._rate(x, p, self.actuators.held)
 
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return x_dot [B, nx] under inputs w [B, m]."""
         return self._rate(x, w, False)
 
     def _rate(self, x: Tensor, w: Tensor, held: bool) -> Tensor:
@@ -363,11 +359,9 @@ class MassSpringDamper(Plant):
         self.tau_max = config.tau_max
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the force [..., 1] from the drive [...]; there is nothing to steer."""
         return (drive.clamp(-1.0, 1.0) * self.tau_max).unsqueeze(-1)
 
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return x_dot [B, 2] under the force w [B, 1]."""
         displacement, speed = x[:, 0], x[:, 1]
         pull = w[:, 0] - self.d * speed - self.k * displacement
         return torch.stack((speed, pull / self.m), dim=-1)

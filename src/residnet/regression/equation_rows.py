@@ -75,7 +75,6 @@ class SampleRows(RowBuilder):
     kind: Literal["least_squares"] = "least_squares"
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """Return the samples; see `RowBuilder.rows`."""
         return sampled
 
 
@@ -95,7 +94,6 @@ class WeakRows(RowBuilder):
     every: float = Field(default=0.05, gt=0.0, le=1.0)
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """Return one row for each window; see `RowBuilder.rows`."""
         return integrated(sampled, step, self.window, self.every)
 
 
@@ -118,7 +116,6 @@ class InstrumentRows(RowBuilder):
     every: float = Field(default=0.05, gt=0.0, le=1.0)
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """Return rows with projected terms; see `RowBuilder.rows`."""
         if self.window > 0:
             apart = max(round(self.every * self.window / step), 1) * step
             sampled, step = integrated(sampled, step, self.window, self.every), apart

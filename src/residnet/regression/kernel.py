@@ -215,7 +215,6 @@ class RbfKernel(Kernel):
         self.coefficients: Tensor
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return f [..., n] at inputs x [..., F]."""
         apart = squared_distances(x, self.points.to(x.dtype))
         out: list[Tensor] = []
         for output in range(self.outputs):
@@ -270,7 +269,6 @@ class RbfKernel(Kernel):
         return {"sigma": sigma}, state
 
     def zero_state(self) -> dict[str, Tensor]:
-        """Return a state without landmarks."""
         count = self.points.shape[1]
         return {
             "points": torch.zeros(0, count, dtype=torch.float64),
@@ -324,7 +322,6 @@ class PolynomialKernel(Kernel):
         return out
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return f [..., n] at inputs x [..., F]."""
         return self.products(x) @ self.coefficients.to(x.dtype)
 
     def paths(
@@ -341,11 +338,9 @@ class PolynomialKernel(Kernel):
     def selected(
         self, paths: Sequence[Path], coefficients: Tensor
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """Return no settings, and the coefficients."""
         return {}, {"coefficients": coefficients}
 
     def zero_state(self) -> dict[str, Tensor]:
-        """Return coefficients of zero."""
         return {"coefficients": torch.zeros_like(self.coefficients)}
 
 
@@ -545,13 +540,6 @@ class KernelRidge(Estimator):
         names: Sequence[str] = (),
         outputs: Sequence[str] = (),
     ) -> list[Solution]:
-        """Return the solution of the least error of each output, then the alternatives.
-
-        See `Estimator.fit`.
-
-        Raises:
-            FitError: with fewer groups than folds.
-        """
         x = whole(x)
         require_data(x, y, names, outputs)
         fold = fold_numbers(groups, self.folds)

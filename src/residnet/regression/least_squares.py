@@ -70,14 +70,6 @@ class LeastSquares(Estimator):
         names: Sequence[str] = (),
         outputs: Sequence[str] = (),
     ) -> list[Solution]:
-        """Return one solution for each penalty, with standard errors.
-
-        See `Estimator.fit`.
-
-        Raises:
-            FitError: with fewer samples than regressors, a regressor that is zero throughout, or
-                regressors that the data cannot tell apart and no penalty decides between.
-        """
         n, j = x.shape
         names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
         require_data(x, y, names, outputs)
@@ -131,14 +123,6 @@ class CentredLeastSquares(Estimator):
         names: Sequence[str] = (),
         outputs: Sequence[str] = (),
     ) -> list[Solution]:
-        """Return the one solution; groups do not matter.
-
-        See `Estimator.fit`.
-
-        Raises:
-            FitError: with no more samples than regressors, or where some are collinear, naming
-                them.
-        """
         x = whole(x)
         names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
         require_data(x, y, names, outputs)
@@ -186,7 +170,6 @@ class ElasticNet(Estimator):
         names: Sequence[str] = (),
         outputs: Sequence[str] = (),
     ) -> list[Solution]:
-        """Return the solution with the penalties of the least error; see `Estimator.fit`."""
         # scikit-learn takes a second to import
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.linear_model import ElasticNetCV

@@ -281,7 +281,6 @@ class Ridge(_PathEstimator):
         self.shared = shared
 
     def path(self, xx: Tensor, xy: Tensor, samples: float) -> Tensor:
-        """Return the coefficients of all penalties, from one eigendecomposition."""
         values, vectors = torch.linalg.eigh(xx / samples)
         projected = vectors.T @ xy / samples
         penalties = torch.tensor(self.penalties, dtype=xy.dtype)
@@ -299,7 +298,6 @@ class Ridge(_PathEstimator):
         return [best, *([i] * n for i in range(count) if self.alternatives)]
 
     def named(self, pick: Sequence[int]) -> dict[str, Any]:
-        """Return the penalty of each output."""
         return {"penalty": [self.penalties[i] for i in pick]}
 
 
@@ -332,7 +330,6 @@ class PLSR(_PathEstimator):
         self.max_order = max_order
 
     def path(self, xx: Tensor, xy: Tensor, samples: float) -> Tensor:
-        """Return the coefficients of all orders."""
         return pls_path(xx, xy, min(self.order or self.max_order or len(xx), len(xx)))
 
     def choices(self, errors: Tensor | None, variance: Tensor, count: int) -> list[list[int]]:
@@ -355,7 +352,6 @@ class PLSR(_PathEstimator):
         return [[k - 1] * n for k in orders]
 
     def named(self, pick: Sequence[int]) -> dict[str, Any]:
-        """Return the order."""
         return {"order": pick[0] + 1 if pick else 0}
 
     def notes(self, errors: Tensor, variance: Tensor) -> dict[str, Any]:

@@ -110,7 +110,6 @@ class _Guarded(Dynamics):
         self.n_state = guarded.n_state
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return state and memory one step later."""
         after, s, _ = self.guarded.flagged_step(x, w, s)
         return after, s
 

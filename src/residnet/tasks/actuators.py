@@ -106,11 +106,6 @@ class StepTest(ActuatorTest):
     n: Revolutions
 
     def read(self) -> list[tuple[np.ndarray, ...]]:
-        """Return the columns of each file.
-
-        Raises:
-            DataError: where time does not go on.
-        """
         found = super().read()
         for path, (t, *_) in zip(self.files, found, strict=True):
             if (bad := np.flatnonzero(np.diff(t) <= 0)).size:

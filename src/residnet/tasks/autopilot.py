@@ -313,13 +313,6 @@ class AutopilotConfig(ComputingTask):
         *,
         anyway: bool = False,
     ) -> Path:
-        """Write a policy of a finished run for controllers; returns the file.
-
-        Raises:
-            UsageError: where there is no such policy or format.
-            WithheldError: where a classical controller costs less, but for `anyway`.
-            ExportError: where the file does not reproduce the policy.
-        """
         from residnet.tasks.autopilot_run import export_policy
 
         return export_policy(self, run, model, out, file_format, anyway=anyway)

@@ -149,7 +149,6 @@ class CourseTaskConfig(ComputingTask):
         return self
 
     def recorded_seed(self) -> int:
-        """Return the seed of the random vessels."""
         return self.spread.seed if self.spread else 0
 
     verbs: ClassVar[tuple[str, ...]] = ("report", "export")

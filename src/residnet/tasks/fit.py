@@ -78,11 +78,9 @@ class FitConfig(FitSettings, ComputingTask):
         return self
 
     def input_files(self) -> list[Path]:
-        """Return the files of the measured logs."""
         return input_files(self.data)
 
     def recorded_seed(self) -> int:
-        """Return the seed of weights and batches."""
         return self.seed
 
     def logs(self) -> Splits:
@@ -152,11 +150,6 @@ class FitConfig(FitSettings, ComputingTask):
         return sections
 
     def evaluate_on(self, run: RunFolder, logs: Sequence[Path], out: Path | None) -> Finished:
-        """Free-run every model of a finished run on other logs.
-
-        Raises:
-            ResidnetError: where a log cannot be used, lacks a channel or is too short.
-        """
         from residnet.tasks.fit_run import evaluate_on
 
         return evaluate_on(self, run, logs, out)

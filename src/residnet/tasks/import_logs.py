@@ -58,7 +58,6 @@ class ImportConfig(Task):
             reader.read(path)
 
     def input_files(self) -> list[Path]:
-        """Return the files of all recordings."""
         return [file for path in self._paths() for file in files_of(path)]
 
     def carry_out(self, folder: RunFolder) -> Outcome:

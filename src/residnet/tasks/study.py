@@ -94,11 +94,9 @@ class StudyConfig(Task):
                 )
 
     def input_files(self) -> list[Path]:
-        """Return the config of the fit."""
         return [self.base]
 
     def recorded_seed(self) -> int:
-        """Return the first seed."""
         return self.seeds[0]
 
     def carry_out(self, folder: RunFolder) -> Outcome:

@@ -506,7 +506,6 @@ class SweepConfig(Task):
         return [self.base, *base.input_files()]
 
     def recorded_seed(self) -> int:
-        """Return the seed of the search."""
         return 0 if isinstance(self.search, GridSearch) else self.search.seed
 
     def carry_out(self, folder: RunFolder) -> Outcome:

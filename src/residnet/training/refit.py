@@ -55,7 +55,6 @@ class OffsetBaseline(Baseline):
         self.speed = speed
 
     def forward(self, z: Tensor) -> Tensor:
-        """Return nu_dot [B, 3] at channels z [B, nz], which begin with u and v."""
         offsets = self.value.repeat(z.shape[0] // self.value.shape[0], 1)
         nu_dot: Tensor = self.baseline(z) + self.growth(z) * offsets
         return nu_dot

@@ -95,7 +95,6 @@ class CourseGuidance(Reference):
         return c * north + s * east, c * east - s * north
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the reference [B, 3] and memory."""
         place = s[:, 0]
         ahead, aside = self.error(x, place)
         closeness = (1.0 - self.at(place)[:, 5] * aside).clamp(min=self.least)

@@ -106,7 +106,6 @@ class Crossing(Reference):
         return torch.cat((point, (desired + wrap(direction - desired))[:, None]), dim=-1), leg
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the reference [B, 18] of step k and the memory one step later."""
         old = s[:, 9].long()
         target, leg = self.target(x, heading(s), old)
         # where the point jumps (first step, change of leg, the stop) it has no rate

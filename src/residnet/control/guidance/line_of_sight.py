@@ -112,7 +112,6 @@ class LookAhead(LineOfSight):
         self.distance = distance
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the angle [B]; never a right angle."""
         return -torch.atan(error / self.distance), s
 
 
@@ -133,7 +132,6 @@ class Enclosure(LineOfSight):
         self.radius = radius
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the angle [B]; a right angle from the radius on."""
         return -torch.asin((error / self.radius).clamp(-1.0, 1.0)), s
 
 
@@ -158,7 +156,6 @@ class IntegralLookAhead(LineOfSight):
         self.n_state = 2
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the angle [B]; never a right angle."""
         return -torch.atan(error / self.distance + self.drift.across(direction, s)), self.drift(
             error, direction, s
         )

@@ -195,7 +195,6 @@ class WaypointGuidance(Reference):
         return direction, ahead, north * torch.sin(direction) - east * torch.cos(direction)
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the reference heading [B, 1] in rad and the memory."""
         number = s[:, 0].long()
         direction, ahead, error = self.leg(x, number, s)
         reached = (ahead <= 0) | (ahead * ahead + error * error <= self.acceptance**2)

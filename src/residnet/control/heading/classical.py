@@ -76,13 +76,6 @@ class HeadingPID(Policy):
         )
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad and the integral [B, 0 or 1] in rad s.
-
-        Args:
-            x: state [B, nx].
-            reference: heading [B, 1] in rad.
-            s: integral [B, 0 or 1] in rad s.
-        """
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         wish = self.kp * error - self.kd * x[:, self.r : self.r + 1]
         if self.n_state == 0:

@@ -326,7 +326,6 @@ class ConditionedLoop(Source):
         return torch.cat((late, self.policy.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what acts [B, m + 2] and the memory."""
         m = self.inputs
         push, reference, noise_psi, noise_r, delay = w[:, m:].split(1, dim=1)
         seen = torch.zeros_like(x)

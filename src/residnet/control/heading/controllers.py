@@ -73,7 +73,6 @@ class LinearLaw(Policy):
         return torch.cat((torch.zeros_like(seen[:, :1]), seen), dim=1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] and the memory."""
         share = 1.0 - torch.exp(-self.dt / self.lag.clamp(min=1e-6))
         heading = s[:, 1:2] + share * wrap(x[:, self.psi : self.psi + 1] - s[:, 1:2])
         rate = s[:, 2:3] + share * (x[:, self.r : self.r + 1] - s[:, 2:3])
@@ -157,7 +156,6 @@ class TunedConfig(TunableConfig, ABC):
 
     @final
     def parameters(self) -> dict[str, float | None]:
-        """Return the parameters by name; None where they are to be tuned."""
         given, lag = self.constants(), self.filter_time
         return {**given, "filter_time": 0.0 if lag is None and None not in given.values() else lag}
 
@@ -191,7 +189,6 @@ class PdConfig(TunedConfig):
     damping_time: Seconds | None = Field(default=None, gt=0)
 
     def constants(self) -> dict[str, float | None]:
-        """Return kp and damping_time; None where they are to be tuned."""
         return {"kp": self.kp, "damping_time": self.damping_time}
 
     def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
@@ -204,7 +201,6 @@ class PdConfig(TunedConfig):
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return kp and kd of the parameters; ki is zero."""
         return (
             parameters["kp"],
             parameters["kp"] * parameters["damping_time"],
@@ -235,14 +231,12 @@ class PidConfig(TunedConfig):
         }
 
     def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
-        """Return the ranges of a PD law, and an integral_time from T to 50 T."""
         pd = PdConfig().law_axes(turning)
         return {**pd, "integral_time": SearchRange(turning.time, 50.0 * turning.time)}
 
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return kp, kd and ki of the parameters."""
         kp = parameters["kp"]
         return kp, kp * parameters["damping_time"], kp / parameters["integral_time"]
 
@@ -265,7 +259,6 @@ class LqrConfig(TunedConfig):
     rate_weight: float | None = Field(default=None, ge=0)
 
     def constants(self) -> dict[str, float | None]:
-        """Return heading_weight and rate_weight; None where they are to be tuned."""
         return {"heading_weight": self.heading_weight, "rate_weight": self.rate_weight}
 
     def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
@@ -278,7 +271,6 @@ class LqrConfig(TunedConfig):
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return kp and kd of the weights."""
         gain, time = torch.tensor(turning.gain), torch.tensor(turning.time)
         kp, kd = regulator_gains(
             parameters["heading_weight"], parameters["rate_weight"], gain, time
@@ -295,7 +287,6 @@ class BangBangConfig(ControllerConfig):
     kind: Literal["bang_bang"] = "bang_bang"
 
     def build(self, steering: Steering) -> Policy:
-        """Build the time-optimal controller of the vessel."""
         vessel, turning = steering.vessel, steering.turning
         if vessel.rate is not None:
             return RatedBangBangHeading(
@@ -366,7 +357,6 @@ class ObservedConfig(TunableConfig, ABC):
         return self.policy(parameters, steering)
 
     def build(self, steering: Steering) -> Policy:
-        """Return the law with its constants."""
         return self.policy(self.complete(), steering)
 
     def policy(self, constants: Mapping[str, float | Tensor], steering: Steering) -> ObservedPolicy:
@@ -423,7 +413,6 @@ class PtosConfig(ObservedConfig):
     damping: Positive | None = None
 
     def law(self, limit: float, rate: float | None) -> HeadingLaw:
-        """Return the time-optimal law."""
         return StoppingLaw(0.0 if rate is None else limit / rate)
 
     def law_axes(self) -> dict[str, SearchRange]:

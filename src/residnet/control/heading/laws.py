@@ -127,7 +127,6 @@ class RegulatorLaw(HeadingLaw):
         decay: Tensor,
         constants: list[Tensor],
     ) -> Tensor:
-        """Return the regulator's rudder over the limit, [B, 1]."""
         heading, rate = regulator_gains(
             constants[0], constants[1], force / (decay * self.limit), 1.0 / decay
         )

@@ -282,7 +282,6 @@ class ObservedPolicy(HeadingPolicy):
         self.at(dt)
 
     def at(self, dt: float) -> None:
-        """Take steps of dt seconds from now on."""
         self.dt = dt
         self.observer.at(dt)
         # a large number where the rudder has no rate: infinity would spoil gradients
@@ -290,7 +289,6 @@ class ObservedPolicy(HeadingPolicy):
         self.n_state = len(FIXED) + self.observer.pending + self.units
 
     def read_from(self, state: Sequence[str]) -> None:
-        """Take heading, speed and yaw rate from a state with these names."""
         self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
     def without_network(self) -> ObservedPolicy:
@@ -305,7 +303,6 @@ class ObservedPolicy(HeadingPolicy):
         return dict(zip(self.names, found, strict=True))
 
     def told(self, s: Tensor, rudder: Tensor) -> Tensor:
-        """Return the memory once the rudder angle [B, 1] is known that is really taken."""
         newest = 5 + self.observer.pending
         parts = (s[:, :3], rudder, s[:, 4:newest])
         if self.observer.pending > 0:
@@ -313,7 +310,6 @@ class ObservedPolicy(HeadingPolicy):
         return torch.cat((parts[0], parts[1], parts[2], s[:, newest:]), dim=1)
 
     def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
-        """Return what the entries of the memory can be, [low, high] by name, with some room."""
         push, rudder, half = 1.001 * self.limit, 1.001 * angle, 1.001 * math.pi
         most = dict(zip(FIXED, (half, 3.0 * turn, push, rudder, rudder), strict=True))
         most |= {f"pending_{k}": rudder for k in range(self.observer.pending)}
@@ -337,13 +333,6 @@ class ObservedPolicy(HeadingPolicy):
         return torch.cat((heading, x[:, self.r : self.r + 1], rest), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad and the memory.
-
-        Args:
-            x: state [B, nx].
-            reference: heading [B, 1] in rad.
-            s: memory.
-        """
         fixed, waiting = 5, self.observer.pending
         rudder, last = s[:, 3:4], s[:, 4:5]
         pending = s[:, fixed : fixed + waiting]
@@ -440,13 +429,11 @@ class NetworkPolicy(HeadingPolicy):
         self.at(dt)
 
     def at(self, dt: float) -> None:
-        """Take steps of dt seconds from now on."""
         self.dt = dt
         # a large number where the rudder has no rate: infinity would spoil gradients
         self.travel = min(self.rate * dt, 2.0 * self.limit)
 
     def read_from(self, state: Sequence[str]) -> None:
-        """Take heading, speed and yaw rate from a state with these names."""
         self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
     def values(self) -> dict[str, float]:
@@ -454,11 +441,9 @@ class NetworkPolicy(HeadingPolicy):
         return {}
 
     def told(self, s: Tensor, rudder: Tensor) -> Tensor:
-        """Return the memory once the rudder angle [B, 1] is known that is really taken."""
         return torch.cat((rudder, s[:, 1:]), dim=1)
 
     def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
-        """Return what the entries of the memory can be, [low, high] by name, with some room."""
         most = dict.fromkeys(("rudder", "last_command"), 1.001 * angle)
         most |= {f"unit_{k}": 1.001 for k in range(self.units)}
         return {name: (-high, high) for name, high in most.items()}
@@ -468,13 +453,6 @@ class NetworkPolicy(HeadingPolicy):
         return {"kind": "network", "units": self.units, "trained_at": self.trained_at}
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad and the memory.
-
-        Args:
-            x: state [B, nx].
-            reference: heading [B, 1] in rad.
-            s: memory.
-        """
         rudder, last, memory = s[:, 0:1], s[:, 1:2], s[:, 2:]
         ratio = (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
         error = wrap(reference - x[:, self.psi : self.psi + 1]) / self.degree

@@ -100,7 +100,6 @@ class SteeredPlant(SteeredVessel):
         self._straight = _straight(plant)
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """Return the varied plant, for steps of dt seconds."""
         return VariedPlant(self.plant, dt, integrator)
 
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
@@ -316,6 +315,5 @@ class SteeredModel(SteeredVessel):
         return torch.cat((variation, variation.new_zeros(len(variation), self.hull.n_state)), dim=1)
 
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the states [B, nx] and inputs [B, m] of straight courses."""
         x, w = self.vessel.start(speed)
         return x[:, [self.vessel.column(name) for name in self.state]], w

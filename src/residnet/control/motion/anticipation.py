@@ -162,7 +162,6 @@ class Assisted(Policy):
         self.step = torch.linalg.matrix_exp(torch.tensor(rows, dtype=torch.float64) * dt)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the command tau [B, 3] and the memory one step later."""
         n = self.feedback.n_state
         correction, integral = self.feedback(x, reference[:, :9], s[:, :n])
         needed = reference[:, 9:12]

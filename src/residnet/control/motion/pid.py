@@ -37,7 +37,6 @@ class NoFeedForward(FeedForward):
     """No feed-forward: feedback alone."""
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Return zeros [B, 3]."""
         return torch.zeros_like(nu)
 
 
@@ -50,7 +49,6 @@ class HullFeedForward(FeedForward):
         self.hull = hull
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [B, 3] in N, N, N m."""
         return self.hull.required(nu_dot, nu)
 
 
@@ -128,10 +126,8 @@ class Allocated(Policy):
         self.n_state = policy.n_state
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory [B, n_state] of the controller at the first state x [B, nx]."""
         return self.policy.initial_state(x)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the commands [B, c] of the thrusters, and the controller's memory."""
         tau, s = self.policy(x, reference, s)
         return self.thrusters.allocate(tau), s

@@ -125,7 +125,6 @@ class ReferenceFilter(Reference):
         return self.waypoints[:, min(k // self.every, self.count - 1)]
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the reference [B, 9] of step k and the memory one step later."""
         place, rate, change = pose(s), velocities(s), accelerations(s)
         u, v = to_body(rate[:, 0], rate[:, 1], place[:, 2])
         along, across = to_body(change[:, 0], change[:, 1], place[:, 2])

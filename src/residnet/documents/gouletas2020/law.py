@@ -73,7 +73,6 @@ class SimulatedPredictor(Predictor):
         self.others: Tensor
 
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the heading errors and yaw rates [B, C], all candidates in one batch."""
         rows, candidates = x.shape[0], rudder.shape[0]
         command = rudder.to(x.dtype).repeat(rows).unsqueeze(-1)
         w = torch.cat((command, self.others.to(x.dtype).expand(rows * candidates, -1)), dim=-1)
@@ -219,7 +218,6 @@ class NominalSteering(Dynamics):
         self.nominal: Tensor
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state [B, nx] after a step."""
         return self.inner.step(x, w, self.nominal.to(x.dtype).expand(x.shape[0], -1))[0], s
 
 
@@ -258,7 +256,6 @@ class DocumentConfig(_Law, ControllerConfig):
     kind: Literal["document"] = "document"
 
     def build(self, steering: Steering) -> Policy:
-        """Return the controller with the exact predictor."""
         return self.law(self.exact(steering), steering)
 
 

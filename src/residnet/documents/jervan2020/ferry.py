@@ -434,11 +434,9 @@ class Sensed(Source):
         self.loop, self.noise = loop, noise
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the memory that the loop starts with."""
         return self.loop.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m] that follow from the measured state."""
         inputs, memory = self.loop(measured(x, self.noise[:, k]), w, k, memory)
         return inputs, memory
 

@@ -156,7 +156,6 @@ class _ScaledRegression(RegressionKind, ABC):
         """Return the estimator, and whether it leaves folds out to choose something."""
 
     def fit(self, data: Regression) -> Fit:
-        """Return the coefficients; see `RegressionKind.fit`."""
         e, f, mean_x, mean_y, std_y = data.standardised
         estimator, chooses = self.estimator()
         groups = data.fold if chooses else None
@@ -273,7 +272,6 @@ class RidgeRegression(_ScaledRegression):
         return Ridge(penalties, folds=None, scale=False, shared=True), self.penalty is None
 
     def fit(self, data: Regression) -> Fit:
-        """Return the coefficients with the one penalty of all axes; see `RegressionKind.fit`."""
         found = super().fit(data)
         return replace(found, notes={"penalty": found.notes["penalty"][0]})
 

@@ -55,7 +55,6 @@ class FirstOrderConfig(ResponseConfig):
     time: Seconds = Field(gt=0)
 
     def rate(self, a: Tensor, target: Tensor, fastest: float) -> Tensor:
-        """Return the derivative of the positions."""
         return ((target - a) / self.time).clamp(-fastest, fastest)
 
 

@@ -127,7 +127,6 @@ class RudderPropellerConfig(ActuatorConfig):
     density: Density = Field(default=1025.0, gt=0)
 
     def build(self) -> RudderPropeller:
-        """Build the module that turns commands into forces."""
         return RudderPropeller(self)
 
 
@@ -169,7 +168,6 @@ class RudderPropeller(Actuators):
         return thrust
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [..., 3] in N, N, N m."""
         rudder, position = self.config.rudder, self.positions(a, command)
         delta, u = position[..., 0], nu[..., 0]
         thrust = self.thrust(position[..., 1], u)
@@ -210,7 +208,6 @@ class SternRuddersConfig(SteeringGearConfig, ActuatorConfig, ABC):
 
     @final
     def build(self) -> SternRudders:
-        """Build the module that turns commands into forces."""
         return SternRudders(self)
 
 
@@ -243,7 +240,6 @@ class FoilRuddersConfig(SternRuddersConfig):
     density: Density = Field(gt=0)
 
     def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lift and drag [...] in N."""
         disc = 0.25 * math.pi * self.diameter**2
         # C_Th V^2 per newton of total thrust: each propeller has its share
         loading = 2.0 / (self.propellers * self.density * disc)
@@ -274,7 +270,6 @@ class LinearRuddersConfig(SternRuddersConfig):
     Y_delta_uu: float = Field(gt=0)
 
     def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lift and no drag [...] in N."""
         return self.Y_delta_uu * u * u * delta, torch.zeros_like(delta)
 
 
@@ -305,7 +300,6 @@ class SternRudders(Actuators):
         return torch.stack((angle * self.delta_max, thrust * self.thrust_max), dim=-1)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [..., 4] in N, N, N m, N m."""
         delta = self.positions(a, command)[..., 0]
         thrust = command[..., 1].clamp(0.0, self.thrust_max)
         lift, drag = self.config.foil(delta, nu[..., 0], nu[..., 1], thrust)
@@ -394,7 +388,6 @@ class WaterJetsConfig(ActuatorConfig):
     nozzle: SteeringGearConfig
 
     def build(self) -> WaterJets:
-        """Build the module that turns commands into forces."""
         return WaterJets(self)
 
 
@@ -433,7 +426,6 @@ class WaterJets(Actuators):
         return torch.stack((drive.clamp(0.0, 1.0) * self.config.motor.n_max, side), dim=-1)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [..., 3] in N, N, N m (6.12)-(6.14)."""
         n, angle = self.positions(a, command).unbind(-1)
         total = self.config.jets * self.thrust(n, nu[..., 0])
         across = total * torch.sin(angle)

@@ -99,7 +99,6 @@ class ThrustersConfig(ActuatorConfig):
         return self
 
     def build(self) -> Thrusters:
-        """Build the module that turns commands into forces."""
         units = self.thrusters
         return Thrusters(
             units, [unit.follow(unit.n_max, unit.n_rate, f"n_{unit.name}") for unit in units]
@@ -199,7 +198,6 @@ class Thrusters(Actuators):
         return both.clamp(-1.0, 1.0) * self.n_max.to(drive.dtype)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [..., 3] in N, N, N m."""
         force: Tensor = self.forces(self.positions(a, command))
         return force
 
@@ -287,7 +285,6 @@ class AzimuthThrustersConfig(ActuatorConfig):
         return self
 
     def build(self) -> AzimuthThrusters:
-        """Build the module that turns commands into forces."""
         return AzimuthThrusters(self)
 
 
@@ -365,11 +362,9 @@ class AzimuthThrusters(ForceActuators):
         return self.allocate(both * self.strongest)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [..., 3] in N, N, N m."""
         return self.asked(self.positions(a, command))
 
     def asked(self, command: Tensor) -> Tensor:
-        """Return the forces tau [..., 3] that revolutions and angles [..., 2k] ask for."""
         n, angle = command.chunk(2, dim=-1)
         thrust = self.thrust(n)
         parts = torch.cat((thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=-1)
@@ -403,7 +398,6 @@ class ForceCommandsConfig(ActuatorConfig):
     ] = ImmediateConfig()
 
     def build(self) -> ForceCommands:
-        """Build the module that turns commands into forces."""
         return ForceCommands(self)
 
 
@@ -432,18 +426,14 @@ class ForceCommands(ForceActuators):
         return both.clamp(-1.0, 1.0) * self.limit.to(drive.dtype)
 
     def allocate(self, tau: Tensor) -> Tensor:
-        """Return the forces tau [..., 3] themselves."""
         return tau
 
     def asked(self, command: Tensor) -> Tensor:
-        """Return the commands [..., 3] themselves."""
         return command
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return the forces tau [..., 3] in N, N, N m."""
         return self.positions(a, command)
 
     def followed(self, command: Tensor) -> Tensor:
-        """Return the commands [..., 3] within the limits."""
         limit = self.limit.to(command.dtype)
         return torch.maximum(torch.minimum(command, limit), -limit)

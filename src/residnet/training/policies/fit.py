@@ -270,7 +270,6 @@ class HeadingChangesData(EpochDataModule):
 
     @property
     def steps(self) -> int:
-        """Batches in an epoch."""
         return int(self.fit.settings.steps)
 
     def batches(self, epoch: int) -> Iterator[HeadingChanges]:
