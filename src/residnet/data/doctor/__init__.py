@@ -144,6 +144,6 @@ def inspect_together(
             measures.
         splits: log's name -> train, validation or test, where a config says.
     """
-    sound = [log for log in logs if not [*run("order", Record(log))]]
+    sound = [log for log in logs if len(log) > 1 and not [*run("order", Record(log))]]
     found = run("between", Together(sound, inputs, splits or {})) if sound else ()
     return Report("together", tuple(found))

@@ -311,6 +311,8 @@ _SLIPS = {
     0.3048: "metres taken as feet",
     1000.0: "mm taken as m",
     0.001: "m taken as mm",
+    60.0: "per minute taken as per second",
+    1.0 / 60.0: "per second taken as per minute",
     100.0: "cm taken as m",
     0.01: "m taken as cm",
 }

@@ -11,7 +11,6 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
-import scipy
 
 from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import (
@@ -23,7 +22,15 @@ from residnet.data.doctor.findings import (
     show,
     slip_in_words,
 )
-from residnet.data.doctor.statistics import FEWEST, STEERING, Record, bridged, fit, high
+from residnet.data.doctor.statistics import (
+    FEWEST,
+    STEERING,
+    Record,
+    bridged,
+    fit,
+    high,
+    reversals,
+)
 
 _LATITUDE = ("latitude", "lat", "gps_lat", "gnss_lat", "latitude_deg", "lat_deg")
 _LONGITUDE = ("longitude", "lon", "lng", "long", "gps_lon", "gnss_lon", "longitude_deg", "lon_deg")
@@ -219,9 +226,7 @@ def idle(log: Record, found: Check) -> Iterator[Finding]:
         still &= np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * high(log[name], 1.0)
     for start, stop in zip(*stretches(still), strict=True):
         run = psi[start : stop + 1]
-        turns = sum(
-            scipy.signal.find_peaks(side, prominence=_SWING)[0].size for side in (run, -run)
-        )
+        turns = reversals(run, _SWING)
         if turns >= 2:
             at = np.zeros(len(log), dtype=bool)
             at[start : stop + 1] = True

@@ -128,6 +128,13 @@ def high(values: np.ndarray, share: float = 0.95) -> float:
     return float(np.nanquantile(np.abs(values), share))
 
 
+def reversals(heading: np.ndarray, swing: float) -> int:
+    """Return how often a heading [T] rad turns round after having gone `swing` rad one way."""
+    return sum(
+        scipy.signal.find_peaks(side, prominence=swing)[0].size for side in (heading, -heading)
+    )
+
+
 def resolution_of(values: np.ndarray) -> float:
     """Return the least step between the values of a channel; 0 where it has no grid."""
     change = np.abs(np.diff(values))
