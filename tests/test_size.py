@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (793, 117),
     "control": (3289, 365),
     "core": (1312, 186),
-    "data": (8821, 798),
+    "data": (8848, 801),
     "documents": (2457, 227),
     "dynamics": (856, 114),
     "export": (2268, 269),
