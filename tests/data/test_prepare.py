@@ -21,7 +21,7 @@ def made(hold: str, *, broken: bool = False) -> Prepared:
     t = STEP * np.arange(60)
     channels = {name: np.zeros(60) for name in STATE} | {"n": t**2}
     if broken:
-        channels["u"][30] = np.nan
+        channels["u"][28:31] = np.nan
     config = PrepareConfig.model_validate(
         {
             "grid": {"step": STEP},

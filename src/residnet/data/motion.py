@@ -138,16 +138,16 @@ def _integrated(log: Log, missing: Sequence[str]) -> Log:
 
 
 def fill_sparse(log: Log, names: tuple[str, ...], held: tuple[str, ...]) -> Log:
-    """Return the log with values at every sample of inputs that were recorded more rarely.
+    """Return the log with values at every sample of channels that lack some, or come more rarely.
 
-    Between two values an input is interpolated, or held where `held` names it, unless they lie
-    further apart than three of their usual intervals.
+    Between two values a channel is interpolated, or held where `held` names it, unless they lie
+    further apart than three of their usual intervals: as a grid does it with rows that lack.
     """
     new = {}
     for name in names:
         values = log[name]
         known = np.isfinite(values)
-        if _dense(values) or known.sum() < 2:
+        if known.all() or known.sum() < 2:
             continue
         at = log.t[known]
         if name in held:

@@ -172,7 +172,7 @@ def _plausible(log: Log, columns: Sequence[str]) -> Log:
 def _masked(log: Log, columns: Sequence[str], config: PrepareConfig) -> Log:
     """Return the log with its whole motion and the masks of the config."""
     whole = complete_motion(log, config.motion)
-    filled = fill_sparse(whole, tuple(columns), config.grid.held)
+    filled = fill_sparse(whole, (*STATE, *columns), config.grid.held)
     # masks look at the samples as recorded: interpolation hides a frozen sensor
     recorded = filled if whole is log else whole.replace(channels=whole.channels | log.channels)
     asked = {*STATE, *columns}

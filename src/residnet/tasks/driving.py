@@ -150,9 +150,9 @@ def lacks(names: Sequence[str]) -> str:
     plain = [name.removeprefix("cmd_") for name in names]
     steering = [name.startswith("delta") for name in plain]
     driving = [name in ("n", "thrust", "throttle") for name in plain]
+    # one whose name says neither may do either
     rest = [n for n, s, d in zip(names, steering, driving, strict=True) if not (s or d)]
-    if len(rest) > 1 or any(name.startswith(("tau", "azimuth", "nozzle")) for name in rest):
+    both = any(name.startswith(("tau", "azimuth", "nozzle")) for name in rest)
+    if both or any(steering) + any(driving) + len(rest) > 1:
         return ""
-    if not any(steering):
-        return "steers"
-    return "" if any(driving) or rest else "drives"
+    return "drives" if any(steering) else "steers"

@@ -36,7 +36,7 @@ _SURE = 0.9
 """Correlation from which a measured factor overrules a header."""
 STATE_NAMES = ("x", "y", "psi", "u", "v", "r", "phi", "p", "wind_speed", "wind_dir")
 _FIXES = {"x": "latitude", "y": "longitude"}
-_MAGNETIC = re.compile(r"magn|compass|kompass|\bhdm\b|\bmag(?![a-z])|_mag(?![a-z])", re.I)
+_MAGNETIC = re.compile(r"magn|compass|kompass|\bhdm\b|\(m\)|\bmag(?![a-z])|_mag(?![a-z])", re.I)
 _QUATERNION = re.compile(
     r"(?P<stem>(?:.*[\W_])?(?:q|quat|quaternions?|orient|orientation|att|attitude|rot|rotation))"
     r"[\W_]*(?P<part>[xyzwijk0-3])\W*",
@@ -45,8 +45,11 @@ _QUATERNION = re.compile(
 _PARTS = {**dict(zip("xyzw", QUATERNION, strict=True)), "i": "qx", "j": "qy", "k": "qz"}
 _COUNTED = (("qw", "qx", "qy", "qz"), QUATERNION)
 """What counted parts may be: most write the scalar part first, some last."""
-_POSE = {"x": r"position\W*x", "y": r"position\W*y", "qw": r"orientation\W*w"}
-"""How the columns of a message geometry_msgs/Pose end."""
+_POSE = {
+    **{"x": r"position\W*x", "y": r"position\W*y"},
+    **{"qw": r"orientation\W*w", "psi": r"orientation\W*yaw"},
+}
+"""How the columns of a message geometry_msgs/Pose end, and of its yaw in PlotJuggler."""
 _NED = re.compile(r"(?:^|[\W_])(?:ned|frd)(?:$|[\W_])", re.IGNORECASE)
 
 
@@ -107,7 +110,8 @@ def _frames(names: Mapping[str, str], texts: Iterable[str]) -> tuple[Frame, ...]
         for name, ending in _POSE.items()
         if name in names
     )
-    return FRAMES if "qw" not in names or not posed or any(map(_NED.search, texts)) else POSE_FRAMES
+    headed = {"qw", "psi"} & set(names)
+    return FRAMES if not headed or not posed or any(map(_NED.search, texts)) else POSE_FRAMES
 
 
 def drafted_channels(

@@ -14,6 +14,7 @@ import numpy as np
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.names import CHANNEL_UNITS, shown
 from residnet.core.units import known_unit, to_si
+from residnet.data.channels import without_fills
 from residnet.data.drafting.channels import (
     CHANNELS,
     READER,
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 _ROWS = 20_000
 _FIRST_ROWS = {"parquet": parquet_rows, "json_lines": json_rows}
 _BRACKETS = re.compile(r"[\[(]")
+_QUOTIENT = re.compile(r"(?P<name>.*\S)\s+/\s+(?P<unit>\S.*)")
 _TURNS = re.compile(r"rpm|rev|1/s|hz|turns|u/?min|umdr|drehz|toeren|tours|giri|varv", re.IGNORECASE)
 _PULSES = (900.0, 2100.0)
 """Pulses in us that servos and speed controllers take."""
@@ -180,6 +182,9 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
         other = other_dimension(column, si) if si else None
         if channel == "n" and other == "m":
             channel = "x"
+        elif channel and channel.startswith("thrust") and written_unit(column, "1/s"):
+            # a thruster that turns, and no force
+            channel = "n" + channel.removeprefix("thrust")
         elif channel and re.match(r"(cmd_)?n(_|$)", channel) and other in ("-", "%", "us"):
             # no revolutions: the share of the throttle, or pulses to it
             channel = re.sub(r"^(cmd_)?n", "throttle", channel)
@@ -306,6 +311,7 @@ def peek(path: Path, rows: int = _ROWS) -> Sheet:
             continue
         values = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
         spoilt = np.isnan(values).sum() > column.isna().sum()
+        values = without_fills(values)
         if spoilt or column.dtype == bool or pd.api.types.is_datetime64_any_dtype(column):
             texts[name] = column
         else:
@@ -320,11 +326,13 @@ def _described(table: pd.DataFrame) -> dict[str, str]:
     rows = [[_unit_in(cell) for cell in row] for row in table.attrs.get("between", [])]
     units = max(rows, key=lambda row: sum(map(bool, row)), default=[])
     units = units if 2 * sum(map(bool, units)) >= len([name for name in names if name]) else []
-    told = [*units, *[""] * len(names)]
-    return {
-        f"{name} [{unit}]" if unit and not _BRACKETS.search(name) else name: name
-        for name, unit in zip(names, told, strict=False)
-    }
+    out = {}
+    for name, below in zip(names, [*units, *[""] * len(names)], strict=False):
+        # physicists write a quantity by its unit, `u / m/s`
+        match = _QUOTIENT.fullmatch(name)
+        alone, unit = (match["name"], _unit_in(match["unit"])) if match else (name, below)
+        out[f"{alone} [{unit}]" if unit and not _BRACKETS.search(name) else name] = name
+    return out
 
 
 def _unit_in(cell: str) -> str:

@@ -45,6 +45,9 @@ def written_unit(column: str, expected: str | None) -> str | None:
 def other_dimension(column: str, expected: str) -> str | None:
     """Return the unit in the brackets of a name where it measures something else; None for none."""
     for text in _IN_BRACKETS.findall(column):
+        if expected == "rad" and text in ("T", "M"):
+            # a true or a magnetic heading
+            continue
         try:
             known_unit(text.strip(), expected)
         except UsageError:
@@ -68,6 +71,9 @@ def unit_by_size(channel: str, values: np.ndarray) -> tuple[str, str]:
     if expected == "rad":
         limit = 7.0 if channel in ("psi", "wind_dir") or "azimuth" in channel else 1.6
         unit = "deg" if largest > limit else "rad"
+    elif expected == "rad/s":
+        # a turn round in two seconds
+        unit = "deg/s" if largest > np.pi else "rad/s"
     elif expected == "1/s":
         unit = "rpm" if largest > 60.0 else "1/s"
     else:

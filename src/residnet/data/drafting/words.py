@@ -47,7 +47,7 @@ _ABOUT: dict[str, str] = {
     " verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards sideways | v vm"
     " quer",
     "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre | delta"
-    " rudder ror rsa steering helm pala",
+    " rudder rud ror rsa steering helm pala",
     "propeller": "propel schraube helice schroef 推進 プロペラ propulseur | prop screw shaft"
     " welle eje arbre aksel 軸",
     "engine": "engine motor maschine maquina moteur hovedmaskin 主機 | main",
@@ -57,7 +57,7 @@ _ABOUT: dict[str, str] = {
     "torque": "torque drehmoment couple koppel dreiemoment トルク",
     "power": "power leistung puissance potencia vermogen effekt 出力",
     "throttle": "throttle actuator gashebel gashendel gasspak gasreglage acelerador accelerateur"
-    " manetta スロットル lever hebel | gas pwm gaz",
+    " manetta スロットル lever hebel | gas pwm gaz esc",
     "azimuth": "azimu schottel pod | azi nozzle alpha",
     "servo": "servo rcou",
     "force": "force kraft fuerza kracht 力 tau",
@@ -201,13 +201,16 @@ def state_channel(words: Words) -> str | None:
         return "p" if w.has("rate") or w.has("angular") else "phi"
     if w.has("turn_rate") or (w.has("heading") and w.has("rate")) or w.text in ("r", "r mid"):
         return "r"
-    if (w.has("turn") and w.has("rate")) or (w.has("angular") and w.text.endswith((" z", " r"))):
+    if (w.has("turn") and w.has("rate")) or (w.has("angular") and _YAWING.search(w.text)):
         return "r"
     if axis := axis_velocity(w):
         return axis
     return _place(w) or _velocity(w)
 
 
+_YAWING = re.compile(r" [zr](?: (?:dps|deg s|rad s))?$")
+_GROUND = re.compile(r"\bvel\w* (?:n|e|d|north|east|down)\b")
+"""A velocity along north, east or down: its N is no propeller."""
 _TWIST = re.compile(
     r"\b(?:(?:twist|velocity) linear|linear velocity|v|vel|velo|velocity|speed|lin|linear)"
     r" ?(?P<axis>[xy])(?: (?:m s|mps|ms))?$"
@@ -253,6 +256,8 @@ def input_channel(words: Words) -> str | None:
     if name in CHANNEL_UNITS and name not in (*MOTION, "t", *ACCELERATION):
         return name
     if not w.lacks("wind", "age", "index", "power", "voltage", "machinery"):
+        return None
+    if _GROUND.search(w.text):
         return None
     sides = {"port": "_port", "starboard": "_stbd", "bow": "_bow", "stern": "_stern"}
     side = next((end for name, end in sides.items() if w.has(name)), "")

@@ -538,10 +538,13 @@ def parquet_rows(path: Path, rows: int) -> pd.DataFrame:
     Raises:
         DataError: where it cannot be read.
     """
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     with _readable(path, "not a readable Parquet table"):
-        table: pd.DataFrame = next(pq.ParquetFile(path).iter_batches(batch_size=rows)).to_pandas()
+        # an index of pandas is a column as its reader sees it
+        batch = next(pq.ParquetFile(path).iter_batches(batch_size=rows))
+        table: pd.DataFrame = pa.Table.from_batches([batch]).to_pandas(ignore_metadata=True)
         return table
 
 

@@ -32,6 +32,7 @@ _BELOW = 3
 _PIECE = 20_000
 _HEAD, _BLOCK, _SCANNED = 1 << 16, 1 << 18, 1 << 20
 _COMMENT = (b"#", b"%", b"//")
+_COMMENTED = re.compile(r"\s*(?:#|%|//)\s+")
 _NUMBER = re.compile(
     r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)", re.IGNORECASE
 )
@@ -150,7 +151,7 @@ def read_csv(
             ) from error
     pieces = pieces or [pd.DataFrame({place: [] for place in where})]
     table = pieces[0] if len(pieces) == 1 else pd.concat(pieces)
-    table = table[where].iloc[: -1 if cut else None]
+    table = _plain(table, decimal)[where].iloc[: -1 if cut else None]
     table.attrs |= {"above": header.above - 1, "cut": cut}
     return table
 
@@ -175,6 +176,32 @@ def _form(
         "skipinitialspace": True,
         "low_memory": False,
     }
+
+
+def _plain(table: pd.DataFrame, decimal: str) -> pd.DataFrame:
+    """Return a table whose numbers have no signs between thousands, and no marks for none (---).
+
+    A column that then still holds a word stays as it is.
+    """
+    import pandas as pd
+
+    between = rf"[ '’\u00a0\u202f{'.' if decimal == ',' else ','}]"
+    grouped = re.compile(rf"[-+]?\d{{1,3}}(?:{between}\d{{3}})+(?:{re.escape(decimal)}\d+)?")
+
+    def number(cell: Any) -> Any:
+        if not isinstance(cell, str):
+            return cell
+        if grouped.fullmatch(cell.strip()):
+            cell = re.sub(between, "", cell)
+        return cell.replace(decimal, ".") if re.search(r"\w", cell) else np.nan
+
+    table = table.copy(deep=False)
+    for name, cells in table.items():
+        if not pd.api.types.is_numeric_dtype(cells.dtype):
+            bare = cells.map(number)
+            values = pd.to_numeric(bare, errors="coerce")
+            table[name] = values if values.isna().sum() == bare.isna().sum() else cells
+    return table
 
 
 def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -206,7 +233,7 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
         comments = [
             line + i
             for line, block, _ in _blocks(file)
-            for i in _comments(block)
+            for i in _passed(block, delimiter, cells[at])
             if line + i >= above
         ]
         form = _form(delimiter, decimal, (above, comments), [*names, _BEYOND])
@@ -215,6 +242,7 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
         except (ValueError, csv.Error) as error:
             reason = shown(" ".join(str(error).split()), 200)
             raise DataError(f"{path}: not a regular table ({reason})") from error
+    table = _plain(table, decimal)
     table.attrs["between"] = cells[at + 1 : above]
     about = {"kind": "csv"} | ({"delimiter": delimiter} if delimiter != "," else {})
     return table, about | ({"decimal": ","} if decimal == "," else {})
@@ -233,7 +261,7 @@ def _delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]], tupl
     for sign in (",", ";", "\t", "|", BLANKS):
         if sign == BLANKS and found:
             break
-        rows = [_cells(line, sign) for line in lines[:_GUESSED]]
+        rows = [_cells(_COMMENTED.sub("", line, count=1), sign) for line in lines[:_GUESSED]]
         place = found_header(rows)
         if place is None:
             continue
@@ -289,6 +317,9 @@ def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str])
                 reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
                 for row in islice(reader, _SEARCHED):
                     rows.append((reader.line_num, [cell.strip() for cell in row]))
+            # names may stand in a line of comment
+            said = [(i, _COMMENTED.sub("", delimiter.join(row), count=1)) for i, row in rows]
+            rows = [*((i, line.split(delimiter)) for i, line in said), *rows]
         except csv.Error as error:
             if not holding():
                 raise DataError(
@@ -361,8 +392,8 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
     numbers like any other. A delimiter more or less at the end of every line makes no cell.
 
     Returns:
-        Whether the file ends within its last line, and the numbers of lines, from 0, that are
-        comments: they begin with `#`, `%` or `//`.
+        Whether the file ends within its last line, and the numbers of lines, from 0, that hold
+        none: they begin with `#`, `%` or `//`, or repeat the names.
 
     Raises:
         DataError: where a line has more or fewer cells than the header, or a byte is zero.
@@ -382,7 +413,7 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
         cells = _counted(block, delimiter, wide)
         odd = (cells != wide) & (cells != 0)
         odd[: max(above - line, 0)] = False
-        said = [i for i in _comments(block) if line + i >= above]
+        said = [i for i in _passed(block, delimiter, header.names) if line + i >= above]
         comments += [line + i for i in said]
         odd[[i for i in said if i < odd.size]] = False
         if odd.any():
@@ -436,10 +467,17 @@ def _lines(block: bytes) -> list[bytes]:
     return lines if lines[-1] else lines[:-1]
 
 
-def _comments(block: bytes) -> list[int]:
-    if not any(sign in block for sign in _COMMENT):
+def _passed(block: bytes, delimiter: str, names: Sequence[str]) -> list[int]:
+    """Return which lines are comments, or the names again, as a recorder begins anew."""
+    again, telling = list(names), max(names, key=len, default="").encode() or _COMMENT[0]
+    if not any(sign in block for sign in (*_COMMENT, telling)):
         return []
-    return [i for i, line in enumerate(_lines(block)) if line.lstrip().startswith(_COMMENT)]
+    return [
+        i
+        for i, line in enumerate(_lines(block))
+        if line.lstrip().startswith(_COMMENT)
+        or (telling in line and _cells(line.decode("utf-8", "replace"), delimiter) == again)
+    ]
 
 
 def _counted(block: bytes, delimiter: str, wide: int) -> np.ndarray:
