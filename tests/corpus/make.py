@@ -287,13 +287,160 @@ def two_boats(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {"t (s)": other.t, **renamed(other, calls, SPEEDS, ACTS)}, "bravo_")
 
 
+def savetxt(folder: Path, k: int, s: pd.DataFrame) -> None:
+    names = "t[s] north[m] east[m] psi[deg] u[m/s] v[m/s] r[deg/s] rudder[deg] shaft[rpm]"
+    rows = s[["t", "x", "y", "heading", "u", "v", "rate", "rudder", "rpm"]].to_numpy()
+    np.savetxt(folder / f"run{k}.txt", rows, fmt="%.3f", header=names)
+
+
+def quotients(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """A quantity by its unit, and signs between thousands."""
+    columns = {"t / ms": (1e3 * s.t + 3_600_000).map("{:,.0f}".format)}
+    columns |= {"N / m": (s.x + 5_990_000).map("{:,.3f}".format), "E / m": s.y}
+    columns |= {"psi / deg": s.heading, "r / deg/min": (60.0 * s.rate).round(1)}
+    csv(folder, k, {**columns, "RSA / deg": s.rudder, "RPM / 1/min": s.rpm.map("{:,.0f}".format)})
+
+
+def marks_for_nothing(folder: Path, k: int, s: pd.DataFrame) -> None:
+    table = pd.DataFrame({"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)}).astype(object)
+    marks = {
+        "north [m]": (-9999.0, 37),
+        "surge [m/s]": ("---", 41),
+        "yaw rate [deg/s]": ("n/a", 23),
+    }
+    for column, (mark, every) in marks.items():
+        table.loc[5::every, column] = mark
+    table.to_csv(folder / f"run{k}.csv", index=False)
+
+
+def begun_anew(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """The names again where the recorder was switched on again, and remarks at the end."""
+    table = pd.DataFrame({"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)})
+    text = table[:220].to_csv(index=False) + "\n" + table[260:].to_csv(index=False)
+    (folder / f"run{k}.csv").write_text(f"{text}\n# battery empty\n")
+
+
+def plotjuggler(folder: Path, k: int, s: pd.DataFrame) -> None:
+    yaw = np.pi / 2 - np.radians(s.heading)
+    columns = {"__time": START.timestamp() + s.t}
+    columns |= {"/odom/pose/pose/position/x": s.y, "/odom/pose/pose/position/y": s.x}
+    columns |= {"/odom/pose/pose/orientation/yaw": ((yaw + np.pi) % (2 * np.pi) - np.pi).round(4)}
+    columns |= {"/odom/twist/twist/linear/x": s.u, "/odom/twist/twist/linear/y": -s.v}
+    columns |= {"/odom/twist/twist/angular/z": -np.radians(s.rate).round(5)}
+    csv(folder, k, {**columns, "/rudder/data": np.radians(s.rudder).round(4), "/rpm/data": s.rpm})
+
+
+def degrees_and_minutes(degrees: float, width: int) -> str:
+    return f"{int(degrees):0{width}d}{60.0 * (degrees % 1.0):09.6f}"
+
+
+def chart_plotter(folder: Path, k: int, s: pd.DataFrame) -> None:
+    at = START + pd.to_timedelta(s.t, "s")
+    columns = {"DATE": at.dt.strftime("%d/%m/%Y"), "UTC": at.dt.strftime("%H:%M:%S.%f").str[:-5]}
+    columns |= {"LAT(DDMM.MMMM)": [degrees_and_minutes(54.3 + x / 111_315.0, 2) for x in s.x]}
+    columns |= {"LON(DDDMM.MMMM)": [degrees_and_minutes(10.15 + y / 65_079.0, 3) for y in s.y]}
+    columns |= {"HDG(T)": s.heading, "STW(KT)": (s.u * 3600 / 1852).round(2)}
+    columns |= {"ROT(DEG/MIN)": (60.0 * s.rate).round(1), "RUD(S+)": s.rudder, "ENG RPM": s.rpm}
+    csv(folder, k, columns)
+
+
+def voyage_recorder(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """Sentences behind a time and the address that they came from."""
+    lines = []
+    for row in s.itertuples():
+        at = START + pd.Timedelta(seconds=row.t)
+        place = f"{degrees_and_minutes(54.3 + row.x / 111_315.0, 2)},N"
+        place += f",{degrees_and_minutes(10.15 + row.y / 65_079.0, 3)},E"
+        for body in (
+            f"GPGGA,{at:%H%M%S}.{at.microsecond // 10_000:02d},{place},1,10,0.9,2.0,M,40.0,M,,",
+            f"HEHDT,{row.heading:.2f},T",
+            f"TIROT,{60.0 * row.rate:.2f},A",
+            f"AGRSA,{row.rudder:.1f},A,,V",
+            f"ERRPM,S,1,{row.rpm:.0f},100.0,A",
+        ):
+            check = 0
+            for sign in body.encode():
+                check ^= sign
+            stamp = at.isoformat(timespec="milliseconds")
+            lines.append(f"{stamp}Z 192.168.0.10 ${body}*{check:02X}")
+    (folder / f"vdr_{k}.txt").write_text("\n".join(lines) + "\n")
+
+
+def labview(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """A table about the columns above theirs, as LabVIEW writes it, and an ending of its own."""
+    names = ("North", "East", "Heading", "Surge", "Sway", "Yaw rate", "Rudder", "Shaft")
+    units = ("m", "m", "deg", "m/s", "m/s", "deg/s", "deg", "rpm")
+    about = [("Channels", "8"), ("Samples", *["500"] * 8), ("Date", *["2025/06/17"] * 8)]
+    about += [("Y_Unit_Label", *units), ("X_Dimension", *["Time"] * 8), ("Delta_X", *["0.2"] * 8)]
+    lines = ["LabVIEW Measurement\t", "Separator\tTab", "***End_of_Header***\t", "\t"]
+    lines += ["\t".join(row) for row in about]
+    lines += ["***End_of_Header***\t", "\t".join(("X_Value", *names, "Comment"))]
+    rows = s[["t", "x", "y", "heading", "u", "v", "rate", "rudder", "rpm"]].to_numpy()
+    lines += ["\t".join(f"{value:.3f}" for value in row) + "\t" for row in rows]
+    (folder / f"trial_{k}.lvm").write_text("\n".join(lines) + "\n")
+
+
+def parquet_index(folder: Path, k: int, s: pd.DataFrame) -> None:
+    at = pd.DatetimeIndex(START + pd.to_timedelta(s.t, "s")).tz_localize("UTC")
+    table = pd.DataFrame(renamed(s, POSE, SPEEDS, ACTS)).set_index(at)
+    table.to_parquet(folder / f"run{k}.parquet")
+
+
+def ulog_csv(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """A folder a recording and a file a topic, in microseconds, as ulog2csv writes them."""
+    psi, stamp = np.radians(s.heading), (1e6 * s.t).round().astype("int64") + 12_345_678
+    place = {"x": s.x, "y": s.y, "heading": ((psi + np.pi) % (2 * np.pi) - np.pi).round(4)}
+    pulses = {"output[0]": (1500 + 14 * s.rudder).round(), "output[1]": (1500 + s.rpm / 3).round()}
+    (folder / f"log_{k}").mkdir(exist_ok=True)
+    for name, late, topic in (
+        ("vehicle_local_position_0", 0, {**place, "xy_valid": np.ones(len(s), dtype=int)}),
+        ("actuator_outputs_0", 500, {**pulses, "noutputs": np.full(len(s), 2)}),
+    ):
+        table = pd.DataFrame({"timestamp": stamp + late, **topic})
+        table.to_csv(folder / f"log_{k}" / f"log_{k}_{name}.csv", index=False)
+
+
+def long_rows(folder: Path, k: int, s: pd.DataFrame) -> None:
+    names = {"x": "north_m", "y": "east_m", "heading": "heading_deg", "rudder": "rudder_deg"}
+    long = s.rename(columns=names).melt(["t"], [*names.values()], "signal").sort_values("t")
+    long.to_csv(folder / f"run{k}.csv", index=False)
+
+
+def file_a_channel(folder: Path, k: int, s: pd.DataFrame) -> None:
+    (folder / f"trial_{k}").mkdir(exist_ok=True)
+    for column in ("x", "y", "heading", "rudder"):
+        table = pd.DataFrame({"t": s.t, "value": s[column]})
+        table.to_csv(folder / f"trial_{k}" / f"{column}.csv", index=False)
+
+
+def hdf5_trials(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """Both trips in one file, a group each."""
+    import h5py
+
+    names = {"t": "time", "x": "north", "y": "east", "heading": "heading", "rudder": "rudder"}
+    with h5py.File(folder / "campaign.h5", "w") as file:
+        for number in COMMANDS:
+            for old, new in names.items():
+                file.create_dataset(f"trial_{number}/{new}", data=seen(number)[old])
+
+
 LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
     layout.__name__: layout
     for layout in (
         *(plain, pandas_index, heading_interpolated, dead_gyro, no_pose, surge_alone, with_roll),
         *(micros_wrap, whole_seconds, summer_hour, magnetic, bridge, rostopic, moos_alog, cut),
         *(two_files, several_rates, excel, json_lines, mat_arrays, rows_npy, bag_topics),
-        *(course_alone, nothing_known, two_boats),
+        *(
+            course_alone,
+            nothing_known,
+            two_boats,
+            savetxt,
+            quotients,
+            marks_for_nothing,
+            begun_anew,
+        ),
+        *(plotjuggler, chart_plotter, voyage_recorder, labview, parquet_index, ulog_csv),
+        *(long_rows, file_a_channel, hdf5_trials),
     )
 }
 

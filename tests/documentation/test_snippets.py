@@ -233,7 +233,7 @@ def short_runs() -> dict[str, tuple[str, ...]]:
     own = [key for key in short["autopilot_ship"] if not key.startswith("policies.constants")]
     return {
         **short,
-        "my_boat": ("effort=0.02",),
+        "my_boat": ("effort=0.02", "bands=null"),
         **dict.fromkeys(("my_autopilot", "from_run", "from_k_and_t"), own),
     }
 

@@ -326,7 +326,8 @@ def _filtered(
             x, p = steps[k] @ x, steps[k] @ p @ steps[k].T + driven[k]
         before[0][k], before[1][k] = x[0], p[0]
         for row in np.flatnonzero(there[k]):
-            innovation = p[:, row, row] + variance[row]
+            # rounding may leave less than nothing of a variance
+            innovation = np.maximum(p[:, row, row], 0.0) + variance[row]
             gain = p[:, :, row] / innovation[:, None]
             miss = seen[k, row] - x[:, row]
             x = x + gain[:, :, None] * miss[:, None, :]

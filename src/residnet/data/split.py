@@ -7,7 +7,7 @@ divided here, and no two splits may share measurements.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE, nearest
 from residnet.data.readers.base import files_of
-from residnet.data.readers.detect import LOG_ENDINGS, format_of
+from residnet.data.readers.detect import LOG_ENDINGS, format_of, is_text_table
 
 SPLITS = ("train", "validation", "test")
 _ENOUGH = 5
@@ -393,6 +393,19 @@ def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
 
 def logs_below(folder: Path) -> list[Path]:
     """Return the recordings and files of logs in a folder, in order; a recording is one log."""
+    # endings of one's own are looked into where there are no others
+    return _below(folder, _ends_as_log) or _below(folder, _holds_log)
+
+
+def _ends_as_log(path: Path) -> bool:
+    return path.suffix.lower() in LOG_ENDINGS
+
+
+def _holds_log(path: Path) -> bool:
+    return format_of(path) is not None or is_text_table(path)
+
+
+def _below(folder: Path, is_log: Callable[[Path], bool]) -> list[Path]:
     if format_of(folder) is not None and not _holds_recordings(folder):
         return [folder]
     found: list[Path] = []
@@ -400,8 +413,8 @@ def logs_below(folder: Path) -> list[Path]:
         if path.name.startswith("."):
             continue
         if path.is_dir():
-            found += logs_below(path)
-        elif path.suffix.lower() in LOG_ENDINGS:
+            found += _below(path, is_log)
+        elif is_log(path):
             found.append(path)
     return found
 

@@ -26,7 +26,7 @@ from residnet.data.drafting.recordings import draft_recordings
 from residnet.data.drafting.tables import draft_tables, named, peek
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.detect import TO_TABLE, kind_of
+from residnet.data.readers.detect import kind_of, to_table
 from residnet.data.readers.joined import partners
 from residnet.data.readers.quantities import QUATERNION
 from residnet.data.readers.recording import Recording
@@ -77,7 +77,8 @@ def others_in(folder: Path) -> str:
     held = ", ".join(
         f"{n} file{'s' * (n > 1)} {end or 'without ending'}" for end, n in endings.items()
     )
-    return f", but {held[:120]}; {TO_TABLE}" if held else ""
+    usual = max(endings, key=lambda ending: endings[ending], default="")
+    return f", but {held[:120]}; {to_table(usual)}" if held else ""
 
 
 @dataclass

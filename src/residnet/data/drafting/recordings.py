@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from residnet.core.errors import ResidnetError
+from residnet.core.errors import DataError, ResidnetError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.drafting.channels import CHANNELS, READER, drafted_channels
@@ -172,6 +172,13 @@ def _named_fields(recordings: Sequence[Recording], marks: Marks) -> _Sources | N
         placed = {"x", "y"} <= held or {"latitude", "longitude"} <= held
         if not series.kind and len(series) >= _FEWEST and "psi" in held and placed:
             found.append(series)
+    if len({frozenset(series.fields) for series in found}) < len(found):
+        names = ", ".join(series.name for series in found)
+        raise DataError(
+            f"{recordings[0].path}: holds {len(found)} tables of the same columns ({names[:120]}),"
+            " each a log of its own; write each to a file, in Python"
+            " pandas.DataFrame({name: column for name, column in table.items()}).to_csv(...)"
+        )
     if len(found) != 1:
         return None
     series = found[0]

@@ -39,6 +39,7 @@ from residnet.data.readers.written import (
     looks_dated,
     parse_texts,
     side_signs,
+    unit_of_steps,
     unix_unit,
 )
 
@@ -52,6 +53,7 @@ _QUOTIENT = re.compile(r"(?P<name>.*\S)\s+/\s+(?P<unit>\S.*)")
 _TURNS = re.compile(r"rpm|rev|1/s|hz|turns|u/?min|umdr|drehz|toeren|tours|giri|varv", re.IGNORECASE)
 _PULSES = (900.0, 2100.0)
 """Pulses in us that servos and speed controllers take."""
+_PARTS_OF_TIME = ("hour", "hours", "hh", "minute", "minutes", "min")
 _DAY = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
 _FORMS: tuple[Form, ...] = ("number", "ddmm")
 _LARGEST = {"latitude": 90.0, "longitude": 180.0}
@@ -107,7 +109,7 @@ def draft_tables(
     if not names:
         raise DataError(
             f"{first.path}: none of its columns is called as a channel is"
-            f" ({', '.join(numeric[:12])}); name them in a channel map (--config)"
+            f" ({', '.join(numeric[:12])}); {_wider(first, clock, numeric)}"
         )
     logs = _raw(sheets, names, left_out)
     cells = [str(text) for texts in first.texts.values() for text in texts.unique()[:20]]
@@ -121,6 +123,25 @@ def draft_tables(
     content |= mark_folders(files, marks)
     _unused(first, names, clock, marks)
     return {**content, "channels": channels}, left_out
+
+
+def _wider(sheet: Sheet, clock: Clock, numeric: Sequence[str]) -> str:
+    """Return what to do with a table whose columns name no channel."""
+    words = [name for name, cells in sheet.texts.items() if 1 < cells.nunique() <= len(cells) / 4]
+    words = [name for name in words if name not in clock.columns]
+    if len(numeric) == 1 and words:
+        return (
+            f"'{words[0]}' says what each row holds: make columns of it, in Python"
+            f" pandas.read_csv(file).pivot_table({numeric[0]!r}, {clock.columns[0]!r},"
+            f" {words[0]!r}).to_csv('log.csv')"
+        )
+    if len(numeric) == 1:
+        return (
+            "where each file holds one quantity, make one table of them, in Python"
+            " pandas.concat({file.stem: pandas.read_csv(file, index_col=0).iloc[:, 0] for file in"
+            " files}, axis=1).sort_index().to_csv('log.csv')"
+        )
+    return "name them in a channel map (--config)"
 
 
 def mark_folders(files: Sequence[Path], marks: Marks) -> dict[str, str]:
@@ -253,6 +274,9 @@ def _unused(sheet: Sheet, names: Mapping[str, str], clock: Clock, marks: Marks) 
         marks.note(CHANNELS, f"columns of text: {', '.join(list(sheet.texts.keys() - used)[:12])}")
     if sheet.empty:
         marks.note(CHANNELS, f"empty columns: {', '.join(sheet.empty[:12])}")
+    if sheet.others:
+        text = f"sheets that are not read: {', '.join(sheet.others)}; write what belongs together"
+        marks.note(CHANNELS, f"{text} into one sheet, or each into a file of its own")
 
 
 @dataclass(frozen=True)
@@ -267,6 +291,7 @@ class Sheet:
         texts: columns that hold text, dates among them.
         empty: columns that hold nothing.
         columns: what the file calls a column, where its name here has a unit that stands below.
+        others: sheets beside it that hold numbers too.
     """
 
     path: Path
@@ -276,6 +301,7 @@ class Sheet:
     texts: dict[str, pd.Series]
     empty: tuple[str, ...]
     columns: dict[str, str]
+    others: tuple[str, ...] = ()
 
     def column(self, name: str) -> str:
         """Return what the file calls a column."""
@@ -317,7 +343,8 @@ def peek(path: Path, rows: int = _ROWS) -> Sheet:
         else:
             numbers[name] = values
     renamed = {name: column for name, column in columns.items() if name != column}
-    return Sheet(path, about, tuple(table.columns), numbers, texts, tuple(empty), renamed)
+    others = table.attrs.get("others", ())
+    return Sheet(path, about, tuple(table.columns), numbers, texts, tuple(empty), renamed, others)
 
 
 def _described(table: pd.DataFrame) -> dict[str, str]:
@@ -348,11 +375,12 @@ def _unit_in(cell: str) -> str:
 def _excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Return the first sheet with two columns of numbers, else the first, and its settings."""
     names = sheet_names(path)
-    tables = ((name, excel_sheet(path, name, rows)) for name in names)
-    for number, (name, table) in enumerate(tables):
-        if len(table.select_dtypes("number").columns) > 1:
-            return table, {"kind": "excel", **({"sheet": name} if number else {})}
-    return excel_sheet(path, None, rows), {"kind": "excel"}
+    tables = {name: excel_sheet(path, name, rows) for name in names}
+    full = [n for n, table in tables.items() if len(table.select_dtypes("number").columns) > 1]
+    name = next(iter([*full, *names]))
+    table = tables[name]
+    table.attrs["others"] = tuple(full[1:])
+    return table, {"kind": "excel", **({"sheet": name} if name != names[0] else {})}
 
 
 @dataclass(frozen=True)
@@ -379,6 +407,12 @@ def clock_of(sheet: Sheet) -> Clock:
         DataError: where no column holds any.
     """
     named = [name for name in sheet.header if words_of(name).has("time")]
+    parts = [name for name in sheet.numbers if plain(name) in _PARTS_OF_TIME]
+    if len(parts) > 1:
+        raise DataError(
+            f"{sheet.path}: its time stands in parts ({', '.join(parts)}); write it as one column,"
+            " such as 2025-06-17 08:30:00.25"
+        )
     dated = {name: cells for name, cells in sheet.texts.items() if looks_dated(cells)}
     if dated:
         return _dated(sheet, dated)
@@ -462,10 +496,8 @@ def _time_unit(values: np.ndarray) -> tuple[str, str]:
         return unix, f"times of this size are Unix time in {unix}"
     if step < 1e-3 and (2e4 < size < 7e4 or 6.5e5 < size < 8e5):
         return "day", "times of this size are days as Excel and MATLAB count them"
-    for unit, longest in (("s", 5.0), ("ms", 5e3), ("us", 5e6)):
-        if step <= longest:
-            return unit, f"the header has no unit; steps of {step:g} would be {unit}"
-    return "ns", f"the header has no unit; steps of {step:g} would be ns"
+    unit = unit_of_steps(step)
+    return unit, f"the header has no unit; steps of {step:g} would be {unit}"
 
 
 def with_degrees(sheet: Sheet, marks: Marks) -> tuple[Sheet, Settings]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, final
 
-from residnet.core.errors import UsageError
+from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.readers.base import LogReader, require_file
 from residnet.data.readers.canonical import CanonicalConfig
@@ -20,6 +20,7 @@ from residnet.data.readers.formats.trees import Hdf5Config, MatConfig
 from residnet.data.readers.formats.ulog import UlogConfig
 from residnet.data.readers.recording import EVERYTHING, Recording, Wanted
 from residnet.data.readers.tables import TABLES
+from residnet.data.readers.texts import first_rows
 from residnet.data.readers.topics import align_clocks
 
 # in the order in which they are asked: content that cannot be mistaken first, endings last
@@ -35,11 +36,15 @@ _RECORDINGS: tuple[type[RecordingConfig], ...] = (
 )
 LOG_ENDINGS = (*TABLES, *(ending for config in _RECORDINGS for ending in config.endings))
 """Endings of files that may be logs."""
-TO_TABLE = (
-    "write such rows as csv with a line of names, in Python"
-    " pandas.DataFrame(rows, columns=[...]).to_csv('log.csv', index=False)"
-)
-"""How what no reader knows becomes a log."""
+_TABLE_OF = {
+    **dict.fromkeys((".gz", ".zip", ".bz2", ".xz"), "pandas.read_csv(file)"),
+    **dict.fromkeys((".xls", ".ods"), "pandas.read_excel(file)"),
+    ".json": "pandas.read_json(file)",
+    ".pkl": "pandas.read_pickle(file)",
+    ".feather": "pandas.read_feather(file)",
+    ".nc": "xarray.open_dataset(file).to_dataframe().reset_index()",
+}
+"""Ending -> how Python gets the table in such a file."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,24 @@ class Format:
 
     name: str
     config: type[RecordingConfig]
+
+
+def to_table(ending: str) -> str:
+    """Return how a file with such an ending, which no reader knows, becomes a log."""
+    rows = _TABLE_OF.get(ending, "pandas.DataFrame(rows, columns=[...])")
+    return (
+        "write such rows as csv with a line of names, in Python"
+        f" {rows}.to_csv('log.csv', index=False)"
+    )
+
+
+def is_text_table(path: Path) -> bool:
+    """Return whether a file of any ending holds lines of names and numbers."""
+    try:
+        table, _ = first_rows(path, 20)
+    except DataError:
+        return False
+    return len(table.select_dtypes("number").columns) > 1
 
 
 @final
@@ -94,8 +117,9 @@ def kind_of(path: Path) -> str:
     if Log.recognises(path):
         return "canonical"
     recording = format_of(path)
-    if recording is None and path.suffix.lower() not in TABLES:
-        raise UsageError(f"{path}: is of no format that residnet knows; {TO_TABLE}")
+    ending = path.suffix.lower()
+    if recording is None and ending not in TABLES and not is_text_table(path):
+        raise UsageError(f"{path}: is of no format that residnet knows; {to_table(ending)}")
     return "table" if recording is None else recording.name
 
 

@@ -376,6 +376,12 @@ def found_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
         # groups above the names are passed over
         while at + 1 < values and _repeats(rows[at]) and not _repeats(rows[at + 1]):
             at += 1
+        # so is a table about the columns that stands above theirs
+        later = found_header(rows[values:])
+        if later is not None:
+            names = rows[values + later[0]]
+            if names != rows[at] and not any(map(_measures, names)) and not _repeats(names):
+                return values + later[0], values + later[1]
         return at, values
     return None
 

@@ -150,6 +150,12 @@ def unix_unit(values: np.ndarray) -> str | None:
     return next(units, None)
 
 
+def unit_of_steps(step: float) -> str:
+    """Return the unit of times that go on by such a step; no recorder waits longer than 5 s."""
+    longest = (("s", 5.0), ("ms", 5e3), ("us", 5e6))
+    return next((unit for unit, most in longest if step <= most), "ns")
+
+
 def _parts(cells: pd.Series) -> pd.DataFrame:
     """Return the parts of dates and times; what stands beside the seconds repeats over rows."""
     import pandas as pd
@@ -202,6 +208,7 @@ def parse_texts(
     zone: str | None = None,
     order: Order | None = None,
     dates: bool = False,
+    unit: str = "s",
 ) -> Stamps:
     """Return the times of text [T]: dates and times of day in most forms, or numbers.
 
@@ -213,6 +220,7 @@ def parse_texts(
         zone: time zone of dates that name none; None takes them as UTC.
         order: of day, month and year; None takes it from the cells.
         dates: none are numbers, and some cells may be empty.
+        unit: of numbers that are no Unix time.
 
     Raises:
         DataError: naming the first cell that is no time.
@@ -224,7 +232,7 @@ def parse_texts(
     if not len(cells):
         return Stamps(np.zeros(len(column), dtype=np.int64), False, known)
     if not dates:
-        return _dated(cells, zone, order) if ":" in cells.iloc[0] else _digits(cells)
+        return _dated(cells, zone, order) if ":" in cells.iloc[0] else _digits(cells, unit)
     stamps = _dated(cells, zone, order)
     ns = np.full(len(column), stamps.ns[0])
     ns[known] = stamps.ns
@@ -246,7 +254,7 @@ def _require(cells: pd.Series, bad: np.ndarray, what: str, do: str = "") -> None
         )
 
 
-def _digits(cells: pd.Series) -> Stamps:
+def _digits(cells: pd.Series, counted: str) -> Stamps:
     """Return the times of numbers as a clock printed them, to the last digit."""
     import pandas as pd
 
@@ -256,12 +264,12 @@ def _digits(cells: pd.Series) -> Stamps:
         # exponents: the digits are not the ones that a clock printed
         numbers = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
         _require(cells, ~np.isfinite(numbers), "time")
-        return parse_numbers(numbers)
+        return parse_numbers(numbers, None if unix_unit(numbers) else 1.0 / _UNITS[counted])
     whole = parts["whole"].astype("int64").to_numpy()
     fraction, remarks = _fractions(parts["fraction"], whole)
     fraction = np.where(cells.str.startswith("-").to_numpy(dtype=bool), -fraction, fraction)
     unit = unix_unit(whole)
-    scale = _UNITS[unit or "s"]
+    scale = _UNITS[unit or counted]
     ns = whole * (_NS // scale) + fraction // scale
     return Stamps(ns, unit is not None, None, remarks)
 

@@ -21,6 +21,11 @@ from residnet.data.readers.written import Stamps, parse_texts, whole_second
 _SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2,4},[\x20-\x7e]*)")
 # a sentence with its checksum at the start of a line, or behind a time
 _WHOLE = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\*[0-9A-Fa-f]{2}\s*$")
+# a date with a time, a time of day or Unix time, among what else a recorder writes
+_STAMP = re.compile(
+    r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[T ,_]+\d{1,2}:\d\d[\d:.,]*(?:Z|[-+]\d\d:?\d\d)?"
+    r"|\d{1,2}:\d\d:\d\d[\d.,]*|\d{9,}(?:\.\d+)?"
+)
 _PER_MINUTE = {"rate_of_turn": 1.0 / 60.0}
 _DAY = 86_400 * 10**9
 _REPORT_EVERY = 5000
@@ -81,6 +86,8 @@ class NmeaConfig(RecordingConfig):
                     bad += bool(line.strip())
                     continue
                 before = match["before"].decode("ascii", errors="replace").strip(" ,;\t[]")
+                stamp = _STAMP.search(before)
+                before = stamp[0].rstrip(".,:") if stamp else before
                 try:
                     message = pynmea2.parse(match["sentence"].decode("ascii").strip())
                     lines.add(message, before, wanted)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, final
 
@@ -30,6 +31,7 @@ from residnet.data.readers.written import (
     Stamps,
     parse_numbers,
     parse_texts,
+    unit_of_steps,
     unix_unit,
     whole_second,
 )
@@ -123,14 +125,19 @@ class TopicFolderConfig(RecordingConfig):
         listed: list[str] = []
         # what is wrong with other topics too is worth a look where that costs little
         take = EVERYTHING if size < LARGE else wanted
+        called = [file.relative_to(root).with_suffix("").as_posix() for file in files]
+        # ulog2csv begins each name with that of the recording
+        own = f"{root.name}_"
+        own = own if all(name.startswith(own) for name in called) else ""
+        steps = [step for file in files if (step := _step_of(file, self.time))]
+        unit = unit_of_steps(min(steps, default=0.0))
         with progress(path.name, size, size) as advance:
-            for file in files:
-                name = file.relative_to(root).with_suffix("").as_posix()
+            for file, name in zip(files, (one.removeprefix(own) for one in called), strict=True):
                 if not take(name):
                     listed.append(name)
                     continue
                 with as_utf8(file) as text:
-                    found = self._topic(text, name, take)
+                    found = self._topic(text, name, take, unit)
                 if isinstance(found, _Topic):
                     topics[name] = found
                 else:
@@ -145,7 +152,7 @@ class TopicFolderConfig(RecordingConfig):
         series = {name: topic.series(name, epoch) for name, topic in topics.items()}
         return Recording(path, series, epoch, tuple(files), tuple(remarks), tuple(listed))
 
-    def _topic(self, file: Path, name: str, wanted: Wanted) -> _Topic | Remark:
+    def _topic(self, file: Path, name: str, wanted: Wanted, unit: str) -> _Topic | Remark:
         """Return one topic; a remark where the file holds none."""
         import pandas as pd
 
@@ -184,7 +191,7 @@ class TopicFolderConfig(RecordingConfig):
             if table.empty:
                 raise pd.errors.EmptyDataError
             columns = {header[i]: table[i] for i in kept}
-            return _Topic(name, columns, clock, stamp)
+            return _Topic(name, columns, (clock, unit), stamp)
         except pd.errors.EmptyDataError:
             text = f"topic {name}: the file has a header and no rows"
             return remark("note", "empty_topic", text)
@@ -195,6 +202,20 @@ class TopicFolderConfig(RecordingConfig):
         except DataError as error:
             text = f"topic {name}: {error}; the file is left out"
             return remark("will mislead", "no_time", text)
+
+
+def _step_of(file: Path, clocks: Sequence[str]) -> float:
+    """Return the usual step of the first times of a topic, in its own unit; 0 for none."""
+    with file.open("rb") as stream:
+        head = stream.read(10_000)
+    lines = head.decode(encoding_of_head(head), errors="replace").splitlines()[:-1]
+    names, *rows = [line.removeprefix("\ufeff").strip().split(",") for line in lines] or [[""]]
+    clock = next((names.index(name) for name in clocks if name in names), len(names))
+    try:
+        steps = np.diff([float(row[clock]) for row in rows if len(row) > clock])
+    except ValueError:
+        return 0.0
+    return float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
 
 
 def _names_sender(column: str) -> bool:
@@ -219,14 +240,15 @@ class _Topic:
         self,
         name: str,
         columns: dict[str, pd.Series],
-        clock: str | None,
+        time: tuple[str | None, str],
         stamp: tuple[str, str] | None,
     ) -> None:
         self._remarks: list[Remark] = []
         self._arrival: Stamps | None = None
         self._sender: np.ndarray | None = None
+        clock, unit = time
         if clock is not None:
-            columns = self._timed(name, columns, clock)
+            columns = self._timed(name, columns, clock, unit)
         whole = {}
         for column, cells in columns.items():
             if column != clock and (values := self._numbers(name, column, cells)) is not None:
@@ -257,15 +279,17 @@ class _Topic:
         remarks = (*self._remarks, *said)
         return Series(name, "", self._fields, stamp, arrival, self._sender, remarks)
 
-    def _timed(self, name: str, columns: dict[str, pd.Series], clock: str) -> dict[str, pd.Series]:
+    def _timed(
+        self, name: str, columns: dict[str, pd.Series], clock: str, unit: str
+    ) -> dict[str, pd.Series]:
         """Read the arrival times; a recorder that loses power leaves half a row."""
         try:
-            self._arrival = parse_texts(columns[clock])
+            self._arrival = parse_texts(columns[clock], unit=unit)
         except DataError:
             if len(columns[clock]) < 2:
                 raise
             columns = {column: cells.iloc[:-1] for column, cells in columns.items()}
-            self._arrival = parse_texts(columns[clock])
+            self._arrival = parse_texts(columns[clock], unit=unit)
             text = f"topic {name}: the last row is cut short; left out"
             self._remarks.append(remark("note", "cut_short", text, rows=1.0))
         return columns
