@@ -98,7 +98,8 @@ HOSTILE = [
 @pytest.mark.parametrize("part", [0, 1, 2])
 def test_hostile_names_of_manoeuvres_logs_and_files(part: int, tmp_path: Path) -> None:
     """Each name is that of a log, of its manoeuvre and, where it can be, of its file."""
-    names = HOSTILE[part::3]
+    # no file of others is asked for
+    names = [name.replace("/tmp", str(tmp_path)) for name in HOSTILE[part::3]]
     work = tmp_path / "work"
     work.mkdir()
     config = written(work, names)
@@ -111,7 +112,6 @@ def test_hostile_names_of_manoeuvres_logs_and_files(part: int, tmp_path: Path) -
     new_config([work / "logs"], work / "run" / "drafted.yaml", None, overwrite=False)
     made = set(tmp_path.rglob("*")) - before
     assert [path for path in made if path != run and run not in path.parents] == []
-    assert not Path("/tmp/escape").exists()
     assert (run / "report.html").is_file()
 
 

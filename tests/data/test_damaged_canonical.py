@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from residnet.core.errors import ResidnetError
+from residnet.api.data import read_logs
+from residnet.core.errors import DataError, ResidnetError
 from residnet.core.log import Log
 from residnet.data.doctor import inspect
 from residnet.data.readers.canonical import CanonicalConfig
@@ -74,3 +76,20 @@ def test_a_changed_file_is_a_log_or_one_line(seed: int, tmp_path: Path) -> None:
             refused.append(str(error))
     assert 10 < len(refused) < 60
     assert [line for line in refused if "\n" in line or "boat" not in line] == []
+
+
+@pytest.mark.parametrize("place", ["column", "manoeuvre"])
+def test_a_name_that_is_no_utf8_text_is_a_log_or_one_line(place: str, tmp_path: Path) -> None:
+    path, t = tmp_path / "boat.parquet", 0.1 * np.arange(80)
+    channels = {name: np.sin(t) for name in ("x", "y", "psi", "voltage")}
+    Log("boat", t, channels, {"voltage": "V"}, "zigzag20").save(path)
+    name = {"column": b"voltage", "manoeuvre": b"zigzag20"}[place]
+    path.write_bytes(path.read_bytes().replace(name, name[:-2] + b"\xe9\xff"))
+    if place == "manoeuvre":
+        assert read_logs(path)[0].manoeuvre.startswith("zigzag")
+        return
+    said = (
+        f"{path}: 'voltaéÿ', the name of a column, is no UTF-8 text; rename it where it is written"
+    )
+    with pytest.raises(DataError, match=re.escape(said)):
+        read_logs(path)

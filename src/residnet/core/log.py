@@ -196,7 +196,7 @@ class Log:
             return False
         try:
             return b"residnet" in (pq.read_schema(path).metadata or {})
-        except (pa.ArrowException, OSError):
+        except (pa.ArrowException, OSError, UnicodeError):
             return False
 
     @classmethod
@@ -219,6 +219,10 @@ class Log:
             )
         try:
             table = pq.read_table(path)
+        except UnicodeError as error:
+            raise DataError(
+                f"{path}: the name of a column is no UTF-8 text; rename it where it is written"
+            ) from error
         except (pa.ArrowException, OSError) as error:
             raise UsageError(
                 f"{path}: not a Parquet file ({str(error).splitlines()[0]})"

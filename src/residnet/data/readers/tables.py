@@ -475,6 +475,12 @@ def _readable(path: Path, what: str) -> Iterator[None]:
         yield
     except ResidnetError:
         raise
+    except UnicodeDecodeError as error:
+        name = shown(bytes(error.object).decode("latin-1"), 60)
+        raise DataError(
+            f"{path}: '{name}', the name of a column, is no UTF-8 text; rename it where it is"
+            " written"
+        ) from error
     except Exception as error:
         reason = shown(" ".join(str(error).split()) or type(error).__name__, 200)
         raise DataError(f"{path}: {what} ({reason})") from error
