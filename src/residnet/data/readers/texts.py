@@ -181,12 +181,13 @@ def _form(
 def _plain(table: pd.DataFrame, decimal: str) -> pd.DataFrame:
     """Return a table whose numbers have no signs between thousands, and no marks for none (---).
 
-    A column that then still holds a word stays as it is.
+    A column that then still holds a word stays as it is, and so does one in which every cell could
+    as well have three decimals.
     """
     import pandas as pd
 
     between = rf"[ '’\u00a0\u202f{'.' if decimal == ',' else ','}]"
-    grouped = re.compile(rf"[-+]?\d{{1,3}}(?:{between}\d{{3}})+(?:{re.escape(decimal)}\d+)?")
+    grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:{between}\d{{3}})+(?:{re.escape(decimal)}\d+)?")
 
     def number(cell: Any) -> Any:
         if not isinstance(cell, str):
@@ -198,9 +199,11 @@ def _plain(table: pd.DataFrame, decimal: str) -> pd.DataFrame:
     table = table.copy(deep=False)
     for name, cells in table.items():
         if not pd.api.types.is_numeric_dtype(cells.dtype):
+            signs = {len(re.findall(r"[^\d+-]", str(cell).strip())) for cell in cells.dropna()}
             bare = cells.map(number)
             values = pd.to_numeric(bare, errors="coerce")
-            table[name] = values if values.isna().sum() == bare.isna().sum() else cells
+            if signs != {1} and values.isna().sum() == bare.isna().sum():
+                table[name] = values
     return table
 
 
