@@ -22,7 +22,7 @@ from residnet.data.readers.recording import remark
 
 _DENSE = 0.9
 """Share of the samples that hold a value in a channel that is measured at every sample."""
-_BRIDGED = 3.0
+BRIDGED = 3.0
 """Usual intervals between the values of a channel that are bridged."""
 _LEVELS = 10.0 ** (0.5 * np.arange(-8, 5))
 """Jerk in units of the noise over the cube of the usual interval between positions."""
@@ -184,7 +184,7 @@ def _near(t: np.ndarray, at: np.ndarray) -> np.ndarray:
     inside = (t >= at[0] - 1e-9) & (t <= at[-1] + 1e-9)
     right = at[np.clip(np.searchsorted(at, t, side="left"), 0, at.size - 1)]
     left = at[np.clip(np.searchsorted(at, t, side="right") - 1, 0, at.size - 1)]
-    return np.asarray(inside & (right - left <= _BRIDGED * usual * (1.0 + 1e-6)))
+    return np.asarray(inside & (right - left <= BRIDGED * usual * (1.0 + 1e-6)))
 
 
 def _turned(x: np.ndarray, y: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

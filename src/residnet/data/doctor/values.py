@@ -14,7 +14,7 @@ from residnet.core.stretches import stretches
 from residnet.data.channels import beyond_belief, fills, noise_of, spike_cells, usual_interval
 from residnet.data.doctor.findings import Check, Finding, Level, check, share_of, show
 from residnet.data.doctor.statistics import MEASURED, STEERING, Record, resolution_of
-from residnet.data.motion import MotionConfig, complete_motion
+from residnet.data.motion import BRIDGED, MotionConfig, complete_motion
 from residnet.data.readers.base import unwrap
 
 
@@ -102,7 +102,9 @@ def missing(log: Record, found: Check) -> Iterator[Finding]:
         )
         level: Level = "fatal" if share > 0.5 else "will mislead"
         figures = {"share": share, "stretches": starts.size, "longest": seconds, "t": first}
-        yield found(text, figures, level=level, at=at)
+        if most <= BRIDGED:
+            level, text = "note", f"{text}; so short ones are interpolated"
+        yield found(text, figures, level=level, at=at, fix="" if level == "note" else None)
 
 
 @check("values", "repeated_rows", fix="delete them, or log at the sensors' rate", certain=True)
