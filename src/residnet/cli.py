@@ -266,6 +266,9 @@ def monitor(
     window: Annotated[str, typer.Option(help="Length of the short free runs.")] = "10 s",
     stretch: Annotated[str, typer.Option(help="Time that is looked back over.")] = "300 s",
     false_alarm: Annotated[str, typer.Option(help="Mean time between false alarms.")] = "10 h",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder for a page.")
+    ] = None,
     refit: Annotated[
         Path | None,
         typer.Option(
@@ -284,11 +287,13 @@ def monitor(
 
     The exit code is 1 where there is an alarm. A refit leaves the run as it is.
     """
-    from residnet.core.files import require_file_place, whole
+    from residnet.core.files import require_file_place, require_room, whole
     from residnet.tasks.registry import finished_task
 
     if file is not None:
         require_file_place(file)
+    if out is not None:
+        require_room(out)
     settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "monitor")
@@ -302,6 +307,10 @@ def monitor(
     if file is not None:
         with whole(file) as part:
             part.write_text(json.dumps(content, indent=1) + "\n")
+    if out is not None:
+        from residnet.tasks.fit_service import write_watched
+
+        print(f"page: {write_watched(out, found)}")
     if any(log.since is not None for log in found):
         raise typer.Exit(1)
 

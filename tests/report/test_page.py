@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from read_page import Page
 
+from residnet.core.format import number
 from residnet.report.blocks import (
     Bullets,
     Cell,
@@ -24,7 +25,6 @@ from residnet.report.blocks import (
     table_of,
 )
 from residnet.report.figure import Case, Figure, Look, Panel
-from residnet.report.format import number
 from residnet.report.page import write_page
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from residnet.core.errors import UsageError
 from residnet.core.files import whole
+from residnet.core.format import DEG, fixed
 from residnet.documents import published
 from residnet.documents.study import histories
 from residnet.judge.goodness import block_interval
@@ -32,7 +33,6 @@ from residnet.report.figure import (
     family,
     write_figure,
 )
-from residnet.report.format import DEG, fixed
 from residnet.report.run_reader import RunFiles, StoredWindow
 
 _PROTOCOL = "record"

@@ -16,6 +16,7 @@ import numpy as np
 
 from residnet.core.errors import UsageError
 from residnet.core.files import whole
+from residnet.core.format import DEG, interval
 from residnet.documents import published
 from residnet.documents.study import beside_published, compared
 from residnet.report.blocks import Block, Section, Table, Text, table_of
@@ -38,7 +39,6 @@ from residnet.report.figure import (
     whiskers,
     write_figure,
 )
-from residnet.report.format import DEG, interval
 from residnet.report.run_reader import RunFiles, StoredWindow
 
 PROTOCOL = "manoeuvre"

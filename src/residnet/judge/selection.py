@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.format import number
 from residnet.data.prepare import Prepared
 from residnet.judge.freerun import Errors, FreeRun
 
@@ -208,16 +209,16 @@ def _simplest(
     if chosen is best:
         reason = (
             f"{chosen.name} errs least of the sound models (mean validation error"
-            f" {chosen.error:.3g})"
+            f" {number(chosen.error)})"
         )
         simpler = [e for e in sound if e.simplicity < best.simplicity]
         if simpler:
             reason += f", and no simpler one comes within {said} of it"
     else:
         reason = (
-            f"{chosen.name} is the simplest sound model within {said} ({100.0 * within:.2g} %)"
-            f" of the best one, {best.name} (mean validation errors {chosen.error:.3g} and"
-            f" {best.error:.3g})"
+            f"{chosen.name} is the simplest sound model within {said}"
+            f" ({number(100.0 * within, 2)} %) of the best one, {best.name} (mean"
+            f" validation errors {number(chosen.error)} and {number(best.error)})"
         )
     better = [entry for entry in unsound if entry.score < chosen.score]
     if better:
@@ -236,7 +237,7 @@ def _least_bad(single: Sequence[Contender], blocks: Blocks) -> tuple[Contender, 
         if apart > blocks.alike * spread:
             return best, (
                 f"No model is sound; {best.name} errs least of those that did not diverge (mean"
-                f" validation error {best.error:.3g}), and is unsound too:"
+                f" validation error {number(best.error)}), and is unsound too:"
                 f" {'; '.join(best.faults)}."
             )
     worse = (

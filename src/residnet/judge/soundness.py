@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import DataError
+from residnet.core.format import interval, number
 from residnet.core.layout import (
     LATERAL,
     POSE,
@@ -288,7 +289,7 @@ class OperatingPoint:
         """The point as words of a sentence."""
         name = f"{self.label}, " if self.label else ""
         outside = "" if self.inside else " (outside the training data)"
-        return f"{name}u = {self.speed:.3g} m/s{outside}"
+        return f"{name}u = {number(self.speed)} m/s{outside}"
 
 
 def operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPoint]:
@@ -335,7 +336,11 @@ def check_stability(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) 
     rates = [growth_rate(model, point.x, point.w) for point in points]
     summary = "; ".join(
         f"{point.text}: slowest mode "
-        + (f"halves in {-math.log(2) / rate:.2g} s" if rate < 0 else f"has rate {rate:+.2g} 1/s")
+        + (
+            f"halves in {number(-math.log(2) / rate, 2)} s"
+            if rate < 0
+            else f"has rate {rate:+.2g} 1/s"
+        )
         for point, rate in zip(points, rates, strict=True)
         if point.label
     )
@@ -348,8 +353,8 @@ def check_stability(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) 
     if not unstable:
         text = (
             "sway and yaw are stable in straight running at"
-            f" {points[0].speed:.2g} to {points[-1].speed:.2g} m/s (no mode doubles within"
-            f" {_DOUBLING:.0f} s). {summary}"
+            f" {interval([points[0].speed, points[-1].speed], digits=2)} m/s (no mode doubles"
+            f" within {_DOUBLING:.0f} s). {summary}"
         )
         return _found(spec, STABILITY, True, text, fault)
     inside = [(point, rate) for point, rate in unstable if point.inside]
@@ -357,8 +362,8 @@ def check_stability(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) 
     where = "inside the training data" if inside else "only outside the training data"
     text = (
         f"sway and yaw unstable in straight running, {where}: worst at {worst.text}, a disturbance"
-        f" doubles in {math.log(2) / rate:.2g} s. Some full hulls are so in truth; otherwise do not"
-        f" trust long free runs there. {summary}"
+        f" doubles in {number(math.log(2) / rate, 2)} s. Some full hulls are so in truth; otherwise"
+        f" do not trust long free runs there. {summary}"
     )
     return _found(spec, STABILITY, False, text, fault)
 
@@ -400,7 +405,7 @@ def contradiction(model: HybridDynamics, runs: Sequence[SteadyRun]) -> str:
         if rate * run.seconds > math.log(_GROWN) and _departure(model, run) > _STAYED:
             return (
                 "it is unstable where the logs are not (a disturbance would double in"
-                f" {math.log(2.0) / rate:.2g} s; log {run.log} runs steadily for"
+                f" {number(math.log(2.0) / rate, 2)} s; log {run.log} runs steadily for"
                 f" {run.seconds:.0f} s)"
             )
     return ""
@@ -517,7 +522,7 @@ def check_bounded(
                 break
     row = int((away > 0.0).double().argmax())
     inputs = ", ".join(
-        f"{name} {float(value):.3g}"
+        f"{name} {number(float(value))}"
         for name, value in zip(spec.signals.columns, w[row], strict=True)
     )
     beyond = f"(more than {divergence:g} times the largest training velocity)"

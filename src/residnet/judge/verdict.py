@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from residnet.core.format import interval, number
+
 Content = Mapping[str, Any]
 """What a JSON object holds."""
 
@@ -54,19 +56,19 @@ def verdict(evidence: Evidence) -> list[str]:
     """Return the verdict sentence by sentence, the most important first.
 
     It says how far off the selected model is in metres and degrees after the times that matter,
-    beside `zero`, the baseline and the noise floor, for how many windows and which speeds that
-    holds, how its velocities compare, what speaks against it and why it was selected, how much of
-    the data lies outside the training range, and what the doctor found. What the files do not hold
-    is left out.
+    what the doctor found in the data, how it fares beside `zero`, the baseline and the noise floor,
+    for how many windows and which speeds that holds, how its velocities compare, what speaks
+    against it and why it was selected, and how much of the data lies outside the training range.
+    What the files do not hold is left out.
     """
-    lost = useless(evidence)
+    first, *rest = [compared(evidence)] if useless(evidence) else ahead(evidence)
     sentences = [
-        *([compared(evidence)] if lost else ahead(evidence)),
-        *([] if lost else [compared(evidence)]),
+        first,
+        evidence.doctor,
+        *rest,
         soundness(evidence),
         str(evidence.selection.get("reason", "")),
         outside(evidence),
-        evidence.doctor,
     ]
     return [sentence for sentence in sentences if sentence]
 
@@ -114,15 +116,15 @@ def _good_until(evidence: Evidence) -> float:
 
 
 def ahead(evidence: Evidence) -> list[str]:
-    """Return how far off the selected model is after the times that matter."""
+    """Return how far off the selected model is after the times that matter, beside others."""
     entries = _horizons(evidence)
     if not entries:
-        return []
+        return [compared(evidence)]
     enough = [entry for entry in entries if entry["windows"] >= _FEWEST]
     until = _good_until(evidence) if enough else 0.0
     chosen = next((e for e in entries if e["seconds"] == until), (enough or entries)[-1])
     off = _off(chosen, evidence.selected, chosen["sailed"])
-    after = f"{chosen['seconds']:.4g} s ahead"
+    after, wanted = f"{chosen['seconds']:.4g} s ahead", []
     if not enough:
         most = max(entry["windows"] for entry in entries)
         start = (
@@ -132,11 +134,12 @@ def ahead(evidence: Evidence) -> list[str]:
     elif until:
         start = f"Up to {after}: there {evidence.selected} is off by {off}."
     else:
-        start = (
-            f"{after[0].upper()}{after[1:]} {evidence.selected} is off by {off}. Good would be"
-            f" within {100.0 * _SHARE:.0f} % of the way and {math.degrees(_TURN):.0f} deg, or twice"
-            " the noise floor, without a diverged window and near the best model of the run."
-        )
+        start = f"{after[0].upper()}{after[1:]} {evidence.selected} is off by {off}."
+        wanted = [
+            f"Good would be within {100.0 * _SHARE:.0f} % of the way and"
+            f" {math.degrees(_TURN):.0f} deg, or twice the noise floor, without a diverged window"
+            " and near the best model of the run."
+        ]
     named = {ZERO: ZERO, evidence.baseline: "the baseline"}
     beside = [
         f"{word} {_off(chosen, name)}"
@@ -152,18 +155,20 @@ def ahead(evidence: Evidence) -> list[str]:
     logs = f"{chosen['logs']} log{'' if chosen['logs'] == 1 else 's'}"
     holds = (
         f"It holds for {chosen['windows']} windows of {logs} at mean speeds of"
-        f" {chosen['slowest']:.2g} to {chosen['fastest']:.2g} m/s."
+        f" {number(chosen['slowest'], 2)} to {number(chosen['fastest'], 2)} m/s."
     )
     return [
         start,
         f"Beside it: {'; '.join([*beside, floor])}.",
+        *wanted,
         *([f"At other times: {'; '.join(rest)}."] if rest else []),
         holds,
+        compared(evidence),
     ]
 
 
 def _pair(errors: Content) -> str:
-    return f"{errors['position']:.2g} m and {math.degrees(errors['heading']):.2g} deg"
+    return f"{number(errors['position'], 2)} m and {number(math.degrees(errors['heading']), 2)} deg"
 
 
 def _off(entry: Content, name: str, sailed: float = 0.0) -> str:
@@ -171,10 +176,12 @@ def _off(entry: Content, name: str, sailed: float = 0.0) -> str:
     own, out = entry["models"][name], []
     for of, factor, unit in (("position", 1.0, "m"), ("heading", math.degrees(1.0), "deg")):
         ends = own["intervals"][of]
-        text = f"{factor * own[of]:.2g} {unit}"
-        details = [f"{factor * ends[0]:.2g} to {factor * ends[1]:.2g}"] if ends else []
+        text = f"{number(factor * own[of], 2)} {unit}"
+        details = [interval(ends, factor, 2)] if ends else []
         if of == "position" and sailed > 0.0:
-            details.append(f"{100.0 * own[of] / sailed:.2g} % of the {sailed:.3g} m sailed")
+            details.append(
+                f"{number(100.0 * own[of] / sailed, 2)} % of the {number(sailed, 2)} m sailed"
+            )
         out.append(text + (f" ({', '.join(details)})" if details else ""))
     known = all(own["intervals"].values()) or sailed == 0.0
     return " and ".join(out) + ("" if known else ", from too few logs for an interval")
@@ -189,8 +196,8 @@ def objections(evidence: Evidence) -> list[str]:
     if own is None:
         return []
     return [
-        f"on {evidence.split} data its NRMSE is {_nrmse(own):.3g}, that of {other}"
-        f" {_nrmse(row):.3g}"
+        f"on {evidence.split} data its NRMSE is {number(_nrmse(own))}, that of {other}"
+        f" {number(_nrmse(row))}"
         for other in dict.fromkeys((ZERO, evidence.baseline))
         if (row := evidence.rows.get(other)) is not None and _nrmse(own) > _nrmse(row)
     ]
@@ -219,8 +226,9 @@ def compared(evidence: Evidence) -> str:
     if zero is not None and useless(evidence):
         return (
             f"WORSE THAN ZERO: on {split} data the selected model {name} has an NRMSE of"
-            f" {error:.3g}{_lost(own)}, and zero, which only holds the velocities that a run starts"
-            f" from, {_nrmse(zero):.3g}{_paired(evidence, ZERO)}. DO NOT USE it for prediction."
+            f" {number(error)}{_lost(own)}, and zero, which only holds the velocities that a run"
+            f" starts from, {number(_nrmse(zero))}{_paired(evidence, ZERO)}. DO NOT USE it for"
+            " prediction."
         )
     parts = []
     for other, row in ((ZERO, zero), (evidence.baseline, evidence.rows.get(evidence.baseline))):
@@ -231,7 +239,7 @@ def compared(evidence: Evidence) -> str:
         shown = f"the {other}" if other == "baseline" else other
         parts.append(f"{abs(change):.0f} % {word} than {shown}{_paired(evidence, other)}")
     better = f" is {' and '.join(parts)};" if parts else ""
-    return f"On {split} data model {name}{better} its NRMSE is {error:.3g}{_lost(own)}."
+    return f"On {split} data model {name}{better} its NRMSE is {number(error)}{_lost(own)}."
 
 
 def soundness(evidence: Evidence) -> str:
@@ -294,4 +302,4 @@ def _paired(evidence: Evidence, other: str) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %" if share >= 0.001 else "less than 0.1 %"
+    return f"{number(100.0 * share, 2)} %" if share >= 0.001 else "less than 0.1 %"

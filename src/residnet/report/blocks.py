@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from typing import Any, ClassVar, Literal, Protocol, TypeAlias
 
-from residnet.report.format import fixed
+from residnet.core.format import fixed
 
 EXPORTS = "exports.json"
 """File of a run folder that says what came of each export."""
@@ -176,6 +176,17 @@ class Table:
         words = [all(mark == "text" for mark in column) for column in marks]
         return [True, *(words or [False] * (len(self.columns) - 1))]
 
+    def part(self, first: int, last: int) -> Table:
+        """Return the table with the columns from `first` up to `last`, those of labels aside."""
+        groups, at = [], 0
+        for title, count in self.groups:
+            held = min(at + count, last) - max(at, first)
+            at += count
+            groups += [(title, held)] if held > 0 else []
+        part = Table([self.columns[0], *self.columns[1 + first : 1 + last]], "", groups)
+        part.rows = [replace(row, cells=row.cells[first:last]) for row in self.rows]
+        return part
+
     @property
     def pieces(self) -> list[Table]:
         """Return the table in pieces that each fit a sheet of A4, itself where it fits whole.
@@ -198,12 +209,8 @@ class Table:
             return [self]
         out: list[Table] = []
         for first, last in stretches:
-            groups = [
-                group for group, end in zip(self.groups, ends, strict=False) if first < end <= last
-            ]
-            piece = Table([self.columns[0], *self.columns[1 + first : 1 + last]], "", groups)
+            piece = self.part(first, last)
             piece.caption = "" if out else self.caption
-            piece.rows = [replace(row, cells=row.cells[first:last]) for row in self.rows]
             out.append(piece)
         return out
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from residnet.core.format import powers
 from residnet.report.figure import INK, Case, Figure, packed
 
 if TYPE_CHECKING:
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from bokeh.plotting import figure as Canvas
 
 _FONT = "12px"
+_LETTER, _NARROW = 6.5, 260.0
+"""Pixels of a letter of that font, and between the axes of a panel on a phone."""
 HEIGHT = "height of a cell"
 """Name of the column of a surface's heights; of their logarithms on a page where they are so."""
 _DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
@@ -159,7 +162,7 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
         hover.formatters = {f"@{{{name}}}": both for name in figure.names(number)}
     canvas.add_tools(hover, models.BoxZoomTool(match_aspect=panel.kind == "map"))
     canvas.toolbar.active_drag = None
-    canvas.xaxis.axis_label = panel.x_label or None
+    canvas.xaxis.axis_label = powers(panel.x_label) or None
     for axis, names, log, count in (
         (canvas.yaxis[0], panel.y_names, panel.y_log, 4),
         (canvas.xaxis[0], panel.x_names, panel.x_log, 5),
@@ -175,7 +178,8 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
         elif not log:
             step = 1.0 if count == 5 and figure.counts(number) else 0.0
             axis.ticker = models.BasicTicker(desired_num_ticks=count, min_interval=step)
-    if panel.x_names and max(map(len, panel.x_names.values())) > 4:
+    lines = [line for name in panel.x_names.values() for line in name.splitlines() or [""]]
+    if _LETTER * max(map(len, lines), default=0) * len(panel.x_names) > _NARROW:
         # long names stand upright, and on a phone those that have room
         policy = models.NoOverlap(min_distance=2)
         canvas.xaxis[0].update(major_label_orientation="vertical", major_label_policy=policy)

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Literal, TypeAlias
 import numpy as np
 
 from residnet.core.files import file_stem, whole
+from residnet.core.format import powers
 from residnet.core.progress import say
 from residnet.core.stretches import stretches
 from residnet.report.blocks import Section
@@ -74,6 +75,8 @@ class Look:
     order: float = 3
 
 
+GLANCE = 280
+"""Most pixels of a panel on a first screen, which on a phone holds rows of a table as well."""
 MEASURED = Look("measured", width=0.7, order=2)
 SOLID = Look("", BLUE, width=1.6)
 DASHED = Look("", ORANGE, "dashed", 1.6, order=4)
@@ -133,7 +136,7 @@ class Panel:
     @property
     def words(self) -> str:
         """What stands above the panel on a page."""
-        return " ".join(": ".join(text for text in (self.title, self.y_label) if text).split())
+        return powers(" ".join(": ".join(one for one in (self.title, self.y_label) if one).split()))
 
 
 @dataclass(frozen=True)
@@ -219,6 +222,29 @@ class Figure:
     def pictured(self) -> list[Case]:
         """Cases in the order of the stills."""
         return [case for case in self.cases if case.still]
+
+    def part(self, panels: int = 1) -> Figure:
+        """Return the first panels without words: a glance, for the first screen of a page.
+
+        It has no stills, since the whole figure stands further down.
+        """
+        # panels beneath each other share the name of their horizontal axis
+        last = self.panels[-1]
+        cases = [replace(case, curves=case.curves[:panels], texts=()) for case in self.cases]
+        shown = [
+            replace(one, height=min(one.height, GLANCE), x_label=one.x_label or last.x_label)
+            for one in self.panels[:panels]
+        ]
+        seen = {name for case in cases for curves in case.curves for name in curves}
+        return replace(
+            self,
+            name=f"{self.name} first",
+            caption="",
+            looks={name: look for name, look in self.looks.items() if name in seen and look.shown},
+            panels=shown,
+            cases=cases,
+            stills=(),
+        )
 
     def names(self, panel: int) -> list[str]:
         """Return the names of what a panel shows in any case, in order."""

@@ -15,6 +15,7 @@ from markupsafe import Markup, escape
 from residnet.core.config import load_mapping
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json, whole
+from residnet.core.format import powers
 from residnet.report.blocks import (
     EXPORTS,
     Block,
@@ -212,14 +213,15 @@ def provenance_facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _breakable(text: str) -> Markup:
     """Return escaped text whose long names and paths may break after underscores and slashes.
 
-    A number and its unit stay in one line.
+    A number and its unit stay in one line, powers are raised, and what stands in backticks is code.
     """
 
     def broken(found: re.Match[str]) -> str:
         return re.sub(r"([_/])", r"\1<wbr>", found[0])
 
-    together = _UNIT.sub("\u00a0", str(escape(text)))
-    return Markup(re.sub(rf"\S{{{_LONG},}}", broken, together))
+    together = powers(_UNIT.sub("\u00a0", str(escape(text))))
+    coded = re.sub(r"`([^`]+)`", r"<code>\1</code>", together)
+    return Markup(re.sub(rf"[^\s<>]{{{_LONG},}}", broken, coded))
 
 
 def _pixels(path: Path) -> Markup:

@@ -15,11 +15,11 @@ import numpy as np
 from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_table
+from residnet.core.format import SHOWN_UNITS, shown_unit
 from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.names import CHANNEL_UNITS, to_si
 from residnet.core.units import known_unit
 from residnet.judge.rollout_files import INPUT
-from residnet.report.format import SHOWN_UNITS, shown_unit
 
 Content = Mapping[str, Any]
 """What a JSON object holds."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.files import whole
+from residnet.core.format import powers
 from residnet.report.figure import INK, Case, Figure, Look, parts
 
 DPI = 140
@@ -131,7 +132,7 @@ def _draw(axes: Any, figure: Figure, case: Case, number: int, handles: dict[str,
                 handles.setdefault(look.label, handle)
     surface = figure.surface is not None
     axes.set_title(case.title if surface else panel.title, loc="left" if surface else "center")
-    axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
+    axes.set(xlabel=powers(panel.x_label), ylabel=powers(panel.y_label))
     if panel.kind == "map":
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from residnet.core.errors import UsageError
+from residnet.core.format import DEG, number
 from residnet.core.names import VELOCITY
 from residnet.judge.metrics import blocks, difference
 from residnet.report.blocks import Block, Cell, Section, Table, table_of
-from residnet.report.figure import Case, Figure, Panel, family, write_figure
-from residnet.report.format import DEG
+from residnet.report.figure import GLANCE, Case, Figure, Panel, family, write_figure
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
@@ -72,7 +72,14 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
     verdict = _sentence(runs, pairs)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        sections = [Section("", [tables[1], _curves(runs, out)])] if pairs else []
+        sections = []
+        if pairs:
+            # of the first protocol, for the first screen: error, difference, interval
+            main = {protocol: pairs[protocol] for protocol in list(pairs)[:1]}
+            glance = _paired_table(runs, main).part(3, 6)
+            glance.caption = f"Selected models, {next(iter(main))}."
+            sections.append(Section("", [_curves(runs, out), glance]))
+            sections.append(Section("Selected models over common windows", [tables[1]]))
         sections += [
             Section("Every model of every run", [tables[0]]),
             Section("Where the runs differ", [tables[-1]]),
@@ -146,10 +153,10 @@ def _metrics_table(runs: Sequence[JudgedRun]) -> Table:
             ("run", "run"),
             ("model", lambda row: f"{row['model']}{' (selected)' if row['chosen'] else ''}"),
             ("protocol", "protocol"),
-            ("u [m/s]", "rmse.u", "{:.3g}".format),
-            ("v [m/s]", "rmse.v", "{:.3g}".format),
-            ("r [deg/s]", "rmse.r", "{:.3g}".format, DEG),
-            ("NRMSE [-]", "nrmse.mean", "{:.3g}".format),
+            ("u [m/s]", "rmse.u", number),
+            ("v [m/s]", "rmse.v", number),
+            ("r [deg/s]", "rmse.r", number, DEG),
+            ("NRMSE [-]", "nrmse.mean", number),
             ("diverged", lambda row: Cell(f"{row['diverged']}/{row['windows']}")),
         ],
         caption="Errors in free run on the test split of each run, by that run's own scales.",
@@ -185,7 +192,7 @@ def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, An
             ("model", "model"),
             ("protocol", "protocol"),
             ("windows", "windows", str),
-            ("NRMSE [-]", "mean", "{:.3g}".format),
+            ("NRMSE [-]", "mean", number),
             ("difference", apart),
             ("95 % interval", interval),
         ],
@@ -278,7 +285,7 @@ def _curves(runs: Sequence[JudgedRun], out: Path) -> Block:
         "Error against horizon",
         f"Selected models over {len(chosen)} common windows of {protocol}, mean over u, v, r.",
         family(curves),
-        [Panel("error [-]", "time from the start of a free run [s]", height=300)],
+        [Panel("error [-]", "time from the start of a free run [s]", height=GLANCE)],
         [Case("", [curves])],
     )
     return write_figure(out / "figures", figure)

@@ -16,6 +16,7 @@ import yaml
 from residnet.core.config import dump_config, validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import whole
+from residnet.core.format import fixed, number, plural
 from residnet.core.names import nearest
 from residnet.core.progress import say
 from residnet.data.prepare import Prepared, samples
@@ -34,9 +35,18 @@ from residnet.identification.planning import Aim, Plan, TrialLimits, plan, share
 from residnet.identification.prepared import prepare_logs, require_window, through_currents
 from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
 from residnet.judge.metrics import find
-from residnet.report.blocks import Section, Table, table_of
-from residnet.report.figure import Case, Figure, Panel, family, write_figure
-from residnet.report.format import fixed
+from residnet.report.blocks import Section, Table, bad_where, table_of
+from residnet.report.figure import (
+    DASHED,
+    GLANCE,
+    SOLID,
+    ZERO,
+    Case,
+    Figure,
+    Panel,
+    family,
+    write_figure,
+)
 from residnet.report.page import write_page
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
@@ -62,13 +72,20 @@ class WatchedLog:
         name: of the log.
         since: time in s from its start to the first alarm; None where there was none.
         last: the verdict at its end.
-        windows: that it held.
+        window: length of its windows in s.
+        scores: the largest score of any cause after each of them.
     """
 
     name: str
     since: float | None
     last: Verdict
-    windows: int
+    window: float
+    scores: Sequence[float]
+
+    @property
+    def windows(self) -> int:
+        """How many windows it held."""
+        return len(self.scores)
 
     def content(self) -> dict[str, Any]:
         """Return what was found as JSON takes it."""
@@ -168,8 +185,85 @@ class Service:
             verdicts = [watcher.take(sums) for sums in self.watch.sums(found)]
             alarms = np.flatnonzero([verdict.alarm for verdict in verdicts])
             first = (int(alarms[0]) + 1) * self.watch.config.window if alarms.size else None
-            out.append(WatchedLog(log.log.name, first, verdicts[-1], len(found)))
+            scores = [verdict.largest for verdict in verdicts]
+            window = self.watch.config.window
+            out.append(WatchedLog(log.log.name, first, verdicts[-1], window, scores))
         return out
+
+
+def write_watched(folder: Path, logs: Sequence[WatchedLog]) -> Path:
+    """Write the page of what a monitor found: which logs raise an alarm, and the scores over time.
+
+    Args:
+        folder: for the page.
+        logs: in the order of time.
+    """
+    step = logs[0].window / 60.0
+    alarmed = [log for log in logs if log.since is not None]
+    told = [f"No alarm in {plural(len(logs), 'log')}: the model fits them as it fitted its own."]
+    if alarmed:
+        first = alarmed[-1].last.suspects[0].change
+        told = [
+            f"ALARM in {len(alarmed)} of {plural(len(logs), 'log')}: as if {first.words}.",
+            "Another cause may look alike: see the scores of all causes.",
+        ]
+    ends = step * np.cumsum([log.windows for log in logs])
+    scores = np.concatenate([log.scores for log in logs])
+    threshold = logs[0].last.threshold
+    curves = {
+        "score": (step * (1.0 + np.arange(len(scores))), scores),
+        "threshold": (np.zeros(1), np.array([threshold])),
+        "logs": (ends, ends),
+    }
+    figure = Figure(
+        "scores",
+        "Largest score over time",
+        "The largest score of any cause after each window; above the threshold it is an alarm.",
+        {
+            "score": replace(SOLID, label="largest score"),
+            "threshold": replace(DASHED, label="threshold", kind="across"),
+            "logs": replace(ZERO, label="end of a log", kind="upright", dash="dotted"),
+        },
+        [Panel("score [-]", "time of the logs [min]", height=GLANCE)],
+        [Case("", [curves])],
+    )
+    glance = table_of(
+        logs,
+        [
+            ("log", lambda log: log.name),
+            (
+                "alarm",
+                lambda log: bad_where(
+                    "no" if log.since is None else f"after {log.since:.0f} s", log.since
+                ),
+            ),
+            ("likeliest cause", lambda log: log.last.suspects[0].change.name),
+            ("score", lambda log: number(log.last.suspects[0].score), str),
+        ],
+        selected=lambda log: log.since is not None,
+    )
+    suspects = table_of(
+        [(log, suspect) for log in logs for suspect in log.last.suspects],
+        [
+            ("log", lambda row: row[0].name),
+            ("cause", lambda row: row[1].change.name),
+            ("score", lambda row: number(row[1].score), str),
+            ("size", lambda row: f"{number(row[1].size)} {row[1].change.unit}", str),
+            ("standard error", lambda row: number(row[1].error, 2), str),
+            ("the logs look as if", lambda row: row[1].change.words),
+        ],
+        rule=lambda row: row[0].name,
+    )
+    return write_page(
+        folder,
+        "New logs watched",
+        f"{plural(len(scores), 'window')} of {logs[0].window:g} s, threshold {number(threshold)}",
+        told,
+        [
+            Section("", [write_figure(folder / "figures", figure), glance]),
+            Section("Every cause, at the end of each log", [suspects], folded=True),
+        ],
+    )
 
 
 @dataclass(frozen=True)
@@ -337,7 +431,7 @@ class PlannedTrials:
                 ("narrower by [%]", lambda trial: fixed(100 * trial.shrinks, 1), str),
                 ("volume per minute", lambda trial: fixed(trial.volume, 2), str),
             ],
-            caption=f"Next trials for {self.model}; candidates by what they narrow per minute.",
+            caption=f"Candidates for {self.model}, by what they narrow per minute.",
             selected=lambda trial: any(trial is one for one in self.plan.chosen),
         )
 
@@ -380,8 +474,10 @@ class PlannedTrials:
             "tracks", "Tracks", "As the model flies them.", family(curves), [panel],
             [Case("", [curves])],
         )  # fmt: skip
-        shown = Section("", [self.table, write_figure(folder / "figures", figure)])
-        page = write_page(folder, "Next trials", f"For {self.model}.", [self.choice], [shown])
+        shown = Section("", [write_figure(folder / "figures", figure), self.table.part(0, 3)])
+        every = Section("Candidates", [self.table], folded=True)
+        about = f"For {self.model}."
+        page = write_page(folder, "Next trials", about, [self.choice], [shown, every])
         return [trials, tracks, page]
 
 

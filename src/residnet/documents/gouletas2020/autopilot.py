@@ -17,6 +17,7 @@ from residnet.control.base import Policy
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.errors import UsageError
+from residnet.core.format import DEG
 from residnet.core.progress import say
 from residnet.data.module import RowsDataModule
 from residnet.documents.gouletas2020.law import (
@@ -26,7 +27,6 @@ from residnet.documents.gouletas2020.law import (
     SimulatedPredictor,
 )
 from residnet.dynamics.rollout import Rollout
-from residnet.report.format import DEG
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.training.trainer import EpochTraining, run_epochs

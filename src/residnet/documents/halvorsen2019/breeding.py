@@ -12,15 +12,15 @@ from pydantic import Field, ValidationError, model_validator
 
 from residnet.core import progress
 from residnet.core.config import Config, Seconds
+from residnet.core.format import DASH, number
 from residnet.documents.study import Results, Study, pictures
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.plant import MassSpringDamperConfig
 from residnet.regression.expressions import Algebra
 from residnet.regression.genetic import breed, limits_of, require_deap, validating
 from residnet.regression.writing import term
-from residnet.report.blocks import Block, Cell, Section, Text, table_of
+from residnet.report.blocks import Cell, Section, Text, table_of
 from residnet.report.figure import COLORS, Case, Figure, Look, Panel, names_of
-from residnet.report.format import DASH, number
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure
 
@@ -292,13 +292,14 @@ class BreedingTaskConfig(Study):
     def sections(self, results: Results, run: Path) -> list[Section]:
         rows = results["rows"]
         about = Text(
-            [
+            quiet=True,
+            paragraphs=[
                 f"Each cell shows in how many of {self.repeats} runs the mean square error on the"
                 f" test record is below {self.threshold:g} (m/s^2)^2. In small print stand the"
                 " document's number of ten runs, in how many runs the terms are the true ones, and"
                 " the mean of the mean square errors.",
                 f"Rows: {self.rows.key}. Columns: {self.columns.key}.",
-            ]
+            ],
         )
         cells = {(row["row"], row["column"]): row for row in rows}
 
@@ -337,9 +338,9 @@ class BreedingTaskConfig(Study):
                 ("equation of the acceleration", written),
             ],
         )
-        found: list[Block] = [about, table, *pictures(run, "study")]
         return [
-            Section("Equations found", found),
+            Section("", [*(one.part() for one in pictures(run, "study")), table, about]),
+            Section("Found by setting", pictures(run, "study")),
             Section("All equations", [equations], folded=True),
         ]
 

@@ -18,6 +18,7 @@ from pydantic import Field, field_validator, model_validator
 
 from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import ConfigError
+from residnet.core.format import DASH, DEG, interval, number
 from residnet.core.layout import RANGE_INPUTS, RANGE_VELOCITIES
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, VELOCITY, nearest
@@ -63,7 +64,6 @@ from residnet.report.figure import (
     names_of,
     whiskers,
 )
-from residnet.report.format import DASH, DEG, interval, number
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure
 
@@ -337,7 +337,22 @@ class SeaTrialTaskConfig(Study, ComputingTask):
         return out
 
     def sections(self, results: Results, run: Path) -> list[Section]:
-        out = []
+        name, trial = next(iter(results["trials"].items()))
+        where, rows = next(iter(trial["rows"].items()))
+        best = _best(rows)
+        first = table_of(
+            (
+                row
+                for row in rows
+                if row is best[row["axis"]] or (row["model"] == STANDARD and row["on"] == where)
+            ),
+            [("acceleration", "axis"), ("model", "model"), ("RMSE", "rmse", number)],
+            caption=f"Trial {name}, {SET_NAMES[where]}",
+            selected=lambda row: row is best[row["axis"]],
+            rule=lambda row: row["axis"],
+        )
+        drawn = [one.part() for one in pictures(run, f"{where}_{name}")]
+        out = [Section("", [*drawn, first])]
         for place, (name, trial) in enumerate(results["trials"].items()):
             blocks: list[Text | Section] = [Text(_about(trial))]
             printed = ({}, {}) if place else (self.published, self.published_absolute)

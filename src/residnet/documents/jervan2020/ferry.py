@@ -35,6 +35,7 @@ from residnet.core.config import (
 )
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
 from residnet.core.files import read_json
+from residnet.core.format import DEG, number
 from residnet.core.frames import wrap
 from residnet.core.layout import (
     ACCELERATIONS,
@@ -80,7 +81,6 @@ from residnet.physics.signals import FORCE_CHANNELS, SignalsConfig
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Block, Cell, Section, Table, table_of
 from residnet.report.figure import DASHED, SOLID, Case, Figure, Panel, family
-from residnet.report.format import DEG, number
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, Exports, MainFigure, PartName
 
@@ -397,7 +397,12 @@ class FerryStudyConfig(Study, ComputingTask):
         }
 
     def sections(self, results: Results, run: Path) -> list[Section]:
-        out = [Section("Residual force on the unseen half", [_residuals(self, results)])]
+        left = _residuals(self, results)
+        drawn = [one.part() for one in pictures(run, "errors_course", "errors_crossing")]
+        out = [
+            Section("", [*drawn[:1], left.part(3, 6)]),
+            Section("Residual force on the unseen half", [left]),
+        ]
         for kind, title in (
             ("course", "Course in closed loop"),
             ("crossing", "Operational crossing"),
@@ -946,7 +951,8 @@ def _residuals(config: FerryStudyConfig, results: Results) -> Table:
             ("chosen by the estimator", "notes"),
         ],
         caption="Mean square of the residual, and what is left of the believed model's.",
-        groups=[("mean square", 3), ("left %", 3), ("", 1)],
+        groups=[("mean square", 3), ("% left of the residual force", 3)],
+        selected=lambda row: row["name"] == best_model(results),
     )
 
 

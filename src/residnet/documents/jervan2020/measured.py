@@ -18,6 +18,7 @@ from torch import Tensor
 
 from residnet.core.config import Config, ConfigPath, Seconds
 from residnet.core.errors import ConfigError, DataError, FitError
+from residnet.core.format import fixed, interval, number, plural, signed
 from residnet.core.layout import ACCELERATIONS, HEADING, PLANAR, POSE, VELOCITIES
 from residnet.core.stretches import stretches
 from residnet.data.prepare import PrepareConfig, prepare
@@ -64,7 +65,6 @@ from residnet.report.figure import (
     names_of,
     whiskers,
 )
-from residnet.report.format import fixed, interval, number, plural, signed
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, PartName
 from residnet.training.lag import fit_lag, followed
@@ -296,7 +296,13 @@ class ForceResidualConfig(Study, ComputingTask):
         return sentences
 
     def sections(self, results: Results, run: Path) -> list[Section]:
-        out = [_data(self, results), _forces(results, run)]
+        drawn = [one.part() for one in pictures(run, "scores")]
+        first = next(iter(_groups(results).values()))
+        out = [
+            Section("", [*drawn, _models(self, results, first).part(3, 6)]),
+            _data(self, results),
+            _forces(results, run),
+        ]
         if results["acceleration"]:
             out.append(_accelerations(self, results, run))
         for force, rows in _groups(results).items():
@@ -1011,6 +1017,6 @@ def _models(config: ForceResidualConfig, results: Results, group: Mapping[str, R
             ("% of the believed model's", 3),
             ("mean over axes less believed, % of zero", 3),
             ("the same less the better of zero and believed on each axis", 3),
-            ("", 1),
         ],
+        selected=lambda row: sum(row["of_zero"]) == min(sum(one["of_zero"]) for one in rows),
     )

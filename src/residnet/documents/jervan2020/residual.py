@@ -23,6 +23,7 @@ from residnet.baselines.given import BelievedConfig, HullEquations
 from residnet.control.motion.anticipation import Lag
 from residnet.core.config import Config
 from residnet.core.errors import FitError
+from residnet.core.format import number
 from residnet.core.frames import to_body
 from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
 from residnet.core.names import ACCELERATION, VELOCITY
@@ -57,7 +58,6 @@ from residnet.report.figure import (
     bars,
     names_of,
 )
-from residnet.report.format import number
 from residnet.training.lag import fit_lag, followed
 
 AXES = ("surge", "sway", "yaw")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.format import DASH, interval, number
 from residnet.physics.actuators.identify import StepAnswer, ThrottleMap, ThrustFit, follow_command
 from residnet.report.blocks import Block, Code, Section, Table, Text, table_of
 from residnet.report.figure import (
@@ -18,10 +19,9 @@ from residnet.report.figure import (
     Figure,
     Look,
     Panel,
-    figures_section,
     joined,
+    read_figures,
 )
-from residnet.report.format import DASH, interval, number
 from residnet.report.run_reader import Content, RunFiles
 
 _TITLES = {
@@ -42,12 +42,13 @@ Step = tuple[np.ndarray, np.ndarray, np.ndarray]
 def sections(run: RunFiles) -> list[Section]:
     """Return the identified parameters, the figure, and the lines for a vessel file."""
     found = run.json("actuators.json")
-    blocks: list[Block] = [parameter_table(found)]
+    drawn = read_figures(run.path / "figures")
+    blocks: list[Block] = [*(one.part() for one in drawn[:1]), parameter_table(found)]
     throttle = found.get("throttle")
     if throttle and not throttle["saturated"]:
         text = "Nothing saturated in the throttle test. The largest revolutions are measured ones."
         blocks.append(Text(text))
-    out = [Section("Identified parameters", blocks), *figures_section(run.path / "figures")]
+    out = [Section("", blocks), *([Section("Figures", drawn)] if drawn else [])]
     lines = run.path / "actuators.yaml"
     if lines.is_file():
         about = "These lines belong to the section actuators of a vessel file."
@@ -87,9 +88,8 @@ def parameter_table(found: Mapping[str, Any]) -> Table:
         rows,
         [
             ("parameter", "title"),
-            ("value", "value", str),
+            ("value", lambda row: f"{row['value']} {row['unit']}", str),
             ("95 % interval", "interval", str),
-            ("unit", "unit", str),
         ],
         rule=lambda row: row["test"],
     )

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from residnet.control.heading.conditions import quiet_after
+from residnet.core.format import DEG, signed
 from residnet.judge.autopilots import not_for
 from residnet.report.blocks import Block, Code, Column, Section, Table, Text, bad_where, table_of
 from residnet.report.figure import (
@@ -24,10 +25,10 @@ from residnet.report.figure import (
     band,
     family,
     figures_section,
+    read_figures,
     steps,
     write_figures,
 )
-from residnet.report.format import DEG, signed
 from residnet.report.run_reader import Content, RunFiles
 
 FLIGHTS = "flights.parquet"
@@ -232,17 +233,23 @@ def sections(run: RunFiles) -> list[Section]:
     write_figures(run.path / "figures", _figures(run))
     test = run.resolved["test"]
     compared = settling_table(run.rows, run.metrics.get("floor"))
+    stated = run.resolved.get("conditions")
+    cost = cost_table(run.rows) if stated else None
+    drawn = [one.part() for one in read_figures(run.path / "figures", "responses")]
+    # settling of the nominal vessel and of the spread, or the cost of a change
+    first = compared.part(0, 3) if cost is None else cost.part(1, 4)
     out = [
+        Section("", [*drawn, first]),
         Section("Controllers compared", [compared, Text(_definition(run.resolved), quiet=True)]),
         Section("Effort", [effort_table(run.rows), Text(_effort(test), quiet=True)]),
         *figures_section(run.path / "figures"),
     ]
-    if stated := run.resolved.get("conditions"):
-        blocks: list[Block] = [cost_table(run.rows), Text(_conditions(stated), quiet=True)]
+    if cost is not None and stated:
+        blocks: list[Block] = [cost, Text(_conditions(stated), quiet=True)]
         beyond = beyond_table(run.rows)
         if beyond is not None:
             blocks += [Text(["Outside the conditions of tuning and training:"]), beyond]
-        out.insert(0, Section("Under the stated conditions", blocks))
+        out.insert(1, Section("Under the stated conditions", blocks))
     if controllers := run.json("controllers.json"):
         out.append(Section("Controllers", [Code(json.dumps(controllers, indent=1))], folded=True))
     return out

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.format import DEG, number
 from residnet.report.blocks import Block, Cell, Column, Section, Table, Text, bad_where, table_of
 from residnet.report.figure import (
     COLORS,
@@ -24,7 +25,6 @@ from residnet.report.figure import (
     read_figures,
     write_figures,
 )
-from residnet.report.format import DEG, number
 from residnet.report.run_reader import Content, RunFiles
 
 TRACKS = "tracks.parquet"
@@ -206,15 +206,16 @@ def sections(run: RunFiles) -> list[Section]:
     write_figures(run.path / "figures", _figures(run))
     out: list[Section] = []
     for protocol, (nominal, drawn) in _by_protocol(run.rows).items():
-        blocks: list[Block] = [Text(_rule(nominal)), nominal_table(nominal)]
+        flown = nominal_table(nominal)
+        blocks: list[Block] = [Text(_rule(nominal)), flown]
         if not out:
-            out.append(Section("", [*blocks[1:], *read_figures(run.path / "figures", "courses")]))
-            blocks = blocks[:1]
+            drawing = [one.part() for one in read_figures(run.path / "figures", "courses")]
+            out.append(Section("", [*drawing, flown.part(0, 4)]))
         if drawn:
             blocks.append(Section("Spread of vessels and currents", [spread_table(drawn)]))
         out.append(Section(f"Protocol {protocol}", blocks))
     out.append(Section("What the numbers mean", [Text(_definition(run))]))
-    return [*out, *figures_section(run.path / "figures", "spread")]
+    return [*out, *figures_section(run.path / "figures")]
 
 
 def _by_protocol(rows: Sequence[Content]) -> dict[str, tuple[list[Content], list[Content]]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from residnet.core.format import DASH, DEG, minus, number
 from residnet.report.blocks import (
     Block,
     Bullets,
@@ -17,7 +18,6 @@ from residnet.report.blocks import (
     bad_where,
     table_of,
 )
-from residnet.report.format import DASH, DEG, minus, number
 from residnet.report.run_reader import Content, RunFiles
 
 _LEVELS = ("fatal", "will mislead")

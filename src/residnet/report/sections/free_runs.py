@@ -6,6 +6,17 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from residnet.core.format import (
+    DASH,
+    DEG,
+    change,
+    fixed,
+    number,
+    percent,
+    plural,
+    signed,
+    title_of,
+)
 from residnet.judge.verdict import diverged_note
 from residnet.report.blocks import (
     Block,
@@ -19,17 +30,6 @@ from residnet.report.blocks import (
     table_of,
 )
 from residnet.report.figure import Figure
-from residnet.report.format import (
-    DASH,
-    DEG,
-    change,
-    fixed,
-    number,
-    percent,
-    plural,
-    signed,
-    title_of,
-)
 from residnet.report.run_reader import Content, RunFiles
 
 _BANDS = ("u", "v", "r", "heading", "position")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.format import minus, number, shown_unit, whole
 from residnet.core.log import Log
 from residnet.report.blocks import (
     Block,
@@ -18,7 +19,6 @@ from residnet.report.blocks import (
     bad_where,
     table_of,
 )
-from residnet.report.format import minus, number, shown_unit, whole
 from residnet.report.run_reader import RunFiles
 
 _NOTE = "note"

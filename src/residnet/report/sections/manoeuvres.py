@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.format import DASH, DEG, fixed, interval, number, plural, shown_unit
 from residnet.core.log import Log
 from residnet.data.simulated import Flight
 from residnet.manoeuvres.closed_loop import Spiral, Zigzag
@@ -43,7 +44,6 @@ from residnet.report.figure import (
     read_figures,
     steps,
 )
-from residnet.report.format import DASH, DEG, fixed, interval, number, plural, shown_unit
 from residnet.report.run_reader import Content, RunFiles
 
 _EACH = 12
@@ -66,6 +66,14 @@ _COMPARED = (
     "period",
     "largest_yaw_rate",
 )
+_TELLING = (
+    "tactical_diameter",
+    "first_overshoot",
+    "track_reach",
+    "loop_height",
+    "largest_cross_track_error",
+)
+"""The index of each kind of manoeuvre that stands on the first screen."""
 _CHANNELS = {
     "u": "surge velocity\nu", "v": "sway velocity\nv", "r": "yaw rate\nr", "p": "roll rate\np",
     "psi": "heading\n", "phi": "roll angle\n",
@@ -85,30 +93,40 @@ def sections(run: RunFiles) -> list[Section]:
     flown = read_figures(run.path / "figures", "manoeuvres")
     out = []
     if content.get("rows"):
-        out.append(Section("", [*flown, _flights(content)]))
+        out.append(Section("", [*(one.part() for one in flown), _flights(content)]))
         blocks: list[Block] = [Text(_about(content), quiet=True)]
         blocks += [Section(title, [table]) for title, table in index_tables(content)]
         out.append(Section("Manoeuvring indices", blocks))
-    return [*out, *figures_section(run.path / "figures", "(?!manoeuvres).*")]
+    return [*out, *figures_section(run.path / "figures")]
 
 
 def _flights(content: Content) -> Table:
-    """Return a row for each flight: how it ended, and the first of its indices."""
+    """Return a row for each flight: what went wrong, else the most telling of its indices."""
 
-    def first(row: Content) -> str:
-        for name in _single([row]):
-            unit, factor = shown_unit(str(content["units"].get(name, "-")))
-            return f"{index_title(name)} {number(_times(factor, row['indices'][name]))} {unit}"
-        return DASH
+    def telling(row: Content) -> str:
+        return next((name for name in _TELLING if name in row["indices"]), "")
+
+    def outcome(row: Content) -> Cell | str:
+        if row["fault"]:
+            return bad_where(row["fault"], True)
+        return index_title(telling(row)) or "ended as it should"
+
+    def value(row: Content) -> str:
+        if not (name := telling(row)):
+            return DASH
+        unit, factor = shown_unit(str(content["units"].get(name, "-")))
+        return f"{number(_times(factor, row['indices'][name]))} {unit}"
 
     rows = sorted(content["rows"], key=lambda row: not row["fault"])
+    several = len({row["craft"] for row in rows}) > 1
+    columns: list[Column] = [("flight", "log")]
     return table_of(
         rows[: max(_EACH, sum(bool(row["fault"]) for row in rows))],
         [
-            ("flight", "log"),
-            ("vessel", "craft"),
-            ("ended", lambda row: bad_where(row["fault"] or "as it should", row["fault"])),
-            ("for example", first),
+            *columns,
+            *([("vessel", "craft")] if several else []),
+            ("outcome", outcome),
+            ("value", value, str),
         ],
     )
 

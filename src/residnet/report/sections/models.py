@@ -12,6 +12,8 @@ import numpy as np
 import pandas as pd
 
 from residnet.core.errors import ConfigError
+from residnet.core.format import DASH, DEG, interval, number
+from residnet.core.format import whole as whole_number
 from residnet.core.names import CHANNEL_UNITS
 from residnet.judge.verdict import diverged_note
 from residnet.physics.terms import parse_term
@@ -28,8 +30,6 @@ from residnet.report.blocks import (
     table_of,
 )
 from residnet.report.figure import BLUE, Case, Curve, Figure, Look, Panel, family
-from residnet.report.format import DASH, DEG, interval, number
-from residnet.report.format import whole as whole_number
 from residnet.report.run_reader import Content, RunFiles
 from residnet.report.sections.runs import model_looks, short_label
 

@@ -9,11 +9,13 @@ from typing import TypeAlias
 
 import numpy as np
 
+from residnet.core.format import DEG, fixed, shown_unit
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.stretches import stretches
 from residnet.report.figure import (
     BLUE,
     COLORS,
+    GLANCE,
     GREEN,
     GREY,
     MASKED,
@@ -32,7 +34,6 @@ from residnet.report.figure import (
     names_of,
     whiskers,
 )
-from residnet.report.format import DEG, fixed, shown_unit
 from residnet.report.run_reader import COLUMNS, RunFiles, StoredWindow
 
 Units: TypeAlias = Mapping[str, tuple[str, str, float]]
@@ -155,7 +156,7 @@ def track(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
         "Track of the median run",
         f"Median of {len(ranked)} {run.focus} runs: {window.log}.",
         {name: replace(look, shown=True) for name, look in looks.items() if name in curves},
-        [replace(_TRACK, height=280)],
+        [replace(_TRACK, height=GLANCE)],
         [Case("", [curves])],
     )
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.errors import DataError
+from residnet.core.format import plural, signed
 from residnet.core.names import VELOCITY
 from residnet.judge.metrics import blocks, intervals
 from residnet.report.blocks import Cell, Column, Section, Table, Text, nested, table_of
@@ -25,7 +26,6 @@ from residnet.report.figure import (
     whiskers,
     write_figures,
 )
-from residnet.report.format import plural, signed
 from residnet.report.run_reader import Content, RunFiles
 
 

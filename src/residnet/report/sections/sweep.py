@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.format import number
 from residnet.report.blocks import Cell, Section, Table, Text, table_of
 from residnet.report.figure import (
     SOLID,
@@ -26,7 +27,6 @@ from residnet.report.figure import (
     steps,
     write_figures,
 )
-from residnet.report.format import number
 from residnet.report.run_reader import Content, RunFiles
 
 _SHOWN = 15
@@ -178,9 +178,11 @@ def sections(run: RunFiles) -> list[Section]:
         "best.yaml holds the config of the best trial with all its keys.",
     ]
     by_number = sorted(content["trials"], key=lambda row: int(row["number"]))
-    figures = read_figures(run.path / "figures")
+    figures, first = read_figures(run.path / "figures"), trials_table(content)
     return [
-        Section("", [trials_table(content), *figures[:1], Text(about, quiet=True)]),
+        Section(
+            "", [*figures[:1], first.part(0, 1 + len(content["keys"])), Text(about, quiet=True)]
+        ),
         *([Section("Figures", figures[1:])] if figures[1:] else []),
         Section("All trials", [_table(content, by_number)], folded=True),
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from residnet.core.format import DASH, DEG, minus, number, percent, plural, title_of
 from residnet.data.doctor import summary
 from residnet.judge.soundness import CHECKS, Finding
 from residnet.judge.verdict import UNSEEN, Evidence, diverged_note
@@ -11,7 +12,6 @@ from residnet.judge.verdict import level as judged_level
 from residnet.judge.verdict import verdict as judged
 from residnet.report.blocks import Bullets, Cell, Facts, Section, Text, table_of
 from residnet.report.figure import Figure
-from residnet.report.format import DASH, DEG, minus, number, percent, plural, title_of
 from residnet.report.run_reader import Content, RunFiles
 from residnet.report.sections.free_runs import distinct
 
@@ -101,6 +101,7 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         f" ({run.main})"
         + ("; small: 95 % interval." if rows[run.lead].get("position_error_end_ci95") else "."),
         "" if run.focus in UNSEEN else "These data are not unseen: read with care.",
+        "Zero: no model at all, the first velocities are held." if "zero" in rows else "",
         "Measurements: where the measured velocities themselves lead." if floor else "",
     ]
     shown = table_of(

@@ -31,6 +31,15 @@ def minus(text: str) -> str:
     return re.sub(r"(?<![\w-])-(?=\d)", "−", text)
 
 
+_POWERS = str.maketrans("234", "²³⁴")
+
+
+def powers(text: str) -> str:
+    """Return the text with powers of units and variables as they are written by hand: m/s²."""
+    raised = r"(?<=[^\W\d_]|\))\^([234])(?!\w|\.\d)"
+    return re.sub(raised, lambda found: found[1].translate(_POWERS), text)
+
+
 def number(value: float | None, digits: int = 3) -> str:
     """Return a number with so many significant digits, and a dash where there is none.
 
