@@ -17,7 +17,8 @@ python=.venv/bin/python
 types() { .venv/bin/mypy --config-file scripts/ci/mypy_tests.ini tests; }
 long() { $python -m pytest -q -n 2 -m long; }
 exporters() { $python -m pytest -q -n 2 -m exporters; }
-configs() { $python scripts/ci/short_configs.py; }
+configs() { rm -rf build/runs && $python scripts/ci/short_configs.py --out build/runs; }
+# with the pages of runs that configs left
 docs() { $python docs/hooks/config_keys.py && .venv/bin/mkdocs build --strict; }
 
 if [ $# -eq 0 ]; then set -- types long exporters configs docs; fi

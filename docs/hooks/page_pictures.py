@@ -1,0 +1,55 @@
+"""Takes pictures of the first screens of pages, for the gallery; needs Chromium or Chrome.
+
+python scripts/ci/short_configs.py --out build/runs
+python docs/hooks/page_pictures.py build/runs/*/report.html
+
+A picture is named after the folder of its page. One of another size stands alone:
+
+python docs/hooks/page_pictures.py runs/quickstart/report.html --name fit_page
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+
+PICTURES = Path(__file__).parents[1] / "pictures"
+SIZE = (1120, 660)
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+
+
+def take(page: Path, out: Path) -> None:
+    """Write what a desk's screen shows of a page before anybody scrolls, in 128 colours."""
+    browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        raise SystemExit(f"install one of {', '.join(_BROWSERS)}")
+    with tempfile.TemporaryDirectory() as scratch:
+        raw = Path(scratch) / "raw.png"
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        command += [f"--user-data-dir={scratch}/profile", "--virtual-time-budget=9000"]
+        command += [f"--window-size={SIZE[0]},{SIZE[1]}", f"--screenshot={raw}"]
+        subprocess.run(
+            [*command, page.resolve().as_uri()], check=True, capture_output=True, timeout=120
+        )
+        with Image.open(raw) as picture:
+            few = picture.convert("RGB").quantize(128, dither=Image.Dither.NONE)
+            few.save(out, optimize=True)
+    print(out)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("pages", nargs="+", type=Path, help="report.html of runs")
+    parser.add_argument("--name", help="of the picture of one page")
+    given = parser.parse_args()
+    for page in given.pages:
+        take(page, PICTURES / f"{given.name or page.parent.name}.png")
+
+
+if __name__ == "__main__":
+    main()
