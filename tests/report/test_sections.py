@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from made_task_runs import (
 )
 from read_page import Page, plain
 
+from residnet.judge.verdict import LEVELS
 from residnet.report.blocks import Section
 from residnet.report.fit import fit_sections, write_fit_figures, write_fit_page
 from residnet.report.page import write_page
@@ -101,6 +103,51 @@ def test_the_first_screen_holds_verdict_picture_and_the_best_rows(
     # what is selected, the baseline, and zero
     assert found.first["rows"][2] < height
     assert found.first["words"] < 6_000
+
+
+def judged(run: Path, level: str) -> RunFiles:
+    """A made-up run whose verdict has that level; a log has a clock that jumps."""
+    ends = {"position": 0.4, "heading": 0.01}
+    # without an interval nothing is good
+    spans = {of: None if level == "limited" else [0.9 * x, 1.1 * x] for of, x in ends.items()}
+    horizon = {
+        "seconds": 30.0,
+        "windows": 3 if level == "too few windows" else 12,
+        **{"logs": 4, "slowest": 0.9, "fastest": 1.1, "sailed": 30.0, "floor": ends},
+        "models": {"plsr": {**ends, "intervals": spans}},
+    }
+    path = made_run(run)
+    content = {"splits": {"test": {"whole": {"horizons": [horizon]}}}}
+    (path / "limits.json").write_text(json.dumps(content))
+    late = {"code": "gaps", "level": "will mislead", "text": "a gap", "action": "", "effect": 0.2}
+    logs = [{"name": "zigzag_01", "findings": [late]}, {"name": "zigzag_02", "findings": []}]
+    (path / "doctor.json").write_text(json.dumps({"logs": logs, "together": []}))
+    if level == "do not use":
+        metrics = json.loads((path / "metrics.json").read_text())
+        for row in metrics["rows"]:
+            row["nrmse"]["mean"] *= 100.0 if row["model"] == "plsr" else 1.0
+        (path / "metrics.json").write_text(json.dumps(metrics))
+    found = RunFiles(path)
+    write_fit_figures(found)
+    return found
+
+
+@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
+@pytest.mark.parametrize(
+    "level", [pytest.param(one, marks=[] if one == "good" else pytest.mark.long) for one in LEVELS]
+)
+def test_five_questions_are_answered_by_the_first_screen_alone(level: str, tmp_path: Path) -> None:
+    page = write_fit_page(judged(tmp_path / "run", level))
+    for width, height in ((1400, 900), (390, 844)):
+        told = layout(page, width, tmp_path).first["told"]
+        seen = " | ".join(" ".join(text.split()) for text, end in told if end < height)
+        # how far off after 30 s, better than doing nothing, and which model
+        assert "error after 30 s" in seen
+        assert "plsr (selected) | 0.40 | 0.57" in seen
+        assert "zero | 12 | 12" in seen
+        # may I use it, and what is wrong with the data
+        assert LEVELS[level] in seen
+        assert "1 of 2 logs hold something that would mislead a fit: gaps (1)." in seen
 
 
 @pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")

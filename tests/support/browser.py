@@ -76,7 +76,9 @@ const use = async (page, pause) => {
 const opening = page => {
   const ends = box => box === null ? null : box.getBoundingClientRect().bottom;
   const places = name => [...page.querySelectorAll(name)].map(ends);
+  const told = [...page.querySelectorAll(".verdict p, .opening th, .opening td, .opening p")];
   return {verdict: ends(page.querySelector(".verdict p")),
+          told: told.map(box => [box.innerText, ends(box)]),
           pictures: places(".opening .panel, .opening figure:not(.still)"),
           rows: places(".opening tbody tr"),
           words: page.body.innerText.split(/\\s+/).length};
@@ -135,7 +137,8 @@ class Layout:
         smallest: size of the smallest text in pixels.
         panels: for each panel of an interactive figure, whether something is drawn in it.
         first: lower edges in pixels of the verdict's first sentence, of the pictures and of the
-            rows of the first screen, and how many words the page shows before anything is unfolded.
+            rows of the first screen, texts of the first screen with their lower edges, and how many
+            words the page shows before anything is unfolded.
         used: what became of pressing the first interactive figure's controls; empty without one.
     """
 

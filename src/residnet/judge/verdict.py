@@ -40,8 +40,15 @@ class Evidence:
     doctor: str = ""
 
 
-GOOD, LIMITED, USELESS, UNKNOWN = LEVELS = ("good", "limited", "do not use", "too few windows")
-"""How far the selected model may be used, the best first; the last says that nobody can know."""
+LEVELS = {
+    "good": "✓ Good",
+    "limited": "! Limited",
+    "do not use": "✗ Do not use",
+    "too few windows": "? Too few windows to say",
+}
+"""How far the selected model may be used, and the words for it, the best first; the last says that
+nobody can know. What they look like stands in the page's styles."""
+GOOD, LIMITED, USELESS, UNKNOWN = LEVELS
 _FEWEST = 5
 """Windows below which nothing is said of how good a model is."""
 _SHARE, _TURN = 0.10, math.radians(10.0)
@@ -74,7 +81,7 @@ def verdict(evidence: Evidence) -> list[str]:
 
 
 def level(evidence: Evidence) -> str:
-    """Return one of `LEVELS`; empty where the selected model has no free runs."""
+    """Return a key of `LEVELS`; empty where the selected model has no free runs."""
     if useless(evidence):
         return USELESS
     if evidence.selected not in evidence.rows:

@@ -16,6 +16,7 @@ from residnet.core.config import load_mapping
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json, whole
 from residnet.core.format import powers
+from residnet.judge.verdict import LEVELS
 from residnet.report.blocks import (
     EXPORTS,
     Block,
@@ -34,13 +35,6 @@ _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (
 _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
 
 
-LEVELS = {
-    "good": "✓ Good",
-    "limited": "! Limited",
-    "do not use": "✗ Do not use",
-    "too few windows": "? Too few windows to say",
-}
-"""Levels of a verdict in words; what they look like stands in the page's styles."""
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """The space between a number and its unit."""
 _LONG = 20
