@@ -1,0 +1,95 @@
+"""How large the page of a fit is, and how soon a browser shows its first screen.
+
+python scripts/bench/page.py [--logs 68] [--times 5]
+
+The run is made up: as many logs of 6 s under two protocols, five models. The time counts from the
+navigation to the first screen with its picture drawn; the least of several is printed beside all,
+since other work of the machine only adds to it. Needs Chromium or Chrome.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+
+import made_run
+from browser import browser
+
+from residnet.report.fit import write_fit_report
+
+_TOLD = """<script>(function wait() {
+  const parts = [...document.querySelectorAll(".live .opening .explorer")];
+  if (!parts.length || !parts.every(part => part.classList.contains("drawn")))
+    return setTimeout(wait, 5);
+  requestAnimationFrame(() => fetch("/done?ms=" + performance.now()));
+})();</script>"""
+
+
+def opened(program: str, page: Path) -> float:
+    """Return the ms from the navigation to the first screen as a fresh browser tells them."""
+    told: list[float] = []
+    done = threading.Event()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked = urlsplit(self.path)
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            if asked.path == "/done":
+                told.append(float(parse_qs(asked.query)["ms"][0]))
+                done.set()
+            elif asked.path == "/report.html":
+                self.wfile.write(page.read_bytes() + _TOLD.encode())
+
+        def log_message(self, format: str, *arguments: object) -> None:
+            """Say nothing."""
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        command = [program, "--headless", "--no-sandbox", "--disable-gpu"]
+        command += [
+            f"--user-data-dir={profile}",
+            f"http://127.0.0.1:{server.server_port}/report.html",
+        ]
+        with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+            done.wait(120)
+            process.terminate()
+    server.shutdown()
+    if not told:
+        raise SystemExit("the page was not drawn within 120 s")
+    return told[0]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--logs", type=int, default=68)
+    parser.add_argument("--times", type=int, default=5)
+    given = parser.parse_args()
+    program = browser()
+    if program is None:
+        raise SystemExit("install Chromium or Chrome")
+    kinds = ("zigzag", "turning", "three_two_one_one", "spiral")
+    logs = [f"{kinds[i % len(kinds)]}_{i:02d}" for i in range(given.logs)]
+    made_run.KINDS = {name: name.rpartition("_")[0] for name in logs}
+    with tempfile.TemporaryDirectory() as folder:
+        page = write_fit_report(made_run.made_run(Path(folder) / "run"))
+        size = page.stat().st_size
+        times = sorted(opened(program, page) for _ in range(given.times))
+    print(
+        f"{given.logs} logs: {size / 1e6:.2f} MB, first screen after {times[0]:.0f} ms"
+        f" (all: {', '.join(f'{time:.0f}' for time in times)} ms)"
+    )
+
+
+if __name__ == "__main__":
+    main()
