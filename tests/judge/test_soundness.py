@@ -182,7 +182,7 @@ def test_instability_outside_the_data_is_told_apart() -> None:
     found = findings(*made({**RUDDER, "u r": (0, 0, 0.2)}))
     assert found[STABILITY].ok is False
     assert "only outside the training data" in found[STABILITY].text
-    assert "u = 3 m/s (outside the training data)" in found[STABILITY].text
+    assert "u = 3.00 m/s (outside the training data)" in found[STABILITY].text
 
 
 def test_growth_rate_is_the_eigenvalue_of_the_linearisation() -> None:
