@@ -37,7 +37,9 @@ def take(page: Path, out: Path) -> None:
             [*command, page.resolve().as_uri()], check=True, capture_output=True, timeout=120
         )
         with Image.open(raw) as picture:
-            few = picture.convert("RGB").quantize(128, dither=Image.Dither.NONE)
+            few = picture.convert("RGB").quantize(
+                128, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+            )
             few.save(out, optimize=True)
     print(out)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import yaml
+from read_page import Page, plain
 from tiny import TINY, call
 
 from residnet.core.config import validate
@@ -69,8 +70,14 @@ def test_a_refit_leaves_the_old_run_alone_and_can_be_exported_and_evaluated(
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file()}
     logs, out = new_logs(tmp_path / "logs", 0.2), tmp_path / "refit"
     given = [*logs, "--model", "baseline", "--window", "5 s", "--refit", out]
-    assert call(monkeypatch, "monitor", run, *given, "--json", tmp_path / "found.json") == 1
+    told = ["--json", tmp_path / "found.json", "--out", tmp_path / "page"]
+    assert call(monkeypatch, "monitor", run, *given, *told) == 1
     said = capsys.readouterr().out
+    page = Page(plain(tmp_path / "page" / "report.html"))
+    alarms, causes = page.tables
+    assert [line[1][:5] for line in alarms[1:]].count("after") >= 1
+    assert alarms[-1][2] == "gain n_stbd"
+    assert [line[1] for line in causes].count("gain n_stbd") == 4
     assert {file: file.read_bytes() for file in run.rglob("*") if file.is_file()} == before
     require_sealed(run)
     found = json.loads((tmp_path / "found.json").read_text())[-1]["refit"]
