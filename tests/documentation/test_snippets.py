@@ -71,6 +71,32 @@ def test_pages_show_what_they_should() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 90
 
 
+GUIDES = [page for page in PAGES if page.parent.name in ("howto", "tutorials", "results")]
+MOST_WORDS = 60
+"""Of prose between what a page gives and its first command."""
+
+
+@pytest.mark.parametrize("page", [pytest.param(page, id=page.stem) for page in GUIDES])
+def test_a_guide_begins_with_what_one_gets_then_the_command(page: Path) -> None:
+    _, _, body = page.read_text().partition("\n\n")
+    assert body.startswith(("| ", "!["))
+    before = re.sub(r"(?m)^\|.*$|<!--.*?-->|^!\[.*$", "", body.partition("```")[0])
+    assert page.stem == "index" or len(before.split()) <= MOST_WORDS
+
+
+def test_sentences_are_short() -> None:
+    said = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "readability.py")],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    for line in said.splitlines():
+        found = re.search(r"mean +([\d.]+) words", line)
+        assert found is not None
+        assert float(found[1]) <= 25, line
+
+
 @pytest.mark.parametrize("block", of_kind("yaml"))
 def test_yaml_is_read(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT / "configs")  # a config that names another means a shipped one
