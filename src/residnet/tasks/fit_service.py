@@ -475,9 +475,9 @@ class PlannedTrials:
             [Case("", [curves])],
         )  # fmt: skip
         shown = Section("", [write_figure(folder / "figures", figure), self.table.part(0, 3)])
-        every = Section("Candidates", [self.table], folded=True)
+        table = Section("Candidates", [self.table], folded=True)
         about = f"For {self.model}."
-        page = write_page(folder, "Next trials", about, [self.choice], [shown, every])
+        page = write_page(folder, "Next trials", about, [self.choice], [shown, table])
         return [trials, tracks, page]
 
 
