@@ -173,9 +173,9 @@ def _named_fields(recordings: Sequence[Recording], marks: Marks) -> _Sources | N
         if not series.kind and len(series) >= _FEWEST and "psi" in held and placed:
             found.append(series)
     if len({frozenset(series.fields) for series in found}) < len(found):
-        names = ", ".join(series.name for series in found)
+        alike = ", ".join(series.name for series in found)
         raise DataError(
-            f"{recordings[0].path}: holds {len(found)} tables of the same columns ({names[:120]}),"
+            f"{recordings[0].path}: holds {len(found)} tables of the same columns ({alike[:120]}),"
             " each a log of its own; write each to a file, in Python"
             " pandas.DataFrame({name: column for name, column in table.items()}).to_csv(...)"
         )

@@ -380,11 +380,11 @@ def found_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
         while at + 1 < values and _repeats(rows[at]) and not _repeats(rows[at + 1]):
             at += 1
         # so is a table about the columns that stands above theirs
-        later = found_header(rows[values:])
-        if later is not None:
-            names = rows[values + later[0]]
+        theirs = found_header(rows[values:])
+        if theirs is not None:
+            names = rows[values + theirs[0]]
             if names != rows[at] and not any(map(_measures, names)) and not _repeats(names):
-                return values + later[0], values + later[1]
+                return values + theirs[0], values + theirs[1]
         return at, values
     return None
 
