@@ -35,7 +35,7 @@ from residnet.identification.planning import Aim, TrialLimits, candidates, momen
 from residnet.identification.prepared import prepare_logs, velocity_limit
 from residnet.identification.settings import FitSettings
 from residnet.physics.vessel import load_vessel
-from residnet.training.free_runs.left_out import LeftOpen, left_open
+from residnet.training.left_out import LeftOpen, left_open
 
 VESSELS: dict[str, dict[str, Any]] = {
     "wam_v_cal": {

@@ -280,31 +280,6 @@ def test_standard_errors_of_a_refitted_baseline_are_named(run: Path) -> None:
     assert note in shown(run)
 
 
-def test_accelerations_of_logs_stand_log_by_log(run: Path) -> None:
-    path = run / "models" / "baseline" / "fit.json"
-    own = {"standard_error": 1.0e-4, "spread": 4.0e-4, "speed": 0.9}
-    values = {
-        ("first", "v_dot"): -5.5e-4,
-        ("first", "r_dot"): 1.5e-4,
-        ("second", "v_dot"): 0.0,
-        ("second", "r_dot"): 3.0e-4,
-    }
-    offsets = [
-        {"log": log, "axis": axis, "value": value} | own for (log, axis), value in values.items()
-    ]
-    assert "Accelerations of each training log" not in shown(run)
-    write_json(
-        path, json.loads(path.read_text()) | {"refit": {"iterations": 3}, "offsets": offsets}
-    )
-    text = shown(run)
-    cells = Page(text).table("log", "first")
-    assert cells["first"] == ["−0.00055", "0.00010", "0.00015", "0.00010"]
-    assert cells["second"] == ["0", "0.00010", "0.00030", "0.00010"]
-    assert "v′ [m/s²], spread 0.00040, at 0.90 m/s" in text
-    assert text.count('class="weak">0.00015') == 1
-    assert 'class="weak">0.00030' not in text
-
-
 @pytest.mark.long
 def test_the_file_stands_alone_and_loads_nothing(run: Path) -> None:
     residuals().to_parquet(run / "residuals.parquet")

@@ -47,16 +47,9 @@ def model_of(
     return HybridDynamics(signals, baseline, head or ZeroHead(), STEP, "rk4")
 
 
-def truth(offset: np.ndarray | None = None) -> HybridDynamics:
-    """The vessel itself, with accelerations [3] at 1 m/s, that grow with the square of the speed,
-    where there are any.
-    """
-    if offset is None:
-        return model_of(QUADRATIC, THETA)
-    return model_of(
-        (*QUADRATIC, "u^2", "v^2"),
-        torch.cat((THETA, torch.from_numpy(np.stack((offset, offset), axis=1))), dim=1),
-    )
+def truth() -> HybridDynamics:
+    """The vessel itself."""
+    return model_of(QUADRATIC, THETA)
 
 
 def inputs(count: int, steps: int, seed: int) -> Tensor:
@@ -79,22 +72,15 @@ def trials(
     noise: float = 0.01,
     seed: int = 0,
     window: float = 0.9,
-    offsets: np.ndarray | None = None,
 ) -> list[Prepared]:
     """Logs of the vessel from rest, velocities noisy, derivatives over `window` seconds (a long one
-    biases them); accelerations `offsets` [B, 3] that each log has for itself at 1 m/s.
+    biases them).
     """
     steps = round(seconds / STEP)
     w = inputs(count, steps, seed)
     with torch.no_grad():
-        vessels = [truth(offset) for offset in ([None] * count if offsets is None else offsets)]
-        start, memory = torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 0)
-        states = torch.cat(
-            [
-                Rollout(vessel)(start, w[i : i + 1], memory)[0][:, :-1]
-                for i, vessel in enumerate(vessels)
-            ]
-        ).numpy()
+        start, memory = torch.zeros(count, 6, dtype=torch.float64), torch.zeros(count, 0)
+        states = Rollout(truth())(start, w, memory)[0][:, :-1].numpy()
     states[:, :, 3:] += noise * np.random.default_rng([seed, 1]).standard_normal((count, steps, 3))
     config = PrepareConfig.model_validate(
         {

@@ -12,16 +12,14 @@ from residnet.baselines.base import ParametricBaseline
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
-from residnet.training.free_runs.left_out import without_logs
-from residnet.training.offsets import OffsetsConfig
+from residnet.training.left_out import without_logs
 from residnet.training.refit import RefitConfig, refit
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("offsets", [None, OffsetsConfig(r=0.01)], ids=["none", "offsets"])
-def test_one_step_goes_where_a_refit_without_the_logs_goes(offsets: OffsetsConfig | None) -> None:
+def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
     logs = trials()[:4]
-    config = RefitConfig(horizon=4.0, every=4.0, iterations=4, prior=1e-4, offsets=offsets)
+    config = RefitConfig(horizon=4.0, every=4.0, iterations=4, prior=1e-4)
     model = model_of(LINEAR)
     known, store = samples(logs, model.signals), WindowStore.gather(logs, torch.float64)
     RegressorsConfig(terms=tuple(LINEAR)).fit(model.baseline, known)

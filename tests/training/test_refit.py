@@ -37,7 +37,6 @@ from residnet.dynamics.rollout import Rollout
 from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training import refit as module
-from residnet.training.offsets import Offsets, OffsetsConfig
 from residnet.training.refit import Problem, RefitConfig, refit, step_sensitivities
 
 
@@ -141,39 +140,22 @@ def windy(integrator: Integrator = "rk4") -> tuple[HybridDynamics, Problem]:
         count=7.0,
         robust=0.05,
         log=torch.tensor([0, 0, 1, 3, 3]),
-        speed=0.4,
     )
     return model, problem
-
-
-def offsets_of(value: float) -> Offsets:
-    """Of four logs, one of which has no window."""
-    begun = Offsets.begin(OffsetsConfig(u=0.02, r=0.01), 4, SCALES, 0.4)
-    return begun.moved(value * torch.from_numpy(np.random.default_rng(8).normal(size=(4, 2))))
-
-
-NONE = Offsets.begin(None, 4, SCALES, 0.4)
 
 
 LEVEL = torch.tensor(0.3, dtype=torch.float64)
 
 
-def with_step(
-    model: HybridDynamics,
-    problem: Problem,
-    place: int,
-    step: float,
-    offsets: Offsets = NONE,
-) -> float:
+def with_step(model: HybridDynamics, problem: Problem, place: int, step: float) -> float:
     """Cost with one coefficient moved."""
     other = copy.deepcopy(model)
     assert isinstance(other.baseline, RegressorBaseline)
     with torch.no_grad():
         other.baseline.theta.view(-1)[problem.active[place]] += step
-    return float(
-        module.level_of(other, problem, offsets)[0]
-        + module._prior_cost(problem, other.baseline, problem.share(LEVEL), offsets)
-    )
+        values = other.baseline.theta.flatten()[problem.active]
+        known = problem.prior_cost(values, problem.share(LEVEL))
+    return float(module.level_of(other, problem)[0] + known)
 
 
 @pytest.mark.parametrize("integrator", get_args(Integrator))
@@ -203,12 +185,10 @@ def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
             torch.testing.assert_close(found[:, :, place], central, rtol=1e-6, atol=1e-8)
 
 
-def normal_equations(
-    model: HybridDynamics, problem: Problem, offsets: module.Offsets
-) -> module.Arrow:
+def normal_equations(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:
     assert isinstance(model.baseline, RegressorBaseline)
-    squares = module.level_of(model, problem, offsets)[1]
-    return module.normal_equations(model, problem, model.baseline, LEVEL, squares, offsets)
+    squares = module.level_of(model, problem)[1]
+    return module.normal_equations(model, problem, model.baseline, LEVEL, squares)
 
 
 def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
@@ -217,8 +197,7 @@ def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
     """
     model, problem = windy()
     assert isinstance(model.baseline, RegressorBaseline)
-    arrow = normal_equations(model, problem, NONE)
-    hessian, gradient = arrow.shared, arrow.gradient
+    hessian, gradient = normal_equations(model, problem)
     step = 1e-5
     central = [
         (with_step(model, problem, i, step) - with_step(model, problem, i, -step)) / (2 * step)
@@ -230,38 +209,6 @@ def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
     assert float(gradient.abs().min()) > 1e-4, "every coefficient is seen"
     torch.testing.assert_close(hessian, hessian.T)
     assert float(torch.linalg.eigvalsh(hessian)[0]) > 0
-
-
-def test_normal_equations_hold_the_gradient_and_the_curvature_of_offsets() -> None:
-    model, problem = windy()
-    assert isinstance(model.baseline, RegressorBaseline)
-    offsets = offsets_of(0.03)
-    share = problem.share(LEVEL)
-    arrow = normal_equations(model, problem, offsets)
-    assert float(arrow.blocks[2].abs().max()) == 0.0, "a log without a window says nothing"
-    believing, step = arrow.believing(offsets, share), 1e-5
-    for log in range(4):
-        for axis in range(2):
-            one = torch.zeros(4, 2, dtype=torch.float64)
-            one[log, axis] = step
-            central = (
-                with_step(model, problem, 0, 0.0, offsets.moved(-one))
-                - with_step(model, problem, 0, 0.0, offsets.moved(one))
-            ) / (2 * step)
-            assert 2.0 * float(believing.slope[log, axis]) == pytest.approx(
-                central, rel=1e-6, abs=1e-8
-            )
-    gradient = [
-        (with_step(model, problem, i, step, offsets) - with_step(model, problem, i, -step, offsets))
-        / (2 * step)
-        for i in range(3)
-    ]
-    torch.testing.assert_close(
-        2.0 * believing.gradient[:3],
-        torch.tensor(gradient, dtype=torch.float64),
-        rtol=1e-6,
-        atol=1e-8,
-    )
 
 
 def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
@@ -281,8 +228,7 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
         "belief": 0 * problem.belief,
     }
     perfect = Problem(**fields)
-    arrow = normal_equations(model, perfect, NONE)
-    hessian, gradient = arrow.shared, arrow.gradient
+    hessian, gradient = normal_equations(model, perfect)
     torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-14)
     step = 3e-6
     centre = with_step(model, perfect, 0, 0.0)

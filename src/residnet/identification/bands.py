@@ -36,7 +36,7 @@ from residnet.judge.bands import RunErrors, calibrate, few, run_errors, usual_sp
 from residnet.judge.freerun import Candidate, free_run
 from residnet.judge.protocol import Window
 from residnet.regression.estimator import Solution
-from residnet.training.free_runs.left_out import without_logs
+from residnet.training.left_out import without_logs
 
 
 def fold_numbers(kinds: Sequence[str], folds: int, seed: int) -> np.ndarray:

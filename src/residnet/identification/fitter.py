@@ -289,8 +289,6 @@ class Fitter:
         ]
         notes["feeding"] = [names[i] for i in refitted.notes["at_rest"]]
         notes["refit"] = refitted.notes
-        if refitted.offsets.axes:
-            notes["offsets"] = refitted.offsets.table([log.log.name for log in self.train])
         table = model.baseline.updated_table(table, refitted.errors)
         return table, refitted.covariance
 

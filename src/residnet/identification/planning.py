@@ -26,7 +26,7 @@ from residnet.identification.models import FittedModel
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
 from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne
-from residnet.training.free_runs.left_out import LeftOpen
+from residnet.training.left_out import LeftOpen
 from residnet.training.refit import RefitConfig, step_sensitivities
 
 

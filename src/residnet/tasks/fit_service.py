@@ -54,7 +54,7 @@ from residnet.runs.provenance import Provenance
 from residnet.runs.task import Outcome
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.fit_run import SPLIT, external_logs, fit_outcome, limit_of, write_judged
-from residnet.training.free_runs.left_out import left_open
+from residnet.training.left_out import left_open
 
 _NAMED = 3
 """Causes that are named."""

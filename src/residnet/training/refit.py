@@ -10,82 +10,31 @@ a baseline that holds beliefs about its parameters adds them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any, NamedTuple
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.baselines.base import Baseline, ParametricBaseline
+from residnet.baselines.base import ParametricBaseline
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
 from residnet.core.layout import HEADING, PLANAR, VELOCITIES, YAW_RATE, zero_acceleration
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.training.offsets import Arrow, Offsets, OffsetsConfig, with_spread
+from residnet.regression.least_squares import Descent, descend
 
 # sensitivities have a row for the heading and one for each velocity
 _HEADING_ROW = slice(0, 1)
 _YAW_RATE_ROW = slice(YAW_RATE - HEADING, len(PLANAR.names) - HEADING)
 
 
-@final
-class OffsetBaseline(Baseline):
-    """A baseline with an acceleration of its own for every row of a batch.
-
-    The accelerations grow with the square of the speed, as hull forces do.
-
-    Args:
-        baseline: as it is without.
-        value: accelerations [B, 3] at `speed`; a batch of several times B rows repeats them.
-        axes: a of surge, sway and yaw (0, 1, 2), in which the values may move.
-        speed: in m/s.
-    """
-
-    def __init__(
-        self, baseline: ParametricBaseline, value: Tensor, axes: Sequence[int], speed: float
-    ) -> None:
-        super().__init__()
-        self.baseline = baseline
-        self.value = value
-        self.unit = torch.eye(3, dtype=value.dtype)[:, list(axes)]
-        self.speed = speed
-
-    def forward(self, z: Tensor) -> Tensor:
-        offsets = self.value.repeat(z.shape[0] // self.value.shape[0], 1)
-        nu_dot: Tensor = self.baseline(z) + self.growth(z) * offsets
-        return nu_dot
-
-    def growth(self, z: Tensor) -> Tensor:
-        """Return the square of the speed over that at which the values hold, [B, 1]."""
-        return z[:, :2].square().sum(1, keepdim=True) / self.speed**2
-
-    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
-        """Return the derivatives of nu_dot [D, B, 3] at z [B, nz] along directions [D, B, nz]."""
-        offsets = self.value.repeat(z.shape[0] // self.value.shape[0], 1)
-        growth = 2.0 * (z[:, :2] * ahead[..., :2]).sum(-1, keepdim=True) / self.speed**2
-        return self.baseline.along(z, ahead) + growth * offsets
-
-    def parameter_count(self) -> list[float]:
-        """Return the parameters of each axis; the offsets are no part of the model."""
-        return self.baseline.parameter_count()
-
-    def sensitivity(self, z: Tensor) -> Tensor:
-        """Return the derivative of nu_dot by free parameters and offsets, [B, 3, P + a].
-
-        The parameters are those that the baseline may move; the offsets are the row's own.
-        """
-        return torch.cat(
-            (self.baseline.sensitivity(z), self.growth(z).unsqueeze(-1) * self.unit), dim=2
-        )
-
-
 def step_sensitivities(
     model: HybridDynamics,
-    baseline: ParametricBaseline | OffsetBaseline,
+    baseline: ParametricBaseline,
     x: Tensor,
     p: Tensor,
     s: Tensor,
@@ -133,8 +82,7 @@ class Problem:
     numbers of the free parameters [P]; precision [P, P] about where least squares put them, the
     part of it that each parameter has for itself, whatever the data say, and that point [P];
     pull to the mirror symmetry [P, P]; beliefs, mean and precision [P]; which parameters stay at
-    zero [P]; count of independent errors per channel; log of each window [B]; speed at which
-    offsets are what they are said to be.
+    zero [P]; count of independent errors per channel; log of each window [B].
     """
 
     x0: Tensor
@@ -152,7 +100,6 @@ class Problem:
     count: float
     robust: float
     log: Tensor
-    speed: float
 
     def at_rest(self, numbers: Sequence[int]) -> Problem:
         """Return the problem with further free parameters, by their numbers, that stay at zero."""
@@ -180,6 +127,19 @@ class Problem:
         cost).
         """
         return (level.square() - self.robust**2).clamp(min=1e-12) / (6.0 * self.count * level)
+
+    def inverse(self, hessian: Tensor) -> Tensor:
+        """Return the inverse of a Hessian [P, P], zero for what rests at zero."""
+        inverse: Tensor = torch.linalg.pinv(hessian, hermitian=True)
+        inverse[self.still] = 0.0
+        inverse[:, self.still] = 0.0
+        return inverse
+
+    def prior_cost(self, values: Tensor, share: Tensor) -> Tensor:
+        """Return what is known of the free parameters [P] without free runs, at a `share`."""
+        moved, off = values - self.start, values - self.believed
+        known = moved @ self.precision @ moved + values @ self.pull @ values
+        return known + share * (self.belief * off.square()).sum()
 
 
 def free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> Tensor:
@@ -241,7 +201,6 @@ def problem_of(
         max(covered * model.dt / config.correlation, 1.0),
         config.robust,
         store.log[starts],
-        float(nu[:, :, :2].square().sum(2).mean().sqrt()),
     )
 
 
@@ -259,9 +218,6 @@ class RefitConfig(Config):
         correlation: time over which errors of a free run hang together; the logs hold so many
             independent errors, which says how much beliefs weigh beside them, and how large the
             standard errors are.
-        offsets: accelerations that each log has for itself (trim, rudder zero, carriage), estimated
-            with the parameters and left out of the model; null where all logs are of exactly the
-            same vessel. The least-squares prior does not know them: give it little weight.
         iterations: at most.
     """
 
@@ -271,7 +227,6 @@ class RefitConfig(Config):
     asymmetric: float = Field(default=0.0, ge=0)
     robust: float = Field(default=0.05, gt=0)
     correlation: Seconds = Field(default=10.0, gt=0)
-    offsets: OffsetsConfig | None = None
     iterations: int = Field(default=10, ge=1, le=10_000)
 
     def with_prior(self, prior: float) -> RefitConfig:
@@ -285,6 +240,8 @@ _ROUNDS = 8
 """Times that terms which feed energy are looked for."""
 _OPEN = 0.5
 """Share of a parameter's information that is the prior's, from which on the data leave it open."""
+_GAIN = 2e-4
+"""Share of the cost that a step must gain for another to be made."""
 _ASTRAY = 1e3
 """Error in scales beyond which free runs do not tell which way to go."""
 
@@ -294,18 +251,16 @@ class Refitted:
     """What a refit hands back.
 
     Attributes:
-        covariance: of the free parameters, [P, P]; what offsets leave open is in it.
+        covariance: of the free parameters, [P, P].
         notes: cost before and after, iterations, windows, horizon, the part of it in s that the
             search began with (all unless free runs diverged), independent errors; terms that
             were left out, since their sign would feed energy.
         open: which free parameters neither accelerations nor free runs determine [P]; they stay
             where least squares put them, which is near zero where these have a ridge.
-        offsets: of each log in the store.
     """
 
     covariance: Tensor
     notes: dict[str, Any]
-    offsets: Offsets
     open: Tensor
 
     @property
@@ -347,21 +302,16 @@ def refit(
     if begin is not None:
         with torch.no_grad():
             baseline.theta.copy_(begin)
-    # spreads that are to be estimated start from what moves a velocity by its scale while errors
-    # hang together
-    offsets = Offsets.begin(
-        config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed
-    )
-    level, _ = level_of(model, problem, offsets)
+    level, _ = level_of(model, problem)
     count, begun = 0, problem.w.shape[1]
     turning: list[int] = []
     if not torch.isfinite(level):
-        offsets, begun, count = _brought_near(model, problem, baseline, offsets, config.iterations)
-        level, _ = level_of(model, problem, offsets)
+        begun, count = _brought_near(model, problem, baseline, config.iterations)
+        level, _ = level_of(model, problem)
     first = level
     for _round in range(_ROUNDS):
-        level, offsets, steps = _minimised(model, problem, baseline, offsets, config.iterations)
-        count += steps
+        found = _minimised(model, problem, baseline, config.iterations)
+        level, count = found.point.level, count + found.steps
         if feeding := baseline.feeding():
             problem = problem.at_rest(feeding)
         elif turned := baseline.undamped(samples):
@@ -371,13 +321,8 @@ def refit(
         else:
             break
         place(baseline, _values(baseline, problem), problem.active)
-    arrow = normal_equations(model, problem, baseline, *level_of(model, problem, offsets), offsets)
-    share = problem.share(level)
-    believing = arrow.believing(offsets, share)
-    inverse = torch.linalg.pinv(believing.reduced()[0], hermitian=True)
-    inverse[problem.still] = 0.0
-    inverse[:, problem.still] = 0.0
-    error = (share * believing.variances(inverse)).clamp(min=0.0).sqrt()
+    hessian, _ = normal_equations(model, problem, baseline, *level_of(model, problem))
+    share, inverse = problem.share(level), problem.inverse(hessian)
     notes = {
         "cost_before": float(first),
         "cost_after": float(level),
@@ -389,26 +334,25 @@ def refit(
         "at_rest": torch.nonzero(problem.still).squeeze(1).tolist(),
     }
     left_open = (inverse @ problem.own).diagonal() > _OPEN
-    return Refitted(share * inverse, notes, replace(offsets, error=error), left_open)
+    return Refitted(share * inverse, notes, left_open)
 
 
 def _brought_near(
     model: HybridDynamics,
     problem: Problem,
     baseline: ParametricBaseline,
-    offsets: Offsets,
     iterations: int,
-) -> tuple[Offsets, int, int]:
+) -> tuple[int, int]:
     """Move the parameters to where free runs are finite over the whole horizon.
 
     The minimum over a part of the horizon that no free run leaves carries over a longer part.
 
     Returns:
-        The offsets, the steps of the first part, and the steps of the search.
+        The steps of the first part, and the steps of the search.
     """
 
     def diverges(part: int) -> bool:
-        level = float(level_of(model, problem.over(part), offsets)[0])
+        level = float(level_of(model, problem.over(part))[0])
         # a single step is nearly linear, and tells the way from anywhere
         return not (level < _ASTRAY or (part == 1 and level < torch.inf))
 
@@ -425,10 +369,8 @@ def _brought_near(
             )
         known, begun = part, begun or part
         if known < whole:
-            shorter = problem.over(known)
-            _, offsets, steps = _minimised(model, shorter, baseline, offsets, iterations)
-            count += steps
-    return offsets, begun, count
+            count += _minimised(model, problem.over(known), baseline, iterations).steps
+    return begun, count
 
 
 def _values(baseline: ParametricBaseline, problem: Problem) -> Tensor:
@@ -438,58 +380,39 @@ def _values(baseline: ParametricBaseline, problem: Problem) -> Tensor:
     return values
 
 
+class _Reached(NamedTuple):
+    """Free parameters [P], and the level and the windows' errors [B] of free runs with them."""
+
+    values: Tensor
+    level: Tensor
+    squares: Tensor
+
+
 def _minimised(
-    model: HybridDynamics,
-    problem: Problem,
-    baseline: ParametricBaseline,
-    offsets: Offsets,
-    iterations: int,
-) -> tuple[Tensor, Offsets, int]:
-    """Move parameters and offsets to the minimum; returns its level and the number of steps."""
-    level, squares = level_of(model, problem, offsets)
-    damping, count = 1e-3, 0
-    arrow = normal_equations(model, problem, baseline, level, squares, offsets)
-    for _ in range(iterations):
-        offsets = with_spread(offsets, arrow, problem.share(level))
-        step = _descend(model, problem, baseline, arrow, offsets, level, damping)
-        if step is None:
-            break
-        level, squares, offsets, damping, gain = step
-        count += 1
-        arrow = normal_equations(model, problem, baseline, level, squares, offsets)
-        if gain < 2e-4:
-            break
-    return level, offsets, count
+    model: HybridDynamics, problem: Problem, baseline: ParametricBaseline, iterations: int
+) -> Descent[_Reached]:
+    """Move the parameters to the minimum."""
 
+    def reached(values: Tensor) -> _Reached:
+        place(baseline, values, problem.active)
+        return _Reached(values, *level_of(model, problem))
 
-def _descend(
-    model: HybridDynamics,
-    problem: Problem,
-    baseline: ParametricBaseline,
-    arrow: Arrow,
-    offsets: Offsets,
-    level: Tensor,
-    damping: float,
-) -> tuple[Tensor, Tensor, Offsets, float, float] | None:
-    """One step of Levenberg and Marquardt: level, errors of the windows, offsets and damping after
-    it, and its gain as a share of the cost; None where nothing gains.
-    """
-    share = problem.share(level)
-    believing = arrow.believing(offsets, share)
-    cost = level + _prior_cost(problem, baseline, share, offsets)
-    kept = baseline.theta.detach().flatten()[problem.active].clone()
-    for _attempt in range(8):
-        step, offset_step = believing.damped(damping).solve()
-        place(baseline, kept - step, problem.active)
-        moved = offsets.moved(offset_step)
-        reached, squares = level_of(model, problem, moved)
-        trial = reached + _prior_cost(problem, baseline, share, moved)
-        if torch.isfinite(trial) and trial < cost:
-            gain = float(cost - trial) / float(cost)
-            return reached, squares, moved, max(damping / 10, 1e-8), gain
-        damping *= 10
-    place(baseline, kept, problem.active)
-    return None
+    def near(point: _Reached) -> tuple[float, Callable[[float], tuple[float, _Reached]]]:
+        place(baseline, point.values, problem.active)
+        hessian, gradient = normal_equations(model, problem, baseline, point.level, point.squares)
+        share = problem.share(point.level)
+
+        def trial(damping: float) -> tuple[float, _Reached]:
+            damped = hessian + damping * torch.diag(hessian.diagonal())
+            moved = reached(point.values - torch.linalg.solve(damped, gradient))
+            return float(moved.level + problem.prior_cost(moved.values, share)), moved
+
+        return float(point.level + problem.prior_cost(point.values, share)), trial
+
+    begin = reached(baseline.theta.detach().flatten()[problem.active].clone())
+    found = descend(begin, near, iterations, gain=_GAIN)
+    place(baseline, found.point.values, problem.active)
+    return found
 
 
 def place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
@@ -500,29 +423,11 @@ def place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
         baseline.theta.copy_(flat.reshape(baseline.theta.shape))
 
 
-def _prior_cost(
-    problem: Problem, baseline: ParametricBaseline, share: Tensor, offsets: Offsets
-) -> Tensor:
-    theta = baseline.theta.detach().flatten()[problem.active]
-    moved, off = theta - problem.start, theta - problem.believed
-    believed = (problem.belief * off.square()).sum() + offsets.unlikely()
-    return moved @ problem.precision @ moved + theta @ problem.pull @ theta + share * believed
-
-
-def _shifted(
-    model: HybridDynamics, problem: Problem, offsets: Offsets
-) -> tuple[HybridDynamics, ParametricBaseline | OffsetBaseline]:
-    """The model with the offset of its log in every window, and its baseline."""
-    assert isinstance(model.baseline, ParametricBaseline)
-    baseline: ParametricBaseline | OffsetBaseline = model.baseline
-    if offsets.axes:
-        baseline = OffsetBaseline(
-            model.baseline, offsets.accelerations()[problem.log], offsets.axes, offsets.speed
-        )
-    shifted = HybridDynamics(model.signals, baseline, model.head, model.dt, model.integrator)
-    # the cost is that of velocities
-    shifted.positions = False
-    return shifted, baseline
+def _of_velocities(model: HybridDynamics) -> HybridDynamics:
+    """Return the same model without positions: the cost is that of velocities."""
+    moving = HybridDynamics(model.signals, model.baseline, model.head, model.dt, model.integrator)
+    moving.positions = False
+    return moving
 
 
 def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
@@ -531,12 +436,11 @@ def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def level_of(model: HybridDynamics, problem: Problem, offsets: Offsets) -> tuple[Tensor, Tensor]:
+def level_of(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:
     """Return the mean error of the windows in scales, and the mean square error of each [B]."""
-    x, total = problem.x0, []
-    shifted, _ = _shifted(model, problem, offsets)
+    x, total, moving = problem.x0, [], _of_velocities(model)
     for k in range(problem.w.shape[1]):
-        x = _ahead(shifted, x, model.signals.prepare(problem.w[:, k]))
+        x = _ahead(moving, x, model.signals.prepare(problem.w[:, k]))
         total.append(x[:, VELOCITIES])
     error = (torch.stack(total, dim=1) - problem.nu) * problem.weight
     squares = error.square().mean((1, 2))
@@ -550,39 +454,30 @@ def normal_equations(
     baseline: ParametricBaseline,
     level: Tensor,
     squares: Tensor,
-    offsets: Offsets,
-) -> Arrow:
-    """Return the Gauss-Newton Hessian and half the gradient of the robust cost.
+) -> tuple[Tensor, Tensor]:
+    """Return the Gauss-Newton Hessian [P, P] and half the gradient [P] of the robust cost.
 
-    What is believed of the offsets is not in it yet. The windows' weights follow from their errors
+    The windows' weights follow from their errors
     `squares` [B], which the search for this point has computed; so one matrix product a step sums
     over all windows.
     """
     batch, steps = problem.w.shape[:2]
-    shared, logs = int(problem.active.numel()), len(offsets.value)
-    count = shared + len(offsets.axes)
-    shifted, baseline_with_offsets = _shifted(model, problem, offsets)
+    count, moving = int(problem.active.numel()), _of_velocities(model)
     x = problem.x0
     sensitivity = torch.zeros(batch, 4, count, dtype=x.dtype)
     hessian = torch.zeros(count, count, dtype=x.dtype)
     gradient = torch.zeros(count, dtype=x.dtype)
-    columns = torch.zeros(logs, count, len(offsets.axes), dtype=x.dtype)
-    slopes = torch.zeros_like(offsets.value)
     window = 0.5 / torch.sqrt(squares + problem.robust**2) / (3 * steps * batch)
     root = window.sqrt()[:, None, None] * problem.weight
     for k in range(steps):
         p = model.signals.prepare(problem.w[:, k])
-        sensitivity = step_sensitivities(shifted, baseline_with_offsets, x, p, sensitivity)
-        x = _ahead(shifted, x, p)
+        sensitivity = step_sensitivities(moving, baseline, x, p, sensitivity)
+        x = _ahead(moving, x, p)
         error = (x[:, VELOCITIES] - problem.nu[:, k]) * root[:, k]
         seen = sensitivity[:, 1:] * root[:, k].unsqueeze(-1)
         flat = seen.reshape(-1, count)
         hessian.addmm_(flat.T, flat)
         gradient.addmv_(flat.T, error.reshape(-1))
-        if offsets.axes:
-            own = seen[:, :, shared:]
-            columns.index_add_(0, problem.log, seen.transpose(1, 2) @ own)
-            slopes.index_add_(0, problem.log, (own * error.unsqueeze(-1)).sum(1))
     theta = baseline.theta.flatten()[problem.active]
     belief = problem.share(level) * problem.belief
     prior = (
@@ -590,14 +485,8 @@ def normal_equations(
         + problem.pull @ theta
         + belief * (theta - problem.believed)
     )
-    whole = hessian[:shared, :shared] + problem.precision + problem.pull + torch.diag(belief)
-    moving = ~problem.still
+    whole = hessian + problem.precision + problem.pull + torch.diag(belief)
+    free = ~problem.still
     # what rests at zero has a row of its own, and takes no step
-    alone = torch.diag(torch.where(moving, torch.zeros_like(theta), whole.diagonal()))
-    return Arrow(
-        torch.where(moving[:, None] & moving, whole, alone),
-        columns[:, :shared] * moving[:, None],
-        columns[:, shared:],
-        (gradient[:shared] + prior) * moving,
-        slopes,
-    )
+    alone = torch.diag(torch.where(free, torch.zeros_like(theta), whole.diagonal()))
+    return torch.where(free[:, None] & free, whole, alone), (gradient + prior) * free

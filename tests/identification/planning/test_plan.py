@@ -26,7 +26,7 @@ from residnet.identification.planning import (
 )
 from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.signals import SignalsConfig
-from residnet.training.free_runs.left_out import LeftOpen, left_open
+from residnet.training.left_out import LeftOpen, left_open
 from residnet.training.refit import RefitConfig, refit
 
 CONFIG = RefitConfig(horizon=4.0, every=4.0, iterations=3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -21,12 +21,10 @@ from residnet.report.blocks import (
     Block,
     Cell,
     Code,
-    Column,
     Mark,
     Section,
     Table,
     Text,
-    nested,
     table_of,
 )
 from residnet.report.figure import BLUE, Case, Curve, Figure, Look, Panel, family
@@ -73,16 +71,6 @@ def _baselines(run: RunFiles) -> Section | None:
         parts: list[Block] = [_coefficients(notes, digits=3, weak_is_grey=True)]
         if notes.get("refit"):
             parts.insert(0, Text(_after_refit(model, notes), quiet=True))
-        if notes.get("offsets"):
-            about = (
-                f"All logs share the parameters of {model}. Beside them, the refit gave each log"
-                " constant accelerations of its own, for trim, rudder zero and the tank; they grow"
-                " with the square of the speed and are no part of the model. A log whose values"
-                " lie far beyond the others' was run with another vessel or set-up. A value below"
-                " twice its standard error (grey) cannot be told from zero."
-            )
-            title = "Accelerations of each training log"
-            parts.append(Section(title, [Text(about, quiet=True), log_offsets(notes["offsets"])]))
         title = f"Parameters of {model}" + (
             ", refitted through rollouts" if notes.get("refit") else ""
         )
@@ -107,24 +95,6 @@ def said_of_refit(model: str) -> str:
         f"{model}: values and standard errors are those after the refit through rollouts. The"
         " ratios of value to error keep the error of the least-squares fit before it."
     )
-
-
-def log_offsets(entries: Sequence[Content]) -> Table:
-    """Return the constant accelerations that a refit found for each training log."""
-    axes = {entry["axis"]: number(float(entry["spread"]), 2) for entry in entries}
-    logs: dict[str, dict[str, Any]] = {}
-    for entry in entries:
-        logs.setdefault(entry["log"], {"log": entry["log"]})[entry["axis"]] = entry
-    columns: list[Column] = [
-        ("value", lambda entry: _weak(entry, number(float(entry["value"]), 2))),
-        ("standard error", lambda entry: number(float(entry["standard_error"]), 2), str),
-    ]
-    at = f"at {number(float(entries[0]['speed']), 2)} m/s"
-    groups = [
-        (f"{axis.replace('_dot', '')}′ [{term_unit(axis, '1')}], spread {spread}, {at}", 2)
-        for axis, spread in axes.items()
-    ]
-    return table_of(logs.values(), [("log", "log"), *nested(axes, columns)], groups=groups)
 
 
 def _weak(entry: Content, text: str) -> Cell:

@@ -19,7 +19,6 @@ from residnet.baselines.base import ParametricBaseline
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.training.offsets import Offsets
 from residnet.training.refit import (
     Problem,
     RefitConfig,
@@ -63,16 +62,10 @@ def left_open(
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
     problem = problem_of(model, baseline, samples, store, config, scales).at_rest(still)
-    offsets = Offsets.begin(
-        config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed
-    )
-    level, squares = level_of(model, problem, offsets)
-    arrow = normal_equations(model, problem, baseline, level, squares, offsets)
-    share = problem.share(level)
-    inverse = torch.linalg.pinv(arrow.believing(offsets, share).reduced()[0], hermitian=True)
-    inverse[problem.still] = 0.0
-    inverse[:, problem.still] = 0.0
-    return LeftOpen(share * inverse, float(level.square() - config.robust**2))
+    level, squares = level_of(model, problem)
+    hessian, _ = normal_equations(model, problem, baseline, level, squares)
+    covariance = problem.share(level) * problem.inverse(hessian)
+    return LeftOpen(covariance, float(level.square() - config.robust**2))
 
 
 _HALVINGS = 4
@@ -105,17 +98,14 @@ def without_logs(
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
     problem = problem_of(model, baseline, samples, store, config, scales).at_rest(still)
-    offsets = Offsets.begin(
-        config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed
-    )
-    level, squares = level_of(model, problem, offsets)
+    level, squares = level_of(model, problem)
     fitted = baseline.theta.detach().clone()
     parameters = fitted.flatten()[problem.active]
     of_window = fold[problem.log]
     folds = int(fold.max()) + 1
     count = torch.bincount(of_window, minlength=folds).to(parameters.dtype)
     parts = [
-        _part(model, _rows(problem, of_window == k), squares[of_window == k], level, offsets)
+        _part(model, _rows(problem, of_window == k), squares[of_window == k], level)
         for k in range(folds)
     ]
     # at the minimum all logs together pull as hard as the prior holds
@@ -139,24 +129,22 @@ def without_logs(
         step = torch.linalg.lstsq(hessian, slope.unsqueeze(1), driver="gelsd").solution.squeeze(1)
         step[problem.still] = 0.0
         others = _rows(problem, of_window != k)
-        kept = _best_share(model, others, offsets, parameters, step)
+        kept = _best_share(model, others, parameters, step)
         place(baseline, kept, problem.active)
         out.append(baseline.theta.detach().clone())
         place(baseline, parameters, problem.active)
     return out
 
 
-def _best_share(
-    model: HybridDynamics, others: Problem, offsets: Offsets, parameters: Tensor, step: Tensor
-) -> Tensor:
+def _best_share(model: HybridDynamics, others: Problem, parameters: Tensor, step: Tensor) -> Tensor:
     """Return the parameters after the largest share of the step that the other logs agree to."""
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
-    before, _ = level_of(model, others, offsets)
+    before, _ = level_of(model, others)
     for halving in range(_HALVINGS):
         trial = parameters + 0.5**halving * step
         place(baseline, trial, others.active)
-        after, _ = level_of(model, others, offsets)
+        after, _ = level_of(model, others)
         place(baseline, parameters, others.active)
         if torch.isfinite(after) and after <= before:
             return trial
@@ -176,12 +164,9 @@ def _rows(problem: Problem, chosen: Tensor) -> Problem:
 
 
 def _part(
-    model: HybridDynamics, part: Problem, squares: Tensor, level: Tensor, offsets: Offsets
+    model: HybridDynamics, part: Problem, squares: Tensor, level: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return Hessian [P, P] and half the gradient [P] of some windows' mean cost, without beliefs.
-
-    Offsets of the logs are eliminated.
-    """
+    """Return Hessian [P, P] and half the gradient [P] of the mean cost of some windows alone."""
     size = int(part.active.numel())
     if len(part.x0) == 0:
         return torch.zeros(size, size, dtype=squares.dtype), torch.zeros(size, dtype=squares.dtype)
@@ -195,5 +180,4 @@ def _part(
         belief=torch.zeros_like(part.belief),
         start=theta,
     )
-    arrow = normal_equations(model, nothing, baseline, level, squares, offsets)
-    return arrow.believing(offsets, part.share(level)).reduced()
+    return normal_equations(model, nothing, baseline, level, squares)
