@@ -180,10 +180,28 @@ def whole(x: Regressors) -> Tensor:
     return torch.cat([part for _, part in x]) if isinstance(x, Pieces) else x
 
 
+class Data(NamedTuple):
+    """What an estimator learns from; finite, with names for every column.
+
+    Attributes:
+        x: inputs [N, J], float64; pieces of them where there are many samples.
+        y: outputs [N, n], float64.
+        groups: number of the group of each sample [N]; None where nothing is known of groups.
+        names: of the columns of x.
+        outputs: names of the columns of y.
+    """
+
+    x: Regressors
+    y: Tensor
+    groups: Tensor | None
+    names: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
 class Estimator(ABC):
     """An estimator of y from x: the constructor only stores settings, `fit` takes the data."""
 
-    @abstractmethod
+    @final
     def fit(
         self,
         x: Regressors,
@@ -208,8 +226,15 @@ class Estimator(ABC):
             outputs: names of the columns of y; `y0`, `y1` and so on where empty.
 
         Raises:
-            FitError: where the data do not determine the coefficients.
+            FitError: where the data are not finite, or do not determine the coefficients.
         """
+        known = column_names(x, names, "x"), column_names(y, outputs, "y")
+        require_data(x, y, *known)
+        return self.solve(Data(x, y, groups, *known))
+
+    @abstractmethod
+    def solve(self, data: Data) -> list[Solution]:
+        """Return the solutions of checked data, as `fit` does."""
 
 
 def column_names(values: Regressors, names: Sequence[str], letter: str) -> tuple[str, ...]:
@@ -238,16 +263,6 @@ def require_data(x: Regressors, y: Tensor, names: Sequence[str], outputs: Sequen
     Raises:
         FitError: where they are not, or where their numbers of samples differ.
     """
-    require_pairs(x, y)
-    names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
-    for rows, part in pieces(x):
-        require_finite(part, names, "basis function", rows.start)
-    for rows in row_pieces(len(y)):
-        require_finite(y[rows], outputs, "output", rows.start)
-
-
-def require_pairs(x: Regressors, y: Tensor) -> None:
-    """Check that there are inputs [N, J], and as many outputs [N, n]."""
     if len(x) != len(y):
         raise FitError(f"{len(x)} samples of the inputs, but {len(y)} of the outputs; give pairs")
     if len(x) == 0 or x.shape[1] == 0:
@@ -255,6 +270,11 @@ def require_pairs(x: Regressors, y: Tensor) -> None:
             f"a regression needs samples and regressors, given {len(x)} samples of"
             f" {x.shape[1]} regressors"
         )
+    names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
+    for rows, part in pieces(x):
+        require_finite(part, names, "basis function", rows.start)
+    for rows in row_pieces(len(y)):
+        require_finite(y[rows], outputs, "output", rows.start)
 
 
 USUAL_FOLDS = 5

@@ -19,17 +19,14 @@ from typing import Any, Literal, NamedTuple, final
 import numpy as np
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError, MissingPackageError
 from residnet.regression.estimator import (
     Coefficient,
+    Data,
     Estimator,
-    Regressors,
     Solution,
-    column_names,
-    require_data,
     whole,
 )
 from residnet.regression.expressions import (
@@ -90,8 +87,6 @@ class EvolutionConfig(Config):
             (`merge`), or it takes no part (`reject`), as in the document, whose Gram matrix is then
             singular (section 5.1.2).
         intercept: whether the constant always is a term.
-        prune: share of the target's energy that a term must explain beside those before it
-            (orthogonal least squares, section 5.1.4); 0 keeps all.
         max_terms: most terms of an individual; those with more take no part, nor those with
             products of more than `max_degree` factors.
         max_degree: most factors of a term.
@@ -118,7 +113,6 @@ class EvolutionConfig(Config):
     split: Literal["gene", "sum", "expand"] = "expand"
     equal_terms: Literal["merge", "reject"] = "merge"
     intercept: bool = False
-    prune: float = Field(default=0.0, ge=0, lt=1)
     max_terms: int = Field(default=40, ge=1, le=200)
     max_degree: int = Field(default=8, ge=1, le=20)
     nesting: int = Field(default=2, ge=0, le=5)
@@ -194,11 +188,8 @@ class Fitness:
         data: Mapping[str, np.ndarray],
         target: np.ndarray,
         train: np.ndarray,
-        prune: float,
     ) -> None:
-        """From channels [N], the target [N], which samples [N] train, and the share of the target's
-        energy below which a term is pruned.
-        """
+        """From channels [N], the target [N], and which samples [N] train."""
         order = np.argsort(~train, kind="stable")
         self.columns = Columns(
             algebra,
@@ -210,7 +201,6 @@ class Fitness:
         self.energy = [
             max(float(part.square().mean()), _TINY) for part in (self.y, self.y_validation)
         ]
-        self.prune = prune
         self.fitted = 0
         self._known: dict[Terms, tuple[float, float, Terms]] = {}
         self._empty()
@@ -276,10 +266,6 @@ class Fitness:
         factor = torch.where(
             good[:, None, None], factor, torch.eye(gram.shape[1], dtype=gram.dtype)
         )
-        if self.prune > 0:
-            self._pruned(
-                group, good, torch.linalg.solve_triangular(factor, right, upper=False)[..., 0]
-            )
         coefficients = torch.cholesky_solve(right, factor).transpose(1, 2)
         train = (self.y - (coefficients @ x)[:, 0]).square().mean(dim=1) / self.energy[0]
         validation = (self.y_validation - (coefficients @ x_validation)[:, 0]).square().mean(
@@ -288,26 +274,7 @@ class Fitness:
         for terms, fine, a, b in zip(
             group, good.tolist(), train.tolist(), validation.tolist(), strict=True
         ):
-            if not fine:
-                self._known[terms] = (np.inf, np.inf, ())
-            elif terms not in self._known:
-                self._known[terms] = (a, b, terms)
-
-    def _pruned(self, group: Sequence[Terms], good: Tensor, parts: Tensor) -> None:
-        """Drop the terms that explain too little beside those before them, and fit the rest.
-
-        This is orthogonal least squares.
-        """
-        keep = parts.square() / self.energy[0] >= self.prune
-        rest = {}
-        for terms, fine, kept in zip(group, good.tolist(), keep.tolist(), strict=True):
-            fewer = tuple(p for p, k in zip(terms, kept, strict=True) if k)
-            if fine and fewer and len(fewer) < len(terms):
-                rest[terms] = fewer
-        threshold, self.prune = self.prune, 0.0
-        found = self.of(list(rest.values()))
-        self.prune = threshold
-        self._known |= dict(zip(rest, found, strict=True))
+            self._known[terms] = (a, b, terms) if fine else (np.inf, np.inf, ())
 
 
 @dataclass(frozen=True)
@@ -419,7 +386,6 @@ def evolve(
         {name: data[name][chosen] for name in algebra.channels},
         target[chosen],
         train[chosen],
-        config.prune,
     )
     # DEAP draws from Python's own generator
     state = random.getstate()
@@ -614,32 +580,17 @@ class GeneticEquations(Estimator):
     def __init__(self, config: EquationSearchConfig) -> None:
         self.config = config
 
-    def fit(
-        self,
-        x: Regressors,
-        y: Tensor,
-        groups: Tensor | None = None,
-        *,
-        names: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-    ) -> list[Solution]:
-        """Return the solution with the best individuals' equations; see `Estimator.fit`.
-
-        Raises:
-            FitError: where the data do not determine an equation.
-            UsageError: where DEAP is not installed.
-        """
-        x = whole(x)
-        names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
-        require_data(x, y, names, outputs)
+    def solve(self, data: Data) -> list[Solution]:
+        x, (_, y, groups, names, outputs) = whole(data.x), data
         config, n = self.config, y.shape[1]
         algebra = Algebra(names, limits_of(config.evolution))
         values, target = x.numpy(), y.numpy()
-        data = {name: values[:, j] for j, name in enumerate(names)}
+        columns = {name: values[:, j] for j, name in enumerate(names)}
         groups = torch.zeros(len(x)) if groups is None else groups
         train = ~validating(groups.numpy(), config.validate_every)
         bred = [
-            breed(algebra, data, target[:, k], train, config, n * config.seed + k) for k in range(n)
+            breed(algebra, columns, target[:, k], train, config, n * config.seed + k)
+            for k in range(n)
         ]
         products = sorted({product for found in bred for product in found.products})
         weights = torch.zeros(len(products), n, dtype=torch.float64)

@@ -16,11 +16,10 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.regression.estimator import (
+    Data,
     Estimator,
-    Regressors,
     Solution,
     fold_numbers,
-    require_data,
     whole,
 )
 
@@ -531,18 +530,9 @@ class KernelRidge(Estimator):
         self.scoring = scoring
         self.alternatives = alternatives
 
-    def fit(
-        self,
-        x: Regressors,
-        y: Tensor,
-        groups: Tensor | None = None,
-        *,
-        names: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-    ) -> list[Solution]:
-        x = whole(x)
-        require_data(x, y, names, outputs)
-        fold = fold_numbers(groups, self.folds)
+    def solve(self, data: Data) -> list[Solution]:
+        x, y = whole(data.x), data.y
+        fold = fold_numbers(data.groups, self.folds)
         folds, count = int(fold.max()) + 1, len(self.penalties)
         absolute = [penalty * len(x) for penalty in self.penalties]
         with torch.no_grad():

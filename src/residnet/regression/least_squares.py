@@ -14,13 +14,12 @@ from torch import Tensor
 from residnet.core.errors import FitError
 from residnet.regression.estimator import (
     Coefficient,
+    Data,
     Estimator,
     Regressors,
     Solution,
-    column_names,
     fold_numbers,
     pieces,
-    require_data,
     whole,
 )
 
@@ -61,18 +60,9 @@ class LeastSquares(Estimator):
     def __init__(self, penalties: Sequence[float] = (0.0,)) -> None:
         self.penalties = tuple(penalties)
 
-    def fit(
-        self,
-        x: Regressors,
-        y: Tensor,
-        groups: Tensor | None = None,
-        *,
-        names: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-    ) -> list[Solution]:
+    def solve(self, data: Data) -> list[Solution]:
+        x, y, groups, names, outputs = data
         n, j = x.shape
-        names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
-        require_data(x, y, names, outputs)
         if n <= j:
             raise FitError(
                 f"{n} samples do not determine {j} coefficients ({', '.join(names)}); give longer"
@@ -114,18 +104,8 @@ class CentredLeastSquares(Estimator):
     A QR factor keeps the digits of nearly collinear columns that a Gram matrix loses.
     """
 
-    def fit(
-        self,
-        x: Regressors,
-        y: Tensor,
-        groups: Tensor | None = None,
-        *,
-        names: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-    ) -> list[Solution]:
-        x = whole(x)
-        names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
-        require_data(x, y, names, outputs)
+    def solve(self, data: Data) -> list[Solution]:
+        x, y, names = whole(data.x), data.y, data.names
         if len(x) <= x.shape[1]:
             raise FitError(
                 f"{len(x)} samples do not determine {x.shape[1]} basis functions; give more data or"
@@ -161,22 +141,13 @@ class ElasticNet(Estimator):
         self.l1_ratio = l1_ratio
         self.folds = folds
 
-    def fit(
-        self,
-        x: Regressors,
-        y: Tensor,
-        groups: Tensor | None = None,
-        *,
-        names: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-    ) -> list[Solution]:
+    def solve(self, data: Data) -> list[Solution]:
         # scikit-learn takes a second to import
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.linear_model import ElasticNetCV
 
-        x = whole(x)
-        require_data(x, y, names, outputs)
-        fold = fold_numbers(groups, self.folds)
+        x, y = whole(data.x), data.y
+        fold = fold_numbers(data.groups, self.folds)
         parts = [
             ((fold != k).nonzero()[:, 0].numpy(), (fold == k).nonzero()[:, 0].numpy())
             for k in range(int(fold.max()) + 1)

@@ -16,12 +16,12 @@ from torch import Tensor
 from residnet.core.arrays.tally import Tally
 from residnet.core.errors import FitError
 from residnet.regression.estimator import (
+    Data,
     Estimator,
     Regressors,
     Solution,
     fold_numbers,
     pieces,
-    require_data,
 )
 
 CONSTANT = 1e-9
@@ -99,21 +99,13 @@ class FoldMoments:
 
     @classmethod
     def checked(
-        cls,
-        x: Regressors,
-        y: Tensor,
-        groups: Tensor | None,
-        folds: int | None,
-        names: Sequence[str],
-        outputs: Sequence[str],
+        cls, x: Regressors, y: Tensor, groups: Tensor | None, folds: int | None
     ) -> FoldMoments:
         """Return the moments for an estimator, in one fold where `groups` is None.
 
         Raises:
-            FitError: with values that are not finite, too few groups, or no more samples than
-                columns.
+            FitError: with too few groups, or no more samples than columns.
         """
-        require_data(x, y, names, outputs)
         fold = fold_numbers(groups, folds) if groups is not None else y.new_zeros(len(x))
         if len(x) <= x.shape[1]:
             raise FitError(
@@ -195,21 +187,13 @@ class _PathEstimator(Estimator):
         return {"cross_validated_error": errors.tolist()}
 
     @final
-    def fit(
-        self,
-        x: Regressors,
-        y: Tensor,
-        groups: Tensor | None = None,
-        *,
-        names: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-    ) -> list[Solution]:
+    def solve(self, data: Data) -> list[Solution]:
         """Return the solution of the least cross-validated error, then the alternatives.
 
-        Without groups there is no cross-validation, and nothing may be left to choose. See
-        `Estimator.fit`.
+        Without groups there is no cross-validation, and nothing may be left to choose.
         """
-        moments = FoldMoments.checked(x, y, groups, self.folds, names, outputs)
+        x, y, groups, _, _ = data
+        moments = FoldMoments.checked(x, y, groups, self.folds)
         variance = moments.variance()
         varies = variance > (CONSTANT * moments.shift_y).square()
         variance = torch.where(varies, variance, torch.inf)

@@ -26,11 +26,9 @@ from residnet.core.errors import FitError
 from residnet.regression.equation_rows import correlation_time
 from residnet.regression.estimator import (
     Coefficient,
+    Data,
     Estimator,
-    Regressors,
     Solution,
-    column_names,
-    require_pairs,
     whole,
 )
 
@@ -556,26 +554,13 @@ class SparseRegression(Estimator):
         self.allowed = allowed
         self.gammas = tuple(gammas)
 
-    def fit(
-        self,
-        x: Regressors,
-        y: Tensor,
-        groups: Tensor | None = None,
-        *,
-        names: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-    ) -> list[Solution]:
+    def solve(self, data: Data) -> list[Solution]:
         """Return the solution of the extended BIC, then the alternatives that differ from it.
 
-        Groups do not matter. See `Estimator.fit`.
-
-        Raises:
-            FitError: where the samples do not tell the candidates apart.
+        Groups do not matter.
         """
-        x = whole(x)
-        names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
-        require_pairs(x, y)
-        reduced = self._reduced(x.numpy(), y.numpy(), names)
+        _, y, _, names, outputs = data
+        reduced = self._reduced(whole(data.x).numpy(), y.numpy(), names)
         preferred = self._solution(reduced, self.search, names, outputs)
         if not self.gammas:
             return [preferred]

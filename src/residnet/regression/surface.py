@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.regression.estimator import Estimator, Regressors, Solution, fold_numbers, whole
+from residnet.regression.estimator import Data, Estimator, Solution, fold_numbers, whole
 from residnet.regression.shrinkage import CONSTANT, FoldMoments, pls_path
 
 
@@ -212,38 +212,20 @@ class SurfacePLSR(Estimator):
         self.choose = choose
         self.test = tuple(test)
 
-    def fit(
-        self,
-        x: Regressors,
-        y: Tensor,
-        groups: Tensor | None = None,
-        *,
-        names: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-    ) -> list[Solution]:
-        """Return the chosen solution; its `choice` has the order and the number of terms kept.
+    def solve(self, data: Data) -> list[Solution]:
+        """Return the chosen solution; its `choice` has the order and the number of terms kept."""
+        x = whole(data.x)
+        found = self.surface(x, data.y, data.groups)
+        return [self.chosen(found, x, data.y, data.groups)]
 
-        See `Estimator.fit`.
+    def surface(self, x: Tensor, y: Tensor, groups: Tensor | None) -> Surface:
+        """Return the errors of all models.
 
         Raises:
             FitError: with fewer than two groups or basis functions, or one that is constant.
         """
-        x = whole(x)
-        found = self.surface(x, y, groups, names=names, outputs=outputs)
-        return [self.chosen(found, x, y, groups)]
-
-    def surface(
-        self,
-        x: Tensor,
-        y: Tensor,
-        groups: Tensor | None,
-        *,
-        names: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-    ) -> Surface:
-        """Return the errors of all models; arguments and errors as of `fit`."""
         fold_numbers(groups, None)
-        moments = FoldMoments.checked(x, y, groups, None, names, outputs)
+        moments = FoldMoments.checked(x, y, groups, None)
         return surface(moments, test=self.test)
 
     def chosen(self, found: Surface, x: Tensor, y: Tensor, groups: Tensor | None) -> Solution:

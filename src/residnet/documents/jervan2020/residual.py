@@ -239,7 +239,7 @@ class SurfaceRegression(RegressionKind):
             x, y = torch.cat((x, data.test[0])), torch.cat((y, data.test[1]))
             groups = (torch.arange(len(x)) >= len(data.x)).long()
             estimator = SurfacePLSR("least", test=[1])
-        found = estimator.surface(x, y, groups, names=data.terms, outputs=_FORCES)
+        found = estimator.surface(x, y, groups)
         best = estimator.chosen(found, x, y, groups)
         pre = best.coefficients * data.x.std(0)[:, None] / data.y.std(0)
         return Fit(best.coefficients, best.intercept, pre, best.choice, found)
