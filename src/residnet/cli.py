@@ -382,12 +382,13 @@ def export(
 ) -> None:
     """Export a model of a finished run for controllers, after a parity check."""
     from residnet.core.files import require_file_place
+    from residnet.runs.task import ExportRequest
     from residnet.tasks.registry import finished_task
 
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "export")
         require_file_place(out or run.exports / model)
-        written = task.export_model(run, model, out, file_format, anyway=anyway)
+        written = task.export_model(ExportRequest(run, model, out, file_format, anyway))
     print(written)
 
 

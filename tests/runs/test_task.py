@@ -14,7 +14,7 @@ from read_page import plain
 from residnet.core.errors import DataError, ExportError, FitError, UsageError, WithheldError
 from residnet.report.blocks import Code, Section
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, MainFigure, Outcome
+from residnet.runs.task import ComputingTask, ExportRequest, MainFigure, Outcome
 
 
 class SampleTask(ComputingTask):
@@ -157,6 +157,6 @@ def test_a_value_that_is_not_finite_is_null() -> None:
 def test_a_verb_that_a_run_does_not_have_names_those_that_it_has(tmp_path: Path) -> None:
     finished = SampleTask(name="verbs").run(out=tmp_path / "run")
     with pytest.raises(UsageError, match="of task 'sample'; it has: report"):
-        SampleTask(name="verbs").export_model(finished.folder, "selected", None, "torchscript")
+        SampleTask(name="verbs").export_model(ExportRequest(finished.folder, "selected"))
     with pytest.raises(UsageError, match="of task 'sample'; it has: report"):
         SampleTask(name="verbs").evaluate_on(finished.folder, [], None)

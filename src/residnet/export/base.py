@@ -202,13 +202,6 @@ def released(exported: Made, objections: Sequence[str], *, anyway: bool) -> Made
     return exported
 
 
-def place_of(out: Path | None, usual: Path, suffix: str) -> Path:
-    """Return the file to write: the one asked for, which gets a suffix where it has none."""
-    if out is None:
-        return usual
-    return out if out.suffix else out.with_name(out.name + suffix)
-
-
 def in_precision(
     exported: Exported, attempt: Callable[[torch.dtype], Attempt]
 ) -> tuple[torch.dtype, Attempt]:

@@ -6,7 +6,7 @@ import importlib
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,12 +22,14 @@ from residnet.core.errors import (
     UsageError,
     WithheldError,
 )
+from residnet.core.names import nearest
 from residnet.core.processes import keep_freed_memory
 from residnet.report.blocks import EXPORTS
 from residnet.runs.folder import RunFolder, seal
 from residnet.runs.provenance import Provenance
 
 if TYPE_CHECKING:
+    from residnet.export.base import Exported
     from residnet.report.blocks import Section
     from residnet.report.browser import Drawn
 
@@ -37,7 +39,7 @@ Exports = Mapping[str, Callable[[], Path]]
 """What writes each export and returns its file, by the name of the model."""
 
 
-class Exported(NamedTuple):
+class WrittenExports(NamedTuple):
     """What came of the exports of a run.
 
     Attributes:
@@ -47,6 +49,59 @@ class Exported(NamedTuple):
 
     files: tuple[Path, ...] = ()
     faults: tuple[ResidnetError, ...] = ()
+
+
+class ExportRequest(NamedTuple):
+    """Which model of a finished run is exported, and how.
+
+    Attributes:
+        run: the finished run.
+        model: its name; `predictor` and `selected` stand for the one that the run puts first.
+        out: file to write; exports/<model> with the format's suffix where None.
+        file_format: one of `residnet list formats`.
+        anyway: whether a model is wanted that is worse than doing without it, too.
+    """
+
+    run: RunFolder
+    model: str
+    out: Path | None = None
+    file_format: str = "torchscript"
+    anyway: bool = False
+
+    def write(self, exported: Exported, objections: Sequence[str] = (), stem: str = "") -> Path:
+        """Write what was asked for; returns the file.
+
+        Args:
+            exported: the model, its policy or its force.
+            objections: what speaks against it; its card names them.
+            stem: name of the file where none was asked for; that of the model where empty.
+
+        Raises:
+            ConfigError: where there is no such format.
+            WithheldError: where something speaks against it, but for `anyway`.
+            ExportError: where the file does not reproduce it.
+        """
+        from residnet.export import exporter
+        from residnet.export.base import released
+
+        chosen = exporter(self.file_format)
+        out = self.out or self.run.exports / f"{stem or exported.name}{chosen.suffix}"
+        file = out if out.suffix else out.with_name(out.name + chosen.suffix)
+        chosen.export(released(exported, objections, anyway=self.anyway), file)
+        return file
+
+    def named(self, names: Collection[str]) -> str:
+        """Return the name that is asked for; `predictor` and `selected` are the only one there is.
+
+        Raises:
+            UsageError: where there is none of that name.
+        """
+        if self.model in ("predictor", "selected") and len(names) == 1:
+            return next(iter(names))
+        if self.model not in names:
+            known = nearest(self.model, names) or f"; give one with --model: {', '.join(names)}"
+            raise UsageError(f"{self.run.path}: nothing to export is named '{self.model}'{known}")
+        return self.model
 
 
 class MainFigure(NamedTuple):
@@ -173,25 +228,15 @@ class Task(Config):
         """
         raise self.lacks_verb(run)
 
-    def export_model(
-        self,
-        run: RunFolder,
-        model: str,
-        out: Path | None,
-        file_format: str,
-        *,
-        anyway: bool = False,
-    ) -> Path:
+    def export_model(self, asked: ExportRequest) -> Path:
         """Export one model of a finished run for controllers; returns the file.
-
-        With `anyway` a model is written that is worse than doing without it, too.
 
         Raises:
             UsageError: where runs of this task have nothing to export, or there is no such model.
-            WithheldError: where it is worse than doing without it.
+            WithheldError: where it is worse than doing without it, but for `asked.anyway`.
             ExportError: where the exported model does not agree with the one that it came from.
         """
-        raise self.lacks_verb(run)
+        raise self.lacks_verb(asked.run)
 
     @final
     def run(
@@ -268,7 +313,7 @@ class Task(Config):
             folder.write_summary(self.task, outcome.verdict, **about, finished=False)
             # the last time, since the report shows it and must come out the same again
             made_from.write(folder)
-            verdict, exported = list(outcome.verdict), Exported()
+            verdict, exported = list(outcome.verdict), WrittenExports()
             if report:
                 from residnet.report.page import draw_sections
 
@@ -348,7 +393,7 @@ class ComputingTask(Task):
             torch.set_num_threads(before)
 
 
-def _write_exports(folder: RunFolder, exports: Exports) -> Exported:
+def _write_exports(folder: RunFolder, exports: Exports) -> WrittenExports:
     """Write all exports, and exports.json, which says what came of each.
 
     A model that cannot be exported does not keep the others, or the run, from coming to their end.
@@ -365,4 +410,4 @@ def _write_exports(folder: RunFolder, exports: Exports) -> Exported:
             place = file.relative_to(folder.path) if file.is_relative_to(folder.path) else file
             rows.append({"model": name, "file": place.as_posix(), "fault": None})
     folder.write_json(folder.path / EXPORTS, {"schema": "residnet.exports/1", "exports": rows})
-    return Exported(tuple(files), tuple(faults))
+    return WrittenExports(tuple(files), tuple(faults))

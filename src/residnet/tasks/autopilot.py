@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, final
 
@@ -32,7 +31,6 @@ from residnet.core.config import (
 )
 from residnet.core.errors import ConfigError, FitError, UsageError
 from residnet.core.files import read_json
-from residnet.core.names import nearest
 from residnet.core.progress import say
 from residnet.data.sea import Disturbance, WindField
 from residnet.documents.gouletas2020.law import DocumentConfig, PredictiveConfig
@@ -41,7 +39,7 @@ from residnet.dynamics.store import chosen_model, load_model
 from residnet.physics.environment import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, Outcome, PartName
+from residnet.runs.task import ComputingTask, ExportRequest, Outcome, PartName
 from residnet.training.policies.config import PolicyTraining
 
 AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]
@@ -304,32 +302,10 @@ class AutopilotConfig(ComputingTask):
 
         return run_autopilot(self, folder)
 
-    def export_model(
-        self,
-        run: RunFolder,
-        model: str,
-        out: Path | None,
-        file_format: str,
-        *,
-        anyway: bool = False,
-    ) -> Path:
+    def export_model(self, asked: ExportRequest) -> Path:
         from residnet.tasks.autopilot_run import export_policy
 
-        return export_policy(self, run, model, out, file_format, anyway=anyway)
-
-
-def named_export(run: RunFolder, name: str, names: Collection[str]) -> str:
-    """Return the export of that name; `predictor` and `selected` are the only one there is.
-
-    Raises:
-        UsageError: where there is no such export, or none is named of several.
-    """
-    if name in ("predictor", "selected") and len(names) == 1:
-        return next(iter(names))
-    if name not in names:
-        known = nearest(name, names) or f"; give one with --model: {', '.join(names)}"
-        raise UsageError(f"{run.path}: nothing to export is named '{name}'{known}")
-    return name
+        return export_policy(self, asked)
 
 
 def school_of(config: AutopilotConfig, name: str) -> SteeredPlant | SteeredModel:

@@ -31,8 +31,6 @@ from residnet.control.heading.vessels import SteeredPlant, fly
 from residnet.core.progress import report, say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.store import rebuilt
-from residnet.export import exporter
-from residnet.export.base import place_of, released
 from residnet.export.closed_loop import CompiledLoop
 from residnet.export.policy import ExportedHeading
 from residnet.judge.autopilots import (
@@ -66,12 +64,11 @@ from residnet.report.sections.autopilot import (
 )
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
-from residnet.runs.task import MainFigure, Outcome
+from residnet.runs.task import ExportRequest, MainFigure, Outcome
 from residnet.tasks.autopilot import (
     AnyController,
     AutopilotConfig,
     JudgedConditions,
-    named_export,
     paced,
     school_of,
     tuned_before,
@@ -144,7 +141,10 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
     return Outcome(
         *_told(config, rows),
         "\n\n".join(table.text() for table in tables),
-        exports={name: partial(export_policy, config, folder, name) for name in config.policies},
+        exports={
+            name: partial(export_policy, config, ExportRequest(folder, name))
+            for name in config.policies
+        },
     )
 
 
@@ -354,32 +354,15 @@ def _told(
     return sentences, figures
 
 
-def export_policy(
-    config: AutopilotConfig,
-    run: RunFolder,
-    model: str,
-    out: Path | None = None,
-    file_format: str = "torchscript",
-    *,
-    anyway: bool = False,
-) -> Path:
+def export_policy(config: AutopilotConfig, asked: ExportRequest) -> Path:
     """Write a policy of a run, with its rows of metrics.json in the card; returns the file.
-
-    Args:
-        config: of the run.
-        run: that trained it.
-        model: name of the policy; `selected` is the only one there is.
-        out: file to write; exports/<model> with the format's suffix where not given.
-        file_format: one of `residnet list formats`.
-        anyway: whether a policy is wanted that costs more than a classical controller.
 
     Raises:
         UsageError: where there is no such policy.
-        WithheldError: where a classical controller costs less, but for `anyway`.
+        WithheldError: where a classical controller costs less, but for `asked.anyway`.
         ExportError: where the file does not reproduce the policy.
     """
-    name, chosen = named_export(run, model, config.policies), exporter(file_format)
-    rows = run.read_metrics()["rows"]
+    name, rows = asked.named(config.policies), asked.run.read_metrics()["rows"]
     flown = paced(config)
     about = {"vessel": config.vessel, "conditions": _stated(flown).model_dump(mode="json")}
     learned = config.policies[name].learned
@@ -387,11 +370,9 @@ def export_policy(
     about |= {"not_for": not_for(name, rows)}
     exported = ExportedHeading(
         name,
-        stored_policy(config, run.models, name, flown.test.dt),
+        stored_policy(config, asked.run.models, name, flown.test.dt),
         safe=config.safe,
         about=about,
         metrics=[row for row in rows if row["model"] == name],
     )
-    file = place_of(out, run.exports / f"{name}{chosen.suffix}", chosen.suffix)
-    chosen.export(released(exported, objections(name, rows), anyway=anyway), file)
-    return file
+    return asked.write(exported, objections(name, rows))

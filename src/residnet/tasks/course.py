@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
 from pathlib import Path
 from typing import ClassVar, Literal, NamedTuple, Self, final
 
@@ -24,12 +22,12 @@ from residnet.core.config import (
     Seconds,
     load_config,
 )
-from residnet.core.errors import ConfigError, UsageError
+from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.dynamics.simulated import check_steps
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, Outcome, PartName
-from residnet.tasks.autopilot import AnyController, AutopilotConfig, named_export
+from residnet.runs.task import ComputingTask, ExportRequest, Outcome, PartName
+from residnet.tasks.autopilot import AnyController, AutopilotConfig
 
 
 class Vessels(NamedTuple):
@@ -206,39 +204,8 @@ class CourseTaskConfig(ComputingTask):
 
         return run_course(self, folder)
 
-    def export_model(
-        self,
-        run: RunFolder,
-        model: str,
-        out: Path | None,
-        file_format: str,
-        *,
-        anyway: bool = False,
-    ) -> Path:
-        """Return the file of a policy with the guidance of a course, named after both.
+    def export_model(self, asked: ExportRequest) -> Path:
+        """Write a policy with the guidance of a course, named after both; returns the file."""
+        from residnet.tasks.course_run import export_course
 
-        TorchScript was exported and checked when the run ended; other formats are written now.
-
-        Raises:
-            UsageError: where there is no such file or format.
-            ExportError: where the new file does not reproduce the policy.
-        """
-        from residnet.export import exporter
-        from residnet.export.base import place_of
-        from residnet.tasks.course_run import export_as
-
-        names = {f"{self.policy}_{protocol}": protocol for protocol in self.protocols}
-        model = named_export(run, model, names)
-        file, chosen = run.exports / f"{model}.pt", exporter(file_format)
-        if not file.is_file():
-            raise UsageError(f"{file}: no such file; the run writes it at its end")
-        written = place_of(out, file.with_name(f"{model}{chosen.suffix}"), chosen.suffix)
-        if file_format != "torchscript":
-            extra = {"card.json": ""}
-            torch.jit.load(str(file), _extra_files=extra)
-            card = json.loads(extra["card.json"])
-            chosen.export(export_as(self, run, card, names[model]), written)
-        elif written != file:
-            written.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, written)
-        return written
+        return export_course(self, asked)

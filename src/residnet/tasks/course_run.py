@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,12 +35,11 @@ from residnet.documents.gouletas2020.autopilot import load_predictive
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.export.policy import ExportedCoursePolicy
-from residnet.export.torchscript import TorchScriptExporter
 from residnet.judge.courses import CourseFlight, row, spread_row
 from residnet.judge.metrics import SCHEMA
 from residnet.report.sections.course import COURSES, SPREAD, TRACKS, text_of
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure, Outcome
+from residnet.runs.task import ExportRequest, MainFigure, Outcome
 from residnet.tasks.autopilot import AnyController, AutopilotConfig
 from residnet.tasks.autopilot_run import stored_policy
 from residnet.tasks.course import NOMINAL, CourseTaskConfig, Vessels
@@ -88,8 +87,8 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> Outcome:
         for name in controllers:
             for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
                 _fly(config, planned, steering, name, controllers[name], sight, done)
-        work = partial(_export, folder.exports, config, known, (planned, guidance), trained)
-        exports[f"{config.policy}_{protocol}"] = partial(work, done.rows)
+        asked = ExportRequest(folder, f"{config.policy}_{protocol}")
+        exports[asked.model] = partial(export_course, config, asked, (planned, guidance))
     shown = {
         "schema": SCHEMA,
         "run": config.name,
@@ -414,61 +413,57 @@ def plan_table(planned: PlannedCourse) -> pd.DataFrame:
 
 
 _SAME = 1e-6
-"""Largest difference of a course planned again from the one that was flown, as a share."""
+"""Turning radii by which a course planned again may differ from the one that was flown."""
 
 
-def _exported(
+def _planned_again(
+    config: CourseTaskConfig, known: AutopilotRun, run: RunFolder, protocol: Protocol
+) -> tuple[PlannedCourse, CourseGuidance]:
+    planned, guidance = plan_for(config, known, protocol)
+    again, flown = plan_table(planned), pd.read_parquet(run.path / COURSES)
+    place, flown = ["north", "east"], flown[flown["protocol"] == protocol]
+    if (
+        len(again) != len(flown)
+        or not (
+            np.abs(again[place].to_numpy() - flown[place].to_numpy()) <= _SAME * known.steady.radius
+        ).all()
+    ):
+        raise ExportError(
+            f"{run.path}: another course is planned for '{protocol}' now than the one that was"
+            " flown; carry the run out again with this version"
+        )
+    return planned, guidance
+
+
+def export_course(
     config: CourseTaskConfig,
-    name: str,
-    flown: tuple[PlannedCourse, CourseGuidance],
-    policy: HeadingPolicy,
-    about: dict[str, Any],
-    metrics: list[dict[str, Any]],
-) -> ExportedCoursePolicy:
-    planned, guidance = flown
-    return ExportedCoursePolicy(
-        name, policy, guidance, planned.course, safe=config.safe, about=about, metrics=metrics
-    )
-
-
-def _export(
-    folder: Path,
-    config: CourseTaskConfig,
-    known: AutopilotRun,
-    flown: tuple[PlannedCourse, CourseGuidance],
-    policy: HeadingPolicy,
-    rows: Sequence[dict[str, Any]],
+    asked: ExportRequest,
+    flown: tuple[PlannedCourse, CourseGuidance] | None = None,
 ) -> Path:
-    """Export a policy with the guidance along a plan, its rows of metrics.json in the card."""
-    protocol = flown[0].protocol
-    about = {
-        "vessel": known.autopilot.vessel,
-        "course": config.course.model_dump(mode="json"),
-        "protocol": protocol,
-    }
-    mine = (protocol, config.policy)
-    metrics = [row for row in rows if (row["protocol"], row["model"]) == mine]
-    file = folder / f"{config.policy}_{protocol}.pt"
-    exported = _exported(config, config.policy, flown, policy, about, metrics)
-    TorchScriptExporter().export(exported, file)
-    return file
+    """Write a policy with the guidance of a course; returns the file.
 
-
-def export_as(
-    config: CourseTaskConfig, run: RunFolder, card: dict[str, Any], protocol: Protocol
-) -> ExportedCoursePolicy:
-    """Return a policy with the guidance of a course, planned again, with the card of its file.
+    A course that is not at hand is planned again.
 
     Raises:
-        ExportError: where the plan is not the one that was flown.
+        UsageError: where there is no such course.
+        ExportError: where another course is planned now than the one that was flown.
     """
-    known, name = ready(config, run), f"{config.policy}_{protocol}"
-    flown = plan_for(config, known, protocol)
-    length = flown[0].course.length
-    if not abs(length - card["length"]) <= _SAME * length:
-        raise ExportError(
-            f"{run.exports / name}.pt: its course has {card['length']:.3f} m, planned again"
-            f" {length:.3f} m; carry the run out again with this version"
-        )
-    policy = load_policy(known, config.policy)
-    return _exported(config, name, flown, policy, card, card["metrics"])
+    protocols = {f"{config.policy}_{protocol}": protocol for protocol in config.protocols}
+    name = asked.named(protocols)
+    known, run, protocol = ready(config, asked.run), asked.run, protocols[name]
+    planned, guidance = flown or _planned_again(config, known, run, protocol)
+    rows = [row for row in run.read_metrics()["rows"] if row["model"] == config.policy]
+    exported = ExportedCoursePolicy(
+        config.policy,
+        load_policy(known, config.policy),
+        guidance,
+        planned.course,
+        safe=config.safe,
+        about={
+            "vessel": known.autopilot.vessel,
+            "course": config.course.model_dump(mode="json"),
+            "protocol": protocol,
+        },
+        metrics=[row for row in rows if row["protocol"] == protocol],
+    )
+    return asked.write(exported, stem=name)

@@ -16,7 +16,7 @@ from residnet.identification.settings import FitSettings, require_known
 from residnet.judge.booklet import BookletConfig
 from residnet.report.blocks import Section
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, Finished, Outcome
+from residnet.runs.task import ComputingTask, ExportRequest, Finished, Outcome
 
 if TYPE_CHECKING:
     from residnet.tasks.fit_service import PlannedTrials, RefitRun, WatchedLog
@@ -198,23 +198,7 @@ class FitConfig(FitSettings, ComputingTask):
 
         return plan_trials(self, run, model, limits)
 
-    def export_model(
-        self,
-        run: RunFolder,
-        model: str,
-        out: Path | None,
-        file_format: str,
-        *,
-        anyway: bool = False,
-    ) -> Path:
-        """Export a model, `predictor` for the one reported first; returns the file.
-
-        Raises:
-            WithheldError: where the model is worse than zero or the baseline, but for `anyway`.
-            ConfigError: where there is no such format.
-            UsageError: where there is no such model.
-            ExportError: where the exported model does not agree with the one that it came from.
-        """
+    def export_model(self, asked: ExportRequest) -> Path:
         from residnet.tasks.fit_run import export_model
 
-        return export_model(run, model, out, file_format, anyway=anyway)
+        return export_model(asked)

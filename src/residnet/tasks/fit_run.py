@@ -22,8 +22,6 @@ from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.simulated import SimulatedTrials
 from residnet.data.split import log_names
 from residnet.dynamics.store import ModelSpec, load_model, model_names
-from residnet.export import exporter
-from residnet.export.base import place_of, released
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.fit import fit
 from residnet.identification.identified import (
@@ -52,7 +50,7 @@ from residnet.report.sections.verdict import evidence, level, verdict
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.provenance import Provenance
-from residnet.runs.task import Exports, Finished, MainFigure, Outcome
+from residnet.runs.task import ExportRequest, Exports, Finished, MainFigure, Outcome
 from residnet.tasks.booklet import write_booklet
 from residnet.tasks.fit import FitConfig
 
@@ -110,8 +108,7 @@ def run_fit(config: FitConfig, folder: RunFolder) -> Outcome:
             # the fit itself is done, and its report is worth having
             failure = str(error)
     exports = {
-        name: partial(export_model, folder, name, None, "torchscript")
-        for name in config.export.models
+        name: partial(export_model, ExportRequest(folder, name)) for name in config.export.models
     }
     return fit_outcome(folder, "test", exports, failure)
 
@@ -232,37 +229,26 @@ def fit_outcome(
     )
 
 
-def export_model(
-    run: RunFolder, name: str, out: Path | None, file_format: str, *, anyway: bool = False
-) -> Path:
-    """Export one model of a fit in the format of that name, and return the file.
+def export_model(asked: ExportRequest) -> Path:
+    """Export one model of a fit, and return the file.
 
-    Args:
-        run: of the fit.
-        name: of the model; `predictor` for the one that is reported first, `selected` for the
-            single one chosen on validation data.
-        out: file to write; exports/<model> with the format's suffix where not given.
-        file_format: one of `residnet list formats`.
-        anyway: whether a model is wanted that is worse than doing without it.
+    `predictor` stands for the one that is reported first, `selected` for the single one chosen on
+    validation data.
 
     Raises:
-        ConfigError: where there is no such format.
         UsageError: where there is no such model.
-        WithheldError: where it is worse than doing without it, but for `anyway`.
+        WithheldError: where it is worse than doing without it, but for `asked.anyway`.
         ExportError: where the exported model does not agree with the one that it came from.
     """
-    chosen_format, metrics = exporter(file_format), run.read_metrics()
+    run, name, metrics = asked.run, asked.model, asked.run.read_metrics()
     chosen = str(metrics.get(name, metrics["selected"])) if name in _CHOSEN else name
     known = model_names(run.models)
     if chosen not in known:
         raise UsageError(f"{run.path}: no model '{name}'{nearest(name, [*_CHOSEN, *known])}")
     spec, model = load_model(run.models / chosen)
     rows = [row for row in metrics["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"]
-    usual = run.exports / f"{chosen}{chosen_format.suffix}"
-    file = place_of(out, usual, chosen_format.suffix)
     against = objections(evidence(RunFiles(run.path), chosen))
-    chosen_format.export(released(ExportedVessel(spec, model, rows), against, anyway=anyway), file)
-    return file
+    return asked.write(ExportedVessel(spec, model, rows), against, chosen)
 
 
 def evaluate_on(

@@ -65,8 +65,6 @@ from residnet.documents.study import Results, Study, compared, joined, notes_tex
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.export import exporter
-from residnet.export.base import place_of, released
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.heads.zero import ZeroHead
 from residnet.judge.courses import Tracking, mse, tracking
@@ -82,7 +80,7 @@ from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Block, Cell, Section, Table, table_of
 from residnet.report.figure import DASHED, SOLID, Case, Figure, Panel, family
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, Exports, MainFigure, PartName
+from residnet.runs.task import ComputingTask, ExportRequest, Exports, MainFigure, PartName
 
 _BELIEVED = "believed"
 _FARTHEST = 3.0
@@ -327,26 +325,14 @@ class FerryStudyConfig(Study, ComputingTask):
         return written(self, study(self), folder)
 
     def exports(self, folder: RunFolder) -> Exports:
-        return {name: partial(self.export_model, folder, name) for name in self.models}
+        return {
+            name: partial(self.export_model, ExportRequest(folder, name)) for name in self.models
+        }
 
-    def export_model(
-        self,
-        run: RunFolder,
-        model: str,
-        out: Path | None = None,
-        file_format: str = "torchscript",
-        *,
-        anyway: bool = False,
-    ) -> Path:
-        """Write the feed-forward of a model; `selected` leaves the least of the residual force.
-
-        Raises:
-            UsageError: where there is no such model or format.
-            WithheldError: where it is worse than the believed one on what judges, but for `anyway`.
-            ExportError: where the file does not reproduce it.
-        """
-        results, chosen = read_json(run.path / self.results_file), exporter(file_format)
-        name = best_model(results) if model == "selected" else model
+    def export_model(self, asked: ExportRequest) -> Path:
+        """Write the feed-forward of a model; `selected` leaves the least of the residual force."""
+        run, results = asked.run, read_json(asked.run.path / self.results_file)
+        name = best_model(results) if asked.model == "selected" else asked.model
         if name not in self.models:
             raise UsageError(f"{run.path}: no model '{name}'{nearest(name, self.models)}")
         chain = [name]
@@ -360,9 +346,7 @@ class FerryStudyConfig(Study, ComputingTask):
         ranges = [(low, high) for low, high in results["training_range"]]
         made = RequiredForce(*force.parts(), mirrored=True)
         exported = ExportedForce(name, made, ranges, rows[-1]["notes"].get("lag"))
-        file = place_of(out, run.exports / f"{name}_feed_forward{chosen.suffix}", chosen.suffix)
-        chosen.export(released(exported, objections(name, results), anyway=anyway), file)
-        return file
+        return asked.write(exported, objections(name, results), f"{name}_feed_forward")
 
     def verdict(self, results: Results) -> list[str]:
         models, best = results["models"], best_model(results)
