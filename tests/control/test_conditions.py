@@ -16,7 +16,6 @@ from residnet.control.heading.conditions import (
     ConditionedLoop,
     ConditionedRun,
     ConditionsConfig,
-    fly_under,
     gauss_markov,
     quiet,
     wave_motion,
@@ -187,12 +186,12 @@ def test_evolution_finds_better_gains_than_a_grid_of_guesses_and_again_the_same(
     gains: dict[str, Any] = dict(found.parameters)
     # a low pass depends on the step that it runs at
     steering = STEERING._replace(dt=0.1)
-    again = fly_under(VESSEL, PdConfig(**gains).build(steering), changes)
+    again = ConditionedRun(VESSEL, PdConfig(**gains).build(steering), 0.1).fly(changes)
     assert found.cost == pytest.approx(float(again.measured(config)["cost"].mean()), rel=1e-2)
     for kp in (0.5, 2.0, 6.0):
         for damping in (0.5, 1.5):
             law = PdConfig(kp=kp, damping_time=damping).build(STEERING)
-            guess = fly_under(VESSEL, law, changes).measured(config)["cost"].mean()
+            guess = ConditionedRun(VESSEL, law, 0.1).fly(changes).measured(config)["cost"].mean()
             assert found.cost < float(guess) * 1.01
     assert tune(PdConfig(), STEERING, config, settings, 5) == found
 

@@ -15,8 +15,8 @@ from residnet.control.base import ClosedLoop
 from residnet.control.courses.config import (
     BuoyConfig,
     BuoyCourseConfig,
+    feasibility,
     plan_course,
-    report_feasibility,
     smallest_turn,
 )
 from residnet.control.courses.course_plan import Course
@@ -54,7 +54,7 @@ def circle(radius: float, step: float = 0.1) -> Course:
 def test_the_steady_turn_is_that_of_the_model(vessel: SteeredPlant) -> None:
     steady = steady_turn(vessel, LIMIT, 100.0, 0.05)
     assert steady.radius == pytest.approx(3.2 / (3.47 * LIMIT), rel=1e-3)
-    assert not any(one["possible"] for one in report_feasibility(WANTED, steady))
+    assert not any(one["possible"] for one in feasibility(WANTED.buoys, steady.radius))
 
 
 def test_turns_take_the_time_of_full_rudder_and_counter_rudder(vessel: SteeredPlant) -> None:

@@ -118,8 +118,8 @@ def test_printed_radii_are_too_tight_for_five_degrees_of_rudder() -> None:
     smallest = 3.2 / (3.47 * math.radians(5))
     found = feasibility(TABLE_6_3, smallest)
     assert smallest == pytest.approx(10.57, abs=0.005)
-    assert not any(buoy.possible for buoy in found)
-    assert all(buoy.possible for buoy in feasibility(widened(TABLE_6_3, smallest), smallest))
+    assert not any(buoy["possible"] for buoy in found)
+    assert all(buoy["possible"] for buoy in feasibility(widened(TABLE_6_3, smallest), smallest))
 
 
 def test_circles_that_overlap_have_no_crossing_tangent() -> None:

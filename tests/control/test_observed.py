@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.control.heading.conditions import ConditionsConfig, fly_under
+from residnet.control.heading.conditions import ConditionedRun, ConditionsConfig
 from residnet.control.heading.controllers import (
     NetworkPolicySpec,
     ObservedLqrConfig,
@@ -140,7 +140,7 @@ def test_a_constant_push_is_taken_away(law: PtosConfig | ObservedLqrConfig) -> N
         bias=DEG, push=0.0, noise_psi=0.0, noise_r=0.0, dt=0.05, duration=30.0, hold=0.0
     )
     changes = pushed.draw(8, 0.05, torch.Generator().manual_seed(2))
-    flown = fly_under(vessel, law.build(steering), changes)
+    flown = ConditionedRun(vessel, law.build(steering), 0.05).fly(changes)
     assert float(flown.error[:, -1].abs().max()) < 0.02 * DEG
 
 

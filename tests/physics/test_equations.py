@@ -22,7 +22,7 @@ from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.actuators import AzimuthThrusters
 from residnet.physics.actuators.rudders import WaterJets
 from residnet.physics.hull import PHASES, froude_number, phase_of
-from residnet.physics.plant import MassSpringDamperConfig, Plant
+from residnet.physics.plant import Plant
 from residnet.physics.vessel import VesselConfig, load_vessel
 from residnet.physics.vessel_file import vessel_files
 
@@ -318,40 +318,6 @@ def test_allocation_makes_the_wanted_forces_with_least_thrust() -> None:
     torch.testing.assert_close(far, torch.tensor([[87.5, 87.5, 0.0, 0.0]], dtype=torch.float64))
     nothing = thrusters.force(tau[:1, :0], thrusters.allocate(tau[:1] * 0), tau[:1])
     torch.testing.assert_close(nothing, tau[:1] * 0, atol=1e-9, rtol=0)
-
-
-def test_mass_spring_damper() -> None:
-    """(5.13) under section 5.3.1's square wave, against SciPy; without force its energy falls."""
-    config = MassSpringDamperConfig()
-    plant = config.build()
-    t = 0.1 * np.arange(500)
-    w = torch.from_numpy(np.where(np.mod(t, 6 * np.pi) < 3 * np.pi, 1.0, -1.0))[None, :, None]
-    x0 = torch.zeros(1, 2, dtype=torch.float64)
-    with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, 0.1, substeps=5))(x0, w, x0[:, :0])
-
-    def rate(_: float, y: np.ndarray, force: float) -> list[float]:
-        return [y[1], -1.3 * y[1] + 0.1 * force - 0.5 * y[0]]
-
-    x = np.zeros(2)
-    for k in range(500):
-        force = float(w[0, k, 0])
-        np.testing.assert_allclose(states[0, k], x, atol=1e-7)
-        x = solve_ivp(
-            rate,
-            (0, 0.1),
-            x,
-            args=(force,),
-            rtol=1e-10,
-            atol=1e-12,
-        ).y[:, -1]
-    start = torch.tensor([[1.0, -0.4]], dtype=torch.float64)
-    free, _, _ = Rollout(PlantDynamics(plant, 0.05))(start, w[:, :400] * 0, start[:, :0])
-    energy = 0.5 * config.m.value * free[0, :, 1] ** 2 + 0.5 * config.k.value * free[0, :, 0] ** 2
-    assert bool((energy[1:] < energy[:-1]).all())
-    assert plant.demand(torch.tensor([2.0, -0.5]), torch.zeros(2)).tolist() == [[1.0], [-0.5]]
-    with pytest.raises(ValueError, match="its unit must be kg/s"):
-        MassSpringDamperConfig.model_validate({"d": {"value": 1.0, "unit": "kg", "source": "made"}})
 
 
 THRUST = 1960 * 7.71**2

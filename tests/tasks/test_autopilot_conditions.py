@@ -13,11 +13,10 @@ import yaml
 from read_page import plain
 from tiny import call
 
-from residnet.control.heading.controllers import PtosConfig
 from residnet.core.config import load_config
 from residnet.judge.autopilots import objections
 from residnet.report.sections.autopilot import cost_verdict
-from residnet.tasks.autopilot import AutopilotConfig, tuned_before
+from residnet.tasks.autopilot import AutopilotConfig
 from residnet.tasks.autopilot_run import stored_policy
 
 pytestmark = pytest.mark.long
@@ -136,25 +135,6 @@ def test_a_network_without_a_law_is_exported_and_read_back(run: Path) -> None:
         command, s, _ = module.step(measured, torch.tensor([[0.5]]), s)
         wish, memory = policy(measured.double(), torch.tensor([[0.5]]).double(), memory)
         assert float(command) == pytest.approx(float(wish), abs=1e-6)
-
-
-def test_a_run_takes_the_constants_that_another_tuned(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    settings = {**SMALL, "seed": 5, "conditions": {**SMALL["conditions"], "tuned_in": str(run)}}
-    config = AutopilotConfig.model_validate(settings)
-    found = tuned_before("ptos", config.peers["ptos"], config)  # type: ignore[arg-type]
-    assert found is not None
-    kept = json.loads((run / "controllers.json").read_text())["controllers"]["ptos"]
-    assert found[0].model_dump(mode="json") == kept["config"]
-    assert None not in found[0].parameters().values()
-    other = PtosConfig(lag=0.1)
-    assert tuned_before("ptos", other, config) is None
-    file = tmp_path / "other.yaml"
-    settings["conditions"]["stated"] = {**STATED, "bias": "0.5 deg"}
-    file.write_text(yaml.safe_dump(settings))
-    assert call(monkeypatch, "check", file) == 2
-    assert "tuned its peers for another 'conditions.stated'" in capsys.readouterr().err
 
 
 def test_the_verdict_begins_with_the_cheapest_policy() -> None:

@@ -221,7 +221,6 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("vessel=wam_v_cal 'rudder=0.5 deg'", "cmd_delta"),
         ("conditions.stated.current=0.5", "no input 'current_north'"),
         ("'conditions.stated.delay=[0.4 s, 0.1 s]'", "in order"),
-        ("conditions.tuned_in=nowhere", "nowhere is not the folder of a finished"),
         ("floor=pd", "must name a peer of kind bang_bang"),
         ("peers.policy.kind=pd", "'policy' names two controllers"),
     ],

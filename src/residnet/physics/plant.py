@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal, Self, final
+from typing import Self, final
 
 import torch
-from pydantic import AfterValidator, Field
 from torch import Tensor, nn
 
-from residnet.core.config import Config, Newtons
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body, to_earth
 from residnet.core.layout import PLANAR, StateLayout
 from residnet.physics.actuators import Actuators
 from residnet.physics.environment import WIND_INPUTS, WindLoadConfig
-from residnet.physics.parameters import Mass, Parameter, above_zero, of_dimension
 from residnet.physics.terms import TermLibrary
 
 ROLLING = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
@@ -315,53 +312,3 @@ class HullPlant(Plant):
         """
         after = self.actuators.advance(x[:, 2 * self.n :], w[:, : self.commands], dt)
         return torch.cat((x[:, : 2 * self.n], after), dim=-1)
-
-
-class MassSpringDamperConfig(Config):
-    """The mass-spring-damper m x_ddot + d x_dot + k x = tau (document 000, eqs. (4.1), (4.2)).
-
-    Attributes:
-        m: mass in kg; by default that of section 5.3. (4.3) is another system: m = 20 kg,
-            d = 10 kg/s, k = 12 N/m (correction H24).
-        d: damping in kg/s.
-        k: stiffness in N/m.
-        tau_max: force that the full drive of a manoeuvre stands for.
-    """
-
-    kind: Literal["mass_spring_damper"] = "mass_spring_damper"
-    m: Annotated[Mass, AfterValidator(above_zero)] = Parameter(
-        value=10.0, unit="kg", source="document 000, section 5.3, (5.13)"
-    )
-    d: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -1))] = Parameter(
-        value=13.0, unit="kg/s", source="document 000, section 5.3, (5.13)"
-    )
-    k: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -2))] = Parameter(
-        value=5.0, unit="N/m", source="document 000, section 5.3, (5.13)"
-    )
-    tau_max: Newtons = Field(default=1.0, gt=0)
-
-    def build(self) -> MassSpringDamper:
-        """Build the plant of this vessel."""
-        return MassSpringDamper(self)
-
-
-@final
-class MassSpringDamper(Plant):
-    """A mass on a spring: displacement x [m] and its rate u [m/s] in x [B, 2]; input tau_x [N]."""
-
-    state = ("x", "u")
-    inputs = ("tau_x",)
-    commands = 1
-
-    def __init__(self, config: MassSpringDamperConfig) -> None:
-        super().__init__()
-        self.m, self.d, self.k = config.m.value, config.d.value, config.k.value
-        self.tau_max = config.tau_max
-
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        return (drive.clamp(-1.0, 1.0) * self.tau_max).unsqueeze(-1)
-
-    def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        displacement, speed = x[:, 0], x[:, 1]
-        pull = w[:, 0] - self.d * speed - self.k * displacement
-        return torch.stack((speed, pull / self.m), dim=-1)

@@ -26,11 +26,8 @@ from residnet.core.config import (
     MetresPerSecond,
     Radians,
     Seconds,
-    load_mapping,
-    validate,
 )
-from residnet.core.errors import ConfigError, FitError, UsageError
-from residnet.core.files import read_json
+from residnet.core.errors import ConfigError, FitError
 from residnet.core.progress import say
 from residnet.data.sea import Disturbance, WindField
 from residnet.documents.gouletas2020.law import DocumentConfig, PredictiveConfig
@@ -103,16 +100,12 @@ class JudgedConditions(Config):
         beyond: further conditions by name, outside of those of tuning and training, that
             controllers are judged under only.
         evolution: the search for the constants of peers.
-        tuned_in: folder of a finished run of the same vessel, rudder, conditions and search, whose
-            constants peers of the same name and kind take, so that runs with several seeds are
-            compared with the same laws; null to tune them here.
     """
 
     stated: ConditionsConfig = ConditionsConfig()
     flights: int = Field(default=1500, ge=2, le=1_000_000)
     beyond: dict[PartName, ConditionsConfig] = Field(default_factory=dict)
     evolution: TuningConfig = TuningConfig()
-    tuned_in: Path | None = None
 
     @property
     def flown(self) -> dict[str, ConditionsConfig]:
@@ -269,7 +262,7 @@ class AutopilotConfig(ComputingTask):
         """Check that the vessel turns steadily and can do what is asked, and so for learned models.
 
         Raises:
-            UsageError: where a run or a model is missing, that of `tuned_in` too.
+            UsageError: where a run or a model is missing.
             FitError: where a learned model does not turn towards the rudder and stay there.
             ConfigError: where the vessel does not, has no time for its changes of heading or no
                 rudder left to hold its course, or where the inputs of a learned model are not its
@@ -287,8 +280,6 @@ class AutopilotConfig(ComputingTask):
             raise ConfigError(f"vessel '{self.vessel}' cannot be steered: {error}") from error
         config = paced(self)
         _check_flights(config, turning, vessel.rate)
-        if config.conditions is not None and config.conditions.tuned_in is not None:
-            _tuned_earlier(config, config.conditions.tuned_in)
         for model, dt in learned:
             model.turning(self.rudder, self.turning_time, dt)
 
@@ -432,55 +423,3 @@ def paced(config: AutopilotConfig) -> AutopilotConfig:
         "policies": policies,
     }
     return config.model_copy(update=changed)
-
-
-def tuned_before(
-    name: str, peer: TunableConfig, config: AutopilotConfig
-) -> tuple[TunableConfig, dict[str, Any]] | None:
-    """Return a peer with the constants that an earlier run found for it, and notes; None for none.
-
-    Args:
-        name: of the peer in both runs.
-        peer: with constants that are to be tuned.
-        config: of this run, at its pace.
-
-    Raises:
-        UsageError: where the run that the config names is not there or not finished.
-        ConfigError: where it is no autopilot run, or of other conditions.
-    """
-    assert config.conditions is not None
-    run = config.conditions.tuned_in
-    if run is None:
-        return None
-    earlier, found = _tuned_earlier(config, run)
-    if earlier.peers.get(name) != peer or name not in found:
-        return None
-    complete = type(peer).model_validate(found[name]["config"])
-    return complete, {**found[name], "tuned_in": str(run)}
-
-
-def _tuned_earlier(config: AutopilotConfig, run: Path) -> tuple[AutopilotConfig, dict[str, Any]]:
-    """Return config and notes on the controllers of an earlier run under the same conditions."""
-    key = "conditions.tuned_in"
-    if not (run / "controllers.json").is_file():
-        raise UsageError(
-            f"{key}: {run} is not the folder of a finished autopilot run; run it first, or leave"
-            " this key out to tune peers here"
-        )
-    data = load_mapping(run / "resolved.yaml")
-    if data.get("task") != "autopilot" or data.get("conditions") is None:
-        raise ConfigError(f"{key}: {run} is no autopilot run under conditions")
-    earlier = paced(validate(data, AutopilotConfig, str(run / "resolved.yaml")))
-    assert config.conditions is not None
-    assert earlier.conditions is not None
-    pairs = {name: (getattr(config, name), getattr(earlier, name)) for name in ("vessel", "rudder")}
-    for name in ("stated", "evolution"):
-        own, other = (getattr(one.conditions, name) for one in (config, earlier))
-        pairs[f"conditions.{name}"] = own, other
-    for name, (own, other) in pairs.items():
-        if own != other:
-            raise ConfigError(
-                f"{key}: {run} tuned its peers for another '{name}'; constants are taken from runs"
-                " of the same vessel, rudder, conditions and search alone"
-            )
-    return earlier, read_json(run / "controllers.json")["controllers"]

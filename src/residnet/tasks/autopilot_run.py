@@ -6,7 +6,7 @@ import math
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pandas as pd
 import torch
@@ -71,7 +71,6 @@ from residnet.tasks.autopilot import (
     JudgedConditions,
     paced,
     school_of,
-    tuned_before,
 )
 from residnet.training.policies.fit import train_policy
 
@@ -156,8 +155,6 @@ def _complete(
     if not isinstance(peer, TunableConfig) or None not in peer.parameters().values():
         return peer, {"config": peer.model_dump(mode="json")}
     assert stated is not None
-    if before := tuned_before(name, peer, config):
-        return cast("tuple[AnyController, dict[str, Any]]", before)
     started = time.time()
     steering = steering._replace(vessel=_in_weather(config, stated))
     found = tune(peer, steering, stated.stated, stated.evolution, config.seed + 11, CompiledLoop)

@@ -16,8 +16,8 @@ from torch import Tensor
 from residnet.control.base import ClosedLoop, Policy, Reference
 from residnet.control.courses.config import (
     PlannedCourse,
+    feasibility,
     plan_course,
-    report_feasibility,
     smallest_turn,
 )
 from residnet.control.courses.course_check import Protocol
@@ -65,7 +65,7 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> Outcome:
         )
     known = ready(config, folder)
     steering, steady = known.steering, known.steady
-    feasible = report_feasibility(config.course, steady)
+    feasible = feasibility(config.course.buoys, steady.radius)
     for circle in feasible:
         if not circle["possible"]:
             say(

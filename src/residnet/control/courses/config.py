@@ -62,27 +62,6 @@ class Piece(NamedTuple):
     radius: float
 
 
-class Feasibility(NamedTuple):
-    """The radius of a buoy's circle beside the smallest that a vessel can turn with, in m."""
-
-    buoy: int
-    radius: float
-    smallest: float
-
-    @property
-    def possible(self) -> bool:
-        """Whether the circle is no tighter than the vessel turns."""
-        return self.radius >= self.smallest
-
-
-def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[Feasibility]:
-    """Return each buoy's radius beside the vessel's smallest turning radius in m.
-
-    Both printed courses ask for less than the vessel can do (correction G18).
-    """
-    return [Feasibility(number + 1, buoy.radius, smallest) for number, buoy in enumerate(buoys)]
-
-
 def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
     """Return the buoys with radii that the vessel can follow."""
     return [buoy.model_copy(update={"radius": max(buoy.radius, smallest)}) for buoy in buoys]
@@ -283,18 +262,19 @@ def smallest_turn(
     return steady_turn(vessel, limit, config.turning_time, step)
 
 
-def report_feasibility(
-    config: BuoyCourseConfig, steady: SteadyTurn
-) -> list[dict[str, float | bool]]:
-    """Return each buoy's radius and the smallest possible one in m, and whether it is possible."""
+def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[dict[str, float | bool]]:
+    """Return each buoy's radius and the smallest possible one in m, and whether it is possible.
+
+    Both printed courses ask for less than the vessel can do (correction G18).
+    """
     return [
         {
-            "buoy": found.buoy,
-            "radius": found.radius,
-            "smallest": found.smallest,
-            "possible": found.possible,
+            "buoy": number,
+            "radius": buoy.radius,
+            "smallest": smallest,
+            "possible": buoy.radius >= smallest,
         }
-        for found in feasibility(config.buoys, steady.radius)
+        for number, buoy in enumerate(buoys, start=1)
     ]
 
 

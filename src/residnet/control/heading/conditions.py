@@ -475,35 +475,36 @@ class ConditionedRun:
         given = self.given(changes)
         with torch.no_grad():
             if longest not in self._flying:
-                self._flying[longest] = self._quick(self.rollout(longest), *given)
+                x, w, s = (part[:2] for part in given)
+                self._flying[longest] = quickly(self.rollout(longest), self.compiler, (x, w, s))
             return self.flights(changes, *self._flying[longest](*given))
 
-    def _quick(self, rollout: Rollout, x: Tensor, w: Tensor, s: Tensor) -> Flying:
-        """Return the flights of a closed loop, compiled where that can be."""
-        if self.compiler is not None:
-            try:
-                return self.compiler(rollout, x[:2], w[:2], s[:2])
-            except ExportError:
-                pass  # what cannot be compiled is flown as it is
 
-        def fly(x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-            states, inputs, _ = rollout(x, w, s)
-            return states, inputs
+def quickly(
+    rollout: Rollout,
+    compiler: Compiler | None,
+    given: tuple[Tensor, Tensor, Tensor],
+    failed: Callable[[ExportError], None] = lambda error: None,
+) -> Flying:
+    """Return the flights of a closed loop, compiled where a compiler is given and works.
 
-        return fly
+    Args:
+        rollout: of the closed loop.
+        compiler: None to fly as it is.
+        given: states, inputs and memory that it is flown with, an example of two rows.
+        failed: is told why a loop is not compiled.
+    """
+    if compiler is not None:
+        try:
+            return compiler(rollout, *given)
+        except ExportError as error:
+            failed(error)
 
+    def fly(x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        states, inputs, _ = rollout(x, w, s)
+        return states, inputs
 
-def fly_under(
-    vessel: SteeredVessel,
-    policy: Policy,
-    changes: HeadingChanges,
-    *,
-    integrator: str = "rk4",
-    dtype: torch.dtype = torch.float64,
-) -> ConditionedFlights:
-    """Return the flights of a controller, at the step of the changes, without gradients."""
-    run = ConditionedRun(vessel, policy.to(dtype), changes.dt, integrator, dtype)
-    return run.fly(changes)
+    return fly
 
 
 _AFTER, _FOR = 10.0 / 7.0, 5.0 / 7.0

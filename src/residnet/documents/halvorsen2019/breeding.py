@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from residnet.core import progress
-from residnet.core.config import Config, Seconds
+from residnet.core.config import Config, Newtons, Seconds
 from residnet.core.format import DASH, number
 from residnet.documents.study import Results, Study, pictures
 from residnet.heads.genetic import GeneticConfig
-from residnet.physics.plant import MassSpringDamperConfig
+from residnet.physics.parameters import Mass, Parameter, above_zero, of_dimension
 from residnet.regression.expressions import Algebra
 from residnet.regression.genetic import breed, limits_of, require_deap, validating
 from residnet.regression.writing import term
@@ -32,6 +32,29 @@ _LEAST = 1e-34
 """Least error in the picture, in (m/s^2)^2: what rounding leaves is less."""
 _PUBLISHED_RUNS = 10
 """Number of runs of each combination in Tables 5.2 and 5.3."""
+
+
+class MassSpringDamperConfig(Config):
+    """The mass-spring-damper m x_ddot + d x_dot + k x = tau (document 000, eqs. (4.1), (4.2)).
+
+    Attributes:
+        m: mass in kg; by default that of section 5.3. (4.3) is another system: m = 20 kg,
+            d = 10 kg/s, k = 12 N/m (correction H24).
+        d: damping in kg/s.
+        k: stiffness in N/m.
+        tau_max: amplitude of the force.
+    """
+
+    m: Annotated[Mass, AfterValidator(above_zero)] = Parameter(
+        value=10.0, unit="kg", source="document 000, section 5.3, (5.13)"
+    )
+    d: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -1))] = Parameter(
+        value=13.0, unit="kg/s", source="document 000, section 5.3, (5.13)"
+    )
+    k: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -2))] = Parameter(
+        value=5.0, unit="N/m", source="document 000, section 5.3, (5.13)"
+    )
+    tau_max: Newtons = Field(default=1.0, gt=0)
 
 
 class RecordConfig(Config):

@@ -19,6 +19,7 @@ from residnet.control.heading.conditions import (
     HeadingChanges,
     SteadyTest,
     nominal,
+    quickly,
     too_many,
 )
 from residnet.control.heading.policies import HeadingPolicy
@@ -26,7 +27,6 @@ from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.errors import ExportError
 from residnet.core.progress import say
 from residnet.data.module import EpochDataModule
-from residnet.dynamics.rollout import Rollout
 from residnet.training.policies.config import PolicyTraining
 from residnet.training.trainer import EpochTraining, run_epochs
 
@@ -101,7 +101,7 @@ class PolicyFit(EpochTraining):
         settings = self.settings
         loop = ConditionedRun(self.vessel, self.policy, dt, settings.integrator, torch.float32)
         rollout = loop.rollout(max(math.ceil(self.conditions.delay[1] / dt), 1))
-        fly = _flying(rollout, self.compiler, loop.given(self._batch(0.0, 2)))
+        fly = quickly(rollout, self.compiler, loop.given(self._batch(0.0, 2)), _slow)
         self._loops[dt] = loop, fly
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -277,21 +277,8 @@ class HeadingChangesData(EpochDataModule):
         return (self.fit.batch(number) for number in range(self.steps))
 
 
-def _flying(
-    rollout: Rollout, compiler: Compiler | None, given: tuple[Tensor, Tensor, Tensor]
-) -> Flying:
-    """Return the flights of a closed loop, compiled where a compiler is given and works."""
-    if compiler is not None:
-        try:
-            return compiler(rollout, *given)
-        except ExportError as error:
-            say(f"  the flights are not compiled, training is much slower: {error}")
-
-    def fly(x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        states, inputs, _ = rollout(x, w, s)
-        return states, inputs
-
-    return fly
+def _slow(error: ExportError) -> None:
+    say(f"  the flights are not compiled, training is much slower: {error}")
 
 
 def train_policy(
