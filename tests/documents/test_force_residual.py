@@ -21,7 +21,6 @@ from residnet.documents.jervan2020.measured import (
     better,
     compare_accelerations,
     force_study,
-    read_measured,
     written,
 )
 from residnet.physics.force_model import FERRY_TERMS
@@ -166,7 +165,7 @@ def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: 
 
 def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0)
-    measured = read_measured(config(tmp_path))
+    measured = config(tmp_path).measured()
     record, test = measured.split(2, 5.0)
     assert measured.parts == "stretches"
     near = torch.nn.functional.max_pool1d(test.double()[None, None], 101, 1, 50)[0, 0] > 0
@@ -174,7 +173,7 @@ def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_p
     assert int((~near & ~record.train).sum()) == int((~measured.good & ~near).sum())
     for number, name in enumerate(("two", "three")):
         log(tmp_path, name, missing=1.0, seed=number + 1, seconds=100.0)
-    measured = read_measured(config(tmp_path))
+    measured = config(tmp_path).measured()
     record, test = measured.split(0, 5.0)
     assert (measured.names, measured.parts) == (("one", "three", "two"), "logs")
     assert bool(test[: record.runs[0]].any())
@@ -189,16 +188,16 @@ def test_a_log_that_stands_twice_is_refused(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0, seconds=60.0)
     log(tmp_path, "copy", missing=1.0, seconds=60.0)
     with pytest.raises(DataError, match="identical rows"):
-        read_measured(config(tmp_path))
+        config(tmp_path).measured()
 
 
 def test_acceleration_of_an_offset_sensor_is_calibrated(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0)
-    found = read_measured(config(tmp_path)).acceleration
+    found = config(tmp_path).measured().acceleration
     assert found["surge"]["offset"] == pytest.approx(OFFSET, abs=1e-4)
     assert found["surge"]["offset_ci95"][0] <= OFFSET <= found["surge"]["offset_ci95"][1] + 1e-6
     assert found["sway"]["offset"] == pytest.approx(0.0, abs=1e-4)
-    measured = read_measured(config(tmp_path, "acceleration=measured"))
+    measured = config(tmp_path, "acceleration=measured").measured()
     truth = torch.from_numpy(motion(0, 300.0)[2])
     torch.testing.assert_close(
         measured.record.nu_dot[measured.good], truth[measured.good], rtol=0, atol=1e-4
@@ -212,7 +211,7 @@ def test_outliers_and_gaps_are_left_out(tmp_path: Path) -> None:
     v = nu[:, 1].copy()
     v[1500:1600] = np.nan
     log(tmp_path, "one", missing=1.0, u=u, v=v)
-    measured = read_measured(config(tmp_path))
+    measured = config(tmp_path).measured()
     assert not bool(measured.good[700])
     assert not bool(measured.good[1500:1600].any())
     assert measured.masked["one"]["outlier"] > 0
@@ -278,7 +277,7 @@ def test_data_that_determine_nothing_are_clear_errors(tmp_path: Path) -> None:
 def test_a_missing_channel_or_log_is_named(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0)
     with pytest.raises(UsageError, match="no channel 'acting_tau'"):
-        read_measured(config(tmp_path, "channels.actual=[acting_tau, acting_tau_y, acting_tau_n]"))
+        config(tmp_path, "channels.actual=[acting_tau, acting_tau_y, acting_tau_n]").measured()
     with pytest.raises(ConfigError, match="matches no file"):
         config(tmp_path, "data.logs=[none_*.csv]").data.files()
 

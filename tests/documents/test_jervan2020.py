@@ -17,7 +17,6 @@ from residnet.control.motion.anticipation import Derivatives, Lag, course, neede
 from residnet.core.config import load_config
 from residnet.core.errors import FitError
 from residnet.documents.jervan2020.ferry import (
-    Ferry,
     FerryModelConfig,
     FerryStudyConfig,
     Flown,
@@ -118,7 +117,7 @@ def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
 def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
     near = "course.waypoints=[[0, 0, 0], [2, 0, 0], [2, -1, 0], [2, -1, 20 deg]]"
     flown = config("azimuth", near, "course.interval=5 s")
-    flight = Ferry(flown).fly(flown.course, [(ForceModel(hull("milliampere")), None)])[0]
+    flight = flown.ferry(flown.true).fly(flown.course, [(ForceModel(hull("milliampere")), None)])[0]
     # the logged force is the controller's: feed-forward and feedback, not what the thrusters make
     motion = course(flown.course, flown.loop.step)
     needed = needed_force(ForceModel(hull("milliampere")), motion, None, flown.loop.step)

@@ -1,0 +1,315 @@
+"""A ferry in closed loop: the true plant, a controller that believes in a model, and its log.
+
+Source: document 002, chapter 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.control.base import ClosedLoop, GivenReference, Reference
+from residnet.control.guidance.crossing import Crossing, CrossingConfig
+from residnet.control.motion.anticipation import Assisted, Lag, course, needed_force, reference_row
+from residnet.control.motion.pid import Allocated, Gain, MotionPID, MotionPIDConfig
+from residnet.control.motion.reference_filter import ReferenceFilterConfig
+from residnet.core.config import (
+    Config,
+    Metres,
+    MetresPerSecond,
+    Newtons,
+    Radians,
+    RadiansPerSecond,
+    Seconds,
+    quantity,
+)
+from residnet.core.errors import ConfigError, DataError
+from residnet.core.layout import (
+    ACTUATORS,
+    MOTION,
+    POSE,
+    VELOCITIES,
+)
+from residnet.dynamics.rollout import Rollout, Source
+from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.judge.courses import Tracking, tracking
+from residnet.physics.actuators import ForceActuators
+from residnet.physics.force_model import ForceModel
+from residnet.physics.hull import HullConfig
+from residnet.physics.plant import HullPlant
+from residnet.physics.vessel import load_vessel
+
+Feed = tuple[ForceModel, Lag | None]
+"""A model as feed-forward, and the lag of the thrusters that it leads."""
+
+
+class LoopConfig(Config):
+    """A PID controller with critically damped poles, and the sampling of its log.
+
+    The gains are Kp = m omega^2, Kd = 2 m omega and Ki = integral omega Kp, with m the believed
+    mass of each axis. The document does not print its gains (correction J10).
+
+    Attributes:
+        frequency: omega of surge, sway and yaw in rad/s.
+        integral: share of omega Kp that is the integral gain, without unit.
+        step: time step of controller and plant in s.
+        every: number of steps from one sample of the log to the next.
+    """
+
+    frequency: tuple[RadiansPerSecond, RadiansPerSecond, RadiansPerSecond]
+    integral: Gain = 0.1
+    step: Seconds = Field(default=0.02, gt=0)
+    every: int = Field(default=5, ge=1)
+
+    def pid(self, hull_mass: Tensor) -> MotionPID:
+        """Return the feedback for a hull's mass matrix [3, 3] in SI units."""
+        mass, omega = hull_mass.diagonal(), torch.tensor(self.frequency, dtype=torch.float64)
+        proportional = mass * omega**2
+        gains = [
+            tuple(part.tolist())
+            for part in (proportional, self.integral * omega * proportional, 2.0 * mass * omega)
+        ]
+        return MotionPIDConfig(proportional=gains[0], integral=gains[1], derivative=gains[2]).build(
+            self.step
+        )
+
+
+class MotionNoise(Config):
+    """White noise on what is measured, drawn anew at every step (Table 4.14, correction J25).
+
+    Attributes:
+        position: standard deviation of x and y in m.
+        heading: standard deviation of psi in rad.
+        velocity: standard deviation of u and v in m/s.
+        yaw_rate: standard deviation of r in rad/s.
+        acceleration: standard deviation of u_dot and v_dot in m/s^2.
+        yaw_acceleration: standard deviation of r_dot in rad/s^2.
+    """
+
+    position: Metres = Field(default=0.0, ge=0)
+    heading: Radians = Field(default=0.0, ge=0)
+    velocity: MetresPerSecond = Field(default=0.0, ge=0)
+    yaw_rate: RadiansPerSecond = Field(default=0.0, ge=0)
+    acceleration: quantity("m/s^2") = 0.0  # type: ignore[valid-type]
+    yaw_acceleration: quantity("rad/s^2") = 0.0  # type: ignore[valid-type]
+
+    def spread(self) -> tuple[float, ...]:
+        """Return the standard deviations of pose, velocities and accelerations, nine numbers."""
+        linear = (self.position, self.velocity, self.acceleration)
+        angular = (self.heading, self.yaw_rate, self.yaw_acceleration)
+        return tuple(value for a, b in zip(linear, angular, strict=True) for value in (a, a, b))
+
+    def draw(self, shape: Sequence[int], seed: int) -> Tensor:
+        """Return noise [..., 9] on pose, velocities and accelerations, float64."""
+        generator = torch.Generator().manual_seed(seed)
+        return torch.randn(*shape, 9, generator=generator, dtype=torch.float64) * torch.tensor(
+            self.spread(), dtype=torch.float64
+        )
+
+
+class Disturbance(Config):
+    """A force that is constant in earth axes.
+
+    Attributes:
+        north: force to the north in N.
+        east: force to the east in N.
+    """
+
+    north: Newtons = 0.0
+    east: Newtons = 0.0
+
+
+def measured(x: Tensor, noise: Tensor) -> Tensor:
+    """Return states [..., nx] with noise [..., 6] on pose and velocities."""
+    return torch.cat((x[..., MOTION] + noise, x[..., ACTUATORS]), dim=-1)
+
+
+@final
+class Sensed(Source):
+    """A closed loop that measures the state with given noise [B, T, 6] on pose and velocities."""
+
+    def __init__(self, loop: ClosedLoop, noise: Tensor) -> None:
+        super().__init__()
+        self.loop, self.noise = loop, noise
+
+    def initial(self, x: Tensor) -> Tensor:
+        return self.loop.initial(x)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        inputs, memory = self.loop(measured(x, self.noise[:, k]), w, k, memory)
+        return inputs, memory
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One simulated run, sampled as its log is; SI units, forces in N, N, N m.
+
+    Attributes:
+        t: time [N] in s.
+        pose: true x, y, psi [N, 3].
+        nu: true u, v, r [N, 3].
+        nu_dot: true accelerations [N, 3].
+        measured: pose, nu and nu_dot as measured [N, 9].
+        command: commanded force tau_c at the samples [N, 3].
+        averaged: tau_c averaged over the steps around each sample [N, 3], so that noise between the
+            samples does not alias.
+        feedback: force of the feedback tau_FB [N, 3].
+        acting: force of the thrusters [N, 3].
+        desired: desired pose eta_d [N, 3].
+        tracking: metrics over every step.
+    """
+
+    t: Tensor
+    pose: Tensor
+    nu: Tensor
+    nu_dot: Tensor
+    measured: Tensor
+    command: Tensor
+    averaged: Tensor
+    feedback: Tensor
+    acting: Tensor
+    desired: Tensor
+    tracking: Tracking
+
+
+def force_hull(name: str) -> tuple[HullPlant, ForceActuators]:
+    """Return a vessel by name or file, and its actuators, which make all three forces.
+
+    Raises:
+        ConfigError: where it is no hull, or its actuators do not push in surge, sway and yaw alike.
+    """
+    config = load_vessel(name)
+    if isinstance(config, HullConfig):
+        plant = config.build()
+        if isinstance(plant.actuators, ForceActuators):
+            return plant, plant.actuators
+    raise ConfigError(
+        f"vessel '{name}': this study needs a hull whose actuators push in surge, sway and yaw"
+        " alike (kind forces or azimuth_thrusters)"
+    )
+
+
+@final
+class Ferry:
+    """The true plant, the believed hull and the control loop between them.
+
+    Args:
+        true: vessel that is simulated.
+        believed: vessel that the controller believes in.
+        loop: feedback and sampling.
+        noise: on what is measured; None for none.
+        disturbance: constant force.
+        seed: of the noise.
+
+    Raises:
+        ConfigError: where a vessel is no hull whose actuators make all three forces.
+    """
+
+    def __init__(
+        self,
+        true: str,
+        believed: str,
+        loop: LoopConfig,
+        noise: MotionNoise | None,
+        disturbance: Disturbance,
+        seed: int,
+    ) -> None:
+        self.loop, self.noise, self.disturbance, self.seed = loop, noise, disturbance, seed
+        self.true, self.thrusters = force_hull(true)
+        self.believed = force_hull(believed)[0].hull
+        if not self.thrusters.state:
+            raise ConfigError(
+                f"vessel '{true}': its forces follow at once; the study is about thrusters that"
+                " lag, give actuators.response"
+            )
+        if disturbance == Disturbance():
+            self.true.in_calm_water()
+
+    def fly(
+        self,
+        path: ReferenceFilterConfig | CrossingConfig,
+        feeds: Sequence[Feed],
+        *,
+        feedback: bool = True,
+    ) -> list[Flight]:
+        """Fly a course or a crossing with each model as feed-forward, all in one batch.
+
+        Raises:
+            DataError: where the closed loop is unstable.
+        """
+        gains, step, lags = self.loop, self.loop.step, [lag for _, lag in feeds]
+        guidance: Reference
+        if isinstance(path, CrossingConfig):
+            guidance, steps = Crossing(path, step, feeds), round(path.duration / step)
+        else:
+            motion = course(path, step)
+            needed = [needed_force(model, motion, lag, step) for model, lag in feeds]
+            asked = torch.stack([reference_row(motion, force) for force in needed])
+            guidance, steps = GivenReference(asked), len(motion.pose)
+        if not feedback:
+            gains = gains.model_copy(update={"frequency": (0.0, 0.0, 0.0)})
+        pid = gains.pid(self.believed.mass)
+        w = torch.zeros(len(feeds), steps, len(self.true.inputs), dtype=torch.float64)
+        if self.disturbance != Disturbance():
+            for key, force in self.disturbance:
+                w[:, :, self.true.inputs.index(f"force_{key}")] = force
+        noise = (self.noise or MotionNoise()).draw((len(feeds), steps), self.seed)
+        loop = ClosedLoop(Allocated(Assisted(pid, lags, step), self.thrusters), guidance)
+        source = loop if self.noise is None else Sensed(loop, noise[..., MOTION])
+        x0 = torch.zeros(len(feeds), len(self.true.state), dtype=torch.float64)
+        with torch.no_grad():
+            model = Rollout(TracedPlantDynamics(self.true, step), source)
+            states, inputs, _ = model(x0, w, x0[:, :0])
+            states = states[:, :-1]
+            if not bool(torch.isfinite(states).all()):
+                raise DataError(
+                    "the ferry left all bounds in closed loop: with these gains and models the loop"
+                    " is unstable"
+                )
+            seen = measured(states, noise[..., MOTION])
+            if isinstance(guidance, GivenReference):
+                references = guidance.values
+            else:
+                memory, followed = guidance.initial_state(states[:, 0]), []
+                for k in range(steps):
+                    reference, memory = guidance(seen[:, k], k, memory)
+                    followed.append(reference)
+                references = torch.stack(followed, dim=1)
+            return [
+                self._flight(states[i], inputs[i], references[i], seen[i], noise[i], pid)
+                for i in range(len(feeds))
+            ]
+
+    def _flight(
+        self, x: Tensor, w: Tensor, reference: Tensor, seen: Tensor, noise: Tensor, pid: MotionPID
+    ) -> Flight:
+        loop, given = self.loop, w[:, : self.true.commands]
+        command, desired = self.thrusters.asked(given), reference[:, :9]
+        error = pid.error(seen, reference)
+        feedback, _ = pid(seen, desired, (error.cumsum(0) - error) * loop.step)
+        rate = self.true.rate(x, w)
+        motion = torch.cat((x[:, VELOCITIES], rate[:, VELOCITIES]), dim=-1)
+        metrics = tracking(x[:, POSE], motion, desired, command, feedback, loop.step)
+        every, half = slice(None, None, loop.every), loop.every // 2
+        ends = torch.cat((command[:1].expand(half, 3), command, command[-1:].expand(half, 3)))
+        t = torch.arange(len(x), dtype=torch.float64) * loop.step
+        acting = self.thrusters.force(x[:, ACTUATORS], given, x[:, VELOCITIES])
+        logged = torch.cat((x[:, MOTION], rate[:, VELOCITIES]), dim=-1) + noise
+        return Flight(
+            t[every],
+            x[every, POSE],
+            x[every, VELOCITIES],
+            rate[every, VELOCITIES],
+            logged[every],
+            command[every],
+            ends.unfold(0, 2 * half + 1, 1).mean(-1)[every],
+            feedback[every],
+            acting[every],
+            reference[every, POSE],
+            metrics,
+        )
