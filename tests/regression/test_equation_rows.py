@@ -1,6 +1,4 @@
-"""Rows of the weak form and of instruments against sums written out, closed forms, and bias that
-must go.
-"""
+"""Rows of the weak form against sums written out and closed forms."""
 
 from __future__ import annotations
 
@@ -9,7 +7,6 @@ import pytest
 
 from residnet.core.errors import ConfigError, FitError
 from residnet.regression.equation_rows import (
-    InstrumentRows,
     Rows,
     SampleRows,
     WeakRows,
@@ -17,8 +14,6 @@ from residnet.regression.equation_rows import (
     step_of,
     unbroken_stretches,
 )
-
-NONE_EXACT = np.zeros(2, dtype=bool)
 
 
 def record(n: int = 200) -> Rows:
@@ -32,7 +27,7 @@ def record(n: int = 200) -> Rows:
 
 def test_windows_are_weighted_sums_within_stretches() -> None:
     sampled = record()
-    rows = WeakRows(window=2.5, every=0.2).rows(sampled, 0.1, NONE_EXACT)
+    rows = WeakRows(window=2.5, every=0.2).rows(sampled, 0.1)
     place = -1 + 2 * np.arange(1, 26) / 26
     weight = (1 - place**2) ** 2
     weight /= weight.sum()
@@ -56,7 +51,7 @@ def test_windows_over_central_differences_are_integrals_by_parts() -> None:
     x = np.random.default_rng(1).normal(size=100)
     rate = (x[2:] - x[:-2]) / (2 * step)
     rows = WeakRows(window=size * step, every=1 / size).rows(
-        Rows(np.ones((98, 1)), rate[:, None], np.zeros(98, dtype=int)), step, NONE_EXACT[:1]
+        Rows(np.ones((98, 1)), rate[:, None], np.zeros(98, dtype=int)), step
     )
     place = np.linspace(-1, 1, size + 2)
     weight = np.concatenate(([0.0, 0.0], (1 - place[1:-1] ** 2) ** 2, [0.0, 0.0]))
@@ -64,40 +59,6 @@ def test_windows_over_central_differences_are_integrals_by_parts() -> None:
     slope = (weight[2:] - weight[:-2]) / (2 * step)
     by_parts = [-(slope @ x[k : k + size + 2]) for k in range(len(rows.y))]
     np.testing.assert_allclose(rows.y[:, 0], by_parts, atol=1e-12)
-
-
-def test_instruments_are_two_stage_least_squares() -> None:
-    sampled = record()
-    rows = InstrumentRows(lag=0.3).rows(sampled, 0.1, np.array([False, True]))
-    now = [i for i in range(6, 200) if sampled.stretch[i] == sampled.stretch[i - 6]]
-    x, y = sampled.x[now], sampled.y[now, 0]
-    z = np.column_stack(
-        [sampled.x[[i - 3 for i in now]], sampled.x[[i - 6 for i in now], 0], x[:, 1]]
-    )
-    project = z @ np.linalg.inv(z.T @ z) @ z.T
-    truth = np.linalg.solve(x.T @ project @ x, x.T @ project @ y)
-    np.testing.assert_allclose(
-        np.linalg.lstsq(rows.x, rows.y[:, 0], rcond=None)[0], truth, rtol=1e-9
-    )
-
-
-def test_instruments_take_away_the_bias_of_noisy_regressors() -> None:
-    random = np.random.default_rng(3)
-    n = 20000
-    state = np.zeros(n)
-    for k in range(1, n):
-        state[k] = 0.98 * state[k - 1] + random.normal()
-    noisy = state + 0.5 * state.std() * random.normal(size=n)
-    sampled = Rows(
-        noisy[:, None], (2.0 * state + 0.1 * random.normal(size=n))[:, None], np.zeros(n, dtype=int)
-    )
-    plain, lagged = (
-        np.linalg.lstsq(rows.x, rows.y, rcond=None)[0].item()
-        for rows in (sampled, InstrumentRows(lag=0.2).rows(sampled, 0.1, NONE_EXACT[:1]))
-    )
-    # a noise of half the deviation leaves 1 / (1 + 0.25) of the coefficient
-    assert plain == pytest.approx(1.6, rel=0.02)
-    assert lagged == pytest.approx(2.0, rel=0.02)
 
 
 def test_correlation_time_of_known_noise() -> None:
@@ -122,18 +83,14 @@ def test_stretches_end_at_gaps_and_manoeuvres() -> None:
 
 def test_least_squares_takes_samples_as_they_are() -> None:
     sampled = record()
-    assert SampleRows().rows(sampled, 0.0, NONE_EXACT) is sampled
+    assert SampleRows().rows(sampled, 0.0) is sampled
 
 
 def test_what_cannot_be_done_is_one_line() -> None:
     sampled = record(100)
     with pytest.raises(FitError, match="no unbroken stretch of samples is 9 s long"):
-        WeakRows(window=9.0).rows(sampled, 0.1, NONE_EXACT)
+        WeakRows(window=9.0).rows(sampled, 0.1)
     with pytest.raises(ConfigError, match="holds 2 samples"):
-        WeakRows(window=0.2).rows(sampled, 0.1, NONE_EXACT)
-    with pytest.raises(ConfigError, match="less than one step"):
-        InstrumentRows(lag=0.04).rows(sampled, 0.1, NONE_EXACT)
-    with pytest.raises(FitError, match="0 samples have a past of 8 s"):
-        InstrumentRows(lag=4.0).rows(sampled, 0.1, NONE_EXACT)
+        WeakRows(window=0.2).rows(sampled, 0.1)
     with pytest.raises(FitError, match="no manoeuvre has two samples"):
         step_of(np.array([0, 1, 2]), np.zeros(3))

@@ -111,14 +111,6 @@ class ResidualHead(nn.Module, ABC):
     def calibrate(self, samples: Samples) -> None:
         """Take scales and ranges from the training samples; called once, before the fit."""
 
-    def silence(self) -> None:
-        """Set the residual to zero, from where a training can go on.
-
-        Raises:
-            ConfigError: where a head cannot.
-        """
-        raise ConfigError("from_baseline: this head cannot start at zero; leave it out")
-
     def residual_std(self) -> Tensor:
         """Return the standard deviation of the residual on the training samples, [3], float64.
 

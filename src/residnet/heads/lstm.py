@@ -189,11 +189,6 @@ class LstmNetwork(nn.Module):
         )
         self.readout = nn.Sequential(*mixer, out)
 
-    def silence(self) -> None:
-        """Set the output to zero."""
-        for parameter in self.readout[-1].parameters():
-            nn.init.zeros_(parameter)
-
     def remembered(self, f: Tensor) -> Tensor:
         """Return the features that the memory sees."""
         return f.index_select(-1, self.seen) if self.partial else f
@@ -247,11 +242,6 @@ class LstmHead(ResidualHead):
         for network in self.networks:
             network.features.calibrate(samples)
         self.scale.calibrate(samples)
-
-    def silence(self) -> None:
-        """Set the residual to zero: the last layer of each network."""
-        for network in self.networks:
-            network.silence()
 
     def residual_std(self) -> Tensor:
         return self.scale.spread

@@ -89,9 +89,6 @@ class MirroredHead(ResidualHead):
         )
         self.inner.calibrate(both)
 
-    def silence(self) -> None:
-        self.inner.silence()
-
     def residual_std(self) -> Tensor:
         return self.inner.residual_std()
 

@@ -73,10 +73,6 @@ class MlpHead(ResidualHead):
         self.features.calibrate(samples)
         self.scale.calibrate(samples)
 
-    def silence(self) -> None:
-        for parameter in self.net[-1].parameters():
-            nn.init.zeros_(parameter)
-
     def residual_std(self) -> Tensor:
         return self.scale.spread
 

@@ -215,8 +215,7 @@ class SymbolicConfig(FeatureConfig):
         candidates: which terms the equations may have, by type.
         terms: names of the candidates, instead of types.
         search: how far the search goes.
-        estimator: what a row of the regression is: a sample, a window of the weak form, or either
-            behind instruments; terms that name no motion count as free of measuring noise.
+        estimator: what a row of the regression is: a sample, or a window of the weak form.
         symmetric: leave out of each axis the terms that a vessel with port/starboard symmetry
             cannot have there, as far as the mirror images of its channels are known.
         delay: inputs that act late; none where left out.
@@ -335,14 +334,8 @@ class SymbolicHead(EquationHead):
         """Return the solutions of a sparse regression of all axes."""
         with torch.no_grad():
             terms = self.basis(torch.from_numpy(past.chosen)).numpy()
-        motions, channels = self.config.candidates.motions, self.features.names
-        exact = np.array(
-            [
-                all(factor.name not in motions for factor in parse_term(term, channels))
-                for term in self.library.terms
-            ]
-        )
-        rows = self.config.estimator.rows(Rows(terms, past.target, past.stretch), past.step, exact)
+        channels = self.features.names
+        rows = self.config.estimator.rows(Rows(terms, past.target, past.stretch), past.step)
         odd = [
             [wrong_parity(term, axis, channels) for axis in range(3)] for term in self.library.terms
         ]

@@ -1,12 +1,11 @@
-"""Rows of a regression: samples, integrals over short windows, or rows behind instruments; delays.
+"""Rows of a regression: samples, or integrals over short windows; delays.
 
 Noise enters an equation twice: through the derivative on its left, which differentiation amplifies,
 and through the regressors on its right, which pull coefficients towards zero. Integrating both
 sides against a test function w that vanishes at the ends of a window, int w y dt = sum c_j int w
 f_j dt, takes the derivative off the noisy record (by parts, int w x_dot dt = -int w_dot x dt).
 Where accelerations are central differences (`savitzky_golay` over three samples) summing them is
-the same as summing by parts. InstrumentRows, the terms themselves some time earlier, share what is
-true with the regressors and not the noise.
+the same as summing by parts.
 """
 
 from __future__ import annotations
@@ -21,8 +20,6 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.stretches import stretch_bounds
 
-_DEPENDENT = 1e-10
-"""Length of a unit instrument beside those before it up to which it adds nothing."""
 _BLOCK = 8_000_000
 """Numbers of windows held at a time."""
 _ROUNDED = 1e-10
@@ -52,17 +49,15 @@ class RowBuilder(Config, ABC):
     sequential: ClassVar[bool] = True
 
     @abstractmethod
-    def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
+    def rows(self, sampled: Rows, step: float) -> Rows:
         """Return the rows of the regression.
 
         Args:
             sampled: terms and targets at samples `step` seconds apart within each stretch.
             step: time between samples, s.
-            exact: which terms are free of measuring noise, such as those of commands alone, [J]
-                bool.
 
         Raises:
-            ConfigError: where a window or a lag holds too few samples.
+            ConfigError: where a window holds too few samples.
             FitError: where no stretch is as long as it must be.
         """
 
@@ -74,7 +69,7 @@ class SampleRows(RowBuilder):
     sequential: ClassVar[bool] = False
     kind: Literal["least_squares"] = "least_squares"
 
-    def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
+    def rows(self, sampled: Rows, step: float) -> Rows:
         return sampled
 
 
@@ -93,57 +88,11 @@ class WeakRows(RowBuilder):
     window: Seconds = Field(default=2.0, gt=0.0)
     every: float = Field(default=0.05, gt=0.0, le=1.0)
 
-    def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
+    def rows(self, sampled: Rows, step: float) -> Rows:
         return integrated(sampled, step, self.window, self.every)
 
 
-@final
-class InstrumentRows(RowBuilder):
-    """The regressors projected on instruments (two-stage least squares).
-
-    Instruments are the terms one and two lags earlier and the exact terms.
-
-    Attributes:
-        lag: longer than noise stays correlated, shorter than the motion takes to change.
-        window: of a weak form taken first, s; 0 for none. Windows that overlap share noise: a lag
-            should then be as long.
-        every: distance between windows as a share of their length.
-    """
-
-    kind: Literal["instruments"] = "instruments"
-    lag: Seconds = Field(default=0.5, gt=0.0)
-    window: Seconds = Field(default=0.0, ge=0.0)
-    every: float = Field(default=0.05, gt=0.0, le=1.0)
-
-    def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        if self.window > 0:
-            apart = max(round(self.every * self.window / step), 1) * step
-            sampled, step = integrated(sampled, step, self.window, self.every), apart
-        lag = round(self.lag / step)
-        if lag < 1:
-            raise ConfigError(
-                f"instruments: a lag of {self.lag:g} s is less than one step of {step:g} s;"
-                " lengthen it"
-            )
-        begins, _ = stretch_bounds(sampled.stretch)
-        now = np.flatnonzero(np.arange(len(begins)) - 2 * lag >= begins)
-        x = sampled.x[now]
-        behind = np.concatenate(
-            (sampled.x[now - lag], sampled.x[now - 2 * lag][:, ~exact], x[:, exact]), axis=1
-        )
-        if len(now) <= behind.shape[1]:
-            few = f"{len(now)} samples have a past of {2 * self.lag:g} s"
-            raise FitError(
-                f"instruments: {few}, {behind.shape[1]} instruments need more; shorten the lag or"
-                " give longer logs"
-            )
-        length = np.linalg.norm(behind, axis=0)
-        q, r = np.linalg.qr(behind / np.where(length > 0, length, 1.0))
-        q = q[:, np.abs(np.diagonal(r)) > _DEPENDENT]
-        return Rows(np.where(exact, x, q @ (q.T @ x)), sampled.y[now], sampled.stretch[now])
-
-
-RowsConfig = Annotated[SampleRows | WeakRows | InstrumentRows, Field(discriminator="kind")]
+RowsConfig = Annotated[SampleRows | WeakRows, Field(discriminator="kind")]
 """Any way to make rows; its `kind` says which."""
 
 

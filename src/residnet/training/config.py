@@ -188,8 +188,6 @@ class TrainingConfig(MachineConfig):
         weight_decay: of AdamW, on matrices only.
         average: decay of the exponential average of the weights that is validated and kept; 0 for
             none.
-        from_baseline: the network's output starts at zero, so that the training starts from its
-            baseline, which stays a candidate: weights are kept only where they gain.
         mirror: every other window is seen in the mirror, port for starboard.
         patience: stop when this many validations in a row bring no better free run, once the last
             stage has begun.
@@ -206,7 +204,6 @@ class TrainingConfig(MachineConfig):
     gradient_clip: float = Field(default=1.0, gt=0)
     weight_decay: float = Field(default=0.0, ge=0)
     average: float = Field(default=0.0, ge=0, lt=1)
-    from_baseline: bool = False
     mirror: bool = False
     patience: int = Field(default=20, ge=1)
     validate_every: int = Field(default=1, ge=1)

@@ -233,14 +233,11 @@ class HeadTraining(EpochTraining):
         return torch.optim.AdamW(groups, lr=1e-3)
 
     def on_fit_start(self) -> None:
-        """Reset the losses; a model that is trained further is a candidate as it is."""
+        """Reset the losses."""
         super().on_fit_start()
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             self.rank, self.world = self.global_rank, torch.distributed.get_world_size()
         self.scales = self.scales.to(self.device)
-        if self.settings.from_baseline and self.epoch == 0:
-            self.validate_start()
-            self.best_diverged = self.diverged
 
     def on_train_epoch_start(self) -> None:
         """Seed the epoch and set the stage's learning rate."""
@@ -376,8 +373,6 @@ def train(
         FitError: where training never gave a finite free run.
     """
     model.head.calibrate(samples)
-    if config.from_baseline:
-        model.head.silence()
     if isinstance(model.head, RecurrentHead):
         return _train_coarse(name, model, store, config, scales, validate, seed, folder)
     dtype = torch.float64 if config.double else torch.float32

@@ -6,7 +6,6 @@ For each candidate lag the regression is linear.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -56,15 +55,6 @@ def _delayed(u: np.ndarray, delay: float, dt: float) -> np.ndarray:
     return out
 
 
-@dataclass(frozen=True)
-class LagFit:
-    """A lag with the share of the residual's variance that regression leaves under it."""
-
-    lag: Lag
-    left: tuple[float, float, float]
-    left_without: tuple[float, float, float]
-
-
 def fit_lag(
     command: Tensor,
     needed: Tensor,
@@ -72,7 +62,7 @@ def fit_lag(
     dt: float,
     use: Tensor | None = None,
     runs: Sequence[int] = (),
-) -> LagFit:
+) -> Lag:
     """Return the lag under which F_believed + basis explains the followed command best.
 
     Args:
@@ -94,7 +84,6 @@ def fit_lag(
     x = basis[keep] - basis[keep].mean(0)
     q, r = torch.linalg.qr(x / x.std(0).clamp(min=1e-300))
     q = q[:, r.diagonal().abs() > 1e-9 * r.diagonal().abs().max()]
-    variance = (command - needed)[keep].var(0).clamp(min=1e-300)
 
     def unexplained(y: Tensor) -> Tensor:
         y = y - y.mean(0)
@@ -121,14 +110,7 @@ def fit_lag(
         diff_step=[1e-4] * 3,
         max_nfev=60,
     )
-    lag = _lag_within_bounds(found.x)
-    rests = [
-        unexplained((force - needed)[keep]) for force in (followed(command, lag, dt, runs), command)
-    ]
-    shares = [(rest.square().mean(0) / variance).tolist() for rest in rests]
-    return LagFit(
-        lag, (shares[0][0], shares[0][1], shares[0][2]), (shares[1][0], shares[1][1], shares[1][2])
-    )
+    return _lag_within_bounds(found.x)
 
 
 def _lag_within_bounds(p: np.ndarray) -> Lag:

@@ -306,7 +306,7 @@ def compare_forces(measured: Measured) -> dict[str, Any]:
             record.dt,
             good,
             record.runs,
-        ).lag
+        )
         out["lag"] = lag.model_dump()
         after = followed(record.command, lag, record.dt, record.runs)
     except FitError as error:

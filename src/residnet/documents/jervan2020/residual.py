@@ -435,7 +435,7 @@ def fit_model(config: ResidualModelConfig, record: Record, base: ForceModel) -> 
     notes: dict[str, Any] = {}
     if config.lag:
         regressors = torch.cat((x, earth_axes[:, 0]), dim=-1) if config.earth else x
-        lag = fit_lag(record.averaged, needed, regressors, record.dt, train, record.runs).lag
+        lag = fit_lag(record.averaged, needed, regressors, record.dt, train, record.runs)
         force = followed(record.averaged, lag, record.dt, record.runs)
         notes["lag"] = lag.model_dump()
     y, earth_force = force - needed, None
