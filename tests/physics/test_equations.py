@@ -260,7 +260,6 @@ def test_froude_phases() -> None:
         "semi_displacement",
     ]  # fmt: skip
     assert phase_of(torch.tensor([0.4, 1.0, 1.1])).tolist() == [1, 2, 2]
-    assert phase_of(torch.tensor([1.1]), (0.4, 1.2)).tolist() == [1]
     with pytest.raises(ValueError, match="length"):
         froude_number(u, v, 0.0)
 

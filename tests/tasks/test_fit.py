@@ -179,7 +179,8 @@ assert model.initial_state(3).shape == (3, card["memory"])
 assert 0.05 < float(x[0, 3]) < 2.5
 """
     file = str(tiny_run / "exports" / "lstm.pt")
-    subprocess.run([sys.executable, "-c", script, file], check=True)
+    done = subprocess.run([sys.executable, "-c", script, file], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.long

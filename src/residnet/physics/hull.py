@@ -500,10 +500,10 @@ def froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
     return torch.hypot(u, v) / math.sqrt(GRAVITY * length)
 
 
-def phase_of(froude: Tensor, boundaries: tuple[float, float] = BOUNDARIES) -> Tensor:
+def phase_of(froude: Tensor) -> Tensor:
     """Return the number of the phase in `PHASES` at each Froude number, integers of the same shape.
 
     A boundary belongs to the phase above it.
     """
-    edges = torch.tensor(boundaries, dtype=froude.dtype, device=froude.device)
+    edges = torch.tensor(BOUNDARIES, dtype=froude.dtype, device=froude.device)
     return torch.bucketize(froude, edges, right=True)
