@@ -4,7 +4,6 @@ the library that it needs.
 
 from __future__ import annotations
 
-import builtins
 import random
 from typing import Any
 
@@ -19,7 +18,6 @@ from residnet.regression.genetic import (
     Found,
     evolve,
     limits_of,
-    require_deap,
 )
 
 NAMES = ("a", "b", "c")
@@ -161,13 +159,6 @@ def test_impossible_settings(config: dict[str, Any], message: str) -> None:
 
 
 def test_without_deap_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.split(".")[0] == "deap":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'residnet\[gp\]'"):
-        require_deap()
+        evolve(Algebra(NAMES), DATA, NOISY, TRAIN, EvolutionConfig(population=10), 0)

@@ -6,6 +6,8 @@ it. The command line prints the message without a traceback and exits with the c
 
 from __future__ import annotations
 
+import importlib.util
+
 
 class ResidnetError(Exception):
     """The base of all errors that residnet raises on purpose.
@@ -58,3 +60,21 @@ class WithheldError(ExportError):
 
     A run whose own exports meet it is complete.
     """
+
+
+def require_package(package: str, what: str, extra: str) -> None:
+    """Refuse to go on without an optional package.
+
+    Args:
+        package: as it is imported.
+        what: needs it.
+        extra: of residnet that installs it.
+
+    Raises:
+        MissingPackageError: where it is not installed.
+    """
+    if importlib.util.find_spec(package) is None:
+        raise MissingPackageError(
+            f"{what} needs the package {package}, which is not installed; install it with:"
+            f" pip install 'residnet[{extra}]'"
+        )

@@ -22,7 +22,6 @@ no number: its first answer is the safe command, with the flag.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +33,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from residnet.core.errors import ExportError, UsageError, WithheldError
+from residnet.core.errors import ExportError, WithheldError
 
 Numbers = npt.NDArray[Any]
 SINGLE, DOUBLE = 1e-5, 1e-12
@@ -222,16 +221,3 @@ def name_of(dtype: torch.dtype) -> str:
 def write_card(file: Path, card: Mapping[str, Any]) -> None:
     """Write a card beside its file."""
     file.with_suffix(".card.json").write_text(json.dumps(card, indent=1) + "\n")
-
-
-def require_package(name: str, what: str) -> None:
-    """Refuse to go on without a package of the extra `export`.
-
-    Raises:
-        UsageError: that says how to install it.
-    """
-    if importlib.util.find_spec(name) is None:
-        raise UsageError(
-            f"{what} needs the package {name}, which is not installed: pip install"
-            " 'residnet[export]'"
-        )

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from residnet.core.errors import ExportError
+from residnet.core.errors import ExportError, require_package
 from residnet.core.files import whole
 from residnet.export.base import (
     SINGLE,
@@ -26,7 +26,6 @@ from residnet.export.base import (
     RoundingError,
     in_precision,
     name_of,
-    require_package,
 )
 
 _TOLERANCE = {torch.float32: SINGLE, torch.float64: 1e-7}
@@ -95,7 +94,7 @@ class OnnxExporter(Exporter):
         It is in float64 where float32 does not determine the track.
         """
         for package in ("onnx", "onnxscript", "onnxruntime"):
-            require_package(package, "format onnx")
+            require_package(package, "format onnx", "export")
         exported.require_numbers()
         with tempfile.TemporaryDirectory() as folder:
             partial = Path(folder) / file.name

@@ -34,6 +34,7 @@ from residnet.identification.settings import FitSettings, ForceConfig
 from residnet.judge.freerun import Candidate, Errors, free_run
 from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
 from residnet.regression.estimator import Coefficient, Solution
+from residnet.regression.sparse import coefficient_row
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import free_run_starts, refit
 
@@ -269,7 +270,7 @@ class Fitter:
         }
         if name in self.settings.refit:
             table, covariance = self._refit(name, model, table, notes)
-        notes["coefficients"] = [_coefficient_row(entry) for entry in table]
+        notes["coefficients"] = [coefficient_row(entry) for entry in table]
         notes |= self._validated(model)
         notes["seconds"] = round(time.perf_counter() - started, 1)
         return self._kept(FittedModel(spec, model, notes, covariance))
@@ -420,15 +421,6 @@ class Fitter:
         kept = replace(fitted, model=rebuilt(fitted.spec, fitted.model))
         self.store.keep(kept)
         return kept
-
-
-def _coefficient_row(entry: Coefficient) -> dict[str, Any]:
-    return {
-        "axis": entry.axis,
-        "term": entry.term,
-        "value": entry.value,
-        "standard_error": entry.error,
-    }
 
 
 def require_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:

@@ -158,6 +158,7 @@ WindLoadsConfig = Annotated[SymmetricWindConfig | TabulatedWindConfig, Field(dis
 
 
 GRAVITY = 9.81
+"""Acceleration of free fall in m/s^2."""
 
 
 class Spectrum(Config, ABC):

@@ -18,7 +18,7 @@ from torch import Tensor
 from residnet.core.config import Config, MetresPerSecond
 from residnet.core.names import VELOCITY
 from residnet.physics.actuators import ActuatorConfig, ActuatorsConfig, RollingActuatorsConfig
-from residnet.physics.environment import WindLoadsConfig
+from residnet.physics.environment import GRAVITY, WindLoadsConfig
 from residnet.physics.parameters import (
     Inertia,
     Length,
@@ -36,7 +36,6 @@ from residnet.physics.plant import ROLLING, Hull, HullPlant
 from residnet.physics.terms import read_rows
 from residnet.physics.vessel_file import VesselFile
 
-GRAVITY = 9.81
 _METRES = {"X": 1, "Y": 1, "K": 2, "N": 2, "u": 1, "v": 1, "r": 0}
 """Power of metre in the unit of the force or acceleration of each axis."""
 

@@ -214,6 +214,7 @@ _STRONG = 10.0
 _SLOWEST, _FASTEST = 0.05, 2.0
 """Limits of the rate in 1/s at which velocities are pulled back."""
 _LEAST = 1e-9
+"""Least width of a range, for channels that do not vary."""
 
 
 @final

@@ -13,7 +13,6 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from types import ModuleType
 from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
@@ -21,7 +20,7 @@ import torch
 from pydantic import Field, model_validator
 
 from residnet.core.config import Config
-from residnet.core.errors import FitError, MissingPackageError
+from residnet.core.errors import FitError, require_package
 from residnet.regression.estimator import (
     Coefficient,
     Data,
@@ -326,23 +325,6 @@ class Individual:
         return Individual([tree.__class__(tree) for tree in self.trees])
 
 
-def require_deap() -> ModuleType:
-    """Return DEAP's genetic programming.
-
-    Raises:
-        MissingPackageError: where it is not installed.
-    """
-    try:
-        from deap import gp
-    except ImportError as error:
-        raise MissingPackageError(
-            "genetic programming needs the library DEAP, which is not installed; install it with:"
-            " pip install 'residnet[gp]'"
-        ) from error
-    module: ModuleType = gp
-    return module
-
-
 def evolve(
     algebra: Algebra,
     data: Mapping[str, np.ndarray],
@@ -366,7 +348,7 @@ def evolve(
             no individual could be fitted.
         UsageError: where DEAP is not installed.
     """
-    require_deap()
+    require_package("deap", "genetic programming", "gp")
     for name, values in [
         *((name, data[name]) for name in algebra.channels),
         ("the target", target),
@@ -400,7 +382,9 @@ class _Breeding:
     """One search."""
 
     def __init__(self, algebra: Algebra, fitness: Fitness, config: EvolutionConfig) -> None:
-        self.gp = require_deap()
+        from deap import gp
+
+        self.gp = gp
         self.algebra, self.fitness, self.config = algebra, fitness, config
         self.set = self._primitives()
         self.meaning = _meanings(algebra)

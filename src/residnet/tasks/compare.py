@@ -20,6 +20,7 @@ from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 
 _MOST = 60
+"""Settings in which runs differ that the page shows."""
 _ABSENT = object()
 Window = tuple[str, str, float]
 """Log, protocol and first time of a window."""

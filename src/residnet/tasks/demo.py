@@ -65,6 +65,7 @@ COLUMNS = {
 _GAP = (30.0, 32.5)
 """Seconds that every fifth log lacks."""
 _EPOCH = 1_717_000_000
+"""Unix time at which the made recordings begin, in May 2024."""
 
 
 def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:

@@ -36,6 +36,7 @@ _INSPECTED = 12
 _SHOWN = 12
 """Guesses that the terminal shows."""
 _WIDTH = 96
+"""Columns of a drafted config."""
 Comments = Callable[[tuple[str, ...]], list[str]]
 """Path of a key -> lines about it."""
 

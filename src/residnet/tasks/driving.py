@@ -21,7 +21,9 @@ _PASSIVE = (
 _STILL = 2e-3
 """Spread of an input, as a share of its size, below which it stays where it is."""
 _SAME = 0.9995
+"""Correlation from which two inputs count as one."""
 _MOST = 8
+"""Most inputs that a drafted config takes."""
 _FORCES = ("tau_x", "tau_y", "tau_n")
 
 

@@ -48,6 +48,7 @@ from residnet.runs.task import ComputingTask, MainFigure, Outcome
 _SHOWN = 24
 """Manoeuvres whose indices are shown on the terminal; more stand in a file."""
 STEP = 0.05
+"""Step in s between the samples of a simulation, where none is given."""
 
 
 class ModelChoice(Config):

@@ -5,7 +5,6 @@ Optuna keeps the trials in a journal that survives any kill; each is a run in a 
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import json
 import logging
@@ -23,9 +22,9 @@ from residnet.core.config import BaseConfig, Config, dump_config, load_config
 from residnet.core.errors import (
     DataError,
     FitError,
-    MissingPackageError,
     ResidnetError,
     UsageError,
+    require_package,
 )
 from residnet.core.files import read_json
 from residnet.core.names import nearest
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     import optuna
 
 _MOST = 100_000
+"""Most trials of a sweep."""
 _STALE = 10
 """Seconds after which the lock of a killed process is taken away."""
 _PRIME = 7_919
@@ -355,7 +355,7 @@ class RayConfig(Config):
         Raises:
             MissingPackageError: where it is not.
         """
-        _require("ray", "runner.kind: ray", "ray")
+        require_package("ray", "runner.kind: ray", "ray")
 
     @property
     def side_by_side(self) -> int:
@@ -403,13 +403,6 @@ class _RayExecutor(Executor):
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         found: Future[Any] = self._wrap(work).remote(*args, **kwargs).future()
         return found
-
-
-def _require(package: str, what: str, extra: str) -> None:
-    if importlib.util.find_spec(package) is None:
-        raise MissingPackageError(
-            f"{what} needs the package {package}; install it with: pip install 'residnet[{extra}]'"
-        )
 
 
 SearchConfig = Annotated[GridSearch | RandomSearch | TpeSearch, Field(discriminator="kind")]
@@ -490,7 +483,7 @@ class SweepConfig(Task):
         Raises:
             ResidnetError: where one does not, or the objective does not fit the task.
         """
-        _require("optuna", "task sweep", "sweep")
+        require_package("optuna", "task sweep", "sweep")
         self.runner.check()
         first = {key: values.extremes()[0] for key, values in self.space.items()}
         for key, values in self.space.items():

@@ -24,10 +24,10 @@ from residnet.core.layout import HEADING, POSITION, VELOCITIES, YAW_RATE
 from residnet.data.prepare import Prepared, samples
 from residnet.physics.signals import Signals
 
-# of search and descent; one that gains nothing ends them
 _ROUNDS = 4
-# the search looks at every so many samples
+"""Most rounds of search and descent; one that gains nothing ends them."""
 _THIN = 10
+"""The search looks at every so many samples."""
 
 
 class CurrentConfig(Config):

@@ -69,6 +69,7 @@ def left_open(
 
 
 _HALVINGS = 4
+"""Times that a step which does not gain is halved."""
 
 
 def without_logs(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from residnet.control.courses.course_check import Asked, Protocol, first_fault
 from residnet.control.courses.fitting import Fit, Fitted
-from residnet.control.courses.outline import Circle, Outlines, Room
+from residnet.control.courses.outline import RINGS, Circle, Outlines, Room
 from residnet.control.courses.route import LEG, Bend, Route, Sketch
 from residnet.control.courses.turn_table import (
     POINTS,
@@ -132,7 +132,6 @@ radius, and how many distances buoys may be passed at.
 """
 _EFFORT = 600
 """Times that a route is drawn for fits, beyond which no other outline is fitted."""
-_RINGS = (0.0, 0.25)
 _TOLERANCE = 2e-3
 """Of distances, as a share of the vessel's turning radius."""
 _LAST = 1e-2
@@ -140,6 +139,7 @@ _LAST = 1e-2
 margin to that.
 """
 _FAR = 0.1
+"""Turning radii by which a fit may miss its circles and still be simplified."""
 _MENDED = 0.1
 """Change of z within which a course is mended whose turns fit each other."""
 _SMALL = math.radians(1.5)
@@ -245,7 +245,7 @@ def _planned(
         for room, wide, rings in tries:
             if effort > _EFFORT:
                 break
-            sketch = _outline(request, room, wide, _RINGS[:rings])
+            sketch = _outline(request, room, wide, RINGS[:rings])
             for outline in () if sketch is None else _simplified(request, sketch):
                 if (shape := _shape(outline)) in known:
                     continue

@@ -21,6 +21,7 @@ from residnet.control.courses.turn_table import POINTS
 from residnet.control.courses.turns import Array
 
 _ROUNDS = 45
+"""Most steps of a fit; those that settle take far fewer."""
 _LOOKED = 8
 """Steps after which the problem looks anew what it has to keep to."""
 _SETTLED = 2e-2

@@ -19,13 +19,15 @@ from residnet.control.courses.route import Bend, Sketch
 from residnet.control.courses.turns import Array
 
 _ANGLES = 36
-_RINGS = (0.0, 0.25)
+"""Places about a circle at which it may be touched, ten degrees apart."""
+RINGS = (0.0, 0.25)
 """How much farther off than its circle a buoy may be passed, in turning radii."""
 _TRIED = 24
 """Paths to a pose that are looked at, the shortest first, before all are."""
 _LOOSE = 0.05
 """Turning radii by which the outline may cut a circle; what it leads to is moved out of it."""
 _ENTERED = 18
+"""Courses, 20 degrees apart, in which a circle may be entered."""
 _FULL = 2.0 * math.pi
 SIDES = ((1, 1), (-1, -1), (1, -1), (-1, 1))
 """To which sides the first and the last turn of each kind of path go."""
@@ -248,7 +250,7 @@ class Outlines:
         room: Room,
         rooms: Sequence[Room],
         unit: float,
-        rings: Sequence[float] = _RINGS,
+        rings: Sequence[float] = RINGS,
     ) -> None:
         self.start, self.heading, self.circles = start, heading, circles
         self.room, self.rooms, self.unit, self.rings = room, rooms, unit, rings

@@ -23,6 +23,7 @@ POINTS = 28
 _MOST = math.radians(500.0)
 """The largest angle of a turn in a table."""
 _HOLDS = 56
+"""Angles of turns in a table, nine degrees apart."""
 _NOTHING = 2e-3
 """Below it what a turn leaves does not count: shares of speed and radius, and rad."""
 _SETTLED = 4.0

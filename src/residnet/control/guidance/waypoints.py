@@ -16,8 +16,11 @@ from residnet.control.heading.turning import Turning
 from residnet.core.errors import ConfigError
 
 _ANGLES = 181
+"""Changes of course in the table, one for each degree."""
 _SAMPLES = 100
+"""Points of the track of a turn."""
 _DISTANCES = 400
+"""Distances that are tried for each turn."""
 
 
 @final

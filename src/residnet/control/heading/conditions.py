@@ -512,6 +512,7 @@ _AFTER, _FOR = 10.0 / 7.0, 5.0 / 7.0
 swinging, for that long (with 14 s from 20 s on, for 10 s).
 """
 _NOMINAL = 16
+"""Flights of the nominal vessel beside those under conditions, half to each side."""
 
 
 def quiet(conditions: ConditionsConfig) -> ConditionsConfig:

@@ -27,21 +27,27 @@ class HeadingPolicy(Policy, ABC):
         limit: of the rudder in rad.
         rate: of the rudder in rad/s; infinite where it stands at its command at once.
         dt: step in s.
+        travel: most that the rudder moves in a step, in rad.
     """
 
-    def __init__(self, turning: Turning, limit: float, rate: float | None, dt: float) -> None:
+    def __init__(
+        self, state: Sequence[str], turning: Turning, limit: float, rate: float | None
+    ) -> None:
         super().__init__()
+        self.read_from(state)
         self.gain, self.time, self.speed = turning.gain, turning.time, turning.speed
-        self.limit, self.dt = limit, dt
+        self.limit = limit
         self.rate = math.inf if rate is None else rate
 
-    @abstractmethod
     def read_from(self, state: Sequence[str]) -> None:
         """Take heading, speed and yaw rate from a state with these names."""
+        self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
     def at(self, dt: float) -> None:
         """Take steps of dt seconds from now on."""
         self.dt = dt
+        # a large number where the rudder has no rate: infinity would spoil gradients
+        self.travel = min(self.rate * dt, 2.0 * self.limit)
 
     @abstractmethod
     def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
@@ -267,8 +273,7 @@ class ObservedPolicy(HeadingPolicy):
         units: int = 0,
         trained_at: float = 0.04,
     ) -> None:
-        super().__init__(turning, limit, rate, dt)
-        self.read_from(state)
+        super().__init__(state, turning, limit, rate)
         self.units, self.degree = units, _DEGREE
         self.law = law
         self.observer = HeadingObserver(turning, limit, lag, dt)
@@ -278,18 +283,12 @@ class ObservedPolicy(HeadingPolicy):
         self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
         self.network = OddCell(_FEATURES, max(units, 1), trained_at).requires_grad_(units > 0)
         self.trained_at = trained_at
-        self.travel = 0.0
         self.at(dt)
 
     def at(self, dt: float) -> None:
-        self.dt = dt
+        super().at(dt)
         self.observer.at(dt)
-        # a large number where the rudder has no rate: infinity would spoil gradients
-        self.travel = min(self.rate * dt, 2.0 * self.limit)
         self.n_state = len(FIXED) + self.observer.pending + self.units
-
-    def read_from(self, state: Sequence[str]) -> None:
-        self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
     def without_network(self) -> ObservedPolicy:
         """Return a copy whose network gives nothing: the law with its constants as they are."""
@@ -420,21 +419,11 @@ class NetworkPolicy(HeadingPolicy):
         units: int,
         trained_at: float = 0.04,
     ) -> None:
-        super().__init__(turning, limit, rate, dt)
-        self.read_from(state)
+        super().__init__(state, turning, limit, rate)
         self.units, self.degree, self.trained_at = units, _DEGREE, trained_at
         self.network = OddCell(8, units, trained_at, hidden=units)
         self.n_state = 2 + units
-        self.travel = 0.0
         self.at(dt)
-
-    def at(self, dt: float) -> None:
-        self.dt = dt
-        # a large number where the rudder has no rate: infinity would spoil gradients
-        self.travel = min(self.rate * dt, 2.0 * self.limit)
-
-    def read_from(self, state: Sequence[str]) -> None:
-        self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
     def values(self) -> dict[str, float]:
         """Return no constants: there is no law that has any."""

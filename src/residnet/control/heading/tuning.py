@@ -24,7 +24,9 @@ from residnet.core.errors import ExportError, FitError
 from residnet.dynamics.rollout import Rollout
 
 _ROWS = 4096
+"""Flights that are flown side by side."""
 _LOST = 1e3
+"""Cost in s of a flight that is lost, far above that of any other."""
 
 
 class TuningConfig(Config):

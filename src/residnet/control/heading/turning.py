@@ -18,6 +18,7 @@ from residnet.dynamics.base import Dynamics
 
 Array = NDArray[np.float64]
 _TIMES, _DELAYS, _RATES = 20, 8, 10
+"""Values of T, the delay and the rate of the gear that the coarse search tries."""
 _THIN = 4000
 """Samples of a manoeuvre that the first, coarse search looks at."""
 _GEARS = (math.radians(1.0), math.radians(40.0))
@@ -242,12 +243,15 @@ def _fit(records: Sequence[Record], time: float, delay: float) -> tuple[float, f
 
 
 _STEPS = 400
+"""Steps of one length before the next are twice as long."""
 _STEADY = 0.1
 """Share of the yaw rate by which it may still change over the last half of the time."""
 _OVERSHOOT = 0.02
+"""Share of the steady yaw rate that a vessel of the first order may overshoot by."""
 _PATIENCE = 8
 """Times the duration given that a turn is waited for."""
 _SWITCHES = 6
+"""Changes of rudder that a zigzag ends after."""
 _FINE = 25
 """Steps until a zigzag's first change of rudder."""
 _LONGEST = 12000

@@ -12,12 +12,13 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from residnet.core import progress
 from residnet.core.config import Config, Newtons, Seconds
+from residnet.core.errors import require_package
 from residnet.core.format import DASH, number
 from residnet.documents.study import Results, Study, pictures
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.parameters import Mass, Parameter, above_zero, of_dimension
 from residnet.regression.expressions import Algebra
-from residnet.regression.genetic import breed, limits_of, require_deap, validating
+from residnet.regression.genetic import breed, limits_of, validating
 from residnet.regression.writing import term
 from residnet.report.blocks import Cell, Section, Text, table_of
 from residnet.report.figure import COLORS, Case, Figure, Look, Panel, names_of
@@ -242,7 +243,7 @@ class BreedingTaskConfig(Study):
         )
 
     def check(self) -> None:
-        require_deap()
+        require_package("deap", "genetic programming", "gp")
 
     def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
         rows, cells = [], self.cells()

@@ -66,6 +66,7 @@ class ThrustFit(NamedTuple):
 
 
 _SATURATION_POINTS = 3
+"""Points at the same revolutions from which a bound is believed."""
 
 
 def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:

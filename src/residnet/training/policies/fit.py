@@ -33,6 +33,7 @@ from residnet.training.trainer import EpochTraining, run_epochs
 _LATE = 1.0 / 3.0
 """Share of a flight at whose end a quiet one should have come to rest."""
 _ALL = 1_000_000
+"""Refused flights of an epoch that costs more than the start: more than there are."""
 _LITTLE = 0.6
 """Share of the range of changes of heading that flights without noise are drawn from."""
 _FAR = 1.15
