@@ -129,6 +129,10 @@ class TunableConfig(ControllerConfig, ABC):
         return {name: value for name, value in given.items() if value is not None}
 
 
+_NOT_OF_THE_LAW = ("kind", "filter_time")
+"""Fields of a linear law's config that are no constants of the law itself."""
+
+
 class TunedConfig(TunableConfig, ABC):
     """A linear law kp e - kd r + ki I whose missing parameters are tuned.
 
@@ -139,10 +143,6 @@ class TunedConfig(TunableConfig, ABC):
 
     own: ClassVar[tuple[str, ...]] = LinearLaw.NUMBERS
     filter_time: Seconds | None = Field(default=None, ge=0)
-
-    @abstractmethod
-    def constants(self) -> dict[str, float | None]:
-        """Return the law's own parameters by name; None where they are to be tuned."""
 
     @abstractmethod
     def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
@@ -156,7 +156,8 @@ class TunedConfig(TunableConfig, ABC):
 
     @final
     def parameters(self) -> dict[str, float | None]:
-        given, lag = self.constants(), self.filter_time
+        fields, lag = type(self).model_fields, self.filter_time
+        given = {name: getattr(self, name) for name in fields if name not in _NOT_OF_THE_LAW}
         return {**given, "filter_time": 0.0 if lag is None and None not in given.values() else lag}
 
     @final
@@ -187,9 +188,6 @@ class PdConfig(TunedConfig):
     kind: Literal["pd"] = "pd"
     kp: float | None = Field(default=None, gt=0)
     damping_time: Seconds | None = Field(default=None, gt=0)
-
-    def constants(self) -> dict[str, float | None]:
-        return {"kp": self.kp, "damping_time": self.damping_time}
 
     def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return the ranges: two decades of kp, damping_time from a twentieth of T to twice T."""
@@ -222,14 +220,6 @@ class PidConfig(TunedConfig):
     damping_time: Seconds | None = Field(default=None, gt=0)
     integral_time: Seconds | None = Field(default=None, gt=0)
 
-    def constants(self) -> dict[str, float | None]:
-        """Return kp, damping_time and integral_time; None where they are to be tuned."""
-        return {
-            "kp": self.kp,
-            "damping_time": self.damping_time,
-            "integral_time": self.integral_time,
-        }
-
     def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
         pd = PdConfig().law_axes(turning)
         return {**pd, "integral_time": SearchRange(turning.time, 50.0 * turning.time)}
@@ -257,9 +247,6 @@ class LqrConfig(TunedConfig):
     kind: Literal["lqr"] = "lqr"
     heading_weight: float | None = Field(default=None, gt=0)
     rate_weight: float | None = Field(default=None, ge=0)
-
-    def constants(self) -> dict[str, float | None]:
-        return {"heading_weight": self.heading_weight, "rate_weight": self.rate_weight}
 
     def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return both weights over decades."""
