@@ -16,10 +16,10 @@ import yaml
 import residnet
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
+from residnet.documents.jervan2020.force_logs import compare_accelerations
 from residnet.documents.jervan2020.measured import (
     ForceResidualConfig,
     better,
-    compare_accelerations,
     force_study,
     written,
 )
