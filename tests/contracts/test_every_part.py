@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import written_logs
 import written_recorders
 
 from residnet.baselines import BaselineConfig
 from residnet.core.config import validate
+from residnet.core.errors import ConfigError, UsageError
+from residnet.core.layout import VELOCITIES, Live
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.registry import kinds
 from residnet.data.readers import ReaderConfig
+from residnet.dynamics.rollout import Rollout, scripted
 from residnet.export import FORMATS, exporter, vessel
+from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
+from residnet.heads.base import Features
+from residnet.heads.linear import RidgeConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import vessel_files
@@ -31,6 +39,7 @@ from residnet.testing import (
     check_vessel,
     example_samples,
 )
+from residnet.testing.examples import SIGNALS, example_model, example_spec
 
 # what makes a kind quick enough for a contract
 HEADS: dict[str, dict[str, Any]] = {
@@ -172,3 +181,90 @@ def test_export_format_that_needs_compilers(name: str, monkeypatch: pytest.Monke
 @pytest.mark.parametrize("name", vessel_files())
 def test_vessel(name: str) -> None:
     check_vessel(name)
+
+
+# velocities of a vessel of which only some were recorded
+PARTIAL = [("u",), ("v",), ("r",), ("u", "v"), ("u", "r"), ("v", "r")]
+
+
+def _drawn(kind: str, signals: SignalsConfig = SIGNALS) -> SignalsConfig:
+    """Return signals of some velocities, others for each kind."""
+    chosen = random.Random(kind).choice(PARTIAL)
+    return signals.model_copy(update={"velocities": chosen})
+
+
+@pytest.mark.parametrize("kind", kinds(HeadConfig))
+def test_a_head_leaves_dead_velocities_at_zero(kind: str) -> None:
+    if kind == "genetic":
+        pytest.importorskip("deap", reason="genetic programming needs the extra gp")
+    signals = _drawn(kind)
+    config = validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here")
+    model = example_model(example_spec(config, signals))
+    inner = getattr(model, "members", [model])[0].head
+    seen = [part for part in inner.modules() if isinstance(part, Features)]
+    assert seen
+    assert not set(signals.live.dead) & {name for part in seen for name in part.names}
+    x = torch.zeros(2, 6, dtype=torch.float64)
+    w = 20.0 * torch.rand(2, 30, 2, generator=torch.Generator().manual_seed(1)).double()
+    run = Rollout(model.double()) if inner.refusal else scripted(Rollout(model.double()), 10_000)
+    nu = run(x, w, model.initial_state(2).double())[0][:, -1, VELOCITIES]
+    alive = signals.live.mask() > 0
+    assert bool((nu[:, ~alive] == 0.0).all())
+    assert bool((nu[:, alive] != 0.0).all())
+
+
+@pytest.mark.parametrize("kind", kinds(BaselineConfig))
+def test_a_baseline_has_no_terms_of_dead_velocities(kind: str) -> None:
+    settings, name = BASELINES.get(kind, ({}, "wam_v_cal"))
+    config = validate({"kind": kind, **settings}, BaselineConfig, "here")
+    boat = name == "example_rudder_boat"
+    for velocities in (("u",), ("r",), ("u", "r")):
+        signals = (RUDDER if boat else SIGNALS).model_copy(update={"velocities": velocities})
+        if kind not in ("equations", "nomoto", "regressors", "still"):
+            with pytest.raises(ConfigError, match=r"signals\.velocities"):
+                config.build(signals.build().names)
+            continue
+        baseline = config.build(signals.build().names)
+        table = config.fit(baseline, example_samples(name, signals))
+        dead = {*signals.live.dead, *(f"{one}_dot" for one in signals.live.dead)}
+        assert not any({entry.axis, entry.term} & dead for entry in table)
+        assert kind in ("equations", "still") or {entry.axis for entry in table} == {
+            f"{one}_dot" for one in velocities
+        }
+
+
+@pytest.mark.parametrize("velocities", PARTIAL)
+def test_what_logs_tell(velocities: tuple[str, ...]) -> None:
+    live = Live.told([*velocities, "x", "phi"])
+    assert live.velocities == velocities
+    assert Live.told([*velocities, "x", "y", "psi"]).whole
+    assert Live.told({*velocities, "psi"} - {"r"}).turns
+    assert live.text.endswith("drift") == (live.moves and live.turns)
+    assert {*live.dead, *live.velocities} == {"u", "v", "r"}
+    assert np.flatnonzero(live.mask()).tolist() == live.axes
+
+
+def _exported(name: str, folder: Path) -> None:
+    spec, file = example_spec(RidgeConfig(), _drawn(name)), folder / f"model{exporter(name).suffix}"
+    exported = ExportedVessel(spec, example_model(spec))
+    if name in ("feed_forward", "parameters"):
+        with pytest.raises(UsageError, match="fit a"):
+            exporter(name).export(exported, file)
+        return
+    card = exporter(name).export(exported, file)
+    assert card["velocities"] == list(spec.signals.velocities)
+
+
+@pytest.mark.parametrize("name", ["torchscript", "c"])
+def test_a_format_exports_it(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
+    _exported(name, tmp_path)
+
+
+@pytest.mark.exporters
+@pytest.mark.parametrize("name", FORMATS.names())
+def test_every_format_exports_it(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
+    _exported(name, tmp_path)

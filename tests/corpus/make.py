@@ -117,6 +117,15 @@ def surge_alone(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {"time [s]": s.t, "speed [m/s]": s.u, "motor [us]": (1100 + s.rpm / 2).round()})
 
 
+def yaw_alone(folder: Path, k: int, s: pd.DataFrame) -> None:
+    csv(folder, k, {"time [s]": s.t, "heading [deg]": s.heading, "rudder [deg]": s.rudder})
+
+
+def speed_and_heading(folder: Path, k: int, s: pd.DataFrame) -> None:
+    columns = {"time [s]": s.t, "speed [m/s]": s.u, "heading [deg]": s.heading}
+    csv(folder, k, {**columns, **renamed(s, ACTS)})
+
+
 def with_roll(folder: Path, k: int, s: pd.DataFrame) -> None:
     roll = {"roll": "roll [deg]", "roll rate": "roll rate [deg/s]"}
     csv(folder, k, {"time [s]": s.t, **renamed(s, POSE, SPEEDS, roll, ACTS)})
@@ -441,6 +450,7 @@ LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
         ),
         *(plotjuggler, chart_plotter, voyage_recorder, labview, parquet_index, ulog_csv),
         *(long_rows, file_a_channel, hdf5_trials),
+        *(yaw_alone, speed_and_heading),
     )
 }
 

@@ -12,8 +12,9 @@ from residnet.api.values import PartGiven, PathGiven, described, hearing, part, 
 from residnet.core.arrays import paged
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
+from residnet.core.layout import Live
 from residnet.core.log import Log
-from residnet.core.names import nearest
+from residnet.core.names import VELOCITY, nearest
 from residnet.core.progress import ProgressCallback, report, say
 from residnet.data.doctor import inspect as examine
 from residnet.data.doctor import inspect_together
@@ -285,7 +286,7 @@ def prepare(
     values; step and derivative by the sampling interval and by how long the yaw rate stays alike;
     models are judged over back-to-back windows of the length that most of the logs for judging
     hold, and of about a third of it; scales are the standard deviations of u, v and r over training
-    and validation logs.
+    and validation logs. Where logs tell some of u, v and r alone, models are of these.
 
     Args:
         logs: a list of logs (of each five, in the order of their manoeuvres, the third is for
@@ -297,10 +298,10 @@ def prepare(
         held: channels whose last value holds until the next; others are interpolated.
         like: data whose settings are taken over; all logs then form the split `external`.
         progress: is told how far the work is.
-        settings: further keys of the sections `signals` (exogenous, forces), `prepare` (masks,
-            derivative, motion, trim, hold) and `evaluation` (protocols, selection, scales, groups,
-            divergence) of a config, as YAML has them; without `selection` the first of `protocols`
-            chooses between models.
+        settings: further keys of the sections `signals` (exogenous, forces, velocities),
+            `prepare` (masks, derivative, motion, trim, hold) and `evaluation` (protocols,
+            selection, scales, groups, divergence) of a config, as YAML has them; without
+            `selection` the first of `protocols` chooses between models.
 
     Returns:
         The data: y, smooth [T, 6], nu_dot [T, 3], w [T, m] of each log, float64, SI.
@@ -318,8 +319,13 @@ def prepare(
             prepared = _prepared({"external": read_logs(logs)}, like.signals, like.prepare)  # type: ignore[arg-type]
             return Data(prepared, like.signals, like.prepare, like.evaluation)
         splits, source = _splits(logs)
+        given = settings.get("velocities")
+        told = [Live.told(log.channels) for members in splits.values() for log in members]
+        # velocities that every log tells
+        shared = [n for n in VELOCITY if all(n in one.velocities for one in told)]
+        live = Live(tuple(shared) or VELOCITY) if given is None else _named_live(given)
         whole = {
-            name: [complete_motion(log, MotionConfig()) for log in members]
+            name: [complete_motion(log, MotionConfig(), live) for log in members]
             for name, members in splits.items()
         }
         every = [log for members in whole.values() for log in members]
@@ -331,10 +337,12 @@ def prepare(
                 f" {', '.join(every[0].channels)} (an empty list makes a model without commands)"
             )
         known = [name for name in taken if all(name in log.channels for log in every)]
-        chosen = Preparation.of(every, known)
+        chosen = Preparation.of(every, known, live)
+        if live.text:
+            say(f"velocities: {live.text}")
         say(f"recipe: {chosen.reason}")
         length = window_length([whole[name] for name in SPLITS[1:]], chosen.memory)
-        judged = judging(whole, length)
+        judged = judging(whole, length, live)
         content = chosen.content()
         grid = {"step": step, "held": held}
         content["grid"] |= {key: value for key, value in grid.items() if value is not None}
@@ -346,6 +354,7 @@ def prepare(
         signals = {
             "inputs": taken if isinstance(taken, str) else list(taken),
             "exogenous": chosen.exogenous,
+            "velocities": live.velocities,
         }
         # what no section knows is refused as an unknown key of `prepare`
         homes: Any = (
@@ -361,6 +370,14 @@ def prepare(
         return Data(_prepared(splits, built[0], built[2]), built[0], built[2], built[1], source)
 
 
+def _named_live(given: Any) -> Live:
+    names = [given] if isinstance(given, str) else list(given)
+    for name in names:
+        if name not in VELOCITY:
+            raise UsageError(f"prepare: velocities: no velocity '{name}'{nearest(name, VELOCITY)}")
+    return Live(tuple(name for name in VELOCITY if name in names))
+
+
 def _prepared(
     splits: Mapping[str, Sequence[Log]], signals: SignalsConfig, config: PrepareConfig
 ) -> dict[str, list[Prepared]]:
@@ -370,7 +387,7 @@ def _prepared(
         out[split] = paged.OneByOne()
         for log in members:
             report("preparing logs", done, total)
-            out[split].append(prepare_log(log, split, signals.columns, config))
+            out[split].append(prepare_log(log, split, signals.columns, config, signals.live))
             if not out[split][-1].good.any():
                 raise DataError(
                     f"log {log.name}: no stretch is as long as the derivative's window; leave the"

@@ -78,6 +78,7 @@ class FreeRuns:
                         measured=log.y[rows][:, order],
                         predicted={name: one.states[:, order] for name, one in found.items()},
                         diverged={name: one.diverged for name, one in found.items()},
+                        live=log.live,
                     )
                 )
                 counted[window.log] += 1
@@ -116,7 +117,7 @@ class FreeRuns:
         Raises:
             UsageError: where there is no such log, model, protocol or window.
         """
-        return self._drawn(log, [0], **chosen)
+        return self._drawn(log, True, **chosen)
 
     def plot_history(self, log: str | None = None, **chosen: Any) -> Figure:
         """Draw velocities and heading against time, measured and predicted.
@@ -128,12 +129,12 @@ class FreeRuns:
         Raises:
             UsageError: where there is no such log, model, protocol or window.
         """
-        return self._drawn(log, [1, 2, 3, 4], **chosen)
+        return self._drawn(log, False, **chosen)
 
     def _drawn(
         self,
         log: str | None,
-        panels: Sequence[int],
+        mapped: bool,
         models: str | Sequence[str] = (),
         protocol: str | None = None,
         window: int | None = None,
@@ -156,7 +157,11 @@ class FreeRuns:
         shown = shown or [model for model in one.predicted if model != "zero"]
         predicted = {model: one.predicted[model] for model in shown}
         one = replace(one, predicted=predicted, diverged={})
-        figure: Figure = still(window_figure(one, f"{name}, {kind}"), only=list(panels))
+        drawn = window_figure(one, f"{name}, {kind}")
+        panels = [i for i, panel in enumerate(drawn.panels) if (panel.kind == "map") == mapped]
+        if not panels:
+            raise UsageError(f"log {name} has no track: {one.live.text}; draw its history")
+        figure: Figure = still(drawn, only=panels)
         return figure
 
 

@@ -12,6 +12,7 @@ from residnet.core.config import Config
 from residnet.core.derivatives import derivatives_along
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
+from residnet.physics.symmetry import live_of
 from residnet.regression.estimator import Coefficient, Solution
 
 
@@ -162,12 +163,19 @@ class IdentifiedConfig(Config, ABC):
 
 
 def require(names: Sequence[str], wanted: Sequence[str], who: str) -> None:
-    """Check that channels exist.
+    """Check that channels exist, and velocities live.
 
     Raises:
         ConfigError: naming the first that does not.
     """
+    live = live_of(names)
     for name in wanted:
+        if name in live.dead:
+            raise ConfigError(
+                f"{who} needs the velocity {name}, but signals.velocities are"
+                f" {', '.join(live.velocities)}; a baseline of kind 'regressors' or 'nomoto' needs"
+                " no other"
+            )
         if name not in names:
             raise ConfigError(
                 f"{who} needs the channel '{name}', but the model has {', '.join(names)}; add it to"

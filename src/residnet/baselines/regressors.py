@@ -7,7 +7,7 @@ fit is good, and the model is not damped.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal, final
 
@@ -20,7 +20,14 @@ from residnet.baselines.sets import Roles, SetName, expand, merged
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
 from residnet.physics.signals import VelocityBound
-from residnet.physics.symmetry import dissipates, mirrored_terms, wrong_parity
+from residnet.physics.symmetry import (
+    dissipates,
+    live_of,
+    living,
+    mirrored_terms,
+    without_dead,
+    wrong_parity,
+)
 from residnet.physics.terms import TermLibrary
 from residnet.regression.estimator import Coefficient, Solution, chosen, regressors
 from residnet.regression.least_squares import LeastSquares
@@ -199,13 +206,23 @@ class RegressorBaseline(ParametricBaseline):
         left = samples.target - phi @ (self.theta * self.allowed).detach().T
         return phi, left.square().mean(0)
 
-    def solution(self, fits: Sequence[Solution], choice: dict[str, Any]) -> Solution:
-        """Return the solution of all axes from one of each, whose table names its terms."""
+    def solution(self, fits: Mapping[int, Solution], choice: dict[str, Any]) -> Solution:
+        """Return the solution of all axes from that of each, whose table names its terms."""
         theta = torch.zeros_like(self.theta)
-        for axis, fit in enumerate(fits):
+        for axis, fit in fits.items():
             for entry in fit.table:
                 theta[axis, self.library.terms.index(entry.term)] = entry.value
-        return Solution(choice, {"theta": theta}, tuple(c for fit in fits for c in fit.table))
+        table = tuple(entry for axis in sorted(fits) for entry in fits[axis].table)
+        return Solution(choice, {"theta": theta}, table)
+
+
+def living_rows(rows: Sequence[Sequence[str]], names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the terms of u, v and r that are not zero at all times; none where an axis is."""
+    live = live_of(names).velocities
+    return [
+        tuple(term for term in row if living(term, names)) if axis in live else ()
+        for axis, row in zip(VELOCITY, rows, strict=True)
+    ]
 
 
 _POINTS = 400
@@ -295,8 +312,13 @@ class RegressorsConfig(IdentifiedConfig):
     def rows(self, names: Sequence[str]) -> list[tuple[str, ...]]:
         """Return the regressors of each axis for channels `names`.
 
-        One that sets and terms both name stands once, as it was named first.
+        One that sets and terms both name stands once, as it was named first. Velocities that are
+        zero at all times have none, and no term holds them.
         """
+        return living_rows(self._named(names), names)
+
+    def _named(self, names: Sequence[str]) -> list[tuple[str, ...]]:
+        """Return the regressors of each axis as the settings name them."""
         given = (
             [tuple(self.terms[axis]) for axis in ("u", "v", "r")]
             if isinstance(self.terms, dict)
@@ -305,7 +327,7 @@ class RegressorsConfig(IdentifiedConfig):
         if self.sets:
             shared = expand(self.sets, Roles.of(names, self.drive, self.steer))
             return [merged((*shared, *row), names) for row in given]
-        return [row or ("1", *names) for row in given] if self.terms == () else given
+        return [row or ("1", *without_dead(names)) for row in given] if self.terms == () else given
 
     def build(self, names: Sequence[str]) -> RegressorBaseline:
         return RegressorBaseline(
@@ -331,9 +353,11 @@ class RegressorsConfig(IdentifiedConfig):
                 outputs=(ACCELERATION[axis],),
             )
 
-        fits = []
+        # an axis that is zero at all times has nothing to fit
+        live = live_of(picked.names).axes
+        fits = {}
         slopes = _own_slopes(baseline.library, picked) if self.dissipative else None
-        for axis in range(len(ACCELERATION)):
+        for axis in live:
             feeding: set[str] = set()
             turning: set[str] = set()
             while True:
@@ -346,8 +370,11 @@ class RegressorsConfig(IdentifiedConfig):
                     feeding, turning = set(), turning | turned
                 else:
                     break
-            fits.append(found)
-        found = [baseline.solution(axes, axes[0].choice) for axes in zip(*fits, strict=True)]
+            fits[axis] = found
+        found = [
+            baseline.solution(dict(zip(live, axes, strict=True)), axes[0].choice)
+            for axes in zip(*fits.values(), strict=True)
+        ]
         if not self.bounded:
             return found
         bound = VelocityBound(_BEYOND, len(picked.names))

@@ -15,11 +15,12 @@ import torch
 from torch import Tensor
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, of_manoeuvres, require
-from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors import RegressorBaseline, living_rows
 from residnet.core.config import Seconds
 from residnet.core.errors import FitError
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
+from residnet.physics.symmetry import live_of
 from residnet.regression.estimator import Coefficient, Ratio, Solution
 from residnet.regression.least_squares import LeastSquares
 
@@ -32,6 +33,9 @@ class SteeredConfig(IdentifiedConfig, ABC):
         steer: channel that turns the vessel.
     """
 
+    needs: ClassVar[tuple[str, ...]] = VELOCITY
+    """Velocities that must live."""
+
     kind: str
     drive: str
     steer: str
@@ -42,8 +46,11 @@ class SteeredConfig(IdentifiedConfig, ABC):
 
     @final
     def build(self, names: Sequence[str]) -> RegressorBaseline:
-        require(names, (*VELOCITY, self.drive, self.steer), f"baseline '{self.kind}'")
-        rows = self.rows()
+        live = live_of(names).velocities
+        acting = [self.drive] if live == ("u",) else [self.steer] if "u" not in live else []
+        acting = acting or [self.drive, self.steer]
+        require(names, (*self.needs, *acting), f"baseline '{self.kind}'")
+        rows = living_rows(self.rows(), names)
         return RegressorBaseline(rows, names, ((1, "v"),) if rows[1] == ("v",) else ())
 
 
@@ -98,13 +105,13 @@ class _NomotoConfig(SteeredConfig, ABC):
             _lag_of("r", self.steer, ""),
         )
         chosen, fits, further = of_manoeuvres(samples, self.manoeuvres), {}, []
-        for axis, terms in enumerate(self.rows()):
+        for axis, terms in enumerate(living_rows(self.rows(), chosen.names)):
             if len(terms) > 1:
                 fits[axis] = self._lag(baseline, chosen, axis, terms)
                 further += _parameters(axis, terms, fits[axis], ratios[axis])
-        if 1 not in fits:
+        if 1 not in fits and "v" in live_of(chosen.names).velocities:
             fits[1] = Solution({}, {}, _decay(fits[2].table))
-        found = baseline.solution([fits[axis] for axis in range(3)], {})
+        found = baseline.solution(fits, {})
         return [replace(found, table=(*found.table, *further))]
 
     def _lag(
@@ -162,8 +169,10 @@ class NomotoConfig(_NomotoConfig):
     """Nomoto's model of first order, T r_dot + r = K steer + b.
 
     Surge is a first-order lag of the drive; sway, of which the model knows nothing, dies out with
-    T.
+    T. Where only surge or only yaw lives, only its lag is found.
     """
+
+    needs = ()
 
     kind: Literal["nomoto"] = "nomoto"
 
@@ -270,7 +279,8 @@ class LinearSteadyConfig(SteeredConfig):
         tables.setdefault("v", _decay(tables["r"]))
         names = (*VELOCITY, self.drive, self.steer)
         states = dict(zip(names, self._means(samples, names).T.tolist(), strict=True))
-        found = baseline.solution([Solution({}, {}, tables[axis]) for axis in VELOCITY], {})
+        fits = {i: Solution({}, {}, tables[axis]) for i, axis in enumerate(VELOCITY)}
+        found = baseline.solution(fits, {})
         return [replace(found, notes={"steady_states": states, "steady_constraints": phi})]
 
     def _dynamic(self, samples: Samples, kinds: tuple[str, ...]) -> Samples:

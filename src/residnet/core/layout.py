@@ -6,6 +6,7 @@ them. Functions serve code that TorchScript compiles, which takes no global slic
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -59,6 +60,80 @@ class StateLayout:
 
 PLANAR = StateLayout(names.POSE, names.VELOCITY)
 """Three degrees of freedom: x, y, psi, u, v, r."""
+
+
+@dataclass(frozen=True)
+class Live:
+    """Which velocities of the planar state live, where only some were recorded.
+
+    The others are zero at all times: they have no equation, no term and no error. The pose is what
+    the live ones lead to, a straight line from surge alone, a turn on the spot from yaw alone; so
+    the time loop, exports and windows are those of the planar state.
+
+    Attributes:
+        velocities: names of those that live, of u, v and r.
+    """
+
+    velocities: tuple[str, ...] = PLANAR.velocities
+
+    @classmethod
+    def told(cls, channels: Iterable[str]) -> Live:
+        """Return the velocities that channels of a log tell; all where they tell none.
+
+        They are measured, or follow from a heading (r) or from position and heading (all).
+        """
+        held = set(channels)
+        if held.issuperset(PLANAR.pose):
+            return cls()
+        held |= {"r"} if "psi" in held else set()
+        return cls(tuple(name for name in PLANAR.velocities if name in held) or PLANAR.velocities)
+
+    @property
+    def whole(self) -> bool:
+        """Whether all velocities live."""
+        return self.velocities == PLANAR.velocities
+
+    @property
+    def dead(self) -> tuple[str, ...]:
+        """Names of those that do not."""
+        return tuple(name for name in PLANAR.velocities if name not in self.velocities)
+
+    @property
+    def axes(self) -> list[int]:
+        """Places of the live ones among u, v, r."""
+        return [PLANAR.velocities.index(name) for name in self.velocities]
+
+    @property
+    def moves(self) -> bool:
+        """Whether the position follows from them."""
+        return "u" in self.velocities or "v" in self.velocities
+
+    @property
+    def turns(self) -> bool:
+        """Whether the heading does."""
+        return "r" in self.velocities
+
+    @property
+    def text(self) -> str:
+        """What follows from some velocities not living, for a reader; empty where all live."""
+        if self.whole:
+            return ""
+        text = f"the logs tell {' and '.join(self.velocities)} alone, and"
+        text += f" {' and '.join(self.dead)} {'are' if len(self.dead) > 1 else 'is'} taken as zero"
+        if not self.moves:
+            return f"{text}: the vessel turns on the spot, and has no error of position"
+        if not self.turns:
+            return f"{text}: positions are the distance run on a straight line"
+        return f"{text}: the vessel moves over ground where it points, without drift"
+
+    def mask(self) -> Tensor:
+        """Return 1 for each of u, v, r that lives and 0 for the others, [3] float64."""
+        alive = [float(name in self.velocities) for name in PLANAR.velocities]
+        return torch.tensor(alive, dtype=torch.float64)
+
+
+ALIVE = Live()
+"""All of u, v and r."""
 
 POSE = PLANAR.pose_columns
 VELOCITIES = PLANAR.velocity_columns

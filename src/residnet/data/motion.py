@@ -14,6 +14,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Metres, Seconds
 from residnet.core.errors import DataError, UsageError
+from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, POSE, STATE
 from residnet.data.channels import noise_of, spikes, without_held
@@ -67,15 +68,22 @@ class MotionConfig(Config):
         return self.always or self.delay > 0.0 or self.antenna is not None
 
 
-def complete_motion(log: Log, config: MotionConfig) -> Log:
+def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
     """Return the log with x, y, psi, u, v, r at every sample, measured or smoothed.
 
     What was smoothed stands in `meta["smoothed"]`, and as a note in `meta["findings"]`.
+
+    Args:
+        log: in SI.
+        config: settings of the smoother.
+        live: velocities that the log tells; the others are zero, and so is what of the pose they
+            alone would move.
 
     Raises:
         UsageError: where the log lacks position or heading.
         DataError: where these hold hardly a value.
     """
+    log = _turning(log if live.whole else _still(log, live))
     told = without_held(log)
     lacking = [name for name in STATE if name not in log.channels]
     made = {name for name in STATE if name in lacking or not _dense(told[name])}
@@ -85,10 +93,13 @@ def complete_motion(log: Log, config: MotionConfig) -> Log:
         # a heading from the rate alone would not be that of positions which were measured
         if {"x", "y"} <= set(lacking) <= set(POSE):
             return _integrated(log, missing)
+        live = Live.told(log.channels)
+        few = ", ".join(live.velocities)
+        few = f", or let the model be one of {few} alone (signals.velocities: [{few}])"
         raise UsageError(
             f"log {log.name}: no channel {', '.join(lacking)}; give position and heading, or u, v"
             " and r without a position: either makes the other where it was not measured; name"
-            " their columns"
+            f" their columns{'' if live.whole else few}"
         )
     made |= set(STATE) if config.always else set(POSE) if config.moves else set()
     names = [name for name in STATE if name in made]
@@ -102,6 +113,53 @@ def complete_motion(log: Log, config: MotionConfig) -> Log:
         units={**log.units, **{name: CHANNEL_UNITS[name] for name in STATE}},
         meta={**log.meta, "smoothed": names, "findings": findings},
     )
+
+
+def _still(log: Log, live: Live) -> Log:
+    """Return the log with zeros where a velocity is dead, and no pose but that of the live ones.
+
+    A heading stays where the vessel turns, and a position where it moves as well.
+    """
+    kept = {"psi"} if live.turns else set[str]()
+    if live.turns and live.moves and log.channels.keys() >= {*POSE}:
+        kept = {*POSE}
+    channels = {n: values for n, values in log.channels.items() if n not in {*POSE} - kept}
+    channels |= dict.fromkeys(live.dead, np.zeros(len(log)))
+    return log.replace(
+        channels=channels,
+        units={name: log.units.get(name, CHANNEL_UNITS.get(name, "-")) for name in channels},
+    )
+
+
+def _turning(log: Log) -> Log:
+    """Return a log without positions with the yaw rate that its heading tells."""
+    if "psi" not in log.channels or {"x", "y"} & log.channels.keys():
+        return log
+    if "r" in log.channels and _dense(log["r"]):
+        return log
+    psi = unwrap(log["psi"])
+    known = np.isfinite(psi)
+    if known.sum() < 5:
+        return log
+    rate = _turned_by(log, psi)[1]
+    note = remark("note", "smoothed_motion", "r comes from a smoother of the heading", channels=1)
+    return log.replace(
+        channels={
+            **log.channels,
+            "psi": psi,
+            "r": np.where(_near(log.t, log.t[known]), rate, np.nan),
+        },
+        units={**log.units, "r": CHANNEL_UNITS["r"]},
+        meta={**log.meta, "smoothed": ["r"], "findings": [*log.meta.get("findings", ()), note]},
+    )
+
+
+def _turned_by(log: Log, psi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smoothed heading [T] in rad and yaw rate [T] in rad/s, from both or the first."""
+    r = log.channels.get("r", np.full(psi.size, np.nan))
+    ratio = max(noise_of(r), 1e-7) / max(noise_of(psi), 1e-7)
+    turning = smooth_track(log.t, np.stack((psi, r), axis=1)[:, :, None], (1.0, ratio))
+    return turning[:, 0, 0], turning[:, 1, 0]
 
 
 def _integrated(log: Log, missing: Sequence[str]) -> Log:
@@ -206,10 +264,8 @@ def _smoothed(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
             f"log {log.name}: {fixes.size} positions and {headings.size} headings, at least 5 of"
             " each are needed to tell the motion; leave the log out"
         )
-    u, v, r = (log.channels.get(name, np.full(t.size, np.nan)) for name in ("u", "v", "r"))
-    ratio = max(noise_of(r), 1e-7) / max(noise_of(psi), 1e-7)
-    turning = smooth_track(t, np.stack((psi, r), axis=1)[:, :, None], (1.0, ratio))
-    heading, rate = turning[:, 0, 0], turning[:, 1, 0]
+    u, v = (log.channels.get(name, np.full(t.size, np.nan)) for name in ("u", "v"))
+    heading, rate = _turned_by(log, psi)
     # positions belong to times between the samples where they are older than their row
     seen_at = t[fixes] - config.delay
     clock = np.union1d(t, seen_at) if config.delay else t

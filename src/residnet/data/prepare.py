@@ -13,7 +13,7 @@ from pydantic import Field
 from residnet.core.arrays import paged
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import POSE, VELOCITIES
+from residnet.core.layout import ALIVE, POSE, VELOCITIES, Live
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.core.samples import Samples
@@ -75,6 +75,7 @@ class Prepared:
         piece: number of the stretch that nothing crosses, [T]; -1 where there is none.
         usable: samples that may be scored [T].
         good: samples whose smoothed state and derivative may be learned from [T].
+        live: which velocities the log tells; the others are zero.
     """
 
     log: Log
@@ -87,6 +88,7 @@ class Prepared:
     piece: np.ndarray
     usable: np.ndarray
     good: np.ndarray
+    live: Live = ALIVE
 
     def __len__(self) -> int:
         return len(self.log)
@@ -96,12 +98,18 @@ class Prepared:
         moved: dict[str, Any] = {
             part.name: paged.on_disk(getattr(self, part.name))
             for part in fields(self)
-            if part.name not in ("log", "split")
+            if part.name not in ("log", "split", "live")
         }
         return replace(self, log=self.log.on_disk(), **moved)
 
 
-def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig) -> Prepared:
+def prepare(
+    log: Log,
+    split: str,
+    columns: Sequence[str],
+    config: PrepareConfig,
+    live: Live = ALIVE,
+) -> Prepared:
     """Align, mask, smooth and differentiate one log.
 
     Single samples that no vessel follows are bridged and left out (`Log.meta["spikes"]`).
@@ -112,6 +120,7 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
         split: which split it belongs to.
         columns: input channels, in the order of w.
         config: grid, masks, derivative.
+        live: velocities that the model moves (`SignalsConfig.live`); the others are zero.
 
     Raises:
         UsageError: where a channel is missing.
@@ -121,7 +130,7 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
     # a channel that the model does not use changes nothing
     needed = {*STATE, *columns}
     log = without_spikes(_plausible(log, columns), needed)
-    log = align(_masked(log, columns, config), config.grid, needed)
+    log = align(_masked(log, columns, config, live), config.grid, needed)
     y, w = log.stack(STATE), log.stack(tuple(columns))
     piece = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), segments(log), -1)
     usable = scored(log) & (piece >= 0)
@@ -147,7 +156,7 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
     held = _means(w, piece) if config.hold == "mean" else w
     good = usable & valid & trimmed
-    prepared = Prepared(log, split, y, smooth, nu_dot, held, w, piece, usable, good)
+    prepared = Prepared(log, split, y, smooth, nu_dot, held, w, piece, usable, good, live)
     return prepared.on_disk() if large else prepared
 
 
@@ -169,13 +178,14 @@ def _plausible(log: Log, columns: Sequence[str]) -> Log:
     return log
 
 
-def _masked(log: Log, columns: Sequence[str], config: PrepareConfig) -> Log:
+def _masked(log: Log, columns: Sequence[str], config: PrepareConfig, live: Live) -> Log:
     """Return the log with its whole motion and the masks of the config."""
-    whole = complete_motion(log, config.motion)
+    whole = complete_motion(log, config.motion, live)
     filled = fill_sparse(whole, (*STATE, *columns), config.grid.held)
     # masks look at the samples as recorded: interpolation hides a frozen sensor
     recorded = filled if whole is log else whole.replace(channels=whole.channels | log.channels)
-    asked = {*STATE, *columns}
+    # what is zero at all times, or follows from it, is no sensor that stands still
+    asked = {*STATE, *columns} if live.whole else {*live.velocities, *columns}
     asked |= {name for mask in config.masks for name in mask.model_dump().get("channels", ())}
     seen = {name: values for name, values in recorded.channels.items() if name in asked}
     masks = apply_masks(recorded.replace(channels=seen), config.masks).masks

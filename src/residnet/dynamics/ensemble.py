@@ -158,6 +158,7 @@ class MeanOfTrajectories(HybridDynamics):
         self.small: Tensor
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        x = self.alive(x)
         nu, rows = velocities(x), x.shape[0]
         missed = (nu - s[:, 1:4]) / self.small.to(x.dtype)
         kept = s[:, :1] / (1.0 + missed.square().sum(dim=-1, keepdim=True))

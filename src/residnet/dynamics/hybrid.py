@@ -19,10 +19,11 @@ from torch import Tensor, nn
 from residnet.baselines.base import Baseline
 from residnet.core.config import Config, Seconds
 from residnet.core.frames import to_body, to_earth
-from residnet.core.layout import heading, position, velocities, yaw_rate
+from residnet.core.layout import heading, pose, position, velocities, yaw_rate
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals
+from residnet.physics.symmetry import live_of
 
 SIZE = 7
 """Entries of the memory: whether there is a prediction, the predicted u, v, r, the estimate."""
@@ -116,6 +117,10 @@ class HybridDynamics(Dynamics):
         self.signals = signals
         self.baseline = baseline
         self.head = head
+        live = live_of(signals.names)
+        self.whole = live.whole
+        self.register_buffer("live", live.mask(), persistent=False)
+        self.live: Tensor
         head.set_step(dt)
         self.shown = head.settle > 0.0
         if self.shown:
@@ -131,8 +136,19 @@ class HybridDynamics(Dynamics):
 
         That is p = signals.prepare(w) and the residual rho [B, 3].
         """
-        nu_dot = self.head.accelerations(self.baseline(self.signals(x, p)), rho)
+        nu_dot = self.found(self.baseline(self.signals(x, p)), rho)
         return torch.cat((self.kinematics(x), nu_dot), dim=-1)
+
+    def found(self, known: Tensor, rho: Tensor) -> Tensor:
+        """Return nu_dot [..., 3] from baseline and residual; a velocity that is dead stays so."""
+        nu_dot: Tensor = self.head.accelerations(known, rho)
+        return nu_dot if self.whole else nu_dot * self.live.to(nu_dot.dtype)
+
+    def alive(self, x: Tensor) -> Tensor:
+        """Return states [..., 6] whose dead velocities are zero, whatever somebody gave."""
+        if self.whole:
+            return x
+        return torch.cat((pose(x), velocities(x) * self.live.to(x.dtype)), dim=-1)
 
     def channels(self, x: Tensor, w: Tensor) -> Tensor:
         """Return what baseline and head see, z [..., nz].
@@ -145,6 +161,7 @@ class HybridDynamics(Dynamics):
         return z
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        x = self.alive(x)
         p = self.signals.prepare(w)
         z: Tensor = self.signals(x, p)
         if self.disturbance is None:
@@ -165,14 +182,14 @@ class HybridDynamics(Dynamics):
             p: what `signals.prepare` returned for the step's inputs.
             rho: residual of the step [B, 3].
         """
-        nu_dot = self.head.accelerations(self.baseline(z), rho)
+        nu_dot = self.found(self.baseline(z), rho)
         if self.positions or (self.signals.wind and len(self.nodes) > 1):
             return self.integrate_from(torch.cat((self.kinematics(x), nu_dot), dim=-1), x, p, rho)
         # nothing but velocities enters the stages: the heading follows once, the position stays
         total, turned = self.weights[0] * nu_dot, self.weights[0] * yaw_rate(x)
         for i in range(1, len(self.nodes)):
             nu = velocities(x) + (self.dt * self.nodes[i]) * nu_dot
-            nu_dot = self.head.accelerations(self.baseline(self.signals.at(nu, p)), rho)
+            nu_dot = self.found(self.baseline(self.signals.at(nu, p)), rho)
             total = total + self.weights[i] * nu_dot
             turned = turned + self.weights[i] * nu[..., -1]
         nu = velocities(x) + self.dt * total
@@ -193,7 +210,7 @@ class HybridDynamics(Dynamics):
         if self.shown:
             return self._observed(z, known)
         rho = self.head.sequence(z)
-        return self.head.accelerations(known, rho)
+        return self.found(known, rho)
 
     def _observed(self, z: Tensor, known: Tensor) -> Tensor:
         """Return nu_dot [B, T, 3] where the head is shown what was predicted wrong.
@@ -215,7 +232,7 @@ class HybridDynamics(Dynamics):
         for k in range(2 * piece):
             unknown, estimate = self.disturbance(x[:, k], s[:, self.width :])
             rho, own = self.head(torch.cat((z[:, k], unknown), dim=-1), s[:, : self.width])
-            nu_dot = self.head.accelerations(known[:, k], rho)
+            nu_dot = self.found(known[:, k], rho)
             after = torch.cat((x[:, k, :3], x[:, k, 3:] + self.dt * nu_dot), dim=-1)
             s = torch.cat((own, self.disturbance.remembered(after, estimate)), dim=-1)
             s = s * inside[:, k, None]
@@ -232,8 +249,7 @@ class HybridDynamics(Dynamics):
             rho, _ = self.head(torch.cat((z, unknown), dim=-1), s[:, : self.width])
         else:
             rho, _ = self.head(z, s[:, : self.width])
-        found: Tensor = self.head.accelerations(self.baseline(z), rho)
-        return found
+        return self.found(self.baseline(z), rho)
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
         """Return the memory [B, n_state] that a measured past leaves.

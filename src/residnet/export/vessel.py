@@ -220,7 +220,7 @@ class ExportedVessel(Exported):
     def contents(self) -> dict[str, Any]:
         """Return all that a user needs to drive the model, and how good it is."""
         spec, band = self.spec, self.spec.band
-        units = spec.signals.units()
+        units, live = spec.signals.units(), spec.signals.live
         guard = GuardedDynamics(self.model, spec)
         accepted = torch.stack((guard.least, guard.most), dim=1).tolist()
         table: dict[str, Any] | None = None
@@ -247,6 +247,8 @@ class ExportedVessel(Exported):
             "dt": spec.dt,
             "integrator": spec.integrator,
             "frame": _FRAME,
+            # of a model of all velocities there is nothing to say
+            **({} if live.whole else {"velocities": list(live.velocities), "about": live.text}),
             "training_range": {name: list(limits) for name, limits in spec.ranges.items()},
             "bad_inputs": {
                 "rules": _RULES,

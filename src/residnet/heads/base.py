@@ -16,6 +16,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import ACCELERATION, nearest
 from residnet.core.samples import Samples
+from residnet.physics.symmetry import without_dead
 from residnet.regression.estimator import Solution
 from residnet.regression.shrinkage import CONSTANT
 
@@ -200,7 +201,7 @@ class FeatureConfig(Config):
                 raise ConfigError(
                     f"head feature '{name}' is not a channel of the model{nearest(name, names)}"
                 )
-        return self.features or tuple(names)
+        return self.features or without_dead(names)
 
 
 class HeadKind(FeatureConfig, ABC):

@@ -310,7 +310,8 @@ class _Calibration:
         if not zero:
             return {}
         errors = np.concatenate([run.error for run in zero])
-        unit = np.sqrt(np.nanmean(errors**2, axis=0))
+        unit, seen = np.zeros(errors.shape[1]), np.isfinite(errors).any(axis=0)
+        unit[seen] = np.sqrt(np.nanmean(np.compress(seen, errors, axis=1) ** 2, axis=0))
         # a channel that zero predicts without any error has no scale of its own
         unit = np.where(unit > 0, unit, 1.0)
         out: dict[str, Band] = {}

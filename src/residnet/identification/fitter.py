@@ -104,13 +104,15 @@ class ValidationScore:
         )
         errors = Errors.of(self.windows, predictions["validated"], self.logs)
         diverged = sum(prediction.diverged for prediction in predictions["validated"])
-        axes = errors.rmse.mean(0) / self.scales
+        live = errors.live
+        axes = (errors.rmse.mean(0) / self.scales)[live.axes]
         window, states = self.windows[0], predictions["validated"][0].states
         measured = self.logs[window.log].y[window.start : window.start + len(states)]
         pairs = (torch.from_numpy(part[:, VELOCITIES]).T for part in (measured, states))
         columns = dict(zip(VELOCITY, zip(*pairs, strict=True), strict=True))
+        columns = {name: columns[name] for name in live.velocities}
         shown = Shown(self.step * torch.arange(len(states)), columns)
-        named = dict(zip(VELOCITY, axes.tolist(), strict=True))
+        named = dict(zip(live.velocities, axes.tolist(), strict=True))
         return Score(diverged, float(axes.mean()), named, shown)
 
 

@@ -456,7 +456,7 @@ def residual_table(
             pairs.append(np.stack(residuals, axis=-1)[log.good])
         joined = np.concatenate(pairs)
         joined = joined[:: max(len(joined) // most, 1)]
-        for axis, name in enumerate(ACCELERATION):
+        for axis, name in _live(logs):
             columns = {
                 "model": entry.name,
                 "axis": name,
@@ -489,7 +489,7 @@ def term_table(fitted: Iterable[FittedModel], logs: Sequence[Prepared]) -> pd.Da
             continue
         run = teacher_forced(entry.model, log)
         target = np.where(log.good[:, None], log.nu_dot - run.baseline, np.nan)
-        for axis, name in enumerate(ACCELERATION):
+        for axis, name in _live([log]):
             for term, value in {
                 "target": target[:, axis],
                 **head.contributions(run.z, axis),
@@ -505,6 +505,11 @@ def term_table(fitted: Iterable[FittedModel], logs: Sequence[Prepared]) -> pd.Da
                 parts.append(pd.DataFrame(columns))
     names = ["model", "log", "axis", "term", "t", "value"]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=names)
+
+
+def _live(logs: Sequence[Prepared]) -> list[tuple[int, str]]:
+    """Return number and name of each acceleration that logs tell."""
+    return [(axis, ACCELERATION[axis]) for axis in logs[0].live.axes]
 
 
 SPLITS = ("train", "test")
@@ -541,7 +546,8 @@ def goodness_rows(
             )
             for name, entry in models.items()
         ]
-        splits[split] = table(predictions, measured, step) if measured else []
+        axes = _live(taken) if measured else []
+        splits[split] = table(predictions, measured, step, axes) if measured else []
     return splits
 
 

@@ -25,13 +25,14 @@ from torch import Tensor
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE
+from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE, Live
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec
 from residnet.physics.signals import SignalsConfig
+from residnet.physics.symmetry import live_of
 
 _AXES = ("surge", "sway", "yaw")
 _TAKEN = (0.1, 1.0, 1.0)
@@ -87,7 +88,8 @@ def causes(signals: SignalsConfig) -> list[Change]:
     """Return the changes that a monitor looks for, given the inputs of a model."""
     units = signals.units()
     out = [Change("mass", "the vessel has become heavier", "share", 0.02, heavier=0.02)]
-    for axis, name in enumerate(_AXES):
+    live = signals.live
+    for axis, name in ((axis, _AXES[axis]) for axis in live.axes):
         words = f"the damping in {name} has grown"
         out.append(Change(f"damping {name}", words, "share", 0.02, damping=axis, damped=0.02))
     for place, name in enumerate(signals.inputs):
@@ -96,13 +98,15 @@ def causes(signals: SignalsConfig) -> list[Change]:
         if units.get(name) == "rad":
             words = f"{name} has an offset"
             out.append(Change(f"offset {name}", words, "rad", 0.01, offset={place: 0.01}))
-    return [
-        *out,
+    gyro = [
         Change("gyro scale", "the gyro shows too much", "share", 0.02, sensor="gyro_scale"),
         Change("gyro offset", "the gyro has an offset", "rad/s", 0.001, sensor="gyro_offset"),
-        Change("speed scale", "u and v are shown too large", "share", 0.02, sensor="speed_scale"),
-        Change("lag", "u, v and r come late", "s", 0.1, sensor="lag"),
     ]
+    speed = Change(
+        "speed scale", "u and v are shown too large", "share", 0.02, sensor="speed_scale"
+    )
+    lag = Change("lag", "u, v and r come late", "s", 0.1, sensor="lag")
+    return [*out, *gyro * live.turns, *[speed] * live.moves, lag]
 
 
 def surroundings() -> list[Change]:
@@ -212,8 +216,16 @@ class ChangedDynamics(Dynamics):
         return out
 
 
-SEEN = ("u", "v", "r", "heading")
-"""What innovations are taken of."""
+SEEN = {"u": SURGE, "v": SWAY, "r": YAW_RATE, "heading": HEADING}
+"""What innovations are taken of, and its columns in states."""
+
+
+def seen_of(live: Live) -> dict[str, int]:
+    """Return what innovations are taken of where only some velocities live."""
+    moved = {*live.velocities, *["heading"] * live.turns}
+    return {name: column for name, column in SEEN.items() if name in moved}
+
+
 _PAST = 5.0
 """Time in s before a window that warms a memory up."""
 _BLOCKS = 5
@@ -274,12 +286,14 @@ def innovations(
     # what a sensor shows is taken of the prediction: noise of the measurement is in the error too
     rate = mean @ path[0].diff(dim=1)[..., VELOCITIES] / model.dt
     path = mean @ path[:, :, 1:]
-    error = _seen(mean @ y[:, 1:] - path[0])
+    columns = [*seen_of(live_of(model.signals.names)).values()]
+    error = _seen(mean @ y[:, 1:] - path[0], columns)
     effects = [
         _seen(
             path[number + 1] - path[0]
             if not change.sensor
-            else shown(change.sensor, path[0], rate, change.size) - (path[number + 1] - path[0])
+            else shown(change.sensor, path[0], rate, change.size) - (path[number + 1] - path[0]),
+            columns,
         )
         / change.size
         for number, change in enumerate(changes)
@@ -305,10 +319,9 @@ def parted(piece: Piece, parts: int) -> list[Piece]:
     ]
 
 
-def _seen(states: Tensor) -> Tensor:
-    """Return differences of states [B, k, 6] as innovations [B, 4 k]."""
-    chosen = torch.cat((states[..., VELOCITIES], states[..., HEADING : HEADING + 1]), dim=-1)
-    return chosen.flatten(1)
+def _seen(states: Tensor, columns: Sequence[int]) -> Tensor:
+    """Return differences of states [B, k, 6] as innovations [B, 4 k], or of fewer columns."""
+    return states[..., list(columns)].flatten(1)
 
 
 def pieces(log: Prepared, steps: int, past: int) -> list[Piece]:
@@ -419,7 +432,9 @@ def apart_from(sums: Sums, count: int, belief: np.ndarray) -> tuple[np.ndarray, 
     return score, information + 1e-300 * np.eye(count)
 
 
-def always_wrong(error: np.ndarray, effects: np.ndarray, causes: Sequence[Change]) -> np.ndarray:
+def always_wrong(
+    error: np.ndarray, effects: np.ndarray, causes: Sequence[Change], channels: int
+) -> np.ndarray:
     """Return what a model has always got wrong: a size [Q, 4] of each cause for each channel.
 
     Channels may disagree: a model whose form is wrong has no single set of sizes that mends it.
@@ -428,8 +443,9 @@ def always_wrong(error: np.ndarray, effects: np.ndarray, causes: Sequence[Change
         error: innovations [B, n] of clean logs.
         effects: of a unit of each change [B, C, n], the causes first.
         causes: Q of them.
+        channels: number of channels that innovations are taken of.
     """
-    count, channels = len(causes), len(SEEN)
+    count = len(causes)
     # sensors are taken to be right: how they are wrong looks like the motion itself
     believed = np.array([0.0 if one.sensor else one.size * BELIEVED for one in causes])
     out = np.zeros((count, channels))
@@ -766,6 +782,7 @@ class Watch:
         self.config = config
         self.dt = spec.dt
         self.causes = causes(spec.signals)
+        self.seen = seen_of(spec.signals.live)
         self.others = surroundings()
         outside = [_CURRENT**-2] * 2 + [_PUSH**-2] * 2
         self.belief = np.diag(outside)
@@ -780,7 +797,8 @@ class Watch:
         fastest = np.max(
             [np.abs(p.y[:, VELOCITIES]).max(axis=0) for log in clean for p in log], axis=0
         )
-        self.limit = _FAR * np.append(fastest, _TURN)
+        most = dict(zip(SEEN, np.append(fastest, _TURN), strict=True))
+        self.limit = _FAR * np.array([most[name] for name in self.seen])
         self.parts = [1, _PARTS] if round(config.window / spec.dt) >= _LEAST_PART * _PARTS else [1]
         found = [[self.innovations(group, parts) for parts in self.parts] for group in groups]
         lost = np.concatenate([(group[0][0] == 0.0).all(axis=1) for group in found])
@@ -825,6 +843,7 @@ class Watch:
                 np.concatenate([group[i][0] for group in found]),
                 np.concatenate([group[i][1] for group in found]),
                 self.causes,
+                len(self.seen),
             )
             for i in range(len(self.parts))
         ]
@@ -882,7 +901,7 @@ class Watch:
             always: what the model has always got wrong [Q, 4]; by all clean logs where None.
         """
         wrong = self.always[i] if always is None else always
-        share = np.tile(wrong, effects.shape[2] // len(SEEN))
+        share = np.tile(wrong, effects.shape[2] // len(self.seen))
         return np.asarray((effects[:, : len(self.causes)] * share).sum(axis=1))
 
     def _sums(self, found: Sequence[_Innovations]) -> Sums:
@@ -918,8 +937,8 @@ class Watch:
         suspects.sort(key=lambda suspect: -suspect.explains)
         count = sum(one.count for one in sums)
         squares = np.sum([one.squares for one in sums], axis=0) / count
-        by_channel = squares.reshape(-1, len(SEEN)).mean(axis=0)
-        innovation = dict(zip(SEEN, np.sqrt(by_channel).tolist(), strict=True))
+        by_channel = squares.reshape(-1, len(self.seen)).mean(axis=0)
+        innovation = dict(zip(self.seen, np.sqrt(by_channel).tolist(), strict=True))
         return Verdict(alarm, self.threshold, suspects, innovation)
 
 

@@ -34,11 +34,12 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
     Raises:
         DataError: where a log has nothing to learn from or to predict.
     """
+    signals = settings.signals
     if settings.prepare.dead_commands == "mask":
-        splits = _without_dead_commands(splits, settings.signals.columns)
+        splits = _without_dead_commands(splits, signals.columns)
     prepared = {
         split: paged.OneByOne(
-            prepare(part, split, settings.signals.columns, settings.prepare)
+            prepare(part, split, signals.columns, settings.prepare, signals.live)
             for log in logs
             for part in shortened(log)
         )

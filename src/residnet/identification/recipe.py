@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
@@ -18,7 +19,7 @@ from residnet.data.prepare import Prepared
 from residnet.judge.protocol import EvaluationConfig, Windows
 from residnet.physics.environment import WIND_INPUTS
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
-from residnet.physics.symmetry import mirrored_channels, wrong_parity
+from residnet.physics.symmetry import live_of, mirrored_channels, wrong_parity
 
 _STILL = 1e-3
 """Spread of a channel, as a share of its size, below which it tells nothing."""
@@ -213,7 +214,7 @@ def _terms(facts: Facts) -> list[str]:
     return [
         *("1", *VELOCITY, *_HULL, *forces),
         *(term for name in driving for term in _propeller(name, name in facts.astern)),
-        *(term for name in turning for term in _rudder(name, driving, facts.astern)),
+        *(term for name in turning for term in _rudder(name, driving, facts)),
         *(_WIND if facts.wind else ()),
     ]
 
@@ -229,12 +230,17 @@ def _propeller(name: str, astern: bool) -> list[str]:
     return [name, f"{name}|{name}|", f"|{name}| u", *back]
 
 
-def _rudder(name: str, driving: Sequence[str], astern: Sequence[str]) -> list[str]:
-    """Return the lift of a rudder in the inflow from speed and propellers."""
+def _rudder(name: str, driving: Sequence[str], facts: Facts) -> list[str]:
+    """Return the lift of a rudder in the inflow from speed and propellers.
+
+    Where no log tells the speed it is that of a usual one.
+    """
+    if "u" in live_of(facts.names).dead:
+        return [name, f"{name}|{name}|", *(f"{n}|{n}| {name}" for n in driving)]
     if len(driving) >= _MANY:
         return [name, f"u|u| {name}"]
     race = [f"{n}|{n}| {name}" for n in driving] + [f"u {n} {name}" for n in driving]
-    return [f"u|u| {name}", *race, *(f"{n}^2 {name}" for n in driving if n in astern)]
+    return [f"u|u| {name}", *race, *(f"{n}^2 {name}" for n in driving if n in facts.astern)]
 
 
 def _large_angles(name: str, driving: Sequence[str]) -> list[str]:
@@ -375,12 +381,13 @@ class Preparation:
 
     Attributes:
         interval: usual step of the logs, s.
-        memory: time after which the yaw rate (or the speed) is another, s.
+        memory: time after which `rate` is another, s.
         step: of the grid, s.
         window: of the derivative, s.
         held: inputs that rest at one value most of the time, as commands do.
         hold: whether an input over a step is the sample at its `start` or the `mean` of its ends.
         exogenous: channels of the true wind, where every log holds them.
+        rate: what the memory is that of: the yaw rate, or the speed where no log tells that.
     """
 
     interval: float
@@ -390,9 +397,10 @@ class Preparation:
     held: tuple[str, ...]
     hold: str
     exogenous: tuple[str, ...]
+    rate: str = "yaw rate"
 
     @classmethod
-    def of(cls, logs: Sequence[Log], inputs: Sequence[str]) -> Preparation:
+    def of(cls, logs: Sequence[Log], inputs: Sequence[str], live: Live = ALIVE) -> Preparation:
         """Return how logs that hold velocities are prepared for models with these inputs."""
         interval = float(np.median([np.median(np.diff(log.t)) for log in logs]))
         memories = [_memory(log) for log in logs]
@@ -400,7 +408,11 @@ class Preparation:
         step = float(f"{interval * max(1, int(memory / 40.0 / interval)):.4g}")
         samples = min(max(7, 2 * round(0.5 * memory / 5.0 / step) + 1), 41)
         held = tuple(name for name in inputs if _rests(logs, name))
-        wind = all(set(WIND_INPUTS) <= set(log.channels) for log in logs)
+        # a true wind acts from where the vessel points
+        wind = live.whole and all(
+            set(WIND_INPUTS) <= set(log.channels) and "psi" not in log.meta.get("integrated", ())
+            for log in logs
+        )
         return cls(
             interval,
             memory,
@@ -409,14 +421,15 @@ class Preparation:
             held,
             "start" if len(held) == len(inputs) else "mean",
             WIND_INPUTS if wind else (),
+            "yaw rate" if live.turns else "speed",
         )
 
     @property
     def reason(self) -> str:
         """What the numbers of time follow from."""
         return (
-            f"logs have a sample each {self.interval:.3g} s, and a yaw rate that stays alike for"
-            f" {self.memory:.3g} s"
+            f"logs have a sample each {self.interval:.3g} s, and a {self.rate} that stays alike"
+            f" for {self.memory:.3g} s"
         )
 
     def content(self) -> dict[str, Any]:
@@ -433,21 +446,27 @@ def _rests(logs: Sequence[Log], name: str) -> bool:
     return bool(resting) and float(np.median(resting)) > 0.9
 
 
-def judging(splits: Mapping[str, Sequence[Log]], length: float) -> dict[str, Any]:
+def judging(
+    splits: Mapping[str, Sequence[Log]], length: float, live: Live = ALIVE
+) -> dict[str, Any]:
     """Return protocols, selection and scales of a config, for logs by split.
 
     Args:
         splits: `train`, `validation` and `test`.
         length: of the free runs, s; see `window_length`.
+        live: velocities of the models.
     """
     laid = protocols(length)
     both = [*splits["train"], *splits["validation"]]
-    return {"protocols": laid, "selection": next(iter(laid)), "scales": scales(both)}
+    return {"protocols": laid, "selection": next(iter(laid)), "scales": scales(both, live)}
 
 
 def _memory(log: Log) -> float:
-    """Return the time in s after which the yaw rate is correlated by 1/e only."""
-    values = log["r"] if "r" in log.channels else log["u"]
+    """Return the time in s after which the yaw rate is correlated by 1/e only.
+
+    Where it does not move that of the speed is taken.
+    """
+    values = next((log[n] for n in ("r", "u", "v") if n in log.channels and log[n].any()), log.t)
     known = np.isfinite(values)
     if known.sum() < 50:
         return float("nan")
@@ -489,14 +508,10 @@ def protocols(length: float) -> dict[str, Any]:
     }
 
 
-def scales(logs: Sequence[Log]) -> dict[str, Any]:
-    """Return the standard deviations of the velocities, in units that read well."""
-    spread = {
-        name: float(np.nanstd(np.concatenate([log[name] for log in logs]))) for name in VELOCITY
-    }
-    least = 1e-4
-    return {
-        "u": f"{max(spread['u'], least):.3g} m/s",
-        "v": f"{max(spread['v'], least):.3g} m/s",
-        "r": f"{np.degrees(max(spread['r'], least)):.3g} deg/s",
-    }
+def scales(logs: Sequence[Log], live: Live = ALIVE) -> dict[str, Any]:
+    """Return the standard deviations of the velocities that live, in units that read well."""
+    least, out = 1e-4, {}
+    for name in live.velocities:
+        spread = max(float(np.nanstd(np.concatenate([log[name] for log in logs]))), least)
+        out[name] = f"{np.degrees(spread):.3g} deg/s" if name == "r" else f"{spread:.3g} m/s"
+    return out

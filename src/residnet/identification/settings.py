@@ -151,6 +151,18 @@ class FitSettings(Parts):
 
     @model_validator(mode="after")
     def _combination(self) -> FitSettings:
+        if self.current is not None and not self.signals.live.whole:
+            raise ValueError(
+                "current: currents are told by u, v and r beside a position; leave `current` out of"
+                f" a model of {', '.join(self.signals.velocities)} alone"
+            )
+        given, wanted = tuple(self.evaluation.scales.named()), self.signals.velocities
+        if given != wanted:
+            raise ValueError(
+                f"evaluation.scales: the velocities of the model are {', '.join(wanted)}"
+                f" (signals.velocities), and scales are given of {', '.join(given) or 'none'}; give"
+                " one of each"
+            )
         baselines = self.all_baselines
         single = (*baselines, *self.heads)
         further = (*self.forces, *self.ensembles, *self.means)

@@ -233,7 +233,9 @@ class Band:
         """
         if self.usual is None:
             return np.ones((len(spread), 1))
+        known = self.usual.any(axis=0)
         ratio = spread / np.maximum(self.tabled(self.usual, len(spread)), 1e-300)
+        ratio = np.compress(known, ratio, axis=1)
         return np.asarray(np.maximum(np.sqrt(np.mean(ratio**2, axis=1, keepdims=True)), 1.0))
 
     def tabled(self, table: np.ndarray, count: int) -> np.ndarray:

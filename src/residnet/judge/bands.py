@@ -75,6 +75,9 @@ def run_errors(
         )
     )
     channels[np.ix_(~found.usable, np.array(_MASKED))] = np.nan
+    live = found.live
+    moved = {*live.velocities, *["heading"] * live.turns, *["position"] * live.moves}
+    channels[:, [name not in moved for name in CHANNELS]] = np.nan
     parts = np.split(channels, found.begins[1:])
     return [
         RunErrors(log.log.name, log.log.manoeuvre, error[1:], prediction.states, prediction.spread)
@@ -296,9 +299,11 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
     number = independent(inside, weight, names, level)
     raised = corrected(level, number)
     quantiles = _quantiles(given, scale, raised)
-    width = shape * quantiles
+    # a channel that no velocity moves is not scored, and its band has no width
+    width = np.nan_to_num(shape * quantiles)
     same = _shape(given, np.zeros_like(slope))
     plain = same * _quantiles(given, np.broadcast_to(same, given.error.shape), raised)
+    plain = np.nan_to_num(plain)
     flat = given.error.reshape(-1, len(CHANNELS))
     band = Band(
         level,
@@ -307,7 +312,7 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
         width,
         plain,
         np.ones(len(CHANNELS)),
-        quantile(flat, np.repeat(weight, given.error.shape[1]), raised),
+        np.nan_to_num(quantile(flat, np.repeat(weight, given.error.shape[1]), raised)),
         unit,
         given.activity,
         slope,
@@ -318,7 +323,8 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
     # as far as the runs of other logs know the scale
     seen = shape * factor(given.measures, slope)
     largest *= _largest(given.error, scale * quantiles) / _largest(given.error, seen * quantiles)
-    return replace(band, whole=quantile(largest, weight, raised), cautions=few(band.logs))
+    whole = np.nan_to_num(quantile(largest, weight, raised), nan=1.0)
+    return replace(band, whole=whole, cautions=few(band.logs))
 
 
 def _largest(error: np.ndarray, width: np.ndarray) -> np.ndarray:
@@ -385,7 +391,7 @@ def _shape(given: _Runs, slope: np.ndarray) -> np.ndarray:
     total = weight.sum(axis=0)
     mean = np.where(total > 0, (weight * np.nan_to_num(scaled)).sum(axis=0), np.nan)
     root = np.sqrt(_smooth(mean / np.where(total > 0, total, 1.0), given.steps))
-    return np.asarray(np.maximum(root, 1e-12 + 1e-6 * np.nanmax(root, axis=0)))
+    return np.asarray(np.maximum(root, 1e-12 + 1e-6 * np.nan_to_num(root).max(axis=0)))
 
 
 def _quantiles(given: _Runs, scale: np.ndarray, level: float) -> np.ndarray:

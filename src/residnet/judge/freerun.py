@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from residnet.core.frames import wrap_array
-from residnet.core.layout import HEADING, POSE, POSITION, VELOCITIES
+from residnet.core.layout import ALIVE, HEADING, POSE, POSITION, VELOCITIES, Live
 from residnet.core.names import STATE, VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
@@ -98,11 +98,13 @@ class Errors:
         error: predicted minus measured x, y, psi, u, v, r [N, 6]; psi within half a turn.
         usable: which samples are [N].
         counts: samples of each window [W].
+        live: velocities that the logs tell; the others are zero, and no error counts.
     """
 
     error: np.ndarray
     usable: np.ndarray
     counts: np.ndarray
+    live: Live = ALIVE
 
     @classmethod
     def of(
@@ -118,7 +120,12 @@ class Errors:
             error,
             np.concatenate([log.usable[part] for log, part in rows]),
             np.array([window.stop - window.start for window in windows]),
+            logs[windows[0].log].live,
         )
+
+    def nrmse(self, scales: np.ndarray) -> np.ndarray:
+        """Return the mean over the live velocities of rmse / scale of each window [W]."""
+        return np.asarray((self.rmse / scales).take(self.live.axes, axis=1).mean(1))
 
     @property
     def begins(self) -> np.ndarray:

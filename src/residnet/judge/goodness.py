@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,12 +64,13 @@ def repeatability(
         by kind of manoeuvre. Two independent runs differ by sqrt(2) times what each is off their
         expectation.
     """
-    divisor = np.array([scales[name] for name in VELOCITY])
+    divisor = np.array([scales.get(name, 1.0) for name in VELOCITY])
+    live = [VELOCITY.index(name) for name in scales]
     found = list(find_pairs(protocol, logs, commands, divisor, step))
     out: dict[str, Any] = {
         "tolerance": {
             "command_share_of_range": _COMMAND,
-            "start": {name: _START * float(scales[name]) for name in VELOCITY},
+            "start": {name: _START * float(scales[name]) for name in scales},
         },
         "pairs": len(found),
         "logs": len({pair.first.log for pair in found} | {pair.log for pair in found}),
@@ -78,10 +79,11 @@ def repeatability(
         apart = np.array([_apart(pair, logs) for pair in found])
         kinds = np.array([logs[pair.first.log].log.manoeuvre for pair in found])
         by_kind = {
-            str(kind): {"pairs": int((kinds == kind).sum())} | _mean(apart[kinds == kind], divisor)
+            str(kind): {"pairs": int((kinds == kind).sum())}
+            | _mean(apart[kinds == kind], divisor, live)
             for kind in np.unique(kinds)
         }
-        out |= _mean(apart, divisor) | {"manoeuvres": by_kind}
+        out |= _mean(apart, divisor, live) | {"manoeuvres": by_kind}
     return out
 
 
@@ -181,9 +183,10 @@ def _end(y: np.ndarray) -> np.ndarray:
     return np.array([c * north + s * east, c * east - s * north, turned])
 
 
-def _mean(apart: np.ndarray, scales: np.ndarray) -> dict[str, float]:
+def _mean(apart: np.ndarray, scales: np.ndarray, live: list[int]) -> dict[str, float]:
     mean = dict(zip((*VELOCITY, "position", "heading"), apart.mean(0).tolist(), strict=True))
-    return mean | {"nrmse": float((apart[:, RANGE_VELOCITIES].mean(0) / scales).mean())}
+    shares = (apart[:, RANGE_VELOCITIES].mean(0) / scales)[live]
+    return mean | {"nrmse": float(shares.mean())}
 
 
 _LEVEL = 0.95
@@ -421,7 +424,10 @@ def noise_variance(residual: np.ndarray, parameters: float) -> float:
 
 
 def table(
-    models: Sequence[OneStep], targets: Sequence[np.ndarray], step: float
+    models: Sequence[OneStep],
+    targets: Sequence[np.ndarray],
+    step: float,
+    axes: Iterable[tuple[int, str]] = tuple(enumerate(ACCELERATION)),
 ) -> list[dict[str, Any]]:
     """Return a row for each model and axis.
 
@@ -429,10 +435,11 @@ def table(
         models: one-step residuals over the same pieces.
         targets: measured accelerations, [T, 3] of each piece.
         step: time between samples, s.
+        axes: number and name of each acceleration that is looked at.
     """
     by_name = {model.model: model for model in models}
     out = []
-    for axis, name in enumerate(ACCELERATION):
+    for axis, name in axes:
         target = np.concatenate([piece[:, axis] for piece in targets])
         series = {model.model: [piece[:, axis] for piece in model.residuals] for model in models}
         joined = {key: np.concatenate(pieces) for key, pieces in series.items()}

@@ -182,16 +182,14 @@ class Judged:
         scales: Mapping[str, float],
     ) -> None:
         self.run, self.candidates, self.logs = run, candidates, logs
-        self.scale = np.array([scales[name] for name in VELOCITY])
+        self.scale = np.array([scales.get(name, 1.0) for name in VELOCITY])
+        self.live = logs[0].live
         self.parts = [(logs[w.log], slice(w.start, w.stop)) for w in run.windows]
         self.numbers = np.array([window.log for window in run.windows])
         self.found = {
             one.name: Errors.of(run.windows, run.predictions[one.name], logs) for one in candidates
         }
-        self.nrmse = {
-            name: np.asarray((found.rmse / self.scale).mean(1))
-            for name, found in self.found.items()
-        }
+        self.nrmse = {name: found.nrmse(self.scale) for name, found in self.found.items()}
 
     def difference(
         self,
@@ -245,14 +243,14 @@ class Judged:
             (found.rmse, self.nrmse[name], found.position_end, found.heading_end)
         )[chosen]
         rmse, mae = by_window[:, :3].mean(0), found.mae[chosen].mean(0)
-        nrmse = rmse / self.scale
+        nrmse, live = rmse / self.scale, self.live
         spread = intervals(by_window, drawn)
         samples = found.samples[chosen]
 
         def named(values: np.ndarray) -> dict[str, float]:
-            return dict(zip(VELOCITY, values.tolist(), strict=True))
+            return {VELOCITY[axis]: float(values[axis]) for axis in live.axes}
 
-        return {
+        out = {
             "windows": len(samples),
             "n": int(samples.sum()),
             "diverged": sum(
@@ -262,15 +260,21 @@ class Judged:
             ),
             "rmse": named(rmse),
             "mae": named(mae),
-            "nrmse": named(nrmse) | {"mean": float(nrmse.mean())},
-            "rmse_ci95": dict(zip(VELOCITY, spread, strict=False)),
+            "nrmse": named(nrmse) | {"mean": float(nrmse[live.axes].mean())},
+            "rmse_ci95": {VELOCITY[axis]: spread[axis] for axis in live.axes},
             "nrmse_mean_ci95": spread[3],
             "ci95_blocks": drawn.row() if drawn is not None else None,
-            "position_error_end": float(by_window[:, 4].mean()),
-            "position_error_end_ci95": spread[4],
-            "heading_error_end": float(by_window[:, 5].mean()),
-            "heading_error_end_ci95": spread[5],
         }
+        for column, name in self._ends:
+            out[f"{name}_error_end"] = float(by_window[:, column].mean())
+            out[f"{name}_error_end_ci95"] = spread[column]
+        return out
+
+    @property
+    def _ends(self) -> list[tuple[int, str]]:
+        """Columns and names of the errors at the end of a window that the velocities lead to."""
+        live = self.live
+        return [(4, "position")] * live.moves + [(5, "heading")] * live.turns
 
     def limits(self, step: float) -> dict[str, Any]:
         """Return the part of limits.json for one protocol and split; `step` of the grid in s."""
@@ -292,7 +296,8 @@ class Judged:
             them (mean speeds, m/s) and the mean way `sailed` in m; `floor` (position and heading):
             what integrated measured velocities are off; and by model `position` and `heading`: the
             mean over the windows, with `interval`s that hold the mean over as many new windows in
-            95 % of cases, None where there are too few blocks.
+            95 % of cases, None where there are too few blocks. Of position and heading only what
+            the live velocities move is told.
         """
         counts, speeds = (
             np.array([part.stop - part.start for _, part in self.parts]),
@@ -319,10 +324,10 @@ class Judged:
                     # the mean of new windows scatters as much as that of those seen
                     wide = None if found is None else mean + np.sqrt(2.0) * (np.array(found) - mean)
                     new.append(None if wide is None else np.maximum(wide, 0.0).tolist())
+                names = [(column - 4, name) for column, name in self._ends]
                 return {
-                    "position": float(means[0]),
-                    "heading": float(means[1]),
-                    "intervals": {"position": new[0], "heading": new[1]},
+                    **{name: float(means[k]) for k, name in names},
+                    "intervals": {name: new[k] for k, name in names},
                 }
 
             measured = [
@@ -361,8 +366,10 @@ class Judged:
         Returns:
             windows; position_mean, position_rms in m and heading_mean, heading_rms in rad at the
             ends of windows. A model that predicted the measured velocities exactly would have
-            these errors.
+            these errors. Empty where only some velocities were recorded.
         """
+        if not self.live.whole:
+            return {}
         measured = [log.y[part] for log, part in self.parts]
         ends = [integrate(y[0, POSE], y[:, VELOCITIES], step)[-1] - y[-1, POSE] for y in measured]
         error = np.array(ends)
@@ -416,17 +423,18 @@ class Judged:
     def worst(self, name: str) -> list[dict[str, Any]]:
         """Return the three windows with the largest nrmse of a model.
 
-        Each with log, manoeuvre, t (start, the log's clock, s), nrmse, rmse, position_error_end.
+        Each with log, manoeuvre, t (start, the log's clock, s), nrmse, rmse, position_error_end
+        (heading_error_end where no velocity moves the position).
         """
-        found, nrmse = self.found[name], self.nrmse[name]
+        found, nrmse, end = self.found[name], self.nrmse[name], self._ends[0][1]
         return [
             {
                 "log": self.parts[i][0].log.name,
                 "manoeuvre": self.parts[i][0].log.manoeuvre,
                 "t": float(self.parts[i][0].log.t[self.run.windows[i].start]),
                 "nrmse": float(nrmse[i]),
-                "rmse": dict(zip(VELOCITY, found.rmse[i].tolist(), strict=True)),
-                "position_error_end": float(found.position_end[i]),
+                "rmse": {VELOCITY[axis]: float(found.rmse[i, axis]) for axis in self.live.axes},
+                f"{end}_error_end": float(getattr(found, f"{end}_end")[i]),
             }
             for i in np.argsort(-nrmse, kind="stable")[:_WORST].tolist()
         ]
@@ -546,4 +554,4 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
         out |= {f"{name}_{channel}": value for channel, value in row[name].items()}
     # beside the score, since the diverged windows in it are no errors of the model
     out["note"] = diverged_note(row)
-    return out | {name: row[name] for name in _ENDS}
+    return out | {name: row[name] for name in _ENDS if name in row}

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from residnet.core.config import Config, MetresPerSecond, RadiansPerSecond, Seconds
 from residnet.core.errors import DataError
 from residnet.core.layout import VELOCITIES
-from residnet.core.names import nearest
+from residnet.core.names import VELOCITY, nearest
 from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
 
@@ -177,7 +177,8 @@ def all_windows(
 class Scales(Config):
     """Scales that nrmse divides by: typical spreads of the measured velocities.
 
-    Other logs that a run is evaluated on are judged by the same scales.
+    Other logs that a run is evaluated on are judged by the same scales. Each velocity that the
+    model moves (`signals.velocities`) has one.
 
     Attributes:
         u: of the surge velocity in m/s.
@@ -185,17 +186,18 @@ class Scales(Config):
         r: of the yaw rate in rad/s.
     """
 
-    u: Annotated[MetresPerSecond, Field(gt=0)]
-    v: Annotated[MetresPerSecond, Field(gt=0)]
-    r: Annotated[RadiansPerSecond, Field(gt=0)]
+    u: Annotated[MetresPerSecond, Field(gt=0)] | None = None
+    v: Annotated[MetresPerSecond, Field(gt=0)] | None = None
+    r: Annotated[RadiansPerSecond, Field(gt=0)] | None = None
 
     def array(self) -> np.ndarray:
-        """Return the scales of u, v, r as one array [3], in m/s, m/s, rad/s."""
-        return np.array([self.u, self.v, self.r])
+        """Return the scales of u, v, r as one array [3], in m/s, m/s, rad/s; 1 without a scale."""
+        return np.array([self.named().get(name, 1.0) for name in VELOCITY])
 
     def named(self) -> dict[str, float]:
         """Return the scales by the name of the velocity."""
-        return {"u": float(self.u), "v": float(self.v), "r": float(self.r)}
+        found = {name: getattr(self, name) for name in VELOCITY}
+        return {name: float(value) for name, value in found.items() if value is not None}
 
 
 class EvaluationConfig(Config):

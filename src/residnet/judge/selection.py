@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.format import number
+from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.judge.freerun import Errors, FreeRun
 
@@ -299,8 +300,11 @@ def shares(
     """
     found = Errors.of(run.windows, run.predictions[model], logs)
     divisor = found.rmse * np.add.reduceat(found.scored, found.begins, dtype=float)
-    divisor = np.where(divisor > 0, divisor, 1.0) * np.array(list(scales.values()))
-    sample = (found.velocities**2 / np.repeat(divisor, found.counts, axis=0)).sum(1)
+    live = [VELOCITY.index(name) for name in scales]
+    divisor = np.where(divisor > 0, divisor, 1.0).take(live, axis=1)
+    divisor = divisor * np.array(list(scales.values()))
+    errors = found.velocities.take(live, axis=1)
+    sample = (errors**2 / np.repeat(divisor, found.counts, axis=0)).sum(1)
     share = sample / (divisor.shape[1] * len(run.windows))
     return np.bincount(np.concatenate(labels), share, count)
 

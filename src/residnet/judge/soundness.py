@@ -213,15 +213,20 @@ def check_model(
     # products this small only lose time to a second thread
     torch.set_num_threads(1)
     # the memory of a mean is too large for a Jacobian at each point; free runs show what it does
-    single = not isinstance(model, MeanOfTrajectories)
-    told = "not looked at: the mean of several models, whose free runs are bounded or not"
+    told = ""
+    if isinstance(model, MeanOfTrajectories):
+        told = "not looked at: the mean of several models, whose free runs are bounded or not"
+    straight = spec.signals.velocities == ("u",)
+    told = "not looked at: the model neither sways nor turns" if straight else told
     try:
         return [
             check_damping(spec, model, recorded),
-            check_stability(spec, model, recorded)
-            if single
-            else Finding(spec.name, STABILITY, None, told, ""),
-            check_symmetry(spec, model, recorded),
+            Finding(spec.name, STABILITY, None, told)
+            if told
+            else check_stability(spec, model, recorded),
+            Finding(spec.name, SYMMETRY, None, told)
+            if straight
+            else check_symmetry(spec, model, recorded),
             check_bounded(spec, model, recorded, divergence),
         ]
     finally:
@@ -268,7 +273,7 @@ def check_damping(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) ->
     ]
     fault = f"its damping has the wrong sign in most of the data ({'; '.join(said)})"
     values = ", ".join(
-        f"d{name}′/d{name} {value:+.3g}" for name, value in zip(VELOCITY, middle, strict=True)
+        f"d{name}′/d{name} {middle[VELOCITY.index(name)]:+.3g}" for name in spec.signals.velocities
     )
     text = f"medians over the training data: {values} 1/s"
     return _found(spec, DAMPING, True, text, fault if said else "")
@@ -314,7 +319,7 @@ def operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPo
     drives = low + torch.linspace(0.0, 1.0, 41, dtype=torch.float64)[:, None] * (high - low)
     drives[:, still] = torch.zeros(len(still), dtype=torch.float64).clamp(low[still], high[still])
     out = []
-    for fraction in _FRACTIONS:
+    for fraction in _FRACTIONS if "u" in spec.signals.velocities else _FRACTIONS[:1]:
         speed = fraction * max(spec.high[0], 1e-6)
         x = torch.zeros(len(drives), len(STATE), dtype=torch.float64)
         x[:, SURGE] = speed
@@ -332,6 +337,9 @@ def _ranges(ends: Sequence[float]) -> Tensor:
 
 def check_stability(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) -> Finding:
     """Check how small disturbances of sway, yaw and memory grow in straight running."""
+    words = {"v": "sway", "r": "yaw"}
+    moved = " and ".join(words[name] for name in words if name in spec.signals.velocities)
+    are = "are" if " " in moved else "is"
     points = operating_points(spec, model)
     rates = [growth_rate(model, point.x, point.w) for point in points]
     summary = "; ".join(
@@ -352,7 +360,7 @@ def check_stability(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) 
     ]
     if not unstable:
         text = (
-            "sway and yaw are stable in straight running at"
+            f"{moved} {are} stable in straight running at"
             f" {interval([points[0].speed, points[-1].speed], digits=2)} m/s (no mode doubles"
             f" within {_DOUBLING:.0f} s). {summary}"
         )
@@ -361,7 +369,7 @@ def check_stability(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) 
     worst, rate = max(inside or unstable, key=lambda pair: pair[1])
     where = "inside the training data" if inside else "only outside the training data"
     text = (
-        f"sway and yaw unstable in straight running, {where}: worst at {worst.text}, a disturbance"
+        f"{moved} unstable in straight running, {where}: worst at {worst.text}, a disturbance"
         f" doubles in {number(math.log(2) / rate, 2)} s. Some full hulls are so in truth; otherwise"
         f" do not trust long free runs there. {summary}"
     )
@@ -476,6 +484,7 @@ def check_symmetry(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) -
     parts = ", ".join(
         f"{name}′ {100 * float(t):.1f} % (largest {100 * float(m):.1f} %)"
         for name, t, m in zip(VELOCITY, typical, largest, strict=True)
+        if name in spec.signals.velocities
     )
     reason = (
         "A single screw, an offset of the steering or too few turns one way may be the reason. "

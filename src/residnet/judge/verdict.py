@@ -55,6 +55,12 @@ _SHARE, _TURN = 0.10, math.radians(10.0)
 """What a good model is off at most: this share of the way sailed and so many radians of heading,
 at the upper end of the interval, or twice the noise floor. It is residnet's choice, and stands in
 the verdict, so that a reader with other needs can choose another."""
+_ENDS = (("position", 1.0, "m"), ("heading", math.degrees(1.0), "deg"))
+"""Errors at the end of a free run, as far as the velocities of the model move them."""
+_GOOD = {
+    "position": f"{100.0 * _SHARE:.0f} % of the way",
+    "heading": f"{math.degrees(_TURN):.0f} deg",
+}
 _OF_BEST = 1.5
 """A good model errs at most so many times as much as the best one of the run, floor aside."""
 
@@ -110,7 +116,8 @@ def _good_until(evidence: Evidence) -> float:
         # what the plant itself leaves, started from measured states, is noise too
         floors = [entry["floor"], *(models[name] for name in plants & set(models))]
         rivals = set(models) - {evidence.selected} - plants
-        for of, least in (("position", _SHARE * entry["sailed"]), ("heading", _TURN)):
+        for of in ends:
+            least = _SHARE * entry["sailed"] if of == "position" else _TURN
             others = [models[name][of] for name in rivals]
             twice = 2.0 * max(floor[of] for floor in floors)
             known = ends[of] is not None and entry["windows"] >= _FEWEST
@@ -142,9 +149,9 @@ def ahead(evidence: Evidence) -> list[str]:
         start = f"Up to {after}: there {evidence.selected} is off by {off}."
     else:
         start = f"{after[0].upper()}{after[1:]} {evidence.selected} is off by {off}."
+        good = " and ".join(_GOOD[of] for of, _, _ in _ENDS if of in chosen["floor"])
         wanted = [
-            f"Good would be within {100.0 * _SHARE:.0f} % of the way and"
-            f" {math.degrees(_TURN):.0f} deg, or twice the noise floor, without a diverged window"
+            f"Good would be within {good}, or twice the noise floor, without a diverged window"
             " and near the best model of the run."
         ]
     named = {ZERO: ZERO, evidence.baseline: "the baseline"}
@@ -153,20 +160,24 @@ def ahead(evidence: Evidence) -> list[str]:
         for name, word in named.items()
         if name in chosen["models"] and name != evidence.selected
     ]
+    # a pose that was integrated from the velocities has no floor but rounding
+    known = any(chosen["floor"].get(of, 0.0) > 1e-9 for of, _, _ in _ENDS)
     floor = f"the noise floor (measured velocities, integrated) {_pair(chosen['floor'])}"
     rest = [
         f"{_pair(entry['models'][evidence.selected])} after {entry['seconds']:.4g} s"
         for entry in entries
         if entry is not chosen
     ]
+    moves = "position" in chosen["floor"]
     logs = f"{chosen['logs']} log{'' if chosen['logs'] == 1 else 's'}"
     holds = (
-        f"It holds for {chosen['windows']} windows of {logs} at mean speeds of"
-        f" {number(chosen['slowest'], 2)} to {number(chosen['fastest'], 2)} m/s."
+        f"It holds for {chosen['windows']} windows of {logs}"
+        + f" at mean speeds of {number(chosen['slowest'], 2)} to"
+        f" {number(chosen['fastest'], 2)} m/s" * moves + "."
     )
     return [
         start,
-        f"Beside it: {'; '.join([*beside, floor])}.",
+        f"Beside it: {'; '.join([*beside, *([floor] if known else [])])}.",
         *wanted,
         *([f"At other times: {'; '.join(rest)}."] if rest else []),
         holds,
@@ -175,13 +186,14 @@ def ahead(evidence: Evidence) -> list[str]:
 
 
 def _pair(errors: Content) -> str:
-    return f"{number(errors['position'], 2)} m and {number(math.degrees(errors['heading']), 2)} deg"
+    found = [f"{number(f * errors[of], 2)} {unit}" for of, f, unit in _ENDS if of in errors]
+    return " and ".join(found)
 
 
 def _off(entry: Content, name: str, sailed: float = 0.0) -> str:
     """Return errors of position and heading with their intervals as text."""
     own, out = entry["models"][name], []
-    for of, factor, unit in (("position", 1.0, "m"), ("heading", math.degrees(1.0), "deg")):
+    for of, factor, unit in (end for end in _ENDS if end[0] in own):
         ends = own["intervals"][of]
         text = f"{number(factor * own[of], 2)} {unit}"
         details = [interval(ends, factor, 2)] if ends else []

@@ -7,16 +7,16 @@ the predicted heading and velocity.
 
 from __future__ import annotations
 
-from typing import final
+from typing import Literal, final
 
 import torch
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
-from residnet.core.layout import PLANAR, heading, surge, sway, velocities
+from residnet.core.layout import PLANAR, Live, heading, surge, sway, velocities
 from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig
@@ -42,12 +42,15 @@ class SignalsConfig(Config):
         pairs: inputs to port and starboard that change places in the mirror, such as
             [[left, right]]; those that end in `_port` and `_stbd` are known without. Angles change
             their sign too.
+        velocities: those of u, v and r that the logs tell and the model moves; the others are zero
+            at all times. A model of surge alone has [u].
     """
 
     inputs: tuple[str, ...]
     exogenous: tuple[str, ...] = ()
     forces: str | DifferentialThrustConfig | None = None
     pairs: tuple[tuple[str, str], ...] = ()
+    velocities: tuple[Literal["u", "v", "r"], ...] = Field(default=("u", "v", "r"), min_length=1)
 
     @model_validator(mode="after")
     def _combination(self) -> SignalsConfig:
@@ -63,6 +66,15 @@ class SignalsConfig(Config):
         if self.resolved().forces is not None and len(self.inputs) != 2:
             raise ValueError(
                 f"forces are made by two thrusters, but inputs are {list(self.inputs)}"
+            )
+        if list(self.velocities) != [name for name in VELOCITY if name in self.velocities]:
+            raise ValueError(
+                f"velocities are named once each, in the order u, v, r; given {self.velocities}"
+            )
+        if self.exogenous and not self.live.whole:
+            raise ValueError(
+                "exogenous: the loads of a wind need u, v and r and a heading; leave it out, or"
+                " give logs with all of these"
             )
         repeated = {
             name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1
@@ -91,6 +103,11 @@ class SignalsConfig(Config):
     def columns(self) -> tuple[str, ...]:
         """Names of the columns of w [B, m]: inputs, then exogenous channels."""
         return self.inputs + self.exogenous
+
+    @property
+    def live(self) -> Live:
+        """The velocities that live."""
+        return Live(self.velocities)
 
     def resolved(self) -> SignalsConfig:
         """Return the same config with the vessel's name replaced by its thrusters.
@@ -145,7 +162,7 @@ class Signals(nn.Module):
         names = VELOCITY + config.inputs
         names += FORCE_CHANNELS if self.forces else ()
         names += WIND_CHANNELS if self.wind else ()
-        self.names: tuple[str, ...] = ChannelNames(names, config.pairs)
+        self.names: tuple[str, ...] = ChannelNames(names, config.pairs, config.live)
         self.count = len(names)
 
     def prepare(self, w: Tensor) -> Tensor:

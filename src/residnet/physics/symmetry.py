@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import final
 
+from residnet.core.layout import ALIVE, Live
 from residnet.core.names import VELOCITY
 from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 
@@ -18,24 +19,49 @@ _ANGLES = ("delta", "rudder", "azimuth")
 class ChannelNames(tuple[str, ...]):
     """Names of channels, a tuple; `partners` says which change places, as declared or by ending.
 
-    A channel that ends in `_port` has the one that ends in `_stbd` for its partner.
+    A channel that ends in `_port` has the one that ends in `_stbd` for its partner. `live` says
+    which velocities among them live; the others are zero.
     """
 
     partners: Mapping[str, str]
+    live: Live
 
-    def __new__(cls, names: Iterable[str], pairs: Iterable[tuple[str, str]] = ()) -> ChannelNames:
-        """From the names, and the pairs that are declared."""
+    def __new__(
+        cls,
+        names: Iterable[str],
+        pairs: Iterable[tuple[str, str]] = (),
+        live: Live = ALIVE,
+    ) -> ChannelNames:
+        """From the names, the pairs that are declared, and the velocities that live."""
         made = super().__new__(cls, names)
         port = [name.removesuffix("_port") for name in made if name[:-5] and name.endswith("_port")]
         ending = [(f"{stem}_port", f"{stem}_stbd") for stem in port if f"{stem}_stbd" in made]
         both = [*pairs, *ending]
         made.partners = {**dict(both), **{b: a for a, b in both}}
+        made.live = live
         return made
 
 
 def partners_of(names: Sequence[str]) -> Mapping[str, str]:
     """Return the partner on the other side of each channel that has one."""
     return (names if isinstance(names, ChannelNames) else ChannelNames(names)).partners
+
+
+def live_of(names: Sequence[str]) -> Live:
+    """Return which velocities live among channels; all where nobody said."""
+    return names.live if isinstance(names, ChannelNames) else ALIVE
+
+
+def without_dead(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the channels without velocities that are zero at all times."""
+    dead = live_of(names).dead
+    return tuple(name for name in names if name not in dead)
+
+
+def living(term: str, names: Sequence[str]) -> bool:
+    """Return whether a product of channels holds no velocity that is zero at all times."""
+    dead = live_of(names).dead
+    return not dead or all(factor.name not in dead for factor in parse_term(term, names))
 
 
 def channel_parity(name: str) -> int | None:

@@ -16,8 +16,8 @@ from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_table
 from residnet.core.format import SHOWN_UNITS, shown_unit
-from residnet.core.layout import RANGE_VELOCITIES
-from residnet.core.names import CHANNEL_UNITS, to_si
+from residnet.core.layout import ALIVE, RANGE_VELOCITIES, Live
+from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
 from residnet.core.units import known_unit
 from residnet.judge.rollout_files import INPUT
 
@@ -45,6 +45,7 @@ class StoredWindow:
         inputs: values [T] by name, SI and rad; empty where the run has stored none.
         low: lower limits of the band [T, 6] by model; empty where no model has one.
         high: upper limits likewise.
+        live: velocities that the logs tell; the others are zero.
     """
 
     log: str
@@ -59,6 +60,7 @@ class StoredWindow:
     inputs: dict[str, np.ndarray] = field(default_factory=dict)
     low: dict[str, np.ndarray] = field(default_factory=dict)
     high: dict[str, np.ndarray] = field(default_factory=dict)
+    live: Live = ALIVE
 
     def rmse(self, model: str) -> np.ndarray:
         """Return the root mean square errors [3] of u, v (usable samples) and r (all samples)."""
@@ -261,6 +263,21 @@ class RunFiles:
         """The channels that are scored."""
         return [name for name in self.rows[0]["rmse"] if name != "mean"]
 
+    @cached_property
+    def live(self) -> Live:
+        """The velocities that the logs tell; models leave the others at zero."""
+        return Live(tuple(name for name in VELOCITY if name in self.channels))
+
+    @property
+    def place(self) -> str:
+        """What an error of the position is called: without a heading it is that of a distance."""
+        return "position" if self.live.turns else "distance run"
+
+    @cached_property
+    def ends(self) -> list[str]:
+        """What of `position` and `heading` is scored at the end of free runs."""
+        return [end for end in ("position", "heading") if f"{end}_error_end" in self.rows[0]]
+
     def row(
         self, model: str | None, split: str, protocol: str, manoeuvre: str = "all"
     ) -> Content | None:
@@ -364,6 +381,7 @@ class RunFiles:
                         },
                         low=_limits(parts, "low"),
                         high=_limits(parts, "high"),
+                        live=self.live,
                     )
                 )
         return out

@@ -11,7 +11,6 @@ import numpy as np
 
 from residnet.core.errors import UsageError
 from residnet.core.format import DEG, number
-from residnet.core.names import VELOCITY
 from residnet.judge.metrics import blocks, difference
 from residnet.report.blocks import Block, Cell, Section, Table, table_of
 from residnet.report.figure import GLANCE, Case, Figure, Panel, family, write_figure
@@ -41,16 +40,17 @@ class JudgedRun(RunFiles):
         found = (split for split in ("test", "external") if split in self.splits)
         self.split = next(found, self.splits[-1])
         self.model = str(self.metrics["selected"])
-        self.scales = np.array([float(self.metrics["scales"][name]) for name in VELOCITY])
+        told = self.metrics["scales"]
+        self.scales = np.array([float(told[name]) for name in self.live.velocities])
 
     @cached_property
     def series(self) -> dict[Window, tuple[np.ndarray, np.ndarray]]:
         """Of each window the times from its start [T] and the errors of the selected model in
-        u, v, r [T, 3], NaN where a sample is not usable.
+        its velocities, u, v, r [T, 3] where all live, NaN where a sample is not usable.
         """
         out = {}
         for one in self.windows(self.split):
-            apart = (one.predicted[self.model] - one.measured)[:, : len(VELOCITY)]
+            apart = (one.predicted[self.model] - one.measured)[:, self.live.axes]
             errors = np.where(one.usable[:, None], apart, np.nan)
             out[one.log, one.protocol, round(float(one.t[0]), 3)] = (one.t - one.t[0], errors)
         return out
@@ -104,7 +104,15 @@ def judged_runs(paths: Sequence[Path]) -> list[JudgedRun]:
     names = short if len(set(short)) == len(short) else [str(path) for path in paths]
     if len(set(names)) < len(names):
         raise UsageError("compare: a run is named twice")
-    return [JudgedRun(name, path) for name, path in zip(names, paths, strict=True)]
+    runs = [JudgedRun(name, path) for name, path in zip(names, paths, strict=True)]
+    for run in runs:
+        if run.live != runs[0].live:
+            raise UsageError(
+                f"compare: {run.name} predicts {', '.join(run.live.velocities)}, and"
+                f" {runs[0].name} {', '.join(runs[0].live.velocities)}; name runs of the same"
+                " velocities (signals.velocities)"
+            )
+    return runs
 
 
 def _common(runs: Sequence[JudgedRun]) -> list[Window]:

@@ -126,6 +126,7 @@ def _table(log: Log) -> pd.DataFrame:
 
 _POSE = [COLUMNS[name][0] for name in ("x", "y", "psi")]
 _OWN = [COLUMNS[name][0] for name in ("u", "v", "r")]
+_SURGE = [COLUMNS[name][0] for name in ("u", "n")]
 _ACTS = [COLUMNS[name][0] for name in ("delta", "n")]
 
 
@@ -165,6 +166,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[pd.DataFrame], dict[str, pd.DataFrame]]]
     "rates": ("one table whose columns come at three rates", _rates),
     "pwm": ("commands as pulses", lambda table: {"": _pulses(table)}),
     "no_pose": ("velocities and commands alone", lambda table: {"": table.drop(columns=_POSE)}),
+    "surge": ("speed and propeller alone", lambda table: {"": table[["time [s]", *_SURGE]]}),
 }
 """Folder -> what it holds, and the tables of a log by the word that its file's name begins with."""
 

@@ -14,6 +14,7 @@ import yaml
 
 from residnet.core.config import validate
 from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.layout import Live
 from residnet.core.log import Log
 from residnet.core.names import POSE, VELOCITY
 from residnet.core.progress import say
@@ -137,19 +138,28 @@ def drafted(
             f" {held}): a model without them can only predict how the vessel coasts; name the"
             " columns that drive it",
         )
-    elif lacking := lacks(inputs):
+    elif lacking := lacks(inputs, read.live):
         marks.guess(
             INPUTS,
             f"nothing among the inputs {lacking} the vessel; where a column that no channel takes"
             " does, name it under data.reader.channels",
         )
     inputs = read.keep(inputs, marks)
-    chosen = Preparation.of(list(read.whole.values()), inputs)
+    live = read.live
+    chosen = Preparation.of(list(read.whole.values()), inputs, live)
     signals = {"inputs": list(inputs)}
+    if not live.whole:
+        signals["velocities"] = list(live.velocities)
+        marks.guess(("signals", "velocities"), live.text)
     signals |= {"exogenous": list(chosen.exogenous)} if chosen.exogenous else {}
+    if not chosen.exogenous and all(
+        {*WIND_INPUTS} <= {*log.channels} for log in read.logs.values()
+    ):
+        marks.note(CHANNELS, "the wind is left out: its loads need u, v, r and a measured heading")
     preparation = chosen.content()
     if "frozen" in _findings(list(read.logs.values()), inputs, marks):
-        preparation |= {"masks": [{"kind": "frozen"}]}
+        where = {} if live.whole else {"channels": list(live.velocities)}
+        preparation |= {"masks": [{"kind": "frozen", **where}]}
     usable = read.usable((*inputs, *chosen.exogenous), preparation)
     split, splits = _split(usable, folder, marks)
     length = window_length([splits[name] for name in SPLITS[1:]], chosen.memory)
@@ -170,7 +180,7 @@ def drafted(
         "integrator": "semi_implicit_euler",
         "recipe": "standard",
         "export": {"models": []},
-        "evaluation": judging(splits, length),
+        "evaluation": judging(splits, length, live),
     }
     validate(config, FitConfig, "draft", folder)
     guesses = tuple((".".join(key), text) for key, text in marks.guesses)
@@ -185,6 +195,7 @@ class _Read:
 
     Attributes:
         reader: `data.reader` of the config.
+        live: velocities that most of the logs tell.
         logs: path -> log, in SI, as the reader gives it.
         whole: path -> the same with the motion at every sample.
         left_out: path -> why it is not used.
@@ -205,11 +216,16 @@ class _Read:
         }
         unsure = unsure if len(unsure) < len(read.logs) else {}
         self.left_out |= unsure
+        told = [Live.told(log.channels) for log in read.logs.values()]
+        self.live = max(told, key=lambda one: (told.count(one), len(one.velocities)))
         for path, log in read.logs.items():
             if path in unsure:
                 continue
             try:
-                self.whole[path], self.logs[path] = complete_motion(log, MotionConfig()), log
+                self.whole[path], self.logs[path] = (
+                    complete_motion(log, MotionConfig(), self.live),
+                    log,
+                )
             except ResidnetError as error:
                 self.left_out[path] = str(error)
         if not self.whole:
@@ -249,7 +265,7 @@ class _Read:
         out: dict[Path, Log] = {}
         for path, log in self.logs.items():
             try:
-                if prepare(log, "train", columns, config).good.any():
+                if prepare(log, "train", columns, config, self.live).good.any():
                     out[path] = self.whole[path]
                 else:
                     self.left_out[path] = "no stretch is as long as the window of the derivative"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, STATE
 from residnet.data.drafting.questions import Marks
@@ -144,8 +145,10 @@ def _alike(a: np.ndarray, b: np.ndarray) -> bool:
     return abs(float(np.corrcoef(a[known], b[known])[0, 1])) > _SAME
 
 
-def lacks(names: Sequence[str]) -> str:
+def lacks(names: Sequence[str], live: Live = ALIVE) -> str:
     """Return what no input does, `drives` or `steers`; empty where both are done.
+
+    A vessel that does not turn needs none that steers, one that does not move none that drives.
 
     Forces, thrusters that turn, and several thrusters do both.
     """
@@ -157,4 +160,5 @@ def lacks(names: Sequence[str]) -> str:
     both = any(name.startswith(("tau", "azimuth", "nozzle")) for name in rest)
     if both or any(steering) + any(driving) + len(rest) > 1:
         return ""
-    return "drives" if any(steering) else "steers"
+    lacking = "drives" if any(steering) else "steers"
+    return lacking if {"drives": live.moves, "steers": live.turns}[lacking] else ""

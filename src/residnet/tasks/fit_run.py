@@ -12,7 +12,7 @@ import numpy as np
 from residnet.core.config import dump_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.core.names import STATE, nearest, si_unit
+from residnet.core.names import CHANNEL_UNITS, STATE, nearest, si_unit
 from residnet.core.progress import say
 from residnet.data.doctor import inspect, inspect_together, inspection, summary
 from residnet.data.drafting.reading import log_files
@@ -56,6 +56,7 @@ from residnet.tasks.fit import FitConfig
 
 _CHOSEN = ("predictor", "selected")
 """What stands for a model's name: the one reported first, and the single one chosen."""
+_END_UNITS = {"position": "m", "heading": "rad"}
 SPLIT = "external"
 """Name of the split of logs that no fit has seen."""
 
@@ -185,7 +186,7 @@ def write_judged(
             },
             "largest": {
                 name: float(np.abs(log.y[log.usable, STATE.index(name)]).max())
-                for name in ("u", "v", "r")
+                for name in log.live.velocities
             },
             **({"integrated": made} if (made := log.log.meta.get("integrated")) else {}),
         }
@@ -212,11 +213,14 @@ def fit_outcome(
     if row is not None:
         figures = {
             "nrmse": MainFigure(row["nrmse"]["mean"]),
-            "rmse_u": MainFigure(row["rmse"]["u"], "m/s"),
-            "rmse_v": MainFigure(row["rmse"]["v"], "m/s"),
-            "rmse_r": MainFigure(row["rmse"]["r"], "rad/s"),
-            "position_error_end": MainFigure(row["position_error_end"], "m"),
-            "heading_error_end": MainFigure(row["heading_error_end"], "rad"),
+            **{
+                f"rmse_{name}": MainFigure(row["rmse"][name], CHANNEL_UNITS[name])
+                for name in files.channels
+            },
+            **{
+                f"{end}_error_end": MainFigure(row[f"{end}_error_end"], _END_UNITS[end])
+                for end in files.ends
+            },
         }
     sentences = [sentence for sentence in verdict(files) if sentence]
     return Outcome(
@@ -320,7 +324,8 @@ def external_logs(
     files = own.build().logs_among(log_files(paths, own.kind not in _PLAIN_TABLES))
     readers = {path: (CanonicalConfig() if Log.recognises(path) else own).build() for path in files}
     read = [readers[path].read(path).replace(name=name) for path, name in log_names(files).items()]
-    logs = [prepare(log, SPLIT, config.signals.columns, config.prepare) for log in read]
+    signals = config.signals
+    logs = [prepare(log, SPLIT, signals.columns, config.prepare, signals.live) for log in read]
     return [part for path in files for part in readers[path].files(path)], read, logs
 
 

@@ -159,7 +159,10 @@ def _splits(fit: FitConfig, names: Mapping[Path, str]) -> dict[str, str]:
 def _regressors(logs: Sequence[Log], fit: FitConfig) -> list[Finding]:
     """Return how well the prepared logs condition the regressors of each baseline."""
     try:
-        prepared = [prepare(log, "train", fit.signals.columns, fit.prepare) for log in logs]
+        signals = fit.signals
+        prepared = [
+            prepare(log, "train", signals.columns, fit.prepare, signals.live) for log in logs
+        ]
         data = samples([log for log in prepared if log.good.any()], fit.signals.build())
     except (DataError, UsageError) as error:
         text = f"the config cannot prepare these logs: {error}"

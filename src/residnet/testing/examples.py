@@ -60,7 +60,7 @@ def example_samples(
     )
     config = PrepareConfig.model_validate({"grid": {"step": STEP}, "derivative": _DERIVATIVE})
     logs = [flight.log for flight in fly_trials(trials.draw(), trials)]
-    prepared = [prepare(log, "train", signals.columns, config) for log in logs]
+    prepared = [prepare(log, "train", signals.columns, config, signals.live) for log in logs]
     return samples(prepared, signals.build())
 
 
@@ -72,20 +72,21 @@ def residual_samples() -> Samples:
     return known.with_target(known.target - design @ line)
 
 
-def example_spec(head: FeatureConfig | None) -> ModelSpec:
+def example_spec(head: FeatureConfig | None, signals: SignalsConfig = SIGNALS) -> ModelSpec:
     """Return the description of a model with an equation as baseline and a head, or none.
 
     Args:
         head: config of any head.
+        signals: inputs, forces and velocities of the model.
     """
-    z = example_samples().z
+    z = example_samples(signals=signals).z
     seen = torch.cat((z[:, RANGE_VELOCITIES], z[:, RANGE_INPUTS][:, :2]), dim=1)
     return ModelSpec.model_validate(
         {
             "schema": "residnet.model/1",
             "name": "example",
             "role": "baseline" if head is None else "head",
-            "signals": SIGNALS.model_dump(),
+            "signals": signals.model_dump(),
             "baseline": RegressorsConfig(terms=("u", "v", "r", "tau_x", "tau_n")).model_dump(),
             "head": None if head is None else head.model_dump(),
             "dt": STEP,
@@ -108,12 +109,10 @@ def example_model(spec: ModelSpec) -> HybridDynamics:
     A head takes its scales from the example samples; a closed form is fitted on them too.
     """
     torch.manual_seed(0)
-    model = spec.build()
-    spec.baseline.fit(model.baseline, example_samples())
+    model, known = spec.build(), example_samples(signals=spec.signals)
+    spec.baseline.fit(model.baseline, known)
     with torch.no_grad():
-        residual = model.head.residual_target(
-            example_samples(), model.baseline(example_samples().z)
-        )
+        residual = model.head.residual_target(known, model.baseline(known.z))
     model.head.calibrate(residual)
     if isinstance(model.head, ClosedFormHead):
         model.head.solve(residual)

@@ -198,7 +198,8 @@ def problem_of(
         believed,
         belief,
         torch.zeros(active.numel(), dtype=torch.bool),
-        max(covered * model.dt / config.correlation, 1.0),
+        # errors are means over three channels, of which some may be zero at all times
+        max(covered * model.dt / config.correlation, 1.0) * float(model.live.mean()),
         config.robust,
         store.log[starts],
     )

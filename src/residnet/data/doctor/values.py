@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from residnet.core.errors import ResidnetError
+from residnet.core.layout import Live
 from residnet.core.log import Log
 from residnet.core.names import POSE, STATE
 from residnet.core.stretches import stretches
@@ -31,14 +32,18 @@ def absent(log: Record, found: Check) -> Iterator[Finding]:
     """Report what of the motion is not measured, and what is and no model takes."""
     names = [name for name in STATE if name not in log]
     if names:
+        live = Live.told(log.log.channels)
         try:
-            whole = complete_motion(log.log, MotionConfig())
+            whole = complete_motion(log.log, MotionConfig(), live)
         except ResidnetError as error:
             yield found(f"it cannot be fitted: {error}", level="will mislead")
         else:
             how = "follow from position and heading by a smoother"
             how = "are integrated from the velocities" if "integrated" in whole.meta else how
-            yield found(f"no {', '.join(names)}: they {how}")
+            if live.whole:
+                yield found(f"no {', '.join(names)}: they {how}")
+            else:
+                yield found(f"no {', '.join(names)}: {live.text}")
     if rolling := [name for name in ("phi", "p") if name in log]:
         text = f"{' and '.join(rolling)} of the roll are measured and not modelled: models are of"
         yield found(f"{text} surge, sway and yaw", code="roll")

@@ -16,6 +16,7 @@ from typing import Any
 
 from residnet.core.config import validate
 from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.layout import Live
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.core.progress import report
@@ -276,6 +277,7 @@ def _entries(reader: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict
 def _turning(log: Log) -> Log | None:
     """Return a log with its yaw rate; None where it has none."""
     try:
-        return log if "r" in log.channels else complete_motion(log, MotionConfig())
+        told = Live.told(log.channels)
+        return log if "r" in log.channels else complete_motion(log, MotionConfig(), told)
     except ResidnetError:
         return None

@@ -180,7 +180,10 @@ def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, ResidnetErro
 
 
 def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
-    """Return channel -> column, by what the columns are called."""
+    """Return channel -> column, by what the columns are called.
+
+    A speed is that forward where no position tells it.
+    """
     alone = {re.sub(r"\W*[\[(].*", "", column).strip().lower(): column for column in columns}
     if {"n", "e"} <= set(alone):
         pair = {"x": alone["n"], "y": alone["e"]}
@@ -221,7 +224,8 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
             marks.guess((*CHANNELS, channel), text)
         elif channel is not None:
             marks.note(CHANNELS, f"'{column}' may be {channel} as well as '{names[channel]}' is")
-    if "u" not in names and "v" in names and speeds:
+    placed = bool({"x", "y", "latitude", "longitude"} & names.keys())
+    if "u" not in names and speeds and ("v" in names or not placed):
         names["u"] = speeds[0]
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
     order = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]

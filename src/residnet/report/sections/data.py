@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from residnet.core.format import DASH, DEG, minus, number
+from residnet.core.names import VELOCITY
 from residnet.report.blocks import (
     Block,
     Bullets,
@@ -45,6 +46,7 @@ def fitted_on_what(run: RunFiles) -> Section | None:
         ("data", _data(run)),
         ("splits", "; ".join(splits)),
         ("inputs", _inputs(run)),
+        ("velocities", run.live.text),
         *_model(run),
     ]
     facts.append(("baseline", str(baseline.get("kind", "")) + fit if baseline else ""))
@@ -109,9 +111,11 @@ def _model(run: RunFiles) -> list[tuple[str, str]]:
     if not card:
         return []
     signals = card.get("signals") or {}
-    names = ["u", "v", "r", *(signals.get("inputs") or []), *(signals.get("exogenous") or [])]
+    names = [*VELOCITY, *(signals.get("inputs") or []), *(signals.get("exogenous") or [])]
     ranges = []
     for name, low, high in zip(names, card["low"], card["high"], strict=False):
+        if name in run.live.dead:
+            continue
         unit, factor = run.unit(name)
         ranges.append(
             f"{name} {number(factor * low)} to {number(factor * high)} {unit}".removesuffix(" -")
@@ -158,7 +162,7 @@ def quality_tables(run: RunFiles) -> tuple[Table, Table]:
                 number,
                 factor,
             )
-            for name in ("u", "v", "r")
+            for name in run.live.velocities
             for unit, factor in [run.unit(name)]
         ),
     ]

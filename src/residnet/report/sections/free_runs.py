@@ -84,11 +84,11 @@ def errors(run: RunFiles) -> Section:
 
 def _quantities(run: RunFiles, nrmse: str = "NRMSE [-]") -> dict[str, str]:
     """Return the titles of what tables of errors show."""
+    ends = {"position": f"{run.place}, end [m]", "heading": "heading, end [deg]"}
     return {
         **{channel: f"{title_of(channel)} [{run.unit(channel)[0]}]" for channel in run.channels},
         "nrmse": nrmse,
-        "position": "position, end [m]",
-        "heading": "heading, end [deg]",
+        **{end: ends[end] for end in run.ends},
         "diverged": "diverged",
     }
 
@@ -310,9 +310,19 @@ def _worst(run: RunFiles, lead: str, known: Content) -> Table | None:
             ("log time at start [s]", "t", 1),
             ("NRMSE", "nrmse", number),
             *((_quantities(run)[c], f"rmse.{c}", number, run.unit(c)[1]) for c in channels),
-            ("position, end [m]", lambda entry: number(entry["position_error_end"], 2), str),
+            _worst_end(run),
         ],
     )
+
+
+def _worst_end(run: RunFiles) -> Column:
+    if run.ends[0] == "heading":
+        return (
+            "heading, end [deg]",
+            lambda entry: number(DEG * entry["heading_error_end"], 2),
+            str,
+        )
+    return f"{run.place}, end [m]", lambda entry: number(entry["position_error_end"], 2), str
 
 
 def _what_limits(
@@ -359,16 +369,23 @@ def _repeatability(run: RunFiles, found: Content) -> str:
     kinds = ", ".join(
         f"{name.replace('_', ' ')} {part['pairs']}" for name, part in found["manoeuvres"].items()
     )
+    ends = " and ".join(
+        {
+            "position": f"{number(found['position'], 2)} m",
+            "heading": f"{number(DEG * found['heading'], 2)} deg",
+        }[end]
+        for end in run.ends
+    )
+    place = f" and {number(share * found['position'], 2)} m" if "position" in run.ends else ""
     exogenous = (run.resolved.get("signals") or {}).get("exogenous")
     wind = " A model that knows the wind, as these do, can do better." if exogenous else ""
     return (
         f"Repeatability: {plural(found['pairs'], 'pair')} of stretches ({kinds}) in"
         f" {found['logs']} of {where} have {rule}. Their measured motions differ by"
         f" {listed(found)} (root"
-        f" mean square), and by {number(found['position'], 2)} m and"
-        f" {number(DEG * found['heading'], 2)} deg at the end. Each motion is off their mean by"
-        f" 1/√2 of that: an NRMSE of {number(share * found['nrmse'])} and"
-        f" {number(share * found['position'], 2)} m. The remaining differences of commands and"
+        f" mean square), and by {ends} at the end. Each motion is off their mean by"
+        f" 1/√2 of that: an NRMSE of {number(share * found['nrmse'])}{place}."
+        " The remaining differences of commands and"
         " starts are part of it. A model that knows only commands and initial velocities is left"
         f" with an error of this order in such runs, whatever its form.{wind}"
     )
@@ -439,15 +456,17 @@ def _coverage(
         note = percent(100 * (value / own - 1)) if value is not None and own > 0 else ""
         return Cell(number(value), note)
 
+    shown = [name for name in _BANDS if name in rows[0]["band_coverage"]]
+
     return table_of(
         rows,
         [
             (title, label),
-            *((name, f"band_coverage.{name}", 2) for name in (*_BANDS, "mean", "whole")),
+            *((name, f"band_coverage.{name}", 2) for name in (*shown, "mean", "whole")),
             ("bands", "band_score", number),
             ("one width", lambda row: beside(row, "band_score_constant")),
             ("spread", lambda row: beside(row, "band_score_spread")),
         ],
-        groups=[("coverage", 7), ("score", 3)],
+        groups=[("coverage", len(shown) + 2), ("score", 3)],
         selected=lambda row: row["model"] == selected,
     )

@@ -306,7 +306,8 @@ def terms(run: RunFiles) -> Iterator[Figure]:
     frame = run.frame("terms.parquet")
     for model, rows in [] if frame is None else frame.groupby("model", sort=False):
         curves: list[dict[str, Curve]] = []
-        for axis in _AXES:
+        axes = [axis for axis in _AXES if (rows["axis"] == axis).any()]
+        for axis in axes:
             of_axis = rows[rows["axis"] == axis]
             wide = of_axis.pivot_table(index="t", columns="term", values="value", sort=False)
             wide *= DEG if axis == "r_dot" else 1.0
@@ -337,9 +338,12 @@ def terms(run: RunFiles) -> Iterator[Figure]:
             " could be left out.",
             looks,
             [
-                Panel("surge [m/s²]", height=230),
-                Panel("sway [m/s²]", height=230),
-                Panel("yaw [deg/s²]", "time [s]", height=230),
+                Panel(
+                    f"{_AXES[axis].split()[0]} [{'deg' if axis == 'r_dot' else 'm'}/s²]",
+                    "time [s]" if axis == axes[-1] else "",
+                    height=230,
+                )
+                for axis in axes
             ],
             [Case("", curves)],
         )

@@ -10,7 +10,8 @@ from typing import TypeAlias
 import numpy as np
 
 from residnet.core.format import DEG, fixed, shown_unit
-from residnet.core.names import CHANNEL_UNITS
+from residnet.core.layout import Live
+from residnet.core.names import CHANNEL_UNITS, VELOCITY
 from residnet.core.stretches import stretches
 from residnet.report.figure import (
     BLUE,
@@ -102,7 +103,10 @@ def free_runs(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
         return None
     inputs = list(chosen[0][0].inputs)
     units = units_of(run, inputs)
-    panels = [*_panels("", units), *(_panel(f"{name}\n", units[name], 125) for name in inputs)]
+    panels = [
+        *_panels("", units, run.live),
+        *(_panel(f"{name}\n", units[name], 125) for name in inputs),
+    ]
     panels[-1] = replace(panels[-1], x_label="time since the start of the free run [s]")
     looks = {"measured": MEASURED, "masked": MASKED} | model_looks(run)
     if any(run.lead in window.low for window, _ in chosen):
@@ -129,9 +133,13 @@ def free_runs(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
         "free_runs",
         "Free runs",
         f"Each run starts from a measured state and is given the inputs alone ({run.focus} data)."
-        " North is up, and each track begins at its start."
-        " Look for a track that turns tighter, wider or later than the measured one, for lag at"
-        " the reversals, and for levels that stay apart once the motion has settled. Where the"
+        + (
+            " North is up, and each track begins at its start."
+            " Look for a track that turns tighter, wider or later than the measured one, for lag at"
+            if run.live.moves and run.live.turns
+            else " Look for lag at"
+        )
+        + " the reversals, and for levels that stay apart once the motion has settled. Where the"
         " ground is grey, samples are masked and u and v are not scored. Of every kind of"
         " manoeuvre and protocol, the runs with the least, the median and the largest error of"
         f" {run.lead} are here, in print those of the median.",
@@ -143,28 +151,42 @@ def free_runs(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
 
 
 def track(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
-    """Draw the track of the run of median error under the main protocol, for the first screen."""
+    """Draw the track of the run of median error under the main protocol, for the first screen.
+
+    Of a vessel without a track its motion stands in its place.
+    """
     ranked = _ranked(run, [one for one in windows if one.protocol == run.main])
     if not ranked:
         return None
     window = ranked[(len(ranked) - 1) // 2]
     shown = {"measured", "start", run.lead, run.baseline}
     looks = {"measured": MEASURED, **model_looks(run), "start": START}
-    curves = {name: curve for name, curve in _curves(window, "", _SI)[0].items() if name in shown}
+    drawn = [
+        {name: curve for name, curve in curves.items() if name in shown}
+        for curves in _curves(window, "", units_of(run))
+    ]
+    mapped = run.live.moves and run.live.turns
+    panels = [replace(_TRACK, height=GLANCE)]
+    if not mapped:
+        panels = _panels("", units_of(run), run.live)
+        panels[-1] = replace(panels[-1], x_label="time since the start of the free run [s]")
     return Figure(
         "track",
-        "Track of the median run",
+        "Track of the median run" if mapped else "Median run",
         f"Median of {len(ranked)} {run.focus} runs: {window.log}.",
-        {name: replace(look, shown=True) for name, look in looks.items() if name in curves},
-        [replace(_TRACK, height=GLANCE)],
-        [Case("", [curves])],
+        {name: replace(look, shown=True) for name, look in looks.items() if name in drawn[0]},
+        panels,
+        [Case("", drawn[: len(panels)])],
     )
 
 
 def window_figure(window: StoredWindow, title: str) -> Figure:
-    """Return the figure of one free run that is held in memory: track, then velocities."""
+    """Return the figure of one free run that is held in memory: track, then velocities.
+
+    A vessel that does not move or turn has no track.
+    """
     looks = {"measured": MEASURED} | family(window.predicted) | {"start": START}
-    panels = _panels(title, _SI)
+    panels = _panels(title, _SI, window.live)
     panels[-1] = replace(panels[-1], x_label="time since the start of the free run [s]")
     curves = [
         {name: curve for name, curve in of_panel.items() if name in looks}
@@ -184,11 +206,16 @@ def _panel(text: str, unit: tuple[str, str, float], height: int = 165) -> Panel:
     return Panel(label, height=height, si=() if factor == 1.0 else (si, factor))
 
 
-def _panels(title: str, units: Units) -> list[Panel]:
-    panels = [replace(_TRACK, title=title)]
-    panels += [_panel(text, units[name]) for name, text in _MOTION.items()]
-    panels[1] = replace(panels[1], title=title)
-    return panels
+def _moved(live: Live) -> set[str]:
+    """Return the columns of a free run that the live velocities move, `x` for the position."""
+    return {*live.velocities, *["x"] * live.moves, *["psi"] * live.turns}
+
+
+def _panels(title: str, units: Units, live: Live) -> list[Panel]:
+    moved = _moved(live)
+    panels = [_panel(text, units[name]) for name, text in _MOTION.items() if name in moved]
+    panels[0] = replace(panels[0], title=title)
+    return [replace(_TRACK, title=title), *panels] if {"x", "psi"} <= moved else panels
 
 
 def _chosen(run: RunFiles, windows: Sequence[StoredWindow]) -> list[tuple[StoredWindow, str]]:
@@ -215,7 +242,7 @@ def _chosen(run: RunFiles, windows: Sequence[StoredWindow]) -> list[tuple[Stored
 def _ranked(run: RunFiles, windows: Sequence[StoredWindow]) -> list[StoredWindow]:
     """Return the runs of the leading model, the one of least error first."""
     scales = run.metrics.get("scales") or {}
-    divisor = np.array([float(scales.get(name, 1.0)) for name in ("u", "v", "r")])
+    divisor = np.array([float(scales.get(name, 1.0)) for name in VELOCITY])
     return sorted(
         (one for one in windows if run.lead in one.predicted),
         key=lambda one: (float((one.rmse(run.lead) / divisor).mean()), one.log, one.number),
@@ -236,12 +263,15 @@ def _curves(window: StoredWindow, lead: str, units: Units) -> list[dict[str, Cur
         return east, north
 
     all_good = np.ones_like(usable)
+    moved = _moved(window.live)
     out = [
         {"measured": track(window.measured, usable)}
         | {model: track(states, all_good) for model, states in window.predicted.items()}
         | {"start": (np.zeros(1), np.zeros(1))}
-    ]
+    ] * ({"x", "psi"} <= moved)
     for column, name in enumerate(_MOTION):
+        if name not in moved:
+            continue
         factor = units[name][2]
         good = usable | (column >= 2)
         measured = factor * (window.measured - origin)[:, column]
@@ -289,7 +319,7 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
 
 def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the error of every model against the horizon, on a logarithmic scale."""
-    cases, units = [], units_of(run)
+    cases, units, shown = [], units_of(run), _errors_of(run)
     factors = [units[name][2] for name in _ERRORS]
     for protocol in run.protocols:
         members = [window for window in windows if window.protocol == protocol]
@@ -304,12 +334,13 @@ def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
                     panel[model] = (time, np.where(column > 0, column, np.nan))
         if members:
             runs = "run" if len(members) == 1 else "runs"
-            cases.append(Case(f"{protocol} ({len(members)} {runs})", curves))
+            kept = [curves[place] for place in shown.values()]
+            cases.append(Case(f"{protocol} ({len(members)} {runs})", kept))
     if not cases:
         return None
     panels = [
-        replace(_panel(f"RMS error of\n{text}", units[name], 175), y_log=True)
-        for name, text in _ERRORS.items()
+        replace(_panel(f"RMS error of\n{_ERRORS[name]}", units[name], 175), y_log=True)
+        for name in shown
     ]
     panels[-2:] = [replace(one, x_label="time since the start [s]") for one in panels[-2:]]
     return Figure(
@@ -326,6 +357,12 @@ def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     )
 
 
+def _errors_of(run: RunFiles) -> dict[str, int]:
+    """Return the channels of `_ERRORS` that the live velocities move, with their places there."""
+    moved = _moved(run.live)
+    return {name: place for place, name in enumerate(_ERRORS) if name in moved}
+
+
 def error_bars(run: RunFiles) -> Figure:
     """Draw the error of every model, train beside test, with 95 % intervals.
 
@@ -334,8 +371,10 @@ def error_bars(run: RunFiles) -> Figure:
     protocol = run.protocols[0]
     models = [model for model, kind in run.kinds.items() if kind != "zero"]
     thick = 0.8 / len(run.sides)
-    curves, panels = [], []
-    for channel, text in (("u", "surge"), ("v", "sway"), ("r", "yaw")):
+    curves = []
+    panels: list[Panel] = []
+    for channel in run.live.velocities:
+        text = _MOTION[channel].partition("\n")[0]
         unit, factor = run.unit(channel)
         group = bar_group(run, protocol, channel)
         panel: dict[str, Curve] = {}
@@ -354,16 +393,15 @@ def error_bars(run: RunFiles) -> Figure:
             ]
             spread += [whiskers(*zip(*known, strict=True))[::-1]] if known else []
         curves.append(panel | {"interval": joined(spread)})
-        title = f"{text} velocity" if channel != "r" else "yaw rate"
         panels.append(
             Panel(
                 "",
                 f"RMSE of {channel} [{unit}]",
-                title + (f"\n({group.replace('_', ' ')} runs)" if group != "all" else ""),
+                text + (f"\n({group.replace('_', ' ')} runs)" if group != "all" else ""),
                 height=70 + 44 * len(models),
                 group=channel,
                 y_names=names_of(short_label(run, model) for model in models)
-                if channel == "u"
+                if not panels
                 else names_of("" for _ in models),
                 y_limits=(len(models) - 0.4, -0.6),
             )
@@ -403,10 +441,11 @@ def residuals(run: RunFiles) -> Figure | None:
     models = [] if frame is None else [one for one in run.heads if (frame["model"] == one).any()]
     if not models:
         return None
-    cases, reach = [], dict.fromkeys((axis for axis, *_ in _AXES), 0.0)
+    axes = [_AXES[place] for place in run.live.axes]
+    cases, reach = [], dict.fromkeys((axis for axis, *_ in axes), 0.0)
     for model in models:
         panels, explained = [], []
-        for axis, name, _, factor in _AXES:
+        for axis, name, _, factor in axes:
             rows = frame[(frame["model"] == model) & (frame["axis"] == axis)]
             target, predicted = factor * rows[["target", "predicted"]].to_numpy(float).T
             panels.append({model: (predicted, target)} if len(rows) else {})
@@ -419,7 +458,7 @@ def residuals(run: RunFiles) -> Figure | None:
     limits = {axis: value or 1.0 for axis, value in reach.items()}
     line = {axis: np.array([-value, value]) for axis, value in limits.items()}
     for case in cases:
-        for panel, (axis, *_) in zip(case.curves, _AXES, strict=True):
+        for panel, (axis, *_) in zip(case.curves, axes, strict=True):
             panel["equal"] = (line[axis], line[axis])  # type: ignore[index]
     looks = model_looks(run)
     return Figure(
@@ -443,7 +482,7 @@ def residuals(run: RunFiles) -> Figure | None:
                 x_limits=(-limits[axis], limits[axis]),
                 y_limits=(-limits[axis], limits[axis]),
             )
-            for axis, name, unit, _ in _AXES
+            for axis, name, unit, _ in axes
         ],
         cases,
         "Head",
@@ -461,7 +500,7 @@ def bands(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the half width of the leading model's bands beside the errors that they are to hold."""
     model = run.lead
     known = (run.json("bands.json").get("models") or {}).get(model) or {}
-    cases, level, units = [], 0.0, units_of(run)
+    cases, level, units, shown = [], 0.0, units_of(run), _errors_of(run)
     factors = [units[name][2] for name in _ERRORS]
     for protocol, found in known.items():
         members = [one for one in windows if one.protocol == protocol and model in one.low]
@@ -488,10 +527,11 @@ def bands(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
             {"width": (time[few], f * mean[few, k]), "errors": (time[few], f * held[few, k])}
             for k, f in zip((0, 1, 2, 4, 3), factors, strict=True)
         ]
+        panels = [panels[place] for place in shown.values()]
         cases.append(Case(protocol, panels))
     if not cases:
         return None
-    panels_of = [_panel(text, units[name]) for name, text in _ERRORS.items()]
+    panels_of = [_panel(_ERRORS[name], units[name]) for name in shown]
     panels_of[-2:] = [replace(one, x_label="time since the start [s]") for one in panels_of[-2:]]
     return Figure(
         "bands",

@@ -11,7 +11,6 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.format import plural, signed
-from residnet.core.names import VELOCITY
 from residnet.judge.metrics import blocks, intervals
 from residnet.report.blocks import Cell, Column, Section, Table, Text, nested, table_of
 from residnet.report.figure import (
@@ -57,12 +56,13 @@ def window_nrmse(run: Path, model: str, split: str) -> dict[str, WindowErrors]:
     """
     files = RunFiles(run)
     name = files.selected if model == "selected" else model
-    scales = np.array([float(files.metrics["scales"][channel]) for channel in VELOCITY])
+    live = files.live
+    scales = np.array([float(files.metrics["scales"][channel]) for channel in live.velocities])
     found: dict[str, list[tuple[tuple[str, int], float, bool]]] = {}
     for window in files.windows(split):
         if name not in window.predicted:
             raise DataError(f"{run}: no model '{name}' among {', '.join(window.predicted)}")
-        error, lost = float((window.rmse(name) / scales).mean()), window.diverged[name]
+        error, lost = float((window.rmse(name)[live.axes] / scales).mean()), window.diverged[name]
         found.setdefault(window.protocol, []).append(((window.log, window.number), error, lost))
     if not found:
         raise DataError(f"{run}: no rollouts of the split '{split}'")

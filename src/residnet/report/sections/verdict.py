@@ -44,8 +44,11 @@ def evidence(run: RunFiles, selected: str) -> Evidence:
     rows = {model: row for model in run.kinds if (row := run.row(model, split, protocol))}
     inspection = run.json("doctor.json")
     doctor = summary(inspection).tally if inspection.get("logs") else ""
+    told = run.live.text
     if made := next((log["integrated"] for log in run.quality if log.get("integrated")), None):
-        doctor = f"{_NO_PLACE.format(', '.join(made))} {doctor}".strip()
+        doctor = f"{_NO_PLACE.format(', '.join(made))} {doctor}".strip() if not told else doctor
+        told += "; no heading was measured" if told and run.live.turns and "psi" in made else ""
+    doctor = f"{told[0].upper()}{told[1:]}. {doctor}".strip() if told else doctor
     return Evidence(
         selected,
         split,
@@ -69,18 +72,18 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     leave, then the others, the nearest first. None where there is no free run.
     """
     rows = {one: row for one in run.kinds if (row := run.row(one, run.focus, run.main))}
-    if run.lead not in rows or "position_error_end" not in rows[run.lead]:
+    if run.lead not in rows or not run.ends:
         return None
     known = {entry["model"]: entry for entry in run.json("selection.json").get("models") or []}
     limits = (run.limits.get("splits") or {}).get(run.focus, {}).get(run.main, {})
     first = [run.lead, run.selected, run.baseline, "zero"]
     table: list[Content] = [rows[one] for one in dict.fromkeys(first) if one in rows]
     if floor := limits.get("kinematics"):
-        ends = {f"{of}_error_end": floor[f"{of}_mean"] for of in ("position", "heading")}
+        ends = {f"{of}_error_end": floor[f"{of}_mean"] for of in run.ends}
         table.append({"model": _MEASURED, "diverged": 0, **ends})
     table += sorted(
         (row for one, row in rows.items() if one not in first),
-        key=lambda row: float(row["position_error_end"]),
+        key=lambda row: float(row[f"{run.ends[0]}_error_end"]),
     )
 
     def error(row: Content, key: str, factor: float) -> Cell:
@@ -99,7 +102,11 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     told = [
         f"Mean of {plural(rows[run.lead]['windows'], 'free run')} on {run.focus} data"
         f" ({run.main})"
-        + ("; small: 95 % interval." if rows[run.lead].get("position_error_end_ci95") else "."),
+        + (
+            "; small: 95 % interval."
+            if rows[run.lead].get(f"{run.ends[0]}_error_end_ci95")
+            else "."
+        ),
         "" if run.focus in UNSEEN else "These data are not unseen: read with care.",
         "Zero: no model at all, the first velocities are held." if "zero" in rows else "",
         "Measurements: where the measured velocities themselves lead." if floor else "",
@@ -111,11 +118,17 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
                 "model",
                 lambda row: _MEASURED if row["model"] == _MEASURED else run.label(row["model"]),
             ),
-            ("position [m]", lambda row: error(row, "position_error_end", 1.0)),
-            ("heading [deg]", lambda row: error(row, "heading_error_end", DEG)),
+            *(
+                (title, lambda row, of=of, f=f: error(row, f"{of}_error_end", f))
+                for of, title, f in (
+                    ("position", f"{run.place} [m]", 1.0),
+                    ("heading", "heading [deg]", DEG),
+                )
+                if of in run.ends
+            ),
             ("sound", sound),
         ],
-        groups=[(f"error {run.horizon}", 2)],
+        groups=[(f"error {run.horizon}", len(run.ends))],
         selected=lambda row: row["model"] == run.lead,
     )
     return Section("", [*figures, shown, Text(" ".join(filter(None, told)), quiet=True)])

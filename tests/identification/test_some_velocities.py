@@ -1,0 +1,93 @@
+"""Logs that tell some of u, v and r alone: their motion, a fit in Python, and what is judged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import residnet
+from residnet.core.errors import ConfigError, UsageError
+from residnet.core.layout import Live
+from residnet.core.log import Log
+from residnet.data.motion import MotionConfig, complete_motion
+from residnet.identification.settings import FitSettings
+
+STEP = 0.2
+
+
+def trial(number: int, *channels: str) -> Log:
+    """Return a boat's speed and yaw rate by first-order lags, with what drives them."""
+    random, t = np.random.default_rng(number), np.arange(0.0, 80.0, STEP)
+    n, delta = (random.uniform(low, 1.0, 17)[(t / 5.0).astype(int)] for low in (0.2, -1.0))
+    u, r = np.zeros(t.size), np.zeros(t.size)
+    for k in range(t.size - 1):
+        u[k + 1] = u[k] + STEP * (0.8 * n[k] - 0.4 * u[k])
+        r[k + 1] = r[k] + STEP * (0.2 * delta[k] - 0.5 * r[k])
+    u, r = u + 0.005 * random.normal(size=t.size), r + 0.002 * random.normal(size=t.size)
+    psi = np.concatenate(([0.0], np.cumsum(0.5 * STEP * (r[1:] + r[:-1]))))
+    known = {"u": u, "r": r, "psi": psi, "n": n, "delta": delta, "x": t, "y": 0.0 * t}
+    return Log(f"trial_{number}", t, {name: known[name] for name in channels}, {"delta": "rad"})
+
+
+@pytest.mark.parametrize(
+    ("channels", "velocities"),
+    [(("u", "n"), ("u",)), (("psi", "delta"), ("r",)), (("u", "psi", "n", "delta"), ("u", "r"))],
+)
+def test_a_fit_is_of_what_the_logs_tell(
+    channels: tuple[str, ...], velocities: tuple[str, ...]
+) -> None:
+    data = residnet.prepare([trial(number, *channels) for number in range(6)])
+    assert data.signals.velocities == velocities
+    models = residnet.fit(data, "regressors", ["ridge"] if len(velocities) > 1 else ())
+    table = residnet.metrics(models, split="test")
+    live = Live(velocities)
+    assert {name for name in table if name.startswith("rmse_")} == {f"rmse_{v}" for v in velocities}
+    assert ("position_error_end" in table) == live.moves
+    assert ("heading_error_end" in table) == live.turns
+    error = table.groupby("model")["nrmse_mean"].mean()
+    assert error["baseline"] < 0.2 < error["zero"]
+    x = np.array([0.0, 0.0, 0.3, 0.5, 0.7, 0.1])
+    after, _ = models["baseline"].step(x, np.full(len(data.signals.inputs), 0.5))
+    # a velocity that was not recorded is zero, whatever it is given as
+    assert np.flatnonzero(after[3:]).tolist() == live.axes
+    runs = models.runs["test"]
+    assert len(runs.plot_history().axes) == len(velocities) + live.turns
+    if not (live.moves and live.turns):
+        with pytest.raises(UsageError, match="has no track"):
+            runs.plot_track()
+    words = " ".join(models.verdict)
+    assert (" m " in words or " m;" in words, " deg" in words) == (live.moves, live.turns)
+
+
+def test_the_pose_is_what_the_live_velocities_lead_to() -> None:
+    straight = complete_motion(trial(0, "u", "x", "y"), MotionConfig(), Live(("u",)))
+    assert not straight["psi"].any()
+    assert straight["x"][-1] == pytest.approx(np.trapezoid(straight["u"], straight.t), rel=1e-2)
+    turning = complete_motion(trial(0, "psi", "delta"), MotionConfig(), Live(("r",)))
+    assert not any(turning[name].any() for name in ("x", "y", "u", "v"))
+    assert np.abs(turning["r"] - trial(0, "r")["r"]).mean() < 0.01
+    assert turning.meta["integrated"] == ["x", "y"]
+    with pytest.raises(UsageError, match=r"signals\.velocities: \[u\]"):
+        complete_motion(trial(0, "u", "n"), MotionConfig())
+
+
+def test_scales_are_of_the_velocities_of_the_model() -> None:
+    content = {
+        "prepare": {"grid": {"step": 0.2}},
+        "signals": {"inputs": ["n"], "velocities": ["u"]},
+        "baseline": {"kind": "regressors"},
+        "evaluation": {
+            "protocols": {"T5": {"kind": "windows", "length": 5.0}},
+            "selection": "T5",
+            "scales": {"u": 0.3},
+        },
+    }
+    assert FitSettings.model_validate(content).evaluation.scales.array().tolist() == [0.3, 1.0, 1.0]
+    for part, key, value, told in (
+        ("evaluation", "scales", {"u": 0.3, "v": 0.1, "r": 0.1}, "give one of each"),
+        ("signals", "velocities", ["r", "u"], "in the order u, v, r"),
+        ("signals", "exogenous", ["wind_speed", "wind_dir"], "need u, v and r"),
+    ):
+        wrong = {**content, part: {**content[part], key: value}}  # type: ignore[dict-item]
+        with pytest.raises((ValueError, ConfigError), match=told):
+            FitSettings.model_validate(wrong)
