@@ -215,10 +215,17 @@ NOT_RUN = {
     "from my_package": "is the reader's own; examples/residnet_sample is tested in its place",
 }
 """Beginning of a line -> why the block with it is not carried out."""
+ELSEWHERE = {
+    "docs/tutorials/first_hour.md": "a test of its own follows it and compares its numbers",
+    "docs/gallery.md": "scripts/ci/long.sh draws it",
+    **dict.fromkeys(
+        (page for page in {block.page for block in BLOCKS} if page.startswith("docs/results/")),
+        "hours of runs, each beside its figures; the stage `configs` runs their configs",
+    ),
+}
+"""Page -> why its blocks are not carried out here."""
 PAGES_RUN = sorted(
-    {block.page for block in BLOCKS if block.kind in ("sh", "python")}
-    # a test of its own follows it and compares its numbers
-    - {"docs/tutorials/first_hour.md"}
+    {block.page for block in BLOCKS if block.kind in ("sh", "python")} - set(ELSEWHERE)
 )
 FIRST = next(block for block in BLOCKS if "residnet new trials/" in block.text)
 """The block of README that makes the run which other pages begin from."""
