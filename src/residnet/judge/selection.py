@@ -1,4 +1,4 @@
-"""The choice of one model among fitted ones: the simplest sound one that is as good as the best.
+"""The choice of one model among fitted ones: the simplest that is as good as the best.
 
 Models are compared by the ratio of their errors, block by block: the logarithms of errors are
 averaged. In a mean of the errors themselves one bad stretch outweighs all others, and its standard
@@ -172,79 +172,53 @@ class Selection:
 def choose(contenders: Iterable[Contender], blocks: Blocks) -> Selection:
     """Choose a single model and an ensemble.
 
-    Among the sound models the simplest is chosen whose error is within one standard error of the
-    least (Breiman and others 1984, Classification and Regression Trees, section 3.4.3; paired here,
-    since all models run over the same windows). Of fewer than five logs half a standard error is
-    taken: their stretches resemble each other, and a whole one took lines for hulls. Where none but
-    `zero` is sound, the least error among the models without a diverged window is taken, if it is
-    below the error of `zero` by more than as much; else `zero`.
+    Among the models that never diverged, those are alike whose error is within one standard error
+    of the least (Breiman and others 1984, Classification and Regression Trees, section 3.4.3;
+    paired here, since all models run over the same windows). Of fewer than five logs half a
+    standard error is taken: their stretches resemble each other, and a whole one took lines for
+    hulls. Of those that are alike a sound one comes before an unsound one, and then the simplest
+    is chosen: what speaks against a model costs it as much error as the logs can tell, no more.
 
     Args:
         contenders: `zero` and at least one other.
         blocks: of the validation data.
     """
     everyone = tuple(contenders)
-    single = [entry for entry in everyone if entry.family != "ensemble"]
-    ensembles = [entry for entry in everyone if entry.family == "ensemble"]
-    sound = [entry for entry in single if entry.sound]
-    if any(entry.family != "zero" for entry in sound):
-        chosen, reason = _simplest(sound, [e for e in single if not e.sound], blocks)
-    else:
-        chosen, reason = _least_bad(single, blocks)
-    best = min(
-        ensembles, key=lambda entry: (not entry.sound, entry.diverged, entry.score), default=None
-    )
+    chosen, reason = _simplest([one for one in everyone if one.family != "ensemble"], blocks)
+    ensembles = [one for one in everyone if one.family == "ensemble"]
+    best = min(ensembles, key=lambda one: (one.diverged, one.score), default=None)
     return Selection(chosen.name, None if best is None else best.name, reason, everyone, blocks)
 
 
-def _simplest(
-    sound: Sequence[Contender], unsound: Sequence[Contender], blocks: Blocks
-) -> tuple[Contender, str]:
-    """Return the simplest sound model that is as good as the best, and why."""
-    best = min(sound, key=lambda entry: entry.score)
+def _simplest(single: Sequence[Contender], blocks: Blocks) -> tuple[Contender, str]:
+    """Return the simplest of the models that are as good as the best, the sound first, and why."""
+    steady = [one for one in single if not one.diverged]
+    best = min(steady, key=lambda one: one.score)
     said = "one standard error" if blocks.alike == 1.0 else "half a standard error"
-    for chosen in sorted(sound, key=lambda entry: (*entry.simplicity, entry.score)):
+    for chosen in sorted(steady, key=lambda one: (not one.sound, *one.simplicity, one.score)):
         apart, spread = difference(chosen, best, blocks)
         if apart <= (within := blocks.alike * spread):
             break
-    if chosen is best:
-        reason = (
-            f"{chosen.name} errs least of the sound models (mean validation error"
-            f" {number(chosen.error)})"
-        )
-        simpler = [e for e in sound if e.simplicity < best.simplicity]
-        if simpler:
-            reason += f", and no simpler one comes within {said} of it"
+    error = f"mean validation error {number(chosen.error)}"
+    if chosen.family == "zero":
+        reason = f"No model beats zero, which predicts nothing, by more than {said}"
+    elif chosen is best:
+        reason = f"{chosen.name} errs least ({error})"
+        if any(one.simplicity < best.simplicity for one in steady):
+            reason += f", and no {'simpler' if best.sound else 'sound'} one comes within {said}"
     else:
+        kind = "simplest sound" if chosen.sound else "simplest"
         reason = (
-            f"{chosen.name} is the simplest sound model within {said}"
-            f" ({number(100.0 * within, 2)} %) of the best one, {best.name} (mean"
-            f" validation errors {number(chosen.error)} and {number(best.error)})"
+            f"{chosen.name} is the {kind} model within {said} ({number(100.0 * within, 2)} %) of the"
+            f" best one, {best.name} ({error} and {number(best.error)})"
         )
-    better = [entry for entry in unsound if entry.score < chosen.score]
-    if better:
-        named = ", ".join(f"{entry.name} ({entry.faults[0]})" for entry in better)
-        reason += f"; not considered, for they are unsound: {named}"
+    lost = [one for one in single if one.score < chosen.score and one.diverged]
+    if lost:
+        named = ", ".join(f"{one.name} ({one.faults[0]})" for one in lost)
+        reason += f"; passed over: {named}"
+    if not chosen.sound:
+        reason += f"; against it speaks: {'; '.join(chosen.faults)}"
     return chosen, reason + "."
-
-
-def _least_bad(single: Sequence[Contender], blocks: Blocks) -> tuple[Contender, str]:
-    """Return what is taken where no model but `zero` is sound, and why."""
-    zero = next(entry for entry in single if entry.family == "zero")
-    steady = [e for e in single if e.family != "zero" and not e.diverged]
-    best = min(steady, key=lambda entry: entry.score, default=None)
-    if best is not None:
-        apart, spread = difference(zero, best, blocks)
-        if apart > blocks.alike * spread:
-            return best, (
-                f"No model is sound; {best.name} errs least of those that did not diverge (mean"
-                f" validation error {number(best.error)}), and is unsound too:"
-                f" {'; '.join(best.faults)}."
-            )
-    worse = (
-        "every other one diverged" if best is None else "none that did not diverge clearly beats it"
-    )
-    return zero, f"No model but zero is sound, and {worse}: zero is taken, which predicts nothing."
 
 
 def blocks_of(run: FreeRun) -> tuple[Blocks, list[np.ndarray]]:

@@ -1,7 +1,8 @@
 """Whether a model behaves like a vessel: damping, stability, symmetry, and motion within bounds.
 
 What a model does where its logs have been, at recorded states and inputs, can make it unsound, so
-that it is not selected. What it does elsewhere is reported, and speaks against no choice.
+that a sound one that is as good is selected. What it does elsewhere is reported, and speaks against
+no choice.
 
 A full hull may be unstable on a course in truth, so that instability is a fault only where the
 vessel, its inputs held, settled from a disturbance such as the entry of a turn, and stayed so for
@@ -72,8 +73,8 @@ class Finding:
     """A finding of one check of one model.
 
     `ok` is None where the check does not apply or could not be made. `fault` says in a few words
-    what makes the model unsound, so that it is not selected; it is empty where the finding is only
-    reported.
+    what makes the model unsound, so that one that is as good comes first; it is empty where the
+    finding is only reported.
     """
 
     model: str
