@@ -88,7 +88,7 @@ class _Lines:
     def __init__(self) -> None:
         self._complete: set[str] = set()
         self._ended = threading.Event()
-        self._doing = self._stage = ""
+        self._doing = self._begun = self._stage = ""
         self._since = self._told = time.monotonic()
 
     def __enter__(self) -> _Lines:
@@ -111,7 +111,9 @@ class _Lines:
     def __call__(self, progress: Progress) -> None:
         if progress.message:
             self._print(progress.message)
-            self._doing, self._since = progress.message.strip(), self._told
+        if progress.stage and progress.done is None:
+            self._begun = self._doing = progress.stage
+            self._since = self._told
         if progress.done is None or progress.total is None:
             return
         if progress.stage != self._stage:
@@ -121,12 +123,13 @@ class _Lines:
             self._doing = f"{progress.stage}, {progress.done:g} of {progress.total:g}"
         elif progress.stage not in self._complete:
             self._complete.add(progress.stage)
+            self._doing = self._begun
             if not progress.message:
                 self._print(f"  {progress.stage}: all {progress.total:g} done")
 
 
 class _Bars:
-    """One bar for each stage that is under way, and one for the last message, which stands above.
+    """One bar for each counted stage that is under way, and one for the stage that began last.
 
     Bars move, and tell the time that is gone, without a word of the work.
     """
@@ -138,10 +141,11 @@ class _Bars:
     def __call__(self, progress: Progress) -> None:
         if progress.message:
             self._bars.console.print(progress.message)
-            if "" in self._stages:
-                self._bars.remove_task(self._stages.pop(""))
-            self._stages[""] = self._bars.add_task(progress.message.strip()[:40], total=None)
         if progress.done is None and progress.total is None:
+            if progress.stage:
+                if "" in self._stages:
+                    self._bars.remove_task(self._stages.pop(""))
+                self._stages[""] = self._bars.add_task(progress.stage, total=None)
             return
         if progress.stage not in self._stages:
             self._stages[progress.stage] = self._bars.add_task(progress.stage, total=None)

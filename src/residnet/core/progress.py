@@ -65,8 +65,13 @@ def listener() -> ProgressCallback | None:
 
 
 def say(message: str) -> None:
-    """Tell the callback that listens, if there is one, a line about the work."""
+    """Tell the callback that listens, if there is one, what the work has found."""
     report("", message=message)
+
+
+def begin(stage: str) -> None:
+    """Tell the callback that listens, if there is one, what is being done from now on."""
+    report(stage, message=f"  {stage}")
 
 
 @contextmanager

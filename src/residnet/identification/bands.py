@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
-from residnet.core.progress import say
+from residnet.core.progress import begin
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
@@ -180,7 +180,7 @@ def calibrate_bands(
         validation: logs that chose between models.
         config: level, folds and starts.
     """
-    say("  calibrating bands")
+    begin("calibrating bands")
     fold = fold_numbers([log.log.manoeuvre for log in identified.train], config.folds, config.seed)
     left_out = FoldModels(identified, fold)
     refitted = left_out.models if int(fold.max()) > 0 else [{}]

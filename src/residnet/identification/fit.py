@@ -16,7 +16,7 @@ from torch import Tensor
 from residnet.core.arrays import paged
 from residnet.core.errors import DataError, FitError, MissingPackageError
 from residnet.core.processes import free_cores, keep_freed_memory, processes
-from residnet.core.progress import Progress, listen, listener, report, say
+from residnet.core.progress import Progress, begin, listen, listener, report, say
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, restored
@@ -82,6 +82,7 @@ def _fitted(fitter: Fitter, logs: Logs) -> Identified:
     models = {"zero": fitter.zero()}
     for name in settings.all_baselines:
         with _optional(settings, name):
+            begin(f"fitting {name}")
             models[name] = fitter.baseline(name)
             say(f"  {name}: {_said(models[name])}")
     _fit_heads(fitter, logs, models)
@@ -145,7 +146,7 @@ def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> No
                 if pool and is_long(fitter, name) and fitter.store.finished(name) is None:
                     there[name] = pool.submit(_fit_there, name, _sent(base))
             for name in heads:
-                say(f"  fitting {name}")
+                begin(f"fitting {name}")
                 with _optional(settings, name):
                     if name in there:
                         models[name] = _opened(there[name].result())

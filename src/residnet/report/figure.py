@@ -18,7 +18,7 @@ import numpy as np
 
 from residnet.core.files import file_stem, whole
 from residnet.core.format import powers
-from residnet.core.progress import say
+from residnet.core.progress import begin
 from residnet.core.stretches import stretches
 from residnet.report.blocks import Section
 
@@ -363,7 +363,7 @@ def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
         before = _read(path)
         for file in (path, *before.stills) if before else ():
             file.unlink(missing_ok=True)
-    say("  drawing figures")
+    begin("drawing figures")
     # the number keeps the order for whoever lists the folder
     return [
         write_figure(folder, one, f"{i:02d}_{one.name}") for i, one in enumerate(figures, start=1)

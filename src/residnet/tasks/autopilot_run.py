@@ -28,7 +28,7 @@ from residnet.control.heading.controllers import (
 from residnet.control.heading.policies import ObservedPolicy
 from residnet.control.heading.tuning import tune
 from residnet.control.heading.vessels import SteeredPlant, fly
-from residnet.core.progress import report, say
+from residnet.core.progress import begin, report, say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.store import rebuilt
 from residnet.export.closed_loop import CompiledLoop
@@ -213,7 +213,7 @@ def _policy(
     policy, store = spec.build(), FolderStore(folder)
     notes, started = store.finished_module(name, policy), time.time()
     if notes is None:
-        say(f"  training {name}")
+        begin(f"training {name}")
         compiler = partial(CompiledLoop, most=wanted.training.outlying)
         notes = train_policy(
             name,

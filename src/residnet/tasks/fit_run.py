@@ -13,7 +13,7 @@ from residnet.core.config import dump_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, STATE, nearest, si_unit
-from residnet.core.progress import say
+from residnet.core.progress import begin, say
 from residnet.data.doctor import inspect, inspect_together, inspection, summary
 from residnet.data.drafting.reading import log_files
 from residnet.data.masks import Spike
@@ -69,7 +69,7 @@ def run_fit(config: FitConfig, folder: RunFolder) -> Outcome:
     Raises:
         ResidnetError: where the logs cannot be used, or do not determine a model.
     """
-    say(f"{config.name}: reading logs")
+    begin(f"{config.name}: reading logs")
     read = config.logs()
     _write_inspection(folder, read, config)
     logs = prepare_logs(read, config)
@@ -78,7 +78,7 @@ def run_fit(config: FitConfig, folder: RunFolder) -> Outcome:
     if config.current is not None:
         folder.write_json(folder.path / "currents.json", currents)
     identified = fit(logs, config, store=FolderStore(folder))
-    say("  free runs")
+    begin("free runs")
     fitted, step = list(identified.values()), config.prepare.grid.step
     if config.bands is not None:
         bands = {entry.name: entry.bands for entry in fitted}
@@ -118,6 +118,7 @@ def _write_inspection(
     folder: RunFolder, splits: Mapping[str, Sequence[Log]], config: FitConfig
 ) -> None:
     """Write doctor.json: what the doctor finds in all logs as the run's masks leave them."""
+    begin("examining logs")
     inputs, masks = config.signals.columns, (*config.prepare.masks, Spike())
     logs = [log for members in splits.values() for log in members]
     split_of = {log.name: split for split, members in splits.items() for log in members}

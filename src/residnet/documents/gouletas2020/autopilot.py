@@ -18,7 +18,7 @@ from residnet.control.heading.controllers import Steering
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.errors import UsageError
 from residnet.core.format import DEG
-from residnet.core.progress import say
+from residnet.core.progress import begin, say
 from residnet.data.module import RowsDataModule
 from residnet.documents.gouletas2020.law import (
     NetworkPredictor,
@@ -202,7 +202,7 @@ def predictive(
     notes = store.finished_module(name, network)
     if notes is None:
         started = time.time()
-        say(f"  training {name}")
+        begin(f"training {name}")
         notes = train_predictor(name, network, config, steering, seed, folder.path)
         notes["seconds"] = round(time.time() - started, 1)
         store.keep_module(name, spec, network, notes)
