@@ -136,9 +136,9 @@ def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> No
     settings, threads = fitter.settings, torch.get_num_threads()
     heads = [name for name in settings.heads if settings.baseline_name_of(name) in models]
     places = side_by_side(fitter)
-    begin = (dict(logs), settings, fitter.store.training_folder, threads)
+    given = (dict(logs), settings, fitter.store.training_folder, threads)
     with _heard() if places > 1 else nullcontext() as wire:
-        pooled = processes(places, _begin, (*begin, wire)) if places > 1 else nullcontext()
+        pooled = processes(places, _begin, (*given, wire)) if places > 1 else nullcontext()
         with pooled as pool:
             there: dict[str, Any] = {}
             for name in heads:
