@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from residnet.judge.verdict import Evidence, diverged_note, level, objections, verdict
+from residnet.judge.verdict import Evidence, by_windows, diverged_note, level, objections, verdict
 
 
 def row(error: float, diverged: int = 0) -> dict[str, Any]:
@@ -185,3 +185,14 @@ def test_an_old_run_without_these_files_still_has_a_verdict() -> None:
         "On test data model mlp is 60 % better than zero and 20 % better than the baseline; its"
         " NRMSE is 0.200."
     ]
+
+
+def test_a_split_is_judged_by_a_protocol_of_which_it_holds_five_windows() -> None:
+    def row(split: str, protocol: str, windows: int) -> dict[str, object]:
+        return {"split": split, "protocol": protocol, "windows": windows, "manoeuvre": "all"}
+
+    held = [row("validation", name, 9) for name in ("T100", "T30", "T10")]
+    few = [*held, row("test", "T30", 2), row("test", "T10", 6)]
+    assert by_windows(few, "test", "T100") == ["T10", "T30", "T100"]
+    assert by_windows([*held, row("test", "T100", 7)], "test", "T100")[0] == "T100"
+    assert by_windows(few, "validation", "T100")[0] == "T100"

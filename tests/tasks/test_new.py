@@ -20,7 +20,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Question
 from residnet.data.readers import ReaderConfig
-from residnet.identification.recipe import window_length
+from residnet.identification.recipe import judging, window_length
 from residnet.tasks.drafting import new_config
 from residnet.tasks.registry import load_task
 
@@ -45,16 +45,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory, logs: list[Log]) -> Path:
     return folder
 
 
-def test_free_runs_are_no_longer_than_the_logs_of_any_split() -> None:
-    def lasting(seconds: float) -> Log:
-        return Log("made", np.arange(0.0, seconds + 0.5, 1.0), {})
+def lasting(seconds: float) -> Log:
+    t = np.arange(0.0, seconds + 0.5, 1.0)
+    return Log("made", t, {name: np.sin(t) for name in ("u", "v", "r")})
 
-    tests = [lasting(180.0) for _ in range(4)]
-    assert window_length([[lasting(180.0)], tests], 20.0) == 100.0
-    assert window_length([[lasting(95.0)], tests], 20.0) == 60.0
-    assert window_length([[], [lasting(30.0)]], 20.0) == 20.0
-    assert window_length([[lasting(95.0), lasting(200.0)], tests], 20.0) == 100.0
-    assert window_length([[], []], 20.0) == 0.5
+
+def test_free_runs_are_no_longer_than_most_logs() -> None:
+    assert window_length([lasting(180.0)], 20.0) == 100.0
+    assert window_length([lasting(95.0), lasting(95.0), lasting(200.0)], 20.0) == 60.0
+    assert window_length([lasting(30.0)], 20.0) == 20.0
+    assert window_length([], 20.0) == 0.5
+
+
+def test_the_length_of_the_test_logs_enters_no_choice() -> None:
+    splits = {"train": [lasting(180.0)] * 3, "validation": [lasting(180.0)]}
+    long, short = (judging({**splits, "test": [lasting(s)]}, 20.0) for s in (180.0, 15.0))
+    assert long["selection"] == short["selection"] == "T100"
+    assert long["scales"] == short["scales"]
+    assert list(long["protocols"]) == list(short["protocols"])[:2] == ["T100", "T30"]
+    assert min(float(one["length"].split()[0]) for one in short["protocols"].values()) < 13.0
 
 
 def test_a_config_from_logs_alone(folder: Path) -> None:

@@ -28,7 +28,7 @@ from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.data.sources import read_logs as read_splits
 from residnet.data.split import SPLITS, check_leaks, divided, log_names
-from residnet.identification.recipe import Preparation, judging, window_length
+from residnet.identification.recipe import Preparation, judging
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.tasks.drafting import Draft, commented, drafted
@@ -341,8 +341,7 @@ def prepare(
         if live.text:
             say(f"velocities: {live.text}")
         say(f"recipe: {chosen.reason}")
-        length = window_length([whole[name] for name in SPLITS[1:]], chosen.memory)
-        judged = judging(whole, length, live)
+        judged = judging(whole, chosen.memory, live)
         content = chosen.content()
         grid = {"step": step, "held": held}
         content["grid"] |= {key: value for key, value in grid.items() if value is not None}

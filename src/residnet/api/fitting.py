@@ -26,7 +26,7 @@ from residnet.identification.prepared import require_window, through_currents, v
 from residnet.identification.settings import FitSettings, Parts
 from residnet.judge.metrics import metrics_table
 from residnet.judge.selection import Selection
-from residnet.judge.verdict import Evidence, verdict
+from residnet.judge.verdict import Evidence, by_windows, verdict
 from residnet.report.run_reader import COLUMNS, StoredWindow
 
 if TYPE_CHECKING:
@@ -267,7 +267,8 @@ class Models(Mapping[str, Model]):
         It speaks of the test logs where they are judged, else of the validation logs.
         """
         split = "test" if "test" in self.runs else "validation"
-        judged, protocol = self.runs[split].evaluation, self.settings.evaluation.selection
+        judged = self.runs[split].evaluation
+        protocol = by_windows(judged.rows, split, self.settings.evaluation.selection)[0]
         whole = {
             row["model"]: row
             for row in judged.rows

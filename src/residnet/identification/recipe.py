@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -447,18 +447,25 @@ def _rests(logs: Sequence[Log], name: str) -> bool:
 
 
 def judging(
-    splits: Mapping[str, Sequence[Log]], length: float, live: Live = ALIVE
+    splits: Mapping[str, Sequence[Log]], memory: float, live: Live = ALIVE
 ) -> dict[str, Any]:
     """Return protocols, selection and scales of a config, for logs by split.
 
+    The test logs take part in no choice: where they are shorter than the free runs that choose,
+    they are judged over shorter ones besides.
+
     Args:
         splits: `train`, `validation` and `test`.
-        length: of the free runs, s; see `window_length`.
+        memory: how long the vessel remembers, s.
         live: velocities of the models.
     """
+    length = window_length(splits["validation"] or splits["train"], memory)
     laid = protocols(length)
     both = [*splits["train"], *splits["validation"]]
-    return {"protocols": laid, "selection": next(iter(laid)), "scales": scales(both, live)}
+    out = {"selection": next(iter(laid)), "scales": scales(both, live)}
+    if splits["test"] and (shorter := window_length(splits["test"], memory)) < length:
+        laid |= {name: one for name, one in protocols(shorter).items() if name not in laid}
+    return {"protocols": laid, **out}
 
 
 def _memory(log: Log) -> float:
@@ -479,16 +486,15 @@ def _memory(log: Log) -> float:
     return float(below[0] * step) if below.size else float("nan")
 
 
-def window_length(splits: Iterable[Sequence[Log]], memory: float) -> float:
-    """Return the length of free runs that most of the logs hold, and one of each split, s.
+def window_length(logs: Sequence[Log], memory: float) -> float:
+    """Return the length in s of free runs that most of the logs hold.
 
     Args:
-        splits: logs of the validation and of the test; empty splits say nothing.
+        logs: to be judged on; none ask for half a second.
         memory: how long the vessel remembers, s.
     """
-    spans = [[float(log.t[-1] - log.t[0]) for log in logs] for logs in splits if logs]
-    lengths = sorted(length for split in spans for length in split)
-    usual = min((lengths[int(0.25 * (len(lengths) - 1))], *map(max, spans)) if spans else (1.0,))
+    lengths = sorted(float(log.t[-1] - log.t[0]) for log in logs) or [1.0]
+    usual = lengths[int(0.25 * (len(lengths) - 1))]
     room = [length for length in _WINDOWS if 1.15 * length <= usual] or [0.5 * usual]
     return next((length for length in room if length <= 15.0 * memory), room[-1])
 

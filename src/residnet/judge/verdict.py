@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +15,24 @@ Content = Mapping[str, Any]
 ZERO = "zero"
 UNSEEN = ("test", "external")
 """Splits that no fit has seen."""
+
+
+def by_windows(rows: Sequence[Content], split: str, deciding: str) -> list[str]:
+    """Return the protocols of some rows, that by which a split is judged first.
+
+    It is the one that chose between the models, unless the split holds fewer than five windows of
+    it, and more of another.
+
+    Args:
+        rows: of metrics.json.
+        split: that is judged.
+        deciding: protocol that chose; empty where nothing was chosen.
+    """
+    count = {row["protocol"]: 0 for row in rows}
+    for row in rows:
+        if row["split"] == split and row["manoeuvre"] == "all":
+            count[row["protocol"]] = min(int(row["windows"]), _FEWEST)
+    return sorted(count, key=lambda name: (-count[name], name != deciding))
 
 
 @dataclass(frozen=True)

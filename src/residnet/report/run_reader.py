@@ -20,6 +20,8 @@ from residnet.core.layout import ALIVE, RANGE_VELOCITIES, Live
 from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
 from residnet.core.units import known_unit
 from residnet.judge.rollout_files import INPUT
+from residnet.judge.verdict import by_windows
+from residnet.report.format import SHOWN_UNITS, shown_unit
 
 Content = Mapping[str, Any]
 """What a JSON object holds."""
@@ -233,9 +235,13 @@ class RunFiles:
 
     @cached_property
     def protocols(self) -> list[str]:
-        """The protocols of the rows, the one that selects first."""
-        names = list(dict.fromkeys(row["protocol"] for row in self.rows))
-        return sorted(names, key=lambda name: name != self.evaluation.get("selection"))
+        """The protocols of the rows, the one by which the focus is judged first."""
+        return by_windows(self.rows, self.focus, self.evaluation.get("selection", ""))
+
+    @property
+    def deciding(self) -> str:
+        """The protocol that chose between the models."""
+        return str(self.evaluation.get("selection") or self.protocols[0])
 
     @cached_property
     def main(self) -> str:

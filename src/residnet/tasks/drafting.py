@@ -162,11 +162,12 @@ def drafted(
         preparation |= {"masks": [{"kind": "frozen", **where}]}
     usable = read.usable((*inputs, *chosen.exogenous), preparation)
     split, splits = _split(usable, folder, marks)
-    length = window_length([splits[name] for name in SPLITS[1:]], chosen.memory)
-    _judge_long_ones(split, splits, length, marks)
+    _judge_long_ones(split, splits, chosen.memory, marks)
+    judged = judging(splits, chosen.memory, live)
     marks.note(("prepare", "grid"), chosen.reason)
     marks.note(
-        ("evaluation", "protocols"), f"free runs of {length:g} s fit into most logs for judging"
+        ("evaluation", "protocols"),
+        f"free runs as long as most logs hold; {judged['selection']} chooses, on validation logs",
     )
     marks.note(("evaluation", "scales"), "standard deviations over training and validation logs")
     marks.note(("recipe",), "a portfolio of models, whose terms and sizes follow from the logs")
@@ -180,7 +181,7 @@ def drafted(
         "integrator": "semi_implicit_euler",
         "recipe": "standard",
         "export": {"models": []},
-        "evaluation": judging(splits, length, live),
+        "evaluation": judged,
     }
     validate(config, FitConfig, "draft", folder)
     guesses = tuple((".".join(key), text) for key, text in marks.guesses)
@@ -351,11 +352,12 @@ def _split(
 
 
 def _judge_long_ones(
-    split: dict[str, Any], splits: dict[str, list[Log]], length: float, marks: Marks
+    split: dict[str, Any], splits: dict[str, list[Log]], memory: float, marks: Marks
 ) -> None:
     """Learn from the logs that are too short to be judged on, but for the last one of a split."""
-    shortest = 1.2 * min(float(entry["length"].split()[0]) for entry in protocols(length).values())
     for name in SPLITS[1:]:
+        laid = protocols(window_length(splits[name], memory)).values()
+        shortest = 1.2 * min(float(entry["length"].split()[0]) for entry in laid)
         for entry, log in list(zip(split[name], splits[name], strict=True)):
             if log.t[-1] - log.t[0] < shortest and len(split[name]) > 1:
                 split[name].remove(entry)

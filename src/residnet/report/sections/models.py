@@ -178,7 +178,7 @@ def _heads(run: RunFiles) -> Section | None:
         return whole_number(found) if found else DASH
 
     def error(model: str) -> Cell:
-        row = run.row(model, "validation", run.protocols[0])
+        row = run.row(model, "validation", run.deciding)
         value = row["nrmse"]["mean"] if row else run.fit(model).get("validation")
         lost = row is not None and row["diverged"]
         note = diverged_note(row) if row else ""
@@ -384,7 +384,7 @@ def breeding(run: RunFiles) -> Iterator[Figure]:
 def learning(run: RunFiles) -> Figure | None:
     """Draw loss and free-run error on validation data by epoch, a case for each trained head."""
     cases = []
-    reference = run.row(run.baseline, "validation", run.protocols[0])
+    reference = run.row(run.baseline, "validation", run.deciding)
     for model in run.heads:
         points = pd.DataFrame(run.fit(model).get("curve") or [])
         if points.empty:
