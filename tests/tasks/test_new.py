@@ -62,7 +62,7 @@ def test_the_length_of_the_test_logs_enters_no_choice() -> None:
     long, short = (judging({**splits, "test": [lasting(s)]}, 20.0) for s in (180.0, 15.0))
     assert long["selection"] == short["selection"] == "T100"
     assert long["scales"] == short["scales"]
-    assert list(long["protocols"]) == list(short["protocols"])[:2] == ["T100", "T30"]
+    assert list(long["protocols"]) == list(short["protocols"])[:2] == ["T100", "T40"]
     assert min(float(one["length"].split()[0]) for one in short["protocols"].values()) < 13.0
 
 
