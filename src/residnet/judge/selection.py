@@ -209,8 +209,8 @@ def _simplest(single: Sequence[Contender], blocks: Blocks) -> tuple[Contender, s
     else:
         kind = "simplest sound" if chosen.sound else "simplest"
         reason = (
-            f"{chosen.name} is the {kind} model within {said} ({number(100.0 * within, 2)} %) of the"
-            f" best one, {best.name} ({error} and {number(best.error)})"
+            f"{chosen.name} is the {kind} model within {said} ({number(100.0 * within, 2)} %) of"
+            f" the best one, {best.name} ({error} and {number(best.error)})"
         )
     lost = [one for one in single if one.score < chosen.score and one.diverged]
     if lost:

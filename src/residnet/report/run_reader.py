@@ -21,7 +21,6 @@ from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
 from residnet.core.units import known_unit
 from residnet.judge.rollout_files import INPUT
 from residnet.judge.verdict import by_windows
-from residnet.report.format import SHOWN_UNITS, shown_unit
 
 Content = Mapping[str, Any]
 """What a JSON object holds."""
