@@ -37,7 +37,7 @@ def total(terms: Sequence[str], weights: Sequence[float]) -> str:
     out = ""
     for text, weight in zip(terms, weights, strict=True):
         number = f"{abs(weight):.6g}"
-        part = number if text == "1" else text if abs(weight) == 1.0 else f"{number} {text}"
+        part = number if text == "1" else text if number == "1" else f"{number} {text}"
         out += (" - " if weight < 0 else " + ") + part
     return ("-" if out.startswith(" - ") else "") + out[3:] or "0"
 
