@@ -20,19 +20,16 @@ UNSEEN = ("test", "external")
 def by_windows(rows: Sequence[Content], split: str, deciding: str) -> list[str]:
     """Return the protocols of some rows, that by which a split is judged first.
 
-    It is the one that chose between the models, unless the split holds fewer than five windows of
-    it, and more of another.
+    It is the one that chose between the models, unless the split is too short for it.
 
     Args:
         rows: of metrics.json.
         split: that is judged.
         deciding: protocol that chose; empty where nothing was chosen.
     """
-    count = {row["protocol"]: 0 for row in rows}
-    for row in rows:
-        if row["split"] == split and row["manoeuvre"] == "all":
-            count[row["protocol"]] = min(int(row["windows"]), _FEWEST)
-    return sorted(count, key=lambda name: (-count[name], name != deciding))
+    names = dict.fromkeys(row["protocol"] for row in rows)
+    held = {row["protocol"] for row in rows if row["split"] == split}
+    return sorted(names, key=lambda name: (name not in held, name != deciding))
 
 
 @dataclass(frozen=True)
