@@ -26,7 +26,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "export": (2260, 267),
     "heads": (1124, 172),
     "identification": (2177, 224),
-    "judge": (1991, 217),
+    "judge": (1989, 217),
     "manoeuvres": (897, 136),
     "physics": (1982, 249),
     "regression": (1814, 204),
