@@ -108,17 +108,6 @@ def test_logs_of_a_surge_alone_are_looked_at_too() -> None:
     assert one.text.startswith("run_6")
 
 
-def test_two_vessels_in_equal_parts_contradict_each_other(fleets: list[Fleet]) -> None:
-    named = 0
-    for fleet in fleets:
-        half = len(fleet.logs) // 2
-        logs = [*fleet.sisters[:half], *fleet.logs[half:]]
-        logs = [log.replace(name=f"log_{i:02d}") for i, log in enumerate(logs)]
-        named += bool(found(logs, fleet))
-    # of 80 such fleets three in five are told (two kinds of boats, seeds 11 and 12)
-    assert named >= 1
-
-
 def test_gusts_on_straight_runs_are_no_dead_rudder(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     random, logs = np.random.default_rng(5), []

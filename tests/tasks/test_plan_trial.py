@@ -30,7 +30,7 @@ def test_what_to_run_stands_in_table_page_and_files(tmp_path: Path) -> None:
     plan: Any = SimpleNamespace(trials=trials, chosen=trials[:1], shrinks=0.4)
     planned = PlannedTrials("hull", plan)
     text = planned.text().splitlines()
-    assert text[0].startswith("Next trials for hull")
+    assert text[0].startswith("Candidates for hull")
     assert text[2].split() == ["zigzag_1", "0.5", "12", "25.0", "3.00"]
     assert text[-1].startswith("Run zigzag_1: together they narrow the intervals")
     files = planned.write(tmp_path)

@@ -24,7 +24,7 @@ from residnet.data.doctor.findings import (
     share_of,
     show,
 )
-from residnet.data.doctor.others import DISAGREE, Fleet, causes, nothing_steers
+from residnet.data.doctor.others import Fleet, causes, nothing_steers
 from residnet.data.doctor.statistics import MEASURED, Record, averaged, high
 from residnet.data.split import row_hashes, sampled_hashes, sampling
 
@@ -323,14 +323,6 @@ def contradictions(logs: Together, found: Check) -> Iterator[Finding]:
     if told[0]:
         # without the steering no log explains another
         return
-    if not fleet.apart and fleet.disagreement > DISAGREE:
-        text = (
-            f"the logs contradict each other: the others leave {fleet.disagreement:.2g} times as"
-            " much of a log as its own stretches leave of each other; no single log stands apart,"
-            " so that they may be of two vessels, loadings or scales"
-        )
-        figures = {"disagreement": fleet.disagreement}
-        yield found(text, figures, code="contradicts_each_other", fix="fit each kind alone")
     count = len(fleet.core)
     for i in fleet.apart:
         log, likely = fleet.logs[i], causes(fleet, i)[0]

@@ -56,11 +56,6 @@ _SUSPECTS, _SUSPICIOUS = 8, 0.5
 much a log must stand apart before it is."""
 _MATERIAL = 0.15
 """Share of what there is to predict that must be wrong: smaller differences mislead no fit."""
-# Of 80 drawn clean fleets the largest was 2.0; of as many with half the logs from another boat, and
-# no log that stands apart, 25 of 66 lie above.
-DISAGREE = 2.5
-"""Times as much that others leave of a log as its own stretches, beyond which no log answers for
-another."""
 _WIND = ("wind_speed", "wind_dir")
 
 
@@ -511,21 +506,6 @@ class Fleet:
         alone, with_it = Model.of(kept), Model.of([*kept, self.rows[i]])
         moved = [one.x @ (alone.theta - with_it.theta) for one in kept]
         return float(np.sqrt(np.mean(np.concatenate(moved) ** 2, axis=0)).max())
-
-    @cached_property
-    def disagreement(self) -> float:
-        """How many times more the others leave of a log than its own other stretches do.
-
-        The median over the logs of the worst velocity; 1 where there are too few logs to say.
-        """
-        if len(self.told) < 4:
-            return 1.0
-        models = self._others(self.told, self.told)
-        worst = []
-        for i in self.told:
-            own = self._by_stretches(self.rows[i]) + self.rows[i].noise
-            worst.append(float((self._left(i, models[i]) / own).max()))
-        return math.sqrt(float(np.median(worst)))
 
     def unexplained(self) -> np.ndarray:
         """Return which share of the change of each velocity [n] the others' model leaves."""
