@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (811, 119),
     "control": (3264, 355),
     "core": (1400, 208),
-    "data": (8994, 814),
+    "data": (8980, 813),
     "documents": (2497, 229),
     "dynamics": (869, 116),
     "export": (2260, 267),
