@@ -20,11 +20,34 @@ class Baseline(nn.Module, ABC):
     """A baseline: accelerations [..., 3] from channels z [..., nz], without memory.
 
     They are in m/s^2, m/s^2 and rad/s^2.
+
+    Attributes:
+        linear: whether they are linear in the velocities.
     """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = False
 
     @abstractmethod
     def forward(self, z: Tensor) -> Tensor:
         """Return nu_dot [..., 3] at channels z [..., nz] (see `residnet.physics.signals`)."""
+
+    def ahead(self, p: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return what velocities do not decide, for `at`: rows [..., q], and what all rows share.
+
+        Args:
+            p: channels behind the velocities [..., nz - 3].
+        """
+        return p, []
+
+    def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
+        """Return nu_dot [B, 3] at velocities nu [B, 3], by what `ahead` found.
+
+        Where the baseline is `linear` that is row + nu held[0].
+        """
+        found: Tensor = self.forward(torch.cat((nu, row), dim=-1))
+        return found
 
     @abstractmethod
     def parameter_count(self) -> list[float]:

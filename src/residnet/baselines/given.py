@@ -18,7 +18,7 @@ from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
 from residnet.core.samples import Samples
 from residnet.physics.hull import HullConfig, OdinConfig
 from residnet.physics.signals import FORCE_CHANNELS
-from residnet.physics.terms import TermLibrary, parse_term, read_rows
+from residnet.physics.terms import SplitTerms, TermLibrary, parse_term, read_rows
 from residnet.physics.vessel import load_vessel
 from residnet.regression.estimator import Solution
 
@@ -39,6 +39,8 @@ class GivenBaseline(Baseline):
         super().__init__()
         terms = list(dict.fromkeys(term for row in rows for term in row))
         self.library = TermLibrary(terms, names)
+        self.split = SplitTerms(terms, names[len(VELOCITY) :])
+        self.linear = self.split.linear
         self.fitted = fitted
         theta = [[row.get(term, 0.0) for term in terms] for row in rows]
         # a baseline without terms has nothing to store
@@ -54,6 +56,16 @@ class GivenBaseline(Baseline):
             return zero_acceleration(z)
         phi: Tensor = self.library(z)
         return phi @ self.theta.to(z.dtype).T
+
+    def ahead(self, p: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return what velocities do not decide; see `Baseline.ahead`."""
+        row, own = self.split.ahead(p, self.theta.to(p.dtype).T)
+        return row, [own]
+
+    def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
+        """Return nu_dot [B, 3] at velocities nu [B, 3], by what `ahead` found."""
+        found: Tensor = self.split(nu, row, held[0])
+        return found
 
     def parameter_count(self) -> list[float]:
         """Return the number of terms of each axis where they were fitted, else zeros."""

@@ -28,7 +28,7 @@ from residnet.physics.symmetry import (
     without_dead,
     wrong_parity,
 )
-from residnet.physics.terms import TermLibrary
+from residnet.physics.terms import SplitTerms, TermLibrary
 from residnet.regression.estimator import Coefficient, Solution, chosen, regressors
 from residnet.regression.least_squares import LeastSquares
 
@@ -70,6 +70,8 @@ class RegressorBaseline(ParametricBaseline):
         self.dissipative = dissipative
         self.names = tuple(names)
         self.bound: VelocityBound | None = VelocityBound(_BEYOND, len(names)) if bounded else None
+        self.split = SplitTerms(terms, names[len(VELOCITY) :])
+        self.linear = self.split.linear and not bounded
 
     def forward(self, z: Tensor) -> Tensor:
         weights = (self.theta * self.allowed).to(z.dtype)
@@ -80,6 +82,25 @@ class RegressorBaseline(ParametricBaseline):
             return phi @ weights.T + back
         known: Tensor = self.library(z)
         return known @ weights.T
+
+    def ahead(self, p: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return what velocities do not decide; see `Baseline.ahead`."""
+        weights = (self.theta * self.allowed).to(p.dtype).T
+        if self.bound is None:
+            row, own = self.split.ahead(p, weights)
+            return row, [own]
+        low, high = self.bound.low.to(p.dtype), self.bound.high.to(p.dtype)
+        row, own = self.split.ahead(torch.clamp(p, low[3:], high[3:]), weights)
+        return row, [own, low[:3], high[:3], self.bound.rate.to(p.dtype)]
+
+    def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
+        """Return nu_dot [B, 3] at velocities nu [B, 3], by what `ahead` found."""
+        if self.bound is None:
+            free: Tensor = self.split(nu, row, held[0])
+            return free
+        near = torch.clamp(nu, held[1], held[2])
+        found: Tensor = self.split(near, row, held[0])
+        return torch.addcmul(found, held[3], near - nu)
 
     def parameter_count(self) -> list[float]:
         """Return the number of coefficients of each axis that are not zero."""

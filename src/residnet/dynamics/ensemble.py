@@ -7,6 +7,7 @@ velocities of its own and averages these. Either steps, warms up and exports lik
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import final
 
 import torch
@@ -150,8 +151,9 @@ class MeanOfTrajectories(HybridDynamics):
             member.positions = False
         self.copies = [member.head.copies for member in members]
         self.widths = [_DOF + member.n_state for member in members]
-        self.n_state = _KNOWN + sum(
-            copies * width for copies, width in zip(self.copies, self.widths, strict=True)
+        *self.begins, self.n_state = accumulate(
+            (copies * width for copies, width in zip(self.copies, self.widths, strict=True)),
+            initial=_KNOWN,
         )
         small = [_TOLD * max(b - a, 1e-6) for a, b in zip(low, high, strict=True)]
         self.register_buffer("small", torch.tensor(small, dtype=torch.float64), persistent=False)
@@ -159,29 +161,78 @@ class MeanOfTrajectories(HybridDynamics):
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         x = self.alive(x)
+        kept = self._kept(x, s)
+        reached: list[Tensor] = []
+        memory: list[Tensor] = []
+        for i, member in enumerate(self.members):
+            at, part = self._own(x, s, kept, i)
+            given = w.expand(self.copies[i], w.shape[0], w.shape[1]).reshape(-1, w.shape[1])
+            after, own = member.step(at, given, part)
+            reached.append(after)
+            memory.append(own)
+        return self._joined(x, reached, memory)
+
+    def ahead(self, w: Tensor, s: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
+        """Return what a stretch of steps needs that no state decides, of each member in turn."""
+        rows: list[list[Tensor]] = []
+        for _ in range(w.shape[1]):
+            rows.append([])
+        shared: list[list[Tensor]] = []
+        for i, member in enumerate(self.members):
+            given, part = w.repeat(self.copies[i], 1, 1), self._part(s, i)[..., 3:]
+            own, kept = member.ahead(given, part.reshape(given.shape[0], self.widths[i] - 3))
+            shared.extend(kept)
+            for row, more in zip(rows, own):
+                row.extend(more)
+        return rows, shared
+
+    def go(
+        self, x: Tensor, row: list[Tensor], shared: list[list[Tensor]], s: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the state and the memory one step later, by what `ahead` found."""
+        x = self.alive(x)
+        kept = self._kept(x, s)
+        reached: list[Tensor] = []
+        memory: list[Tensor] = []
+        for i, member in enumerate(self.members):
+            at, part = self._own(x, s, kept, i)
+            after, own = member.go(at, row[2 * i : 2 * i + 2], shared[3 * i : 3 * i + 3], part)
+            reached.append(after)
+            memory.append(own)
+        return self._joined(x, reached, memory)
+
+    def _kept(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the share [B, 1] of their distances from the mean that members keep."""
+        missed = (velocities(x) - s[:, 1:4]) / self.small.to(x.dtype)
+        return s[:, :1] / (1.0 + missed.square().sum(dim=-1, keepdim=True))
+
+    def _part(self, s: Tensor, i: int) -> Tensor:
+        """Return a member's share of the memory [K, B, 3 + n_state]."""
+        copies, width = self.copies[i], self.widths[i]
+        own = s[:, self.begins[i] : self.begins[i] + copies * width]
+        return own.reshape(s.shape[0], copies, width).transpose(0, 1)
+
+    def _own(self, x: Tensor, s: Tensor, kept: Tensor, i: int) -> tuple[Tensor, Tensor]:
+        """Return the states and memories [K B, ...] that a member steps from."""
+        copies, rows, part = self.copies[i], x.shape[0], self._part(s, i)
+        moved = velocities(x) + kept * part[..., :3]
+        at = torch.cat((pose(x).expand(copies, rows, 3), moved), dim=-1)
+        width = self.widths[i] - 3
+        return at.reshape(copies * rows, -1), part[..., 3:].reshape(copies * rows, width)
+
+    def _joined(
+        self, x: Tensor, states: list[Tensor], memories: list[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the mean's state and memory from those of the members, [K B, ...] each."""
         nu, rows = velocities(x), x.shape[0]
-        missed = (nu - s[:, 1:4]) / self.small.to(x.dtype)
-        kept = s[:, :1] / (1.0 + missed.square().sum(dim=-1, keepdim=True))
         total = torch.zeros_like(nu)
         own: list[Tensor] = []
         memory: list[Tensor] = []
-        begin = 4
-        for i, member in enumerate(self.members):
-            copies, width = self.copies[i], self.widths[i]
-            part = s[:, begin : begin + copies * width].reshape(rows, copies, width)
-            begin += copies * width
-            part = part.transpose(0, 1)
-            moved = nu + kept * part[..., :3]
-            at = torch.cat((pose(x).expand(copies, rows, 3), moved), dim=-1)
-            after, kept_memory = member.step(
-                at.reshape(copies * rows, -1),
-                w.expand(copies, rows, w.shape[-1]).reshape(copies * rows, -1),
-                part[..., 3:].reshape(copies * rows, width - 3),
-            )
-            reached = velocities(after).reshape(copies, rows, 3)
+        for i in range(len(states)):
+            reached = velocities(states[i]).reshape(self.copies[i], rows, 3)
             total = total + reached.mean(dim=0)
             own.append(reached)
-            memory.append(kept_memory.reshape(copies, rows, width - 3))
+            memory.append(memories[i].reshape(self.copies[i], rows, self.widths[i] - 3))
         mean = total / len(self.widths)
         parts = [torch.ones_like(s[:, :1]), mean]
         for i in range(len(own)):

@@ -161,8 +161,11 @@ class HybridDynamics(Dynamics):
         return z
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        return self.stepped(x, self.signals.prepare(w), s)
+
+    def stepped(self, x: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state and the memory one step later, from p = signals.prepare(w) [B, k]."""
         x = self.alive(x)
-        p = self.signals.prepare(w)
         z: Tensor = self.signals(x, p)
         if self.disturbance is None:
             rho, s = self.head(z, s)
@@ -185,16 +188,76 @@ class HybridDynamics(Dynamics):
         nu_dot = self.found(self.baseline(z), rho)
         if self.positions or (self.signals.wind and len(self.nodes) > 1):
             return self.integrate_from(torch.cat((self.kinematics(x), nu_dot), dim=-1), x, p, rho)
-        # nothing but velocities enters the stages: the heading follows once, the position stays
-        total, turned = self.weights[0] * nu_dot, self.weights[0] * yaw_rate(x)
+        row, held = self.baseline.ahead(p)
+        return self.moved(x, row, held, rho)
+
+    def moved(self, x: Tensor, row: Tensor, held: list[Tensor], rho: Tensor) -> Tensor:
+        """Return the state [B, 6] one step later where nothing but velocities enters the stages.
+
+        The heading follows once, the position stays.
+
+        Args:
+            x: states [B, 6].
+            row: what the baseline found ahead for the step [B, q].
+            held: what it found for all steps.
+            rho: residual of the step [B, 3].
+        """
+        place, psi, nu = x.split([2, 1, 3], dim=-1)
+        nu_dot = self.found(self.baseline.at(nu, row, held), rho)
+        total, mean = self.weights[0] * nu_dot, self.weights[0] * nu
         for i in range(1, len(self.nodes)):
-            nu = velocities(x) + (self.dt * self.nodes[i]) * nu_dot
-            nu_dot = self.found(self.baseline(self.signals.at(nu, p)), rho)
-            total = total + self.weights[i] * nu_dot
-            turned = turned + self.weights[i] * nu[..., -1]
-        nu = velocities(x) + self.dt * total
-        psi = heading(x) + self.dt * (nu[..., -1] if self.semi_implicit else turned)
-        return torch.cat((position(x), psi.unsqueeze(-1), nu), dim=-1)
+            stage = torch.add(nu, nu_dot, alpha=self.dt * self.nodes[i])
+            nu_dot = self.found(self.baseline.at(stage, row, held), rho)
+            total = torch.add(total, nu_dot, alpha=self.weights[i])
+            mean = torch.add(mean, stage, alpha=self.weights[i])
+        after = torch.add(nu, total, alpha=self.dt)
+        turned = after if self.semi_implicit else mean
+        psi = torch.add(psi, turned[..., -1:], alpha=self.dt)
+        return torch.cat((place, psi, after), dim=-1)
+
+    def ahead(self, w: Tensor, s: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
+        """Return what a stretch of steps needs that no state decides; see `Dynamics.ahead`."""
+        p = self.signals.prepare(w)
+        rows: list[list[Tensor]] = []
+        if self.positions or self.signals.wind:
+            for row in p.unbind(1):
+                rows.append([row, row])
+            return rows, [[], [], []]
+        known, held = self.baseline.ahead(p)
+        own, kept = self.head.ahead(p, s[:, : self.width])
+        for one, other in zip(known.unbind(1), own.unbind(1)):
+            rows.append([one, other])
+        steps: list[Tensor] = []
+        if self.baseline.linear:
+            # a step is linear in states, row and residual: what it does to the unit of each
+            unit = torch.eye(12, dtype=w.dtype, device=w.device)
+            x, row, rho = unit.split([6, 3, 3], dim=-1)
+            steps.append(self.moved(x, row, held, rho))
+        return rows, [held, kept, steps]
+
+    def go(
+        self, x: Tensor, row: list[Tensor], shared: list[list[Tensor]], s: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the state and the memory one step later, by what `ahead` found."""
+        if self.positions or self.signals.wind:
+            return self.stepped(x, row[0], s)
+        x = self.alive(x)
+        nu = velocities(x)
+        unknown, estimate = nu, nu
+        if self.disturbance is None:
+            rho, own = self.head.at(nu, row[1], s, shared[1])
+        else:
+            unknown, estimate = self.disturbance(x, s[:, self.width :])
+            seen = torch.cat((nu, unknown), dim=-1) if self.shown else nu
+            rho, own = self.head.at(seen, row[1], s[:, : self.width], shared[1])
+            rho = rho if self.shown else rho + unknown
+        if self.baseline.linear:
+            after = torch.cat((x, row[0], rho), dim=-1) @ shared[2][0]
+        else:
+            after = self.moved(x, row[0], shared[0], rho)
+        if self.disturbance is None:
+            return after, own
+        return after, torch.cat((own, self.disturbance.remembered(after, estimate)), dim=-1)
 
     def known(self, z: Tensor) -> Tensor:
         """Return what the baseline says at channels z [..., nz], accelerations [..., 3]."""

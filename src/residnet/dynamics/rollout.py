@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import torch
 from torch import Tensor, nn
@@ -18,12 +18,23 @@ from torch.jit._fuser import optimized_execution
 from residnet.dynamics.base import Dynamics
 
 
-class Source(nn.Module, ABC):
-    """Where the inputs of a rollout come from."""
+_TOGETHER = 16_384
+"""Rows of inputs whose share of the steps is found at once: enough to be quick, and few to keep."""
 
-    def __init__(self) -> None:
+
+class Source(nn.Module, ABC):
+    """Where the inputs of a rollout come from.
+
+    Args:
+        given: whether they are those that the rollout is given, whatever the state.
+    """
+
+    __constants__: ClassVar = ["given"]
+
+    def __init__(self, *, given: bool = False) -> None:
         super().__init__()
         self.may_stop = False
+        self.given = given
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the source's memory [B, k] at the start, from the initial state x [B, nx]."""
@@ -45,6 +56,9 @@ class Source(nn.Module, ABC):
 class Playback(Source):
     """A source that gives the inputs back as they are."""
 
+    def __init__(self) -> None:
+        super().__init__(given=True)
+
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         return w, memory
 
@@ -56,6 +70,7 @@ class Rollout(nn.Module):
         super().__init__()
         self.model = model
         self.source = Playback() if source is None else source
+        self.together = _TOGETHER
 
     def forward(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Run the model freely over T steps.
@@ -69,9 +84,18 @@ class Rollout(nn.Module):
             states [B, T+1, nx] from x0 on, inputs that acted [B, T, m], and the memory after the
             last step [B, n_state].
         """
-        memory = self.source.initial(x0)
         x = x0
         states = [x0]
+        if self.source.given:
+            # what no state decides is found for many steps at once
+            stretch = max(self.together // max(x0.shape[0], 1), 1)
+            for begin in range(0, w.shape[1], stretch):
+                rows, shared = self.model.ahead(w[:, begin : begin + stretch], s)
+                for row in rows:
+                    x, s = self.model.go(x, row, shared, s)
+                    states.append(x)
+            return torch.stack(states, dim=1), w, s
+        memory = self.source.initial(x0)
         applied: list[Tensor] = []
         for k in range(w.shape[1]):
             acting, memory = self.source(x, w[:, k], k, memory)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from residnet.core.arrays import paged
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
-from residnet.core.names import ACCELERATION, nearest
+from residnet.core.names import ACCELERATION, VELOCITY, nearest
 from residnet.core.samples import Samples
 from residnet.physics.symmetry import without_dead
 from residnet.regression.estimator import Solution
@@ -55,6 +55,30 @@ class ResidualHead(nn.Module, ABC):
 
         Called once per step; the memory is [B, n_state].
         """
+
+    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return what velocities do not decide, for `at`: rows [B, T, q], and what all share.
+
+        Args:
+            p: channels behind the velocities, of T steps [B, T, nz - 3].
+            s: memory before them [B, n_state].
+        """
+        return p, []
+
+    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the residual [B, 3] and the memory for the next step, by what `ahead` found.
+
+        Of a memory that inputs alone decide only that after the last step is told.
+
+        Args:
+            nu: velocities [B, 3], behind them what was predicted wrong where there is `settle`.
+            row: of the step [B, q].
+            s: memory [B, n_state].
+            held: what all steps share.
+        """
+        z = torch.cat((nu[:, :3], row, nu[:, 3:]), dim=-1)
+        found: tuple[Tensor, Tensor] = self.forward(z, s)
+        return found
 
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory.
@@ -242,11 +266,63 @@ class Features(nn.Module):
         self.register_buffer("std", torch.ones(self.count, dtype=torch.float64))
         self.register_buffer("low", torch.full((self.count,), -torch.inf, dtype=torch.float64))
         self.register_buffer("high", torch.full((self.count,), torch.inf, dtype=torch.float64))
+        # velocities decide some of them, the channels behind these the others
+        near = [place for place, name in enumerate(chosen) if name in VELOCITY]
+        far = [place for place, name in enumerate(chosen) if name not in VELOCITY]
+        for name, places in (
+            ("near", near),
+            ("axis", [VELOCITY.index(chosen[place]) for place in near]),
+            ("far", far),
+            ("column", [list(names).index(chosen[place]) - len(VELOCITY) for place in far]),
+        ):
+            self.register_buffer(name, torch.tensor(places, dtype=torch.long), persistent=False)
         self.index: Tensor
         self.mean: Tensor
         self.std: Tensor
         self.low: Tensor
         self.high: Tensor
+        self.near: Tensor
+        self.axis: Tensor
+        self.far: Tensor
+        self.column: Tensor
+
+    def inputs(self, p: Tensor) -> Tensor:
+        """Return the features that velocities do not decide, held in their range [..., F'].
+
+        Args:
+            p: channels behind the velocities [..., nz - 3].
+        """
+        low, high = self.low.index_select(0, self.far), self.high.index_select(0, self.far)
+        chosen = p.index_select(-1, self.column)
+        return torch.clamp(chosen, low.to(p.dtype), high.to(p.dtype))
+
+    def reach(self, like: Tensor) -> list[Tensor]:
+        """Return the least and the largest u, v and r [3], zero for what is no feature."""
+        none = torch.zeros(3, dtype=like.dtype, device=like.device)
+        low, high = self.low.to(like.dtype), self.high.to(like.dtype)
+        return [
+            none.index_copy(0, self.axis, low.index_select(0, self.near)),
+            none.index_copy(0, self.axis, high.index_select(0, self.near)),
+        ]
+
+    def layer(self, p: Tensor, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what a layer of the features makes of all but velocities, and what of these.
+
+        The layer is a matrix product of the features; with v the velocities within `reach` it is
+        the first of what is returned, rows [..., H], plus v times the second [..., 3, H].
+
+        Args:
+            p: channels behind the velocities [..., nz - 3].
+            weight: of the layer [..., H, F].
+            bias: of the layer [..., H].
+        """
+        std, mean = self.std.to(p.dtype), self.mean.to(p.dtype)
+        whole = weight / std
+        shift = bias - whole @ mean
+        row = self.inputs(p) @ whole.index_select(-1, self.far).transpose(-1, -2) + shift
+        near = whole.index_select(-1, self.near).transpose(-1, -2)
+        own = near.new_zeros((3, near.shape[-1])).index_copy(0, self.axis, near)
+        return row, own
 
     def calibrate(self, samples: Samples) -> None:
         """Take mean, standard deviation and range of each feature from the samples.

@@ -14,10 +14,10 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.arrays.paged import row_pieces
-from residnet.core.names import ACCELERATION
+from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
-from residnet.physics.terms import TermLibrary, polynomial_terms
+from residnet.physics.terms import SplitTerms, TermLibrary, polynomial_terms
 from residnet.regression.estimator import (
     Estimator,
     Solution,
@@ -77,6 +77,9 @@ class BasisHead(ClosedFormHead):
         self.library = TermLibrary(
             config.terms or polynomial_terms(chosen, config.degree, magnitudes=magnitudes), chosen
         )
+        self.split = SplitTerms(
+            self.library.terms, [name for name in chosen if name not in VELOCITY]
+        )
         self.folds = config.folds
         self.by_free_run = config.choose == "free_run"
         self.register_buffer(
@@ -99,6 +102,24 @@ class BasisHead(ClosedFormHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         return self.basis(z) @ self.coefficients.to(z.dtype) + self.intercept.to(z.dtype), s
+
+    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return what velocities do not decide; see `ResidualHead.ahead`."""
+        std, far = self.features.std.to(p.dtype), self.features.far
+        row, own = self.split.ahead(
+            self.features.inputs(p) / std.index_select(0, far), self.coefficients.to(p.dtype)
+        )
+        row = torch.cat((row[..., :3] + self.intercept.to(p.dtype), row[..., 3:]), dim=-1)
+        low, high = self.features.reach(p)
+        scale = torch.ones_like(low).index_copy(
+            0, self.features.axis, std.index_select(0, self.features.near)
+        )
+        return row, [low, high, scale, own]
+
+    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the residual [B, 3] at velocities nu [B, 3], by what `ahead` found."""
+        rho: Tensor = self.split(torch.clamp(nu, held[0], held[1]) / held[2], row, held[3])
+        return rho, s
 
     @abstractmethod
     def estimator(self, folds: int | None) -> Estimator:

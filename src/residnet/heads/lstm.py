@@ -10,6 +10,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead, Tanh, quick_tanh
@@ -111,12 +112,17 @@ class LstmCore(nn.Module):
 
     def forward(self, f: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return output h [B, H] and memory [B, 2H] after one step of features [B, F]."""
-        gates = f @ self.w_input.T + s[:, : self.hidden] @ self.w_hidden.T + self.bias
+        return self.gated(f @ self.w_input.T + self.bias, s)
+
+    def gated(self, gates: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return output and memory as `forward` does, from the features' share [B, 4H]."""
+        h, before = s.split([self.hidden, self.hidden], dim=-1)
+        gates = gates + h @ self.w_hidden.T
         # one operation over all numbers is quicker than three over parts that lie apart
         i, forget, _, o = torch.sigmoid(gates).chunk(4, dim=-1)
         g = gates[:, 2 * self.hidden : 3 * self.hidden]
         block = nn.functional.softsign(g) if self.softsign else quick_tanh(g)
-        c = torch.addcmul(forget * s[:, self.hidden :], i, block)
+        c = torch.addcmul(forget * before, i, block)
         h = o * (nn.functional.softsign(c) if self.softsign else quick_tanh(c))
         return h, torch.cat((h, c), dim=-1)
 
@@ -135,17 +141,20 @@ class LstmCore(nn.Module):
 
         It starts from an empty memory.
         """
-        zeros = torch.zeros(f.shape[0], self.hidden, dtype=f.dtype, device=f.device)
+        return self.along(f, f.new_zeros((f.shape[0], 2 * self.hidden)))
+
+    def along(self, f: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return outputs [B, T, H] for features [B, T, F] from memory s [B, 2H] on, and the last.
+
+        The last is the memory [B, 2H] after them.
+        """
         if f.shape[1] == 0:
-            return torch.zeros(
-                f.shape[0], 0, self.hidden, dtype=f.dtype, device=f.device
-            ), torch.cat((zeros, zeros), dim=-1)
+            return f.new_zeros((f.shape[0], 0, self.hidden)), s
         if not self.softsign:
             weights = [self.w_input, self.w_hidden, self.bias, self.no_bias]
-            start = [zeros.unsqueeze(0), zeros.unsqueeze(0)]
+            start = [part.unsqueeze(0).contiguous() for part in s.chunk(2, dim=-1)]
             out, h, c = torch.lstm(f, start, weights, True, 1, 0.0, self.training, False, True)
             return out, torch.cat((h[0], c[0]), dim=-1)
-        s = torch.cat((zeros, zeros), dim=-1)
         outputs: list[Tensor] = []
         for k in range(f.shape[1]):
             h, s = self.forward(f[:, k], s)
@@ -169,6 +178,8 @@ class LstmNetwork(nn.Module):
             persistent=False,
         )
         self.seen: Tensor
+        # a memory of inputs alone
+        self.fed = self.partial and not any(name in VELOCITY for name in seen)
         softsign = config.activation == "softsign"
         self.core = LstmCore(len(seen), config.hidden_size, softsign)
         self.encoder: LstmCore | None = (
@@ -204,6 +215,48 @@ class LstmNetwork(nn.Module):
         f = self.features(z)
         h, s = self.core(self.remembered(f), s)
         return self.read(h, f), s
+
+    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return what velocities do not decide; see `ResidualHead.ahead`."""
+        hidden = self.core.hidden
+        held = self.features.reach(p)
+        own, row = self.readout[0].weight, p[..., :0]
+        if self.skip:
+            # the first layer sees the output of the memory, then all features
+            row, near = self.features.layer(p, own[:, hidden:], self.readout[0].bias)
+            own = own[:, :hidden]
+            held.append(near)
+        if self.fed:
+            # velocities, which the memory does not see, may be anything
+            z = torch.cat((p.new_zeros(p.shape[:-1] + (3,)), p), dim=-1)  # noqa: RUF005
+            h, s = self.core.along(self.remembered(self.features(z)), s)
+            held.append(s)
+            return row + self.dropout(h) @ own.T, held
+        weight = self.core.w_input
+        if self.partial:
+            none = weight.new_zeros((weight.shape[0], self.features.count))
+            weight = none.index_copy(1, self.seen, weight)
+        gates, near = self.features.layer(p, weight, self.core.bias)
+        held.append(near)
+        held.append(own.T)
+        return torch.cat((gates, row), dim=-1), held
+
+    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return [B, outputs] and the memory at velocities nu [B, 3], by what `ahead` found."""
+        v = torch.clamp(nu, held[0], held[1])
+        if self.fed:
+            out, s = torch.addmm(row, v, held[2]), held[3]
+        else:
+            gates, row = row.split([4 * self.core.hidden, row.shape[1] - 4 * self.core.hidden], -1)
+            h, s = self.core.gated(torch.addmm(gates, v, held[-2]), s)
+            h = self.dropout(h)
+            if not self.skip:
+                return self.readout(h), s
+            out = torch.addmm(torch.addmm(row, v, held[2]), h, held[-1])
+        for i, layer in enumerate(self.readout):
+            if i > 0:
+                out = layer(out)
+        return out, s
 
     def memory_after(self, z: Tensor) -> Tensor:
         """Return the memory [B, 2H] that past channels [B, T, nz] leave."""
@@ -257,6 +310,35 @@ class LstmHead(ResidualHead):
         if self.restoring is not None:
             rho = rho + self.restoring(z)
         # joining a single part would copy it
+        return rho, memory[0] if len(memory) == 1 else torch.cat(memory, dim=-1)
+
+    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return what velocities do not decide of each network; see `ResidualHead.ahead`."""
+        rows: list[Tensor] = []
+        held: list[Tensor] = []
+        for i, network in enumerate(self.networks):
+            row, own = network.ahead(p, s[:, i * self.width : (i + 1) * self.width])
+            rows.append(row)
+            held.extend(own)
+        return rows[0] if len(rows) == 1 else torch.cat(rows, dim=-1), held
+
+    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the residual [B, 3] and the memory for the next step, by what `ahead` found."""
+        out: list[Tensor] = []
+        memory: list[Tensor] = []
+        rows, many = row.shape[-1] // len(self.networks), len(held) // len(self.networks)
+        for i, network in enumerate(self.networks):
+            y, m = network.at(
+                nu,
+                row[:, i * rows : (i + 1) * rows],
+                s[:, i * self.width : (i + 1) * self.width],
+                held[i * many : (i + 1) * many],
+            )
+            out.append(y)
+            memory.append(m)
+        rho: Tensor = self.scale(out[0] if len(out) == 1 else torch.cat(out, dim=-1))
+        if self.restoring is not None:
+            rho = rho + self.restoring(nu)
         return rho, memory[0] if len(memory) == 1 else torch.cat(memory, dim=-1)
 
     def sequence(self, z: Tensor) -> Tensor:

@@ -78,3 +78,17 @@ class MlpHead(ResidualHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         return self.scale(self.net(self.features(z))), s
+
+    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return what velocities do not decide of the first layer; see `ResidualHead.ahead`."""
+        row, own = self.features.layer(p, self.net[0].weight, self.net[0].bias)
+        low, high = self.features.reach(p)
+        return row, [low, high, own]
+
+    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the residual [B, 3] at velocities nu [B, 3], by what `ahead` found."""
+        out = torch.addmm(row, torch.clamp(nu, held[0], held[1]), held[2])
+        for i, layer in enumerate(self.net):
+            if i > 0:
+                out = layer(out)
+        return self.scale(out), s

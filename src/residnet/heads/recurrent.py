@@ -104,22 +104,59 @@ class RecurrentHead(ResidualHead):
             wrong = self.far * torch.tanh(wrong / (self.far * self.scale.spread.to(z.dtype)))
         else:
             wrong = torch.zeros_like(z[..., :3])
-        copies, hidden = self.copies, self.n_state
-        f = torch.cat((self.features(z), wrong), dim=-1).view(copies, -1, self.seen)
-        h = s.reshape(copies, -1, hidden)
+        f = torch.cat((self.features(z), wrong), dim=-1).view(self.copies, -1, self.seen)
+        h = self.gated(torch.baddbmm(self.bias, f, self.w_input), s)
+        out = torch.baddbmm(torch.baddbmm(self.bias_out, f, self.w_skip), h, self.w_out)
+        rho: Tensor = self.scale(out.reshape(-1, 3))
+        if self.restoring is not None:
+            rho = rho + self.restoring(z)
+        return rho, h.reshape(-1, self.n_state)
+
+    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return what velocities do not decide; see `ResidualHead.ahead`."""
+        hidden, count = self.n_state, self.features.count
+        # of gates and residual, one layer: [K, 3 H + 3, F]
+        weight = torch.cat((self.w_input, self.w_skip), dim=-1)
+        weight, wrong = weight.split([count, 3], dim=1)
+        bias = torch.cat((self.bias, self.bias_out), dim=-1)[:, 0]
+        rows: list[Tensor] = []
+        near: list[Tensor] = []
+        for k, part in enumerate(p.chunk(self.copies)):
+            row, own = self.features.layer(part, weight[k].T, bias[k])
+            rows.append(row)
+            near.append(own)
+        own = torch.cat((torch.stack(near), wrong), dim=1)
+        held = self.features.reach(p)
+        held.extend(own.split([3 * hidden, 3], dim=-1))
+        return torch.cat(rows), held
+
+    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the residual [K B, 3] and the memories, by what `ahead` found."""
+        near, wrong = nu.split([3, 3], dim=-1)
+        far = self.far * self.scale.spread.to(nu.dtype)
+        seen = torch.cat(
+            (torch.clamp(near, held[0], held[1]), self.far * torch.tanh(wrong / far)), dim=-1
+        ).view(self.copies, -1, 6)
+        gates, skip = row.view(self.copies, -1, row.shape[-1]).split([3 * self.n_state, 3], dim=-1)
+        h = self.gated(torch.baddbmm(gates, seen, held[2]), s)
+        out = torch.baddbmm(torch.baddbmm(skip, seen, held[3]), h, self.w_out)
+        rho: Tensor = self.scale(out.reshape(-1, 3))
+        if self.restoring is not None:
+            rho = rho + self.restoring(near)
+        return rho, h.reshape(-1, self.n_state)
+
+    def gated(self, share: Tensor, s: Tensor) -> Tensor:
+        """Return the outputs [K, B, H] from the features' share [K, B, 3 H] and memories."""
+        hidden = self.n_state
+        h = s.reshape(self.copies, -1, hidden)
         # splits in place of slices: their gradients are joined and not added up
-        gates, new = torch.baddbmm(self.bias, f, self.w_input).split([2 * hidden, hidden], dim=-1)
+        gates, new = share.split([2 * hidden, hidden], dim=-1)
         held, old = torch.bmm(h, self.w_hidden).split([2 * hidden, hidden], dim=-1)
         kept, reset = torch.sigmoid(gates + held).chunk(2, dim=-1)
         if self.share != 1.0:
             kept = torch.exp(self.share * torch.log(kept.clamp(min=self.least)))
         new = torch.tanh(new + reset * (old + self.bias_hidden))
-        h = new + kept * (h - new)
-        out = torch.baddbmm(torch.baddbmm(self.bias_out, f, self.w_skip), h, self.w_out)
-        rho: Tensor = self.scale(out.reshape(-1, 3))
-        if self.restoring is not None:
-            rho = rho + self.restoring(z)
-        return rho, h.reshape(-1, hidden)
+        return new + kept * (h - new)
 
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [K B, T, 3] along measured channels [K B, T, nz], from no memory."""

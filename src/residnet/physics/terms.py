@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations, combinations_with_replacement, product
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import torch
 from pydantic import Field
@@ -48,6 +48,12 @@ class Factor(NamedTuple):
     def symbol(self) -> str:
         """The channel, or the function of it, without magnitude and power."""
         return f"{self.function}({self.name})" if self.function else self.name
+
+    @property
+    def text(self) -> str:
+        """The factor as a term has it."""
+        base = f"|{self.name}|" if self.magnitude else self.symbol
+        return base if self.power == 1 else f"{base}^{self.power}"
 
 
 def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tuple[Factor, ...]:
@@ -210,6 +216,69 @@ class TermLibrary(nn.Module):
             slope.mul_(factor).addcmul_(out, moved.index_select(-1, self.index[d]))
             out = out * factor
         return slope
+
+
+@final
+class SplitTerms(nn.Module):
+    """A weighted sum of terms by what moves: velocities, or all the other channels.
+
+    Args:
+        terms: of the sum.
+        names: other channels than velocities that appear in them.
+
+    Attributes:
+        linear: whether the sum is linear in the velocities.
+    """
+
+    def __init__(self, terms: Sequence[str], names: Sequence[str]) -> None:
+        super().__init__()
+        moving: list[str] = []
+        beside: list[str] = []
+        alone: list[str] = []
+        places: list[int] = []
+        apart: list[int] = []
+        for place, term in enumerate(terms):
+            parts: list[list[str]] = [[], []]
+            for factor in parse_term(term, (*VELOCITY, *names)):
+                parts[factor.name in VELOCITY].append(factor.text)
+            other, own = (" ".join(part) or "1" for part in parts)
+            if parts[1]:
+                moving, beside, places = [*moving, own], [*beside, other], [*places, place]
+            else:
+                alone, apart = [*alone, other], [*apart, place]
+        self.alone, self.moving = TermLibrary(alone, names), TermLibrary(moving, VELOCITY)
+        # a term of velocities alone needs no factor
+        self.coupled = any(other != "1" for other in beside)
+        self.beside = TermLibrary(beside if self.coupled else (), names)
+        self.linear = not self.coupled and (self.moving.linear or not moving)
+        for name, rows in (("places", places), ("apart", apart)):
+            self.register_buffer(name, torch.tensor(rows, dtype=torch.long), persistent=False)
+        self.places: Tensor
+        self.apart: Tensor
+
+    def ahead(self, p: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what velocities do not decide: rows [..., q], and the weights of what they do.
+
+        Args:
+            p: channels `names` [..., k].
+            weights: of the terms [J, n].
+        """
+        row = self.alone(p) @ weights.index_select(0, self.apart)
+        own = weights.index_select(0, self.places)
+        if self.linear:
+            slope = own.new_zeros(3, own.shape[1])
+            return row, slope if len(own) == 0 else slope.index_add(0, self.moving.channel, own)
+        return (torch.cat((row, self.beside(p)), dim=-1) if self.coupled else row), own
+
+    def forward(self, nu: Tensor, row: Tensor, own: Tensor) -> Tensor:
+        """Return the sum [B, n] at velocities nu [B, 3], by what `ahead` found."""
+        if self.linear:
+            return torch.addmm(row, nu, own)
+        found: Tensor = self.moving(nu)
+        if self.coupled:
+            row, beside = row.split([own.shape[1], own.shape[0]], dim=-1)
+            found = found * beside
+        return torch.addmm(row, found, own)
 
 
 def _function(name: str, x: Tensor) -> Tensor:
