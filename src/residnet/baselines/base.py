@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Self, final
 
+import torch
 from torch import Tensor, nn
 
 from residnet.core.config import Config

@@ -182,8 +182,8 @@ class MeanOfTrajectories(HybridDynamics):
             given, part = w.repeat(self.copies[i], 1, 1), self._part(s, i)[..., 3:]
             own, kept = member.ahead(given, part.reshape(given.shape[0], self.widths[i] - 3))
             shared.extend(kept)
-            for row, more in zip(rows, own):
-                row.extend(more)
+            for k in range(len(own)):
+                rows[k].extend(own[k])
         return rows, shared
 
     def go(
@@ -234,7 +234,7 @@ class MeanOfTrajectories(HybridDynamics):
             own.append(reached)
             memory.append(memories[i].reshape(self.copies[i], rows, self.widths[i] - 3))
         mean = total / len(self.widths)
-        parts = [torch.ones_like(s[:, :1]), mean]
+        parts = [torch.ones_like(mean[:, :1]), mean]
         for i in range(len(own)):
             both = torch.cat((own[i] - mean, memory[i]), dim=-1)
             parts.append(both.transpose(0, 1).reshape(rows, self.copies[i] * self.widths[i]))

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from residnet.baselines.base import Baseline
 from residnet.core.config import Config, Seconds
 from residnet.core.frames import to_body, to_earth
-from residnet.core.layout import heading, pose, position, velocities, yaw_rate
+from residnet.core.layout import heading, pose, velocities
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals
@@ -185,8 +185,8 @@ class HybridDynamics(Dynamics):
             p: what `signals.prepare` returned for the step's inputs.
             rho: residual of the step [B, 3].
         """
-        nu_dot = self.found(self.baseline(z), rho)
-        if self.positions or (self.signals.wind and len(self.nodes) > 1):
+        if self.positions or self.signals.wind:
+            nu_dot = self.found(self.baseline(z), rho)
             return self.integrate_from(torch.cat((self.kinematics(x), nu_dot), dim=-1), x, p, rho)
         row, held = self.baseline.ahead(p)
         return self.moved(x, row, held, rho)
@@ -225,8 +225,9 @@ class HybridDynamics(Dynamics):
             return rows, [[], [], []]
         known, held = self.baseline.ahead(p)
         own, kept = self.head.ahead(p, s[:, : self.width])
-        for one, other in zip(known.unbind(1), own.unbind(1)):
-            rows.append([one, other])
+        ones, others = known.unbind(1), own.unbind(1)
+        for k in range(len(ones)):
+            rows.append([ones[k], others[k]])
         steps: list[Tensor] = []
         if self.baseline.linear:
             # a step is linear in states, row and residual: what it does to the unit of each
@@ -243,7 +244,7 @@ class HybridDynamics(Dynamics):
             return self.stepped(x, row[0], s)
         x = self.alive(x)
         nu = velocities(x)
-        unknown, estimate = nu, nu
+        estimate = nu
         if self.disturbance is None:
             rho, own = self.head.at(nu, row[1], s, shared[1])
         else:

@@ -189,7 +189,7 @@ class Signals(nn.Module):
             p: what `prepare` returned for the step's inputs.
         """
         if not self.wind:
-            return self.at(velocities(x), p)
+            return torch.cat((velocities(x), p), dim=-1)
         known = p.shape[-1] - 2
         along, across = to_body(p[..., known], p[..., known + 1], x[..., 2])
         along, across = along - x[..., 3], across - x[..., 4]
@@ -198,10 +198,6 @@ class Signals(nn.Module):
         return torch.cat(
             (velocities(x), p[..., :known], torch.stack((along, across, magnitude), dim=-1)), dim=-1
         )
-
-    def at(self, nu: Tensor, p: Tensor) -> Tensor:
-        """Return the channels z [..., nz] at velocities nu [..., 3], where there is no wind."""
-        return torch.cat((nu, p), dim=-1)
 
     def slopes(self, x: Tensor, p: Tensor) -> Tensor:
         """Return the derivatives of the channels by heading and velocities, [4, B, nz].

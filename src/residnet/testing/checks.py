@@ -169,6 +169,16 @@ def check_head(config: FeatureConfig) -> None:
         rho, memory = head(far[None], empty(1, z.dtype))
         beyond, _ = head(further[None], empty(1, z.dtype))
         held = head.sequence(far.expand(1, 200, -1))
+        x = torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :3]), dim=-1)
+        w, s = z[..., 3 : 3 + model.signals.inputs], torch.rand(_ROWS, model.n_state).to(z)
+        free = Rollout(model.double())
+        model.positions = False
+        states, _, memory = (free if head.refusal else _scripted(free, who))(x, w, s)
+        for k in range(_STEPS):
+            x, s = model.step(x, w[:, k], s)
+        message = f"{who}: what it finds ahead of a free run changes its steps"
+        require_equal(states[:, -1], x, 1e-9, message)
+        require_equal(memory, s, 1e-9, f"{message}' memory")
     require_finite(torch.cat((rho, beyond)), f"{who}: not finite far outside of the training range")
     require_finite(memory, f"{who}: its memory is not finite far outside of the training range")
     require_finite(held, f"{who}: not finite after 200 steps outside of the training range")
@@ -253,6 +263,11 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     compiled = _scripted(baseline, who)
     with torch.no_grad():
         require_equal(compiled(z), accelerations, 1e-9, f"{who}: scripted, it answers otherwise")
+        row, held = baseline.ahead(z[:, 3:])
+        message = f"{who}: what it finds ahead of a free run changes its accelerations"
+        require_equal(baseline.at(z[:, :3], row, held), accelerations, 1e-9, message)
+        if baseline.linear:
+            require_equal(row + z[:, :3] @ held[0], accelerations, 1e-9, f"{who}: is not linear")
     counts = baseline.parameter_count()
     require(len(counts) == 3, f"{who}: parameter_count gives {counts}, not one for each axis")
     empty = resolved.build(known.names)
