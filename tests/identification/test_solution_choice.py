@@ -11,7 +11,7 @@ from residnet.heads.zero import ZeroHead
 from residnet.identification.fitter import choose_solution
 from residnet.physics.signals import SignalsConfig
 from residnet.regression.estimator import Solution
-from residnet.training.heads import Score
+from residnet.training.score import Score
 
 
 def model() -> HybridDynamics:

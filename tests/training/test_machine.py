@@ -18,7 +18,8 @@ from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig
 from residnet.training.config import MachineConfig, TrainingConfig
-from residnet.training.heads import HeadTraining, Score, train
+from residnet.training.heads import HeadTraining, train
+from residnet.training.score import Score
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
 HEADS = {

@@ -28,8 +28,8 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig, MlpHead
 from residnet.training.config import TrainingConfig
-from residnet.training.heads import HeadTraining, Score, Validate, train
-from residnet.training.trainer import Shown
+from residnet.training.heads import HeadTraining, Validate, train
+from residnet.training.score import Score, Shown
 
 ONE_STEP = {"epochs": 2, "window": 1.0, "batch": 8}
 HALF_SECOND = {"horizon": 0.5, "epochs": 2, "batch": 8}

@@ -6,7 +6,7 @@ import copy
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,10 +37,7 @@ from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.sparse import coefficient_row
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import free_run_starts, refit
-
-if TYPE_CHECKING:
-    # its module imports Lightning, which checking a config must not wait for
-    from residnet.training.heads import Score
+from residnet.training.score import Score, Shown
 
 
 def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
@@ -95,9 +92,6 @@ class ValidationScore:
 
     def __call__(self, model: HybridDynamics) -> Score:
         """Return the divergences and the mean nrmse of the validation windows, run in float32."""
-        from residnet.training.heads import Score
-        from residnet.training.trainer import Shown
-
         candidate = Candidate("validated", "head", model)
         predictions = free_run(
             [candidate], self.windows, self.logs, self.step, self.limit, dtype=torch.float32
@@ -398,6 +392,7 @@ class Fitter:
     def _train(
         self, name: str, model: HybridDynamics, residual: Samples, seed: int
     ) -> dict[str, Any]:
+        # its module imports Lightning, which a fit without networks must not wait for
         from residnet.training.heads import train
 
         settings = self.settings.training.get(name, TrainingConfig())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
@@ -24,7 +24,8 @@ from residnet.heads.recurrent import RecurrentHead
 from residnet.physics.signals import Signals
 from residnet.physics.symmetry import mirrored_channels
 from residnet.training.config import TrainingConfig
-from residnet.training.trainer import EpochTraining, Shown, run_epochs
+from residnet.training.score import Score
+from residnet.training.trainer import EpochTraining, run_epochs
 
 Shared = Callable[[Tensor], Tensor]
 """A sum over this process's windows to the mean of the sums of all processes."""
@@ -100,25 +101,6 @@ def rollout_loss(
         error, torch.zeros_like(error), reduction="none", delta=5.0
     )
     return (square * weight).sum() / shared(3.0 * weight.sum()).clamp(min=1.0)
-
-
-@dataclass(frozen=True, order=True)
-class Score:
-    """How a model does in free runs over the validation logs; the lesser score is the better one.
-
-    The error of windows that diverged says little, so that fewer of them count first.
-
-    Attributes:
-        diverged: number of windows that diverged.
-        error: mean nrmse over u, v, r; a diverged window counts with the error of `zero`.
-        axes: nrmse of each axis by name.
-        shown: one of the free runs.
-    """
-
-    diverged: int
-    error: float
-    axes: dict[str, float] = field(default_factory=dict, compare=False)
-    shown: Shown | None = field(default=None, compare=False)
 
 
 Validate = Callable[[HybridDynamics], Score]

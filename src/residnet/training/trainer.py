@@ -14,7 +14,7 @@ import warnings
 from abc import ABC, abstractmethod
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import lightning as L
 import torch
@@ -26,13 +26,7 @@ from residnet.core.files import whole
 from residnet.core.progress import report
 from residnet.data.module import EpochDataModule, epoch_seed
 from residnet.training.config import MachineConfig
-
-
-class Shown(NamedTuple):
-    """A free run for TensorBoard: times [T], and columns by name, measured and predicted [T]."""
-
-    t: Tensor
-    columns: dict[str, tuple[Tensor, Tensor]]
+from residnet.training.score import Shown
 
 
 class Epochs(Protocol):
