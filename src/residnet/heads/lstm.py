@@ -220,10 +220,12 @@ class LstmNetwork(nn.Module):
         """Return what velocities do not decide; see `ResidualHead.ahead`."""
         hidden = self.core.hidden
         held = self.features.reach(p)
-        own, row = self.readout[0].weight, p[..., :0]
+        own: Tensor = self.readout[0].weight  # type: ignore[assignment]
+        bias: Tensor = self.readout[0].bias  # type: ignore[assignment]
+        row = p[..., :0]
         if self.skip:
             # the first layer sees the output of the memory, then all features
-            row, near = self.features.layer(p, own[:, hidden:], self.readout[0].bias)
+            row, near = self.features.layer(p, own[:, hidden:], bias)
             own = own[:, :hidden]
             held.append(near)
         if self.fed:
@@ -232,7 +234,7 @@ class LstmNetwork(nn.Module):
             h, s = self.core.along(self.remembered(self.features(z)), s)
             held.append(s)
             return row + self.dropout(h) @ own.T, held
-        weight = self.core.w_input
+        weight: Tensor = self.core.w_input
         if self.partial:
             none = weight.new_zeros((weight.shape[0], self.features.count))
             weight = none.index_copy(1, self.seen, weight)

@@ -81,7 +81,9 @@ class MlpHead(ResidualHead):
 
     def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
         """Return what velocities do not decide of the first layer; see `ResidualHead.ahead`."""
-        row, own = self.features.layer(p, self.net[0].weight, self.net[0].bias)
+        weight: Tensor = self.net[0].weight  # type: ignore[assignment]
+        bias: Tensor = self.net[0].bias  # type: ignore[assignment]
+        row, own = self.features.layer(p, weight, bias)
         low, high = self.features.reach(p)
         return row, [low, high, own]
 
