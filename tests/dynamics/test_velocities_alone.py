@@ -9,10 +9,14 @@ import torch
 
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.layout import HEADING_AND_VELOCITIES, POSITION
+from residnet.core.samples import Samples
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
 from residnet.dynamics.rollout import Rollout
+from residnet.heads.base import FeatureConfig
 from residnet.heads.lstm import LstmConfig
+from residnet.heads.mlp import MlpConfig
+from residnet.heads.recurrent import RecurrentConfig
 from residnet.physics.signals import SignalsConfig
 
 DT = 0.05
@@ -50,3 +54,45 @@ def test_heading_and_velocities_do_not_hang_on_positions(
     torch.testing.assert_close(alone, whole, rtol=0, atol=1e-13)
     torch.testing.assert_close(*slopes, rtol=0, atol=1e-13)
     assert torch.equal(states[1][..., POSITION], x0[:, None, POSITION].expand(5, 41, 2))
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        MlpConfig(hidden=(5, 4)),
+        LstmConfig(hidden_size=4, features=("b", "r", "u"), readout=3, memory=("b",)),
+        LstmConfig(hidden_size=4, readout=3, memory=("u", "a"), per_axis=True),
+        RecurrentConfig(members=2, hidden_size=4, step=DT),
+    ],
+    ids=["mlp", "lstm of inputs", "lstm by axis", "recurrent"],
+)
+@pytest.mark.parametrize("terms", TERMS)
+def test_gradients_are_those_of_single_steps(head: FeatureConfig, terms: str) -> None:
+    torch.manual_seed(5)
+    signals = SignalsConfig(inputs=("a", "b")).build()
+    baseline = RegressorBaseline([TERMS[terms]] * 3, signals.names, bounded=terms != "linear")
+    z = torch.randn(60, len(signals.names), dtype=torch.float64)
+    known = Samples(z, z[:, :3].flip(1), *torch.zeros(2, 60).long(), ("a",), signals.names)
+    if baseline.bound is not None:
+        baseline.bound.calibrate(known)
+    baseline.theta.data.copy_(0.2 * torch.randn(3, 5) - 0.6 * torch.eye(3, 5))
+    built = head.build(signals.names)  # type: ignore[attr-defined]
+    model = HybridDynamics(signals, baseline, built, DT)
+    model.head.calibrate(known)
+    model = model.double()
+    rows = 3 * model.head.copies
+    x0 = torch.randn(rows, 6, dtype=torch.float64)
+    w, s = torch.randn(rows, 20, 2, dtype=torch.float64), torch.rand(rows, model.n_state).double()
+    free = Rollout(model)
+    # several stretches, the last one shorter
+    free.together = 7 * rows
+    found = []
+    for model.positions in (True, False):
+        model.zero_grad()
+        states, _, memory = free(x0, w, s)
+        (states[..., HEADING_AND_VELOCITIES].square().sum() + memory.square().sum()).backward()
+        slopes = [p.grad for p in model.head.parameters() if p.grad is not None]
+        found.append([states[..., HEADING_AND_VELOCITIES].detach(), memory.detach(), *slopes])
+    assert len(found[0]) == len(found[1]) > 4
+    for alone, ahead in zip(*found, strict=True):
+        torch.testing.assert_close(ahead, alone, rtol=1e-8, atol=1e-10)
