@@ -17,7 +17,7 @@ from torch.jit._fuser import optimized_execution
 
 from residnet.dynamics.base import Dynamics
 
-_TOGETHER = 16_384
+_TOGETHER = 4_096
 """Rows of inputs whose share of the steps is found at once: enough to be quick, and few to keep."""
 
 
