@@ -275,7 +275,11 @@ class Models(Mapping[str, Model]):
             if (row["protocol"], row["manoeuvre"]) == (protocol, "all")
         }
         selection, limits = self.selection.content(), judged.limits.get(protocol, {})
-        return verdict(Evidence(self.predictor, split, whole, "baseline", selection, limits))
+        return verdict(
+            Evidence(
+                self.predictor, split, whole, "baseline", selection, limits, protocol=protocol
+            )
+        )
 
     @property
     def metrics(self) -> pd.DataFrame:

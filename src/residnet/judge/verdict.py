@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from residnet.core.format import interval, number
+from residnet.core.format import interval, number, plural
 
 Content = Mapping[str, Any]
 """What a JSON object holds."""
@@ -44,6 +44,7 @@ class Evidence:
         selection: contents of selection.json; empty where a run has none.
         limits: contents of limits.json for that split and protocol; empty where a run has none.
         doctor: one sentence on what the data doctor found; empty where nobody looked.
+        protocol: by which the runs were made.
     """
 
     selected: str
@@ -53,6 +54,7 @@ class Evidence:
     selection: Content = field(default_factory=dict)
     limits: Content = field(default_factory=dict)
     doctor: str = ""
+    protocol: str = ""
 
 
 LEVELS = {
@@ -157,7 +159,7 @@ def ahead(evidence: Evidence) -> list[str]:
     if not enough:
         most = max(entry["windows"] for entry in entries)
         start = (
-            f"{most} window{'' if most == 1 else 's'} on {evidence.split} data cannot say how good"
+            f"{plural(most, 'window')} on {evidence.split} data cannot say how good"
             f" {evidence.selected} is ({_FEWEST} are needed); {after} it is off by {off}."
         )
     elif until:
@@ -184,9 +186,10 @@ def ahead(evidence: Evidence) -> list[str]:
         if entry is not chosen
     ]
     moves = "position" in chosen["floor"]
-    logs = f"{chosen['logs']} log{'' if chosen['logs'] == 1 else 's'}"
+    laid = f" ({evidence.protocol})" if evidence.protocol else ""
     holds = (
-        f"It holds for {chosen['windows']} windows of {logs}"
+        f"It holds for {plural(chosen['windows'], 'free run')}{laid} of"
+        f" {plural(chosen['logs'], 'log')}"
         + f" at mean speeds of {number(chosen['slowest'], 2)} to"
         f" {number(chosen['fastest'], 2)} m/s" * moves + "."
     )

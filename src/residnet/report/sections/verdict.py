@@ -57,6 +57,7 @@ def evidence(run: RunFiles, selected: str) -> Evidence:
         run.json("selection.json"),
         (run.limits.get("splits") or {}).get(split, {}).get(protocol, {}),
         doctor,
+        protocol,
     )
 
 
