@@ -26,7 +26,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "export": (2260, 267),
     "heads": (1267, 190),
     "identification": (2174, 224),
-    "judge": (1989, 217),
+    "judge": (1990, 217),
     "manoeuvres": (897, 136),
     "physics": (2022, 252),
     "regression": (1814, 204),
