@@ -276,9 +276,7 @@ class Models(Mapping[str, Model]):
         }
         selection, limits = self.selection.content(), judged.limits.get(protocol, {})
         return verdict(
-            Evidence(
-                self.predictor, split, whole, "baseline", selection, limits, protocol=protocol
-            )
+            Evidence(self.predictor, split, whole, "baseline", selection, limits, protocol=protocol)
         )
 
     @property
