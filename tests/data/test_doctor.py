@@ -297,6 +297,17 @@ def test_the_side_and_the_time_of_an_answer() -> None:
         assert late.figures["lag"] == pytest.approx(-early, abs=0.25)
 
 
+@pytest.mark.parametrize("trip", [1, 2])
+def test_an_answer_that_fades_as_the_vessel_slows_is_not_early(trip: int) -> None:
+    # the rudder of the corpus' boat works by the square of its speed, without any lag
+    true = pd.read_csv(Path(__file__).parents[1] / "corpus" / f"truth_{trip}.csv")
+    channels = {name: true[name].to_numpy() for name in ("u", "v", "r", "n", "delta")}
+    record = Record(Log("one", true.t.to_numpy(), channels), ["n", "delta"])
+    delay = delay_of(record, ("delta",), "r")
+    assert delay is not None
+    assert delay.seconds == pytest.approx(0.0, abs=0.15)
+
+
 @pytest.mark.parametrize("period", [5.8, 8.4, 11.0])
 @pytest.mark.parametrize("late", [0.1, 0.4])
 def test_a_repeated_manoeuvre_is_not_answered_half_a_period_early(

@@ -425,15 +425,19 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     blocks = replace(blocks, first=first[inside])
     other = [name for name in log if name in ("n", "delta", "wind_speed") and name not in names]
     moving, fixed = ({n: log[n] for n in part} for part in (log.moving, other))
-    known, y = blocks.integrals(regressors(moving, fixed, len(log)))(0), blocks.change(log[answer])
-    driven = np.stack([log[name] for name in names], axis=-1)
-    given = blocks.integrals(np.concatenate((driven, driven * np.abs(driven)), axis=1))
+    y = blocks.change(log[answer])
     sums: dict[int, np.ndarray] = {}
+
+    def terms(shift: int) -> np.ndarray:
+        # the flow over a rudder falls as the vessel turns: without their product in the fit the
+        # answer seems to come early
+        late = {name: np.roll(log[name], shift) for name in names}
+        return blocks.integrals(regressors(moving, {**fixed, **late}, len(log)))(0)
 
     def left(shift: int) -> np.ndarray:
         """Return the squares [K] that a fit leaves with the inputs shifted, NaN where unknown."""
         if shift not in sums:
-            x = np.column_stack((known, given(shift)))
+            x = terms(shift)
             good = np.isfinite(x).all(axis=1) & np.isfinite(y)
             scale = np.maximum(np.linalg.norm(x[good], axis=0), 1e-300)
             part = x[good] / scale
@@ -464,7 +468,7 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     alike = [shift for shift in lowest() if total[shift] <= _ALIKE * floor]
     best = min(alike, key=lambda shift: (-shift * step > EARLY, abs(shift)))
     good = np.isfinite(sums[best]) & np.isfinite(left(0))
-    if abs(best) >= reach - gap or good.sum() < 5 * known.shape[1]:
+    if abs(best) >= reach - gap or good.sum() < 5 * terms(0).shape[1]:
         return None
     # how well the least is determined: its scatter over sections of the log
     tried = list(sums)
