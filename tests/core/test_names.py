@@ -57,7 +57,7 @@ def test_unknown_unit_names_the_nearest() -> None:
 
 def test_wrong_dimension_names_the_units_that_fit() -> None:
     with pytest.raises(
-        UsageError, match=r"unit 'kn' does not measure \[rad\]; units that do: rad, deg, cdeg$"
+        UsageError, match=r"unit 'kn' does not measure \[rad\]; units that do: rad, deg, cdeg, gon$"
     ):
         to_si("kn", "rad")
     with pytest.raises(UsageError, match=r"units that do: none$"):

@@ -433,6 +433,109 @@ def hdf5_trials(folder: Path, k: int, s: pd.DataFrame) -> None:
                 file.create_dataset(f"trial_{number}/{new}", data=seen(number)[old])
 
 
+def portuguese(folder: Path, k: int, s: pd.DataFrame) -> None:
+    names = {"x": "posição norte (m)", "y": "posição leste (m)", "heading": "rumo (graus)"}
+    names |= {"u": "avanço (m/s)", "v": "deriva (m/s)", "rate": "taxa de guinada (graus/s)"}
+    names |= {"rudder": "leme (graus)", "rpm": "rotação do hélice (rpm)"}
+    table = pd.DataFrame({"tempo (s)": s.t, **renamed(s, names)})
+    table.to_csv(folder / f"ensaio{k}.csv", index=False, sep="\t", decimal=",")
+
+
+def polish(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """An older Windows of its own, whose letters are other ones in Western Europe."""
+    north, east = (54.3 + s.x / 111_315.0).round(7), (10.15 + s.y / 65_079.0).round(7)
+    columns = {"czas [s]": s.t, "szerokość [°]": north, "długość [°]": east, "kurs [°]": s.heading}
+    columns |= {"prędkość kątowa [°/s]": s.rate, "ster [°]": s.rudder}
+    table = pd.DataFrame({**columns, "obroty śruby [obr/min]": s.rpm})
+    form = {"sep": ";", "decimal": ",", "encoding": "cp1250"}
+    table.to_csv(folder / f"proba{k}.csv", index=False, **form)
+
+
+def chinese(folder: Path, k: int, s: pd.DataFrame) -> None:
+    names = {"t": "时间(s)", "x": "北向位置(m)", "y": "东向位置(m)", "heading": "艏向角(°)"}
+    names |= {"u": "纵向速度(m/s)", "v": "横向速度(m/s)", "rate": "转艏角速度(°/s)"}
+    names |= {"rudder": "舵角(°)", "rpm": "螺旋桨转速(rpm)"}
+    table = pd.DataFrame(renamed(s, names))
+    table.to_csv(folder / f"trip{k}.csv", index=False, encoding="gb18030")
+
+
+def russian(folder: Path, k: int, s: pd.DataFrame) -> None:
+    names = {"t": "время, с", "x": "север, м", "y": "восток, м", "heading": "курс, град"}
+    names |= {"rate": "угловая скорость, град/с", "rudder": "руль, град"}
+    table = pd.DataFrame(renamed(s, {**names, "rpm": "обороты винта, об/мин"}))
+    form = {"sep": ";", "decimal": ",", "encoding": "cp1251"}
+    table.to_csv(folder / f"opyt{k}.csv", index=False, **form)
+
+
+def signal_k(folder: Path, k: int, s: pd.DataFrame) -> None:
+    lines = []
+    for row in s.itertuples():
+        at = (START + pd.Timedelta(seconds=row.t)).isoformat(timespec="milliseconds") + "Z"
+        place = {"latitude": 54.3 + row.x / 111_315.0, "longitude": 10.15 + row.y / 65_079.0}
+        told: dict[str, object] = {"navigation.position": place}
+        told |= {"navigation.headingTrue": float(np.radians(row.heading))}
+        told |= {"steering.rudderAngle": float(np.radians(row.rudder))}
+        told |= {"propulsion.main.revolutions": row.rpm / 60.0}
+        values = [{"path": path, "value": value} for path, value in told.items()]
+        update = {"timestamp": at, "source": {"label": "n2k"}, "values": values}
+        lines.append(json.dumps({"context": "vessels.self", "updates": [update]}))
+    (folder / f"boat{k}.jsonl").write_text("\n".join(lines) + "\n")
+
+
+def topic_echo(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """Messages as `ros2 topic echo` prints them."""
+    lines = [
+        f"header:\n  stamp:\n    sec: {int(row.t)}\n    nanosec: 0\npose:\n  x: {row.y}\n---"
+        for row in s[:50].itertuples()
+    ]
+    (folder / f"pose{k}.txt").write_text("\n".join(lines) + "\n")
+
+
+def newest_first(folder: Path, k: int, s: pd.DataFrame) -> None:
+    csv(folder, k, {"time [s]": s.t[::-1], **renamed(s[::-1], POSE, ACTS)})
+
+
+def three_files(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """Three recorders with Unix time and rates of their own; the trip stands first in the names."""
+    for word, every, columns in (
+        ("gps", 10, {"x": "north [m]", "y": "east [m]"}),
+        ("compass", 5, {"heading": "heading [deg]"}),
+        ("actuators", 8, ACTS),
+    ):
+        part = seen(k, every)
+        table = {"time": START.timestamp() + 3600 * k + part.t, **renamed(part, columns)}
+        pd.DataFrame(table).to_csv(folder / f"trip{k}_{word}.csv", index=False)
+
+
+def lever(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """Commands as counts of a lever, 1000 all the way."""
+    columns = {"time [s]": s.t, **renamed(s, POSE)}
+    columns |= {"steering": (s.rudder / 0.035).round(), "throttle": (s.rpm / 1.5).round()}
+    csv(folder, k, columns)
+
+
+def frames_in_names(folder: Path, k: int, s: pd.DataFrame) -> None:
+    columns = {"Time_us": (1e6 * s.t).round().astype("int64"), "NED.N": s.x, "NED.E": s.y}
+    columns |= {"NED.D": 0.1 + 0.0 * s.t, "Euler.theta": 0.0 * s.t}
+    columns |= {"Euler.psi": np.radians(s.heading).round(4), "Body.u": s.u, "Body.v": s.v}
+    columns |= {"Body.r": np.radians(s.rate).round(5)}
+    csv(folder, k, {**columns, "Act.delta": np.radians(s.rudder).round(4), "Act.n": s.rpm / 60.0})
+
+
+def to_port(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """What counts to port, told in words alone; headings in gon."""
+    columns = {"t [s]": s.t, "x [m]": s.x, "y [m]": s.y, "heading [gon]": s.heading / 0.9}
+    columns |= {"surge [m/s]": s.u, "sway to port [m/s]": -s.v}
+    columns |= {"yaw rate to port [deg/s]": -s.rate, "rudder to port [deg]": -s.rudder}
+    csv(folder, k, {**columns, "shaft [rpm]": s.rpm})
+
+
+def parts_of_time(folder: Path, k: int, s: pd.DataFrame) -> None:
+    at = (START + pd.to_timedelta(s.t, "s")).dt
+    columns = {"YYYY": at.year, "MM": at.month, "DD": at.day, "hh": at.hour, "mm": at.minute}
+    csv(folder, k, {**columns, "ss": s.t % 60.0, **renamed(s, POSE, ACTS)})
+
+
 LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
     layout.__name__: layout
     for layout in (
@@ -451,6 +554,8 @@ LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
         *(plotjuggler, chart_plotter, voyage_recorder, labview, parquet_index, ulog_csv),
         *(long_rows, file_a_channel, hdf5_trials),
         *(yaw_alone, speed_and_heading),
+        *(portuguese, polish, chinese, russian, signal_k, topic_echo, newest_first, three_files),
+        *(lever, frames_in_names, to_port, parts_of_time),
     )
 }
 

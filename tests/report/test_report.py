@@ -95,7 +95,7 @@ def test_bad_news_is_told(run: Path) -> None:
     write_json(run / "metrics.json", content)
     page = html.unescape(shown(run))
     first = page.partition('id="at-a-glance"')[2].partition("</section>")[0]
-    assert '<td class="bad">✗<small>2/6 diverged</small>' in first
+    assert '<td class="text"><div>✗<small>2/6 diverged</small>' in first
     assert "plsr is worse than the baseline in sway v" in page
     assert "times its training error" in page
 

@@ -102,7 +102,7 @@ def test_a_row_agrees_with_the_flights_that_it_sums_up(run: Path) -> None:
 
 def test_the_page_shows_costs_and_the_start_of_the_learning_curve(run: Path) -> None:
     text = plain(run / "report.html")
-    for words in ("Under the stated conditions", "policy, network set to zero", "epoch 0 is"):
+    for words in ("Under the stated conditions", "policy, network switched off", "epoch 0 is"):
         assert words in text
     fit = json.loads((run / "models" / "learned" / "fit.json").read_text())
     assert fit["best_validation"] <= fit["start_validation"]

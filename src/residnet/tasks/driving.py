@@ -43,7 +43,21 @@ def driving(logs: Sequence[Log], marks: Marks) -> tuple[str, ...]:
         for name in logs[0].channels
         if name not in _PASSIVE and all(name in log.channels for log in logs)
     }
-    names = [name for name in values if _acts(name, marks) and _moves(name, values[name], marks)]
+    # the signals of a control loop: of e_yaw, r_yaw, u_yaw and y_yaw the second drives the vessel
+    loops = {
+        n[2:] for n in values if n.startswith("y_") and {f"u{n[1:]}", f"r{n[1:]}"} <= {*values}
+    }
+    own = {f"{signal}_{loop}" for loop in loops for signal in "eruy"}
+    acting = [
+        name
+        for name in values
+        if (name in own and name[0] == "u") or (name not in own and _acts(name, marks))
+    ]
+    if loops:
+        marks.guess(
+            INPUTS, f"u_{min(loops)} is taken as what a controller asks for, by the names beside it"
+        )
+    names = [name for name in acting if _moves(name, values[name], marks)]
     names = _measured(_forces(logs, names, marks), marks)
     out: list[str] = []
     for name in names:

@@ -53,7 +53,10 @@ _QUOTIENT = re.compile(r"(?P<name>.*\S)\s+/\s+(?P<unit>\S.*)")
 _TURNS = re.compile(r"rpm|rev|1/s|hz|turns|u/?min|umdr|drehz|toeren|tours|giri|varv", re.IGNORECASE)
 _PULSES = (900.0, 2100.0)
 """Pulses in us that servos and speed controllers take."""
-_PARTS_OF_TIME = ("hour", "hours", "hh", "minute", "minutes", "min")
+_PARTS_OF_TIME = (
+    *("year", "yyyy", "jahr", "month", "mm", "monat", "day", "dd", "tag", "hour", "hours", "hh"),
+    *("stunde", "minute", "minutes", "min", "second", "seconds", "sekunde", "ss"),
+)
 _DAY = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
 _FORMS: tuple[Form, ...] = ("number", "ddmm")
 _LARGEST = {"latitude": 90.0, "longitude": 180.0}
@@ -141,6 +144,8 @@ def _wider(sheet: Sheet, clock: Clock, numeric: Sequence[str]) -> str:
             " pandas.concat({file.stem: pandas.read_csv(file, index_col=0).iloc[:, 0] for file in"
             " files}, axis=1).sort_index().to_csv('log.csv')"
         )
+    if all(_unit_in(re.sub(r"\.\d+$", "", name)) for name in numeric):
+        return "these are units: write each column's name in one cell above its unit, or before it"
     return "name them in a channel map (--config)"
 
 
@@ -225,6 +230,15 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
         elif channel is not None:
             marks.note(CHANNELS, f"'{column}' may be {channel} as well as '{names[channel]}' is")
     placed = bool({"x", "y", "latitude", "longitude"} & names.keys())
+    theta = next((column for column in columns if "theta" in about[column].text.split()), None)
+    if placed and theta is not None and not {"psi", "phi"} & names.keys():
+        names["psi"] = theta
+        marks.guess((*CHANNELS, "psi"), f"'{theta}' is taken as the heading, for no other is there")
+    for port, stbd in (("delta_port", "delta_stbd"), ("cmd_delta_port", "cmd_delta_stbd")):
+        if (port in names) != (stbd in names):
+            # one rudder: the side says where positive angles turn it
+            one = port if port in names else stbd
+            names[one.rpartition("_")[0]] = names.pop(one)
     if "u" not in names and speeds and ("v" in names or not placed):
         names["u"] = speeds[0]
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
@@ -265,7 +279,10 @@ def _raw(
             for channel, column in names.items()
             if column in sheet.numbers
         }
-        logs.append(Raw(clock.seconds, columns))
+        # the newest first
+        way = -1 if (np.diff(clock.seconds[np.isfinite(clock.seconds)]) < 0.0).all() else 1
+        columns = {channel: values[::way] for channel, values in columns.items()}
+        logs.append(Raw(clock.seconds[::way], columns))
     return logs
 
 
@@ -412,7 +429,8 @@ def clock_of(sheet: Sheet) -> Clock:
     """
     named = [name for name in sheet.header if words_of(name).has("time")]
     parts = [name for name in sheet.numbers if plain(name) in _PARTS_OF_TIME]
-    if len(parts) > 1:
+    whole = any(sheet.texts[name].astype("string").str.contains(":").any() for name in sheet.texts)
+    if len(parts) > 1 and not whole:
         raise DataError(
             f"{sheet.path}: its time stands in parts ({', '.join(parts)}); write it as one column,"
             " such as 2025-06-17 08:30:00.25"
@@ -438,7 +456,18 @@ def clock_of(sheet: Sheet) -> Clock:
                 f"{sheet.path}: no column is called time or increases as time does; name it in a"
                 " channel map (--config)"
             )
-        raise DataError(f"{sheet.path}: column '{named[0]}' holds no times that can be read")
+        cells = sheet.texts.get(named[0])
+        odd = (
+            []
+            if cells is None
+            else [c for c in cells.dropna() if not re.match(r"[\d.,]+$", str(c))]
+        )
+        told = (
+            f", such as '{shown(str(odd[-1]))}' in its last rows; delete what is no row"
+            if odd
+            else ""
+        )
+        raise DataError(f"{sheet.path}: column '{named[0]}' holds no times that can be read{told}")
     values = sheet.numbers[chosen]
     unit = written_unit(chosen, "s")
     guess = ""

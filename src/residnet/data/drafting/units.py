@@ -121,6 +121,9 @@ def _whole(column: str, values: np.ndarray) -> float:
     if written is not None:
         return 100.0 if written == "%" else 1.0
     largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+    if largest > 180.0:
+        # no angle of a rudder: counts of a lever, to the power of ten above them
+        return float(10.0 ** np.ceil(np.log10(largest)))
     # numbers that end at a round one are rather shares than angles
     return next((whole for whole in (1.0, 100.0) if 0.995 * whole <= largest <= whole), 0.0)
 

@@ -1,4 +1,4 @@
-"""What columns are called: English, German, French, Spanish, Dutch, Norwegian and Japanese words.
+"""What columns are called: English, German, French, Spanish, Dutch, Norwegian, Japanese and others.
 
 A name is read for what it is about (a rudder, a speed, the wind) and then for the channel that
 these make together, so that compounds and orders of words need no list of their own.
@@ -15,67 +15,72 @@ from residnet.core.names import ACCELERATION, CHANNEL_UNITS
 # what a name may be about -> parts of words, and whole words behind a bar
 _ABOUT: dict[str, str] = {
     "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻"
-    " 時間 日時 micros millis | t time stamp tid sec secs seconds elapsed hora heure uhrzeit datum"
-    " date datetime fecha utc dato",
-    "north": "north nord norte noord hochwert 北 | n northing",
-    "east": "east ost oste este oost rechtswert ostwert ostkoord ostricht 東 | e easting est",
-    "position": "posit posic posisj coordin koordinat coorden coordonn 位置 | pos local utm pose",
+    " 時間 日時 micros millis czas время 时间 aika | t time stamp tid sec secs seconds elapsed"
+    " hora heure uhrzeit datum date datetime fecha utc dato tempo",
+    "north": "north nord norte noord hochwert 北 север polnoc | n northing",
+    "east": "east ost oste este oost rechtswert ostwert ostkoord ostricht 東 восток 东 ostlig"
+    " wschod | e easting est leste",
+    "position": "posit posic posisj coordin koordinat coorden coordonn 位置 posiz pozyc полож |"
+    " pos local utm pose ned enu",
     "x": "| x",
     "y": "| y",
-    "latitude": "latit breitengrad breedte bredde breddegrad 緯度 | lat breite",
-    "longitude": "longitude longitud longitudine langengrad lengte lengde 経度 | lon lng long"
-    " laenge lange",
+    "latitude": "latit breitengrad breedte bredde breddegrad 緯度 纬度 широт szerokosc | lat"
+    " breite",
+    "longitude": "longitude longitud longitudine langengrad lengte lengde 経度 经度 долгот"
+    " dlugosc | lon lng long laenge lange",
     "heading": "heading steuerkurs gierwinkel rumbo voorliggende heng kurswinkel 船首方位 方位"
     " 回頭角 船首角 方位角 針路 lacet guinada giringsvinkel girvinkel gierhoek kompaskoers"
-    " kompasskurs | kompas psi yaw hdg cap koers kurs kompass compass koersen kompassi peiling"
-    " hdt proa prua rotta stavriktning",
+    " kompasskurs курс 艏向 航向 | kompas psi yaw hdg cap koers kurs kompass compass koersen"
+    " kompassi peiling hdt proa prua rotta stavriktning rumo",
     "ground": "ground grund fond grond grunn 対地 | cog sog smg cmg",
     "course": "course | cog cmg",
-    "rate": "rate taux geschwind vitesse velocidad velocita snelheid hastighet 速度 角速度"
-    " 回頭率 | speed velo velocity rot",
+    "rate": "rate taux geschwind vitesse velocidad velocita snelheid hastighet 速度 角速度 回頭率"
+    " taxa скорост predkosc | speed velo velocity rot",
     "turn": "turn dreh gier wende drei giring 回頭 旋回 virage girat giro guin accostat sving"
-    " svang | rot angvelo yaw lacet girhastighet",
-    "turn_rate": "turnrate drehrate gierrate wenderate drehgeschwind giergeschwind"
-    " wendegeschwind angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet"
-    " bochtaanwijzer girhastighet 回頭角速度 回頭率 旋回角速度 | rot yawrate wz gyroz",
-    "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 | gyro gyrz",
+    " svang guinada 转艏 поворот | rot angvelo yaw lacet girhastighet",
+    "turn_rate": "turnrate drehrate gierrate wenderate drehgeschwind giergeschwind wendegeschwind"
+    " angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet bochtaanwijzer"
+    " girhastighet 回頭角速度 回頭率 旋回角速度 转艏角速度 | rot yawrate wz gyroz omega gz",
+    "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 углов katowa | gyro gyrz",
     "speed": "speed velo 風速 geschwind vitesse velocidad velocita snelheid hastighet 速度 船速"
-    " fahrt vaart 速力 | velo sog stw fart vel spd log tws",
+    " fahrt vaart 速力 скорост predkosc | velo sog stw fart vel spd log tws",
     "surge": "surge langsgeschw laengsgeschw longitudinal avance avante voraus vooruit voorwaart"
-    " fremover forover 前後 langs avanzamento | u forward ahead corredera",
+    " fremover forover 前後 langs avanzamento avanco 纵向 framat продольн | u forward ahead"
+    " corredera",
     "sway": "sway quergeschw seitlich lateral dwars tverr sideveis 左右 derive deriva transvers"
-    " verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards sideways | v vm"
-    " quer",
-    "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre | delta"
-    " rudder rud ror rsa steering helm pala",
-    "propeller": "propel schraube helice schroef 推進 プロペラ propulseur | prop screw shaft"
-    " welle eje arbre aksel 軸",
-    "engine": "engine motor maschine maquina moteur hovedmaskin 主機 | main",
+    " verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards sideways 横向"
+    " sidled попереч | v vm quer",
+    "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre руль |"
+    " delta rudder rud ror rsa steering helm pala leme ster",
+    "propeller": "propel schraube helice schroef 推進 プロペラ propulseur 螺旋桨 винт srub | prop"
+    " screw shaft welle eje arbre aksel 軸 elica",
+    "engine": "engine motor maschine maquina moteur hovedmaskin 主機 двигат silnik | main",
     "revolutions": "drehzahl revolution umdreh tours toerental omdreining turtall varvtal regime"
-    " tours giri 回転 revoluc | rpm erpm rps rev revs n",
-    "thrust": "thrust schub poussee empuje stuwkracht skyv 推力",
+    " giri 回転 revoluc 转速 оборот obrot rotac | rpm erpm rps rev revs n",
+    "thrust": "thrust schub poussee empuje stuwkracht skyv 推力 тяг spinta empuxo",
     "torque": "torque drehmoment couple koppel dreiemoment トルク",
     "power": "power leistung puissance potencia vermogen effekt 出力",
     "throttle": "throttle actuator gashebel gashendel gasspak gasreglage acelerador accelerateur"
-    " manetta スロットル lever hebel | gas pwm gaz esc",
+    " manetta スロットル lever hebel 油门 | gas pwm gaz esc",
     "azimuth": "azimu schottel pod | azi nozzle alpha",
     "servo": "servo rcou",
     "force": "force kraft fuerza kracht 力 tau",
-    "wind": "wind vind vent viento 風 | tws twd",
+    "wind": "wind vind vent viento 風 风 ветер wiatr | tws twd vento",
     "true": "true wahr vrai verdadero real reel ware sann 真 | tws twd",
     "relative": "relativ apparent scheinb aparente schijnb tilsyn 相対 gemessen measured",
     "direction": "direction direzion richtung riktning direccion richting retning angle winkel"
     " 方向 風向 | dir twd from angulo hoek vinkel",
-    "angle": "angle winkel angulo hoek vinkel lage 角 | ang",
-    "roll": "roll roulis balanceo krenging 横揺 kranken slagside | phi heel",
+    "angle": "angle winkel angulo hoek vinkel lage 角 | ang angolo",
+    "roll": "roll roulis balanceo krenging 横揺 kranken slagside 横摇 横倾 крен przechyl | phi"
+    " heel",
     "pitch": "pitch tangage cabeceo stampf | theta trim",
     "acceleration": "accel beschleun versnell akselerasjon 加速 | udot vdot rdot dot acc",
     "command": "command soll setpoint consigne befehl gevraagd onsket 指令 demand reference"
-    " desired | cmd set ref des order ordre ordered",
-    "port": "backbord babord babor bakboord 左舷 portside | port bb ps left links izquierda"
-    " izquierdo gauche venstre",
-    "starboard": "starboard steuerbord tribord estribor stuurboord styrbord 右舷 | stbd sb stb"
-    " right rechts derecha derecho droite hoyre",
+    " desired задан | cmd set ref des order ordre ordered comando",
+    "port": "backbord babord babor bakboord 左舷 portside bombordo sinistra лев | port bb ps left"
+    " links izquierda izquierdo gauche venstre",
+    "starboard": "starboard steuerbord tribord estribor stuurboord styrbord 右舷 estibordo dritta"
+    " прав | stbd sb stb right rechts derecha derecho droite hoyre",
     "current": "current stromung courant corriente stroming 潮流",
     "depth": "depth tiefe profond profund diepte dybde 水深",
     "voltage": "volt spannung tension battery batterie bateria batteri | amp ampere current_a",
@@ -121,13 +126,14 @@ class Words(NamedTuple):
 
 
 _IN_BRACKETS = re.compile(r"[\[({][^\])}]*[\])}]")
+_LETTERS = str.maketrans({"ß": "ss", "ø": "o", "Ø": "O", "æ": "ae", "ł": "l"})
 
 
 def plain(name: str) -> str:
     """Return a name in lower case and plain letters, its words apart, its units left out."""
     text = _IN_BRACKETS.sub(" ", name)
     text = re.sub(r"([a-z])([A-Z])", r"\1 \2", text)
-    text = text.replace("ß", "ss").replace("ø", "o").replace("Ø", "O").replace("æ", "ae")
+    text = text.translate(_LETTERS)
     decomposed = unicodedata.normalize("NFKD", text)
     # voicing marks of kana are letters, not accents
     letters = "".join(c for c in decomposed if not unicodedata.combining(c) or c in "\u3099\u309a")
@@ -180,6 +186,10 @@ def state_channel(words: Words) -> str | None:
     w, name = words, words.text.replace(" ", "_")
     if name in MOTION:
         return name
+    last = w.text.rpartition(" ")[2]
+    if last in ("psi", "u", "v", "r", "phi", "p") and w.about <= words_of(last).about:
+        # what stands before it, as in `body.r`, says nothing
+        return last
     if w.has("machinery") and w.lacks("speed", "surge"):
         return None
     if w.has("wind"):
@@ -202,6 +212,9 @@ def state_channel(words: Words) -> str | None:
     if w.has("turn_rate") or (w.has("heading") and w.has("rate")) or w.text in ("r", "r mid"):
         return "r"
     if (w.has("turn") and w.has("rate")) or (w.has("angular") and _YAWING.search(w.text)):
+        return "r"
+    if w.has("angular", "rate") and w.lacks("x", "y", "pitch"):
+        # of an axis that is not told: what turns is the vessel
         return "r"
     if axis := axis_velocity(w):
         return axis

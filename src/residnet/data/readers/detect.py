@@ -42,6 +42,11 @@ _TABLE_OF = {
     ".json": "pandas.read_json(file)",
     ".pkl": "pandas.read_pickle(file)",
     ".feather": "pandas.read_feather(file)",
+    **dict.fromkeys(
+        (".db", ".sqlite", ".sqlite3"),
+        "pandas.read_sql('SELECT * FROM log', sqlite3.connect(file))",
+    ),
+    **dict.fromkeys((".gpx", ".xml"), "pandas.read_xml(file, xpath='//*[@lat]')"),
     ".nc": "xarray.open_dataset(file).to_dataframe().reset_index()",
 }
 """Ending -> how Python gets the table in such a file."""

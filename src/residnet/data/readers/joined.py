@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, final
@@ -317,10 +318,9 @@ def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
     members = list(groups.values())
     if not 2 <= len(members) <= 6:
         return {}
-    words = [_words(group) for group in members]
-    for number, chosen in enumerate(words):
-        others = set().union(*(set(w) for k, w in enumerate(words) if k != number))
-        words[number] = [word for word in chosen if word not in others]
+    held = [_words(group) for group in members]
+    shared = Counter(word for words in held for word in words)
+    words = [[word for word in own if shared[word] == 1] for own in held]
     if not all(words):
         return {}
     trips = {

@@ -297,6 +297,10 @@ class TableReader(LogReader):
         ends = np.flatnonzero(measured)[[0, -1]] if measured.any() else np.array([0, -1])
         kept = ends[0] + np.flatnonzero(np.isfinite(t[ends[0] : ends[1] + 1]))
         require_samples(path, kept)
+        if (np.diff(t[kept]) < 0.0).all():
+            kept = kept[::-1]
+            text = "the rows stand with the newest first, and are read from the last one on"
+            findings.append(remark("note", "newest_first", text))
         tick = None if config.time.unit == DATE else to_si(config.time.unit)
         recorded = np.stack([values[kept] for values in raw.values()], axis=1)
         t[kept], said = steady_clock(t[kept], recorded, tick)
@@ -600,7 +604,7 @@ class _JsonLines:
                 text = line.decode("utf-8-sig", errors="replace").strip()
                 try:
                     if text:
-                        yield _flat(_object(text))
+                        yield from _rows_of(_object(text))
                         number += 1
                 except (ValueError, RecursionError) as error:
                     # a recorder that was switched off ends within a line
@@ -618,6 +622,17 @@ def _object(text: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError("no object")
     return value
+
+
+def _rows_of(value: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the rows that an object holds: one, or one for each update of Signal K."""
+    updates = value.get("updates")
+    if not isinstance(updates, list) or "context" not in value:
+        yield _flat(value)
+        return
+    for update in updates:
+        told = {entry["path"]: entry["value"] for entry in update.get("values", [])}
+        yield _flat({"timestamp": update.get("timestamp")} | told)
 
 
 def _flat(value: Mapping[str, Any], before: str = "") -> dict[str, Any]:

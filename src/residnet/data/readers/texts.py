@@ -8,7 +8,7 @@ import io
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
@@ -47,7 +47,11 @@ _MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",
     codecs.BOM_UTF16_BE: "utf-16",
 }
-_JAPANESE = re.compile(r"[\u3040-\u30ff\u4e00-\u9fff]")
+# Chinese looks like narrow kana in a Japanese encoding
+_JAPANESE = re.compile(r"\A[^\uff61-\uff9f]*[\u3040-\u30ff\u4e00-\u9fff]")
+_CHINESE = re.compile(r"[\u4e00-\u9fa5]{2}")
+_CYRILLIC, _RUN = re.compile(rb"[\xc0-\xff\xa8\xb0\xb8\xb9]+"), re.compile(rb"[\xc0-\xff]{4}")
+_POLISH = re.compile(r"[a-z][³¹¿¼¾][a-z]")
 _LATIN = re.compile(r"[\x00-\x7fÀ-ÿ°º²³µ·±´×–’]*")
 _ASCII = bytes(range(128))
 
@@ -225,6 +229,12 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
         if not any(line.strip() for line in lines) or b"\x00" in head:
             raise DataError(
                 f"{path}: the file is empty or no text; a table with a header line was expected"
+            )
+        if "---" in lines and any(line.startswith("header:") for line in lines):
+            raise DataError(
+                f"{path}: holds messages as `ros2 topic echo` prints them; record a bag"
+                " (`ros2 bag record`), or write them as csv, in Python pandas.json_normalize("
+                "list(yaml.safe_load_all(open(file)))).to_csv('log.csv', index=False)"
             )
         delimiter, cells, (at, above) = _delimiter(path, lines)
         comma, point = (
@@ -643,14 +653,18 @@ def _of_bytes(block: bytes) -> str:
     if not block:
         return "utf-8"
     beyond = block.translate(None, _ASCII)
+    # words of Cyrillic are runs of such letters; a Latin one stands among plain letters
+    if _CYRILLIC.fullmatch(beyond) and _RUN.search(block):
+        return "cp1251"
+    western = block.decode("cp1252", errors="replace")
+    if _POLISH.search(western):
+        return "cp1250"
     # a Latin letter and the next one may look like one Japanese sign, but not the other way
-    if _LATIN.fullmatch(beyond.decode("cp1252", errors="replace")):
+    if _LATIN.fullmatch(western):
         return "cp1252"
-    for name, likely in (("cp932", _JAPANESE), ("cp1252", re.compile(""))):
-        try:
+    for name, likely in (("cp932", _JAPANESE), ("gb18030", _CHINESE), ("cp1252", re.compile(""))):
+        with suppress(UnicodeDecodeError):
             if likely.search(block.decode(name)):
                 return name
-        except UnicodeDecodeError:
-            continue
     # it gives every byte a sign: numbers can be read, and names stay names
     return "latin-1"

@@ -42,7 +42,7 @@ _KINDS = {
     "network": "learned, no law inside",
     "constants": "law, constants trained",
     "untrained": "policy before training",
-    "network_off": "policy, network set to zero",
+    "network_off": "policy, network switched off",
     "classical": "classical, tuned",
     "predictive": "document's autopilot",
     "floor": "knows the nominal vessel",
@@ -391,7 +391,7 @@ def cost_verdict(rows: Sequence[Content]) -> list[str]:
         without = (
             "; it has no law inside"
             if off is None
-            else f"; with its network set to zero it costs {off['cost']['mean']:.3f} s"
+            else f"; with its network switched off it costs {off['cost']['mean']:.3f} s"
         )
         sentences.append(
             f"Under the stated conditions '{name}' costs {cost:.3f} s a change,"

@@ -227,7 +227,7 @@ def limits(run: RunFiles) -> Section | None:
     notes = (
         "Intervals are percentiles of a block bootstrap. For few blocks they are widened as"
         " Student's t is. Change and difference are those of the mean NRMSE; negative is better. A"
-        " bold interval excludes zero. Bands are thirds of the windows; bands of fewer than three"
+        " bold interval excludes 0. Bands are thirds of the windows; bands of fewer than three"
         " windows are left out."
     )
     title = "How good, where it fails, what limits it"

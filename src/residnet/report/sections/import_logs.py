@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,16 @@ from residnet.report.blocks import (
     bad_where,
     table_of,
 )
+from residnet.report.figure import (
+    GLANCE,
+    SOLID,
+    START,
+    Case,
+    Curve,
+    Figure,
+    Panel,
+    write_figure,
+)
 from residnet.report.run_reader import RunFiles
 
 _NOTE = "note"
@@ -29,10 +40,45 @@ def sections(run: RunFiles) -> list[Section]:
     findings: Mapping[str, Sequence[Mapping[str, Any]]] = run.json("findings.json")
     logs = [Log.load(path) for path in sorted((run.path / "logs").glob("*.parquet"))]
     channels = [Section(log.name, [channel_table(log)], folded=True) for log in logs]
+    table = log_table(logs, findings)
     return [
-        Section("Recordings", [log_table(logs, findings), *channels]),
+        Section("", [write_figure(run.path / "figures", motion(logs)), table]),
+        Section("Channels", channels),
         Section("What was noticed on the way in", _noticed(findings)),
     ]
+
+
+def motion(logs: Sequence[Log]) -> Figure:
+    """Return the tracks of the recordings, one to be chosen; else a channel that all of them hold.
+
+    Args:
+        logs: at least one; positions count from the first of each.
+    """
+    shared = [name for name in logs[0].channels if all(name in log.channels for log in logs)]
+    if placed := {"x", "y"} <= set(shared):
+        panel = Panel("north [m]", "east [m]", kind="map", height=GLANCE)
+    else:
+        name = next(iter(shared), next(iter(logs[0].channels)))
+        unit, factor = shown_unit(logs[0].units.get(name, "-"))
+        panel = Panel(f"{name} [{unit}]", "time [s]", height=GLANCE)
+
+    def curves(log: Log) -> dict[str, Curve]:
+        if not placed:
+            return {"log": (log.t, factor * log[name])} if name in log.channels else {}
+        known = np.isfinite(log["x"]) & np.isfinite(log["y"])
+        first = int(np.argmax(known))
+        track = tuple(log[axis][known] - log[axis][first] for axis in ("y", "x"))
+        return {"log": (track[0], track[1]), "start": (np.zeros(1), np.zeros(1))}
+
+    return Figure(
+        "recordings",
+        "What was recorded",
+        "",
+        {"log": replace(SOLID, label="measured"), "start": START},
+        [panel],
+        [Case(log.name, [curves(log)], still=log is logs[0]) for log in logs],
+        "Recording",
+    )
 
 
 def log_table(logs: Sequence[Log], findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:

@@ -347,7 +347,7 @@ def _spiral(crafts: Sequence[str], group: Sequence[Flight], looks: Mapping[str, 
     return Figure(
         f"spiral_{name}",
         f"Spiral: {name}",
-        "Steady yaw rate over helm; a loop about zero shows an unstable vessel.",
+        "Steady yaw rate over helm; a loop about 0 shows an unstable vessel.",
         {craft: looks[craft] for craft in crafts}
         | {f"{craft} steady": replace(looks[craft], kind="points") for craft in crafts},
         [Panel("steady yaw rate [deg/s]", label, name, height=360)],

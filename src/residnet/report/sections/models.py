@@ -59,7 +59,7 @@ def _baselines(run: RunFiles) -> Section | None:
     blocks: list[Block] = [
         Text(
             "u′, v′, r′ are the accelerations du/dt, dv/dt, dr/dt. Each is the sum of its terms. A"
-            " value below twice its standard error (grey) cannot be told from zero.",
+            " value below twice its standard error (grey) cannot be told from 0.",
             quiet=True,
         )
     ]
@@ -85,7 +85,7 @@ def _after_refit(model: str, notes: Content) -> str:
     )
     said = f" Left out, for their sign would feed energy: {at_rest}." if at_rest else ""
     if left_open:
-        said += f" The data leave open, and they stay near zero: {left_open}."
+        said += f" The data leave open, and they stay near 0: {left_open}."
     return said_of_refit(model) + said
 
 
@@ -281,7 +281,7 @@ def remarks(notes: Content) -> list[str]:
             )
     if notes["unexcited"]:
         out.append(
-            "These terms are zero in all samples, so nothing is known of them:"
+            "These terms are 0 in all samples, so nothing is known of them:"
             f" {_some(notes['unexcited'])}."
         )
     if same:

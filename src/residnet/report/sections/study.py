@@ -196,7 +196,7 @@ def sections(run: RunFiles) -> list[Section]:
         f"Free-run NRMSE of model {content['model']} on {content['split']} data, mean over the"
         f" windows and {plural(rows[0]['seeds'], 'seed')}.",
         f"Difference: to {content['reference']} over the same windows, seeds averaged first;"
-        " negative is better, and a bold interval excludes zero. Its 95 % interval comes from"
+        " negative is better, and a bold interval excludes 0. Its 95 % interval comes from"
         " blocks of windows.",
     ]
     shown = variants_table(rows, content["reference"])

@@ -97,8 +97,8 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         faults = list((known.get(row["model"]) or {}).get("faults") or [])
         faults += [note] if (note := diverged_note(row)) else []
         if faults:
-            return Cell("✗", faults[0], "bad")
-        return Cell("✓" if row["model"] in known else DASH)
+            return Cell("✗", faults[0], "text")
+        return Cell("✓" if row["model"] in known else DASH, mark="text")
 
     told = [
         f"Mean of {plural(rows[run.lead]['windows'], 'free run')} on {run.focus} data"
