@@ -92,14 +92,28 @@ HOSTILE = [
         "\ufeffx",
         "x" * 300,
     ),
+    # what shells, formats, templates and tables take for more than a name
+    *("$(reboot)", "|cat", "&&true", ">out", "<in", "!!", "#", "//host/x", "\\\\host\\x", "~root"),
+    *("=1+1", "+1", "-1", "@SUM(A1)", "nan", "null", "true", "0", "1e9", "inf", "t", "psi", "u"),
+    *("{% raw %}", "${HOME}", "%HOME%", "%n", "{0.__class__}", "<!--", "]]>", "&#0;", "\\n", "$$"),
+    *("COM1", "LPT1.csv", "aux", "x.", "x ", ".hidden", "...", "a,b;c", "a|b", "a\u2028b", "\x7f"),
+    *(
+        "report.html",
+        "metrics.json",
+        "models",
+        "figures",
+        "naïve",
+        "%2e%2e%2fescape",
+        "file:///escape",
+    ),
 ]
 
 
-@pytest.mark.parametrize("part", [0, 1, 2])
+@pytest.mark.parametrize("part", range(6))
 def test_hostile_names_of_manoeuvres_logs_and_files(part: int, tmp_path: Path) -> None:
     """Each name is that of a log, of its manoeuvre and, where it can be, of its file."""
     # no file of others is asked for
-    names = [name.replace("/tmp", str(tmp_path)) for name in HOSTILE[part::3]]
+    names = [name.replace("/tmp", str(tmp_path)) for name in HOSTILE[part::6]]
     work = tmp_path / "work"
     work.mkdir()
     config = written(work, names)

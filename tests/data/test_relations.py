@@ -177,3 +177,15 @@ def test_columns_in_any_unit_and_order(vessel: tuple[str, int], data: st.DataObj
         apart -= 2.0 * np.pi * np.round(apart / (2.0 * np.pi)) * (name == "psi")
         size = max(1.0, float(np.abs(log[name]).max()))
         assert np.abs(apart).max() <= EXACT * size, name
+
+
+@given(vessel=vessels)
+@drawn
+def test_the_order_of_logs_says_nothing(vessel: tuple[str, int]) -> None:
+    logs = logs_of(vessel)
+    inputs = inputs_of(logs[0])
+    one, two = prepared(logs, inputs), prepared(logs[::-1], inputs)
+    ends = np.cumsum([len(log) for log in logs[::-1]])[:-1]
+    for first, other in ((one.z, two.z), (one.target, two.target), (fitted(one), fitted(two))):
+        again = np.concatenate(np.split(np.asarray(other), ends)[::-1])
+        np.testing.assert_allclose(again, np.asarray(first), rtol=EXACT, atol=EXACT)

@@ -104,7 +104,7 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         f"Mean of {plural(rows[run.lead]['windows'], 'free run')} on {run.focus} data"
         f" ({run.main})"
         + (
-            "; small: 95 % interval."
+            "; small: 95 % interval of this mean (above: of as many new runs)."
             if rows[run.lead].get(f"{run.ends[0]}_error_end_ci95")
             else "."
         ),
