@@ -41,6 +41,11 @@ def horizon(
     return {**about, "sailed": 2.0 * seconds, "floor": errors(0.1, 0.2), "models": models}
 
 
+def under(content: dict[str, Any]) -> dict[str, Any]:
+    """Contents of limits.json for the protocol that decides."""
+    return {"T30": content}
+
+
 def evidence(error: float = 0.2, **change: Any) -> Evidence:
     given: dict[str, Any] = {
         "selected": "mlp",
@@ -51,9 +56,14 @@ def evidence(error: float = 0.2, **change: Any) -> Evidence:
             "reason": "mlp has the least validation error.",
             "models": [{"model": "mlp", "faults": []}],
         },
-        "limits": {
-            "compared": {"mlp": {"zero": difference(-0.3, 0.1), "baseline": difference(-0.05, 0.1)}}
-        },
+        "limits": under(
+            {
+                "compared": {
+                    "mlp": {"zero": difference(-0.3, 0.1), "baseline": difference(-0.05, 0.1)}
+                }
+            }
+        ),
+        "protocol": "T30",
     }
     return Evidence(**{**given, **change})
 
@@ -129,26 +139,26 @@ def test_unsound_models_and_divergences_are_named() -> None:
 def test_a_model_is_good_in_metres_and_degrees(
     entries: list[dict[str, Any]], expected: str, said: str
 ) -> None:
-    given = evidence(limits={"horizons": entries})
+    given = evidence(limits=under({"horizons": entries}))
     assert level(given) == expected
     assert any(said in sentence for sentence in verdict(given)[:3])
 
 
 def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     entries = [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))]
-    said = verdict(evidence(limits={"horizons": entries}))
+    said = verdict(evidence(limits=under({"horizons": entries})))
     assert said[0].endswith(
         "is off by 3.0 m (2.7 to 3.3, 5.0 % of the 60 m sailed) and 5.0 deg (4.5 to 5.5)."
     )
     assert said[1].startswith("Beside it: zero 30 m (27 to 33) and 40 deg (36 to 44); the baseline")
     assert said[1].endswith("floor (measured velocities, integrated) 0.10 m and 0.20 deg.")
     assert said[2] == "At other times: 0.50 m and 2.0 deg after 10 s."
-    assert said[3] == "It holds for 12 free runs of 4 logs at mean speeds of 1.5 to 2.5 m/s."
+    assert said[3] == "It holds for 12 free runs (T30) of 4 logs at mean speeds of 1.5 to 2.5 m/s."
 
 
 def test_no_number_of_a_verdict_has_an_exponent_that_a_reader_must_work_out() -> None:
     lost = errors(1234.0, 113.0)
-    said = " ".join(verdict(evidence(limits={"horizons": [horizon(100, lost)]})))
+    said = " ".join(verdict(evidence(limits=under({"horizons": [horizon(100, lost)]}))))
     assert "off by 1234 m (1111 to 1357, 617 % of the 200 m sailed) and 113 deg" in said
     assert "e+" not in said
 
@@ -156,14 +166,14 @@ def test_no_number_of_a_verdict_has_an_exponent_that_a_reader_must_work_out() ->
 def test_a_model_as_near_as_the_plant_itself_is_good() -> None:
     """Another model is nearer, but within twice what the plant leaves all are alike."""
     entry = horizon(10, errors(0.5, 1.0), best=errors(0.2, 1.0))
-    assert level(evidence(limits={"horizons": [entry]})) == "limited"
+    assert level(evidence(limits=under({"horizons": [entry]}))) == "limited"
     entry["models"]["truth"] = errors(0.4, 0.9)
     rows = {"zero": row(0.5), "mlp": row(0.2), "truth": row(0.1) | {"kind": "truth"}}
-    assert level(evidence(limits={"horizons": [entry]}, rows=rows)) == "good"
+    assert level(evidence(limits=under({"horizons": [entry]}), rows=rows)) == "good"
 
 
 def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
-    limits = {"horizons": [horizon(30, errors(1.0, 1.0))]}
+    limits = under({"horizons": [horizon(30, errors(1.0, 1.0))]})
     rows = {"zero": row(0.5), "baseline": row(0.25), "mlp": row(0.2, diverged=1)}
     assert level(evidence(limits=limits, rows=rows)) == "limited"
     assert level(evidence(error=0.6, limits=limits)) == "do not use"
@@ -171,8 +181,30 @@ def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
     assert level(evidence(selected="unknown")) == ""
 
 
+def test_a_horizon_is_judged_by_the_protocol_of_most_windows() -> None:
+    few = {"horizons": [horizon(10, errors(0.5, 2.0), windows=4)]}
+    many = {"horizons": [horizon(10, errors(0.6, 2.0), windows=20), horizon(20, errors(1, 3))]}
+    given = evidence(limits={"T10": many, "T30": few})
+    assert level(given) == "good"
+    said = verdict(given)
+    assert said[0].startswith("Up to 10 s ahead: there mlp is off by 0.60 m")
+    assert any("12 free runs" not in text and "20 free runs (T10)" in text for text in said)
+    # a horizon that only another protocol has is not asked for
+    assert "20 s" not in " ".join(said)
+
+
+def test_a_model_that_the_data_cannot_tell_from_zero_is_not_to_be_used() -> None:
+    compared = {"mlp": {"zero": difference(-0.01, 0.1)}}
+    given = evidence(limits=under({"compared": compared, "horizons": [horizon(30, errors(1, 1))]}))
+    assert level(given) == "do not use"
+    assert verdict(given)[0].startswith("NO BETTER THAN ZERO")
+    # too few logs for an interval tell neither
+    unknown = under({"compared": {"mlp": {"zero": difference(-0.01, None)}}})
+    assert level(evidence(limits=unknown)) == "limited"
+
+
 def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
-    limits = {"outside": {"share": 0.123, "channels": {"u": 0.1, "delta": 0.03}}}
+    limits = under({"outside": {"share": 0.123, "channels": {"u": 0.1, "delta": 0.03}}})
     said = verdict(evidence(limits=limits, doctor="Data doctor: nothing would mislead a fit."))
     assert any(text.startswith("Of the test data, 12 % lies outside") for text in said)
     assert any("(u 10 %, delta 3.0 %)" in text for text in said)

@@ -31,7 +31,7 @@ class Fleet:
     steering: str
 
 
-def drawn(kind: str, seed: int, count: int) -> list[Fleet]:
+def drawn(kind: str, seed: int, count: int, fewest: int = 8, most: int = 20) -> list[Fleet]:
     """Return fleets of 8 to 20 logs of vessels drawn at random; `kind` is boat or twin."""
     random = np.random.default_rng([seed, KINDS.index(kind), 7])
     vessels = draw(random, count, shortest=1.0, longest=300.0)
@@ -44,7 +44,7 @@ def drawn(kind: str, seed: int, count: int) -> list[Fleet]:
     unit = vessels.length / vessels.speed
     step = np.array([0.05, 0.1, 0.2, 0.5, 1.0])
     step = step[np.argmin(np.abs(step[:, None] - unit / 15.0), axis=0)]
-    sizes = random.integers(8, 21, count)
+    sizes = random.integers(fewest, most + 1, count)
     both: list[list[list[Log]]] = [[[] for _ in range(count)] for _ in range(2)]
     for k in range(int(sizes.max())):
         for of, members in zip((vessels, other), both, strict=True):

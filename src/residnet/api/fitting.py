@@ -260,11 +260,16 @@ class Models(Mapping[str, Model]):
         """Name of the model that is reported first: the recipe's mean, else the selected one."""
         return self.selection.predictor
 
-    @cached_property
+    @property
     def verdict(self) -> list[str]:
-        """The verdict on the predictor in whole sentences, the most important first.
+        """The verdict on the predictor in whole sentences, the most important first."""
+        return verdict(self.evidence)
 
-        It speaks of the test logs where they are judged, else of the validation logs.
+    @cached_property
+    def evidence(self) -> Evidence:
+        """What the verdict is passed on.
+
+        It is of the test logs where they are judged, else of the validation logs.
         """
         split = "test" if "test" in self.runs else "validation"
         judged = self.runs[split].evaluation
@@ -274,9 +279,14 @@ class Models(Mapping[str, Model]):
             for row in judged.rows
             if (row["protocol"], row["manoeuvre"]) == (protocol, "all")
         }
-        selection, limits = self.selection.content(), judged.limits.get(protocol, {})
-        return verdict(
-            Evidence(self.predictor, split, whole, "baseline", selection, limits, protocol=protocol)
+        return Evidence(
+            self.predictor,
+            split,
+            whole,
+            "baseline",
+            self.selection.content(),
+            judged.limits,
+            protocol=protocol,
         )
 
     @property

@@ -42,9 +42,9 @@ class Evidence:
         rows: of metrics.json under one protocol over all manoeuvres of that split, by model.
         baseline: name of the first baseline; empty where there is none.
         selection: contents of selection.json; empty where a run has none.
-        limits: contents of limits.json for that split and protocol; empty where a run has none.
+        limits: contents of limits.json for that split by protocol; empty where a run has none.
         doctor: one sentence on what the data doctor found; empty where nobody looked.
-        protocol: by which the runs were made.
+        protocol: by which those runs were made.
     """
 
     selected: str
@@ -112,16 +112,35 @@ def level(evidence: Evidence) -> str:
     entries = _horizons(evidence)
     if entries and all(entry["windows"] < _FEWEST for entry in entries):
         return UNKNOWN
-    return GOOD if _good_until(evidence) else LIMITED
+    return GOOD if good_until(evidence) else LIMITED
 
 
 def _horizons(evidence: Evidence) -> list[Content]:
-    """Return the horizons at which the errors of the selected model are known."""
-    found = evidence.limits.get("horizons") or []
-    return [entry for entry in found if evidence.selected in entry["models"]]
+    """Return the horizons at which the errors of the selected model are known, the nearest first.
+
+    They are those of the protocol of the rows, each by the protocol of which most windows last so
+    long, named as its `protocol`.
+    """
+    most: dict[float, dict[str, Any]] = {}
+    for protocol in sorted(evidence.limits, key=lambda name: name != evidence.protocol):
+        for entry in evidence.limits[protocol].get("horizons") or []:
+            seconds, known = entry["seconds"], evidence.selected in entry["models"]
+            if seconds in most:
+                known &= entry["windows"] > most[seconds]["windows"]
+            elif protocol != evidence.protocol:
+                known = False
+            if known:
+                most[seconds] = {**entry, "protocol": protocol}
+    return [most[seconds] for seconds in sorted(most)]
 
 
-def _good_until(evidence: Evidence) -> float:
+def _own(evidence: Evidence) -> Content:
+    """Return what limits.json says under the protocol of the rows."""
+    found: Content = evidence.limits.get(evidence.protocol) or {}
+    return found
+
+
+def good_until(evidence: Evidence) -> float:
     """Return the time in s up to which the selected model is good; 0 where it never is."""
     row, until = evidence.rows[evidence.selected], 0.0
     if row.get("diverged") and evidence.split in UNSEEN:
@@ -152,7 +171,7 @@ def ahead(evidence: Evidence) -> list[str]:
     if not entries:
         return [compared(evidence)]
     enough = [entry for entry in entries if entry["windows"] >= _FEWEST]
-    until = _good_until(evidence) if enough else 0.0
+    until = good_until(evidence) if enough else 0.0
     chosen = next((e for e in entries if e["seconds"] == until), (enough or entries)[-1])
     off = _off(chosen, evidence.selected, chosen["sailed"])
     after, wanted = f"{chosen['seconds']:.4g} s ahead", []
@@ -186,9 +205,8 @@ def ahead(evidence: Evidence) -> list[str]:
         if entry is not chosen
     ]
     moves = "position" in chosen["floor"]
-    laid = f" ({evidence.protocol})" if evidence.protocol else ""
     holds = (
-        f"It holds for {plural(chosen['windows'], 'free run')}{laid} of"
+        f"It holds for {plural(chosen['windows'], 'free run')} ({chosen['protocol']}) of"
         f" {plural(chosen['logs'], 'log')}"
         + f" at mean speeds of {number(chosen['slowest'], 2)} to"
         f" {number(chosen['fastest'], 2)} m/s" * moves + "."
@@ -241,11 +259,16 @@ def objections(evidence: Evidence) -> list[str]:
 
 
 def useless(evidence: Evidence) -> bool:
-    """Return whether the selected model is `zero`, or no better: then no range is to be trusted."""
+    """Return whether the selected model is `zero`, or is not shown to be better.
+
+    Then no range is to be trusted.
+    """
     own, zero = evidence.rows.get(evidence.selected), evidence.rows.get(ZERO)
     if evidence.selected == ZERO:
         return True
-    return own is not None and zero is not None and _nrmse(own) >= _nrmse(zero)
+    if own is None or zero is None:
+        return False
+    return _nrmse(own) >= _nrmse(zero) or _alike(evidence, ZERO)
 
 
 def compared(evidence: Evidence) -> str:
@@ -261,8 +284,9 @@ def compared(evidence: Evidence) -> str:
         return f"The run holds no free runs of its selected model on {split} data."
     error = _nrmse(own)
     if zero is not None and useless(evidence):
+        than = "NO BETTER" if _nrmse(own) <= _nrmse(zero) else "WORSE"
         return (
-            f"WORSE THAN ZERO: on {split} data the selected model {name} has an NRMSE of"
+            f"{than} THAN ZERO: on {split} data the selected model {name} has an NRMSE of"
             f" {number(error)}{_lost(own)}, and zero, which only holds the velocities that a run"
             f" starts from, {number(_nrmse(zero))}{_paired(evidence, ZERO)}. DO NOT USE it for"
             " prediction."
@@ -297,7 +321,7 @@ def soundness(evidence: Evidence) -> str:
 
 def outside(evidence: Evidence) -> str:
     """Return how much of the data lies outside the training range, empty where nobody looked."""
-    found = evidence.limits.get("outside") or {}
+    found = _own(evidence).get("outside") or {}
     if not found:
         return ""
     share = float(found["share"])
@@ -325,10 +349,21 @@ def _lost(row: Content) -> str:
     return f" ({note}, which count with the error of zero)" if note else ""
 
 
+def _difference(evidence: Evidence, other: str) -> Content:
+    """Return the difference to another model, empty where nobody looked."""
+    compared = (_own(evidence).get("compared") or {}).get(evidence.selected) or {}
+    return compared.get(other) or {}
+
+
+def _alike(evidence: Evidence, other: str) -> bool:
+    """Return whether there is an interval of the difference to another model that holds zero."""
+    found = _difference(evidence, other)
+    return bool(found) and found["ci95"] is not None and not found["excludes_zero"]
+
+
 def _paired(evidence: Evidence, other: str) -> str:
     """The paired interval of the difference to another model in brackets, where there is one."""
-    compared = (evidence.limits.get("compared") or {}).get(evidence.selected) or {}
-    found = compared.get(other)
+    found = _difference(evidence, other)
     if not found:
         return ""
     if found["ci95"] is None:

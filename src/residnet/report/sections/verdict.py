@@ -55,7 +55,7 @@ def evidence(run: RunFiles, selected: str) -> Evidence:
         rows,
         run.baseline or "",
         run.json("selection.json"),
-        (run.limits.get("splits") or {}).get(split, {}).get(protocol, {}),
+        (run.limits.get("splits") or {}).get(split, {}),
         doctor,
         protocol,
     )
