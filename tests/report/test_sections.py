@@ -217,6 +217,20 @@ def test_indices_stand_flight_by_flight_or_by_kind(tmp_path: Path) -> None:
     assert "Flights without indices: constant." in text
 
 
+def test_currents_of_logs_stand_with_their_errors(tmp_path: Path) -> None:
+    run = made_run(tmp_path)
+    rows = [
+        {"log": name, "fitted": fitted, "current_north": 0.31, "current_east": -0.1,
+         "standard_error": [0.02, 0.015]}
+        for name, fitted in (("zigzag_01", True), ("zigzag_02", False))
+    ]  # fmt: skip
+    (run / "currents.json").write_text(json.dumps(rows))
+    write_fit_page(RunFiles(run))
+    text = plain(run / "report.html")
+    assert "0.31 ± 0.020" in text
+    assert "of other logs" in text
+
+
 def test_an_import_shows_gaps_channels_and_findings(tmp_path: Path) -> None:
     text = plain(page_of("import", tmp_path / "run"))
     page = Page(text)

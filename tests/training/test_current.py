@@ -195,3 +195,29 @@ def test_a_log_without_samples_is_named() -> None:
             [empty, *logs[1:]],
             CurrentConfig(),
         )
+
+
+def test_standard_errors_hold_where_the_regressors_are_not_the_true_ones() -> None:
+    """Lines in every channel cannot be this hull; the halves of the logs disagree, and say so."""
+    logs, truth = sailed(**CURRENT)
+    signals = SIGNALS.build()
+    linear = RegressorsConfig(sets=("linear",)).build(signals.names)
+    found, table = estimate_currents(linear, signals, logs[3:], CurrentConfig(), logs[:3])
+    claimed = np.array([row["standard_error"] for row in table])
+    off = ((found - np.concatenate((truth[3:], truth[:3]))) / claimed) ** 2
+    assert 0.3 < np.sqrt(off.mean()) < 2.0
+    problem = module._Problem(linear, signals, logs[3:], 4.0)
+    alone = problem.step(
+        torch.from_numpy(found[:-3]), problem.solve(torch.from_numpy(found[:-3]))[1]
+    )
+    assert (claimed[:-3].ravel() > 2.0 * alone[1].diagonal().sqrt().numpy()).all()
+    assert [row["fitted"] for row in table] == [True] * len(logs[3:]) + [False] * 3
+
+
+def test_logs_kept_apart_change_nothing_for_the_others() -> None:
+    logs, _ = sailed(**CURRENT)
+    signals = SIGNALS.build()
+    linear = RegressorsConfig(sets=("linear",)).build(signals.names)
+    alone, _ = estimate_currents(linear, signals, logs[3:6], CurrentConfig())
+    beside, _ = estimate_currents(linear, signals, logs[3:6], CurrentConfig(), logs[:2])
+    np.testing.assert_array_equal(beside[:3], alone)

@@ -164,8 +164,9 @@ def through_currents(
 ) -> tuple[PreparedSplits, list[dict[str, Any]]]:
     """Return logs by split as motion through the water, and the table of their currents.
 
-    Training and validation logs are moved; others keep their motion over ground. Where the
-    settings name no current, nothing changes and the table is empty.
+    Training and validation logs are moved by the currents that are fitted with the coefficients,
+    others by those that these coefficients see in them. Where the settings name no current, nothing
+    changes and the table is empty.
 
     Args:
         logs: prepared logs by split.
@@ -180,13 +181,17 @@ def through_currents(
     signals = settings.signals.build()
     baseline = settings.all_baselines[settings.current.baseline].build(signals.names)
     assert isinstance(baseline, RegressorBaseline), "the settings were validated"
-    fitted = [*logs["train"], *logs["validation"]]
-    values, table = estimate_currents(baseline, signals, fitted, settings.current)
-    moved = [through_water(log, value, signals) for log, value in zip(fitted, values, strict=True)]
-    count = len(logs["train"])
+    order = sorted(splits, key=lambda split: split not in ("train", "validation"))
+    every = [log for split in order for log in logs[split]]
+    fitted = sum(len(logs[split]) for split in ("train", "validation"))
+    values, table = estimate_currents(
+        baseline, signals, every[:fitted], settings.current, every[fitted:]
+    )
     say(f"  {_summary(table)}")
-    train, validation = paged.OneByOne(moved[:count]), paged.OneByOne(moved[count:])
-    return {**splits, "train": train, "validation": validation}, table
+    moved = iter(
+        [through_water(log, value, signals) for log, value in zip(every, values, strict=True)]
+    )
+    return {split: paged.OneByOne([next(moved) for _ in logs[split]]) for split in order}, table
 
 
 def _summary(table: list[dict[str, Any]]) -> str:

@@ -34,8 +34,8 @@ class CurrentConfig(Config):
     """Settings for logs that each ran in a constant current which nobody measured.
 
     The currents are estimated first; what follows fits and chooses models on these logs as motion
-    through the water, without current. Test logs stay as they were measured: there the current is
-    not known beforehand, and models take it as zero.
+    through the water, without current. Logs that are kept for tests are moved too: each by the
+    current that the coefficients of the fitted logs see in it, so that nothing of them is fitted.
 
     Attributes:
         baseline: name of the baseline whose regressors explain the accelerations while the currents
@@ -51,24 +51,69 @@ class CurrentConfig(Config):
 
 
 def estimate_currents(
-    baseline: RegressorBaseline, signals: Signals, logs: Sequence[Prepared], config: CurrentConfig
+    baseline: RegressorBaseline,
+    signals: Signals,
+    logs: Sequence[Prepared],
+    config: CurrentConfig,
+    others: Sequence[Prepared] = (),
 ) -> tuple[np.ndarray, list[dict[str, Any]]]:
-    """Return currents to north and east [L, 2] in m/s of logs over ground, and their table.
+    """Return currents to north and east [L + K, 2] in m/s of logs over ground, and their table.
 
-    The baseline gives the regressors and keeps its own coefficients. The table's standard errors
-    hold where the regressors are the true ones and the errors of neighbouring samples independent.
+    The baseline gives the regressors and keeps its own coefficients. Standard errors from least
+    squares hold where the regressors are the true ones and the errors of neighbouring samples
+    independent, which they never are. So the two halves of each log are estimated apart, and the
+    errors of all are widened by as much as the halves differ more than they say (Birge 1932, Phys.
+    Rev. 40, 207-227).
+
+    Args:
+        baseline: whose regressors explain the accelerations.
+        signals: of the logs.
+        logs: L logs that are fitted.
+        config: what is expected of currents.
+        others: K logs that the coefficients are not fitted on.
 
     Raises:
         FitError: where a log has no sample to learn from, or the logs do not determine their
             currents.
     """
-    for p in logs:
+    for p in (*logs, *others):
         if not p.good.any():
             raise FitError(
                 f"log {p.log.name}: has no sample to estimate its current from; leave it out"
             )
-    problem = _Problem(baseline, signals, logs, config.spread**-2)
-    current = torch.zeros(len(logs), 2, dtype=torch.float64)
+    precision = config.spread**-2
+    problem = _Problem(baseline, signals, logs, precision)
+    current, error, theta = _found(problem, config)
+    apart, alone, _ = _found(replace(problem, logs=[h for p in logs for h in _halves(p)]), config)
+    first, second = apart.reshape(-1, 2, 2).unbind(1)
+    scatter = (first - second).square() / alone.reshape(-1, 2, 2).square().sum(1)
+    widened = max(float(scatter.mean().sqrt()), 1.0)
+    if others:
+        known = _found(replace(problem, logs=others, theta=theta), config)
+        current, error = torch.cat((current, known[0])), torch.cat((error, known[1]))
+    rows = [
+        {
+            "log": p.log.name,
+            "fitted": i < len(logs),
+            "current_north": float(c[0]),
+            "current_east": float(c[1]),
+            "standard_error": (widened * e).tolist(),
+        }
+        for i, (p, c, e) in enumerate(zip((*logs, *others), current, error, strict=True))
+    ]
+    return current.numpy(), rows
+
+
+def _halves(log: Prepared) -> list[Prepared]:
+    """Return a log twice, with the samples of its first and of its second half."""
+    rows = np.flatnonzero(log.good)
+    late = np.arange(len(log)) >= (rows[len(rows) // 2] if len(rows) else 0)
+    return [replace(log, good=log.good & part) for part in (~late, late)]
+
+
+def _found(problem: _Problem, config: CurrentConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Return currents [L, 2], the standard errors of least squares [L, 2], and coefficients."""
+    current = torch.zeros(len(problem.logs), 2, dtype=torch.float64)
     best = _descend(problem, current, config)
     for _round in range(_ROUNDS):
         again = _descend(problem, problem.search(best[1], best[2], config.spread), config)
@@ -77,16 +122,7 @@ def estimate_currents(
         best = again
     _cost, current, state = best
     error = problem.step(current, state)[1].diagonal().sqrt().reshape(-1, 2)
-    rows = [
-        {
-            "log": p.log.name,
-            "current_north": float(c[0]),
-            "current_east": float(c[1]),
-            "standard_error": e.tolist(),
-        }
-        for p, c, e in zip(logs, current, error, strict=True)
-    ]
-    return current.numpy(), rows
+    return current, error, state.theta
 
 
 def _descend(
@@ -169,6 +205,8 @@ class _Problem:
     signals: Signals
     logs: Sequence[Prepared]
     precision: float
+    theta: Tensor | None = None
+    """Coefficients [3, J] that are known and stay; else they are eliminated."""
 
     def regression(self, current: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return regressors [N, J], accelerations [N, 3] and log [N] of all samples.
@@ -190,8 +228,8 @@ class _Problem:
         The likelihood holds the prior of the currents.
         """
         phi, target, group = self.regression(current)
-        theta = torch.zeros_like(self.baseline.theta)
-        for axis in range(3):
+        theta = torch.zeros_like(self.baseline.theta) if self.theta is None else self.theta
+        for axis in range(3) if self.theta is None else ():
             columns = self.baseline.columns(axis)
             theta[axis, columns] = torch.linalg.solve(
                 _gram(phi[:, columns]), phi[:, columns].T @ target[:, axis]
@@ -217,13 +255,13 @@ class _Problem:
             blocks = torch.zeros(count, 2, 2, dtype=torch.float64).index_add_(
                 0, state.group, slope[:, :, None] * slope[:, None, :]
             )
-            mixed = torch.zeros(count, len(columns), 2, dtype=torch.float64).index_add_(
-                0, state.group, phi[:, :, None] * slope[:, None, :]
-            )
-            mixed = mixed.permute(1, 0, 2).reshape(len(columns), 2 * count)
-            hessian += weight * (
-                torch.block_diag(*blocks) - mixed.T @ torch.linalg.solve(_gram(phi), mixed)
-            )
+            hessian += weight * torch.block_diag(*blocks)
+            if self.theta is None:
+                mixed = torch.zeros(count, len(columns), 2, dtype=torch.float64).index_add_(
+                    0, state.group, phi[:, :, None] * slope[:, None, :]
+                )
+                mixed = mixed.permute(1, 0, 2).reshape(len(columns), 2 * count)
+                hessian -= weight * (mixed.T @ torch.linalg.solve(_gram(phi), mixed))
             gradient = gradient + weight * torch.zeros_like(current).index_add_(
                 0, state.group, slope * state.error[:, axis : axis + 1]
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from residnet.core.format import DASH, DEG, minus, number
 from residnet.core.names import VELOCITY
@@ -70,7 +71,31 @@ def fitted_on_what(run: RunFiles) -> Section | None:
         blocks += [
             Section("Data quality", [short, Section("Log by log", [full], folded=True)]),
         ]
+    if found := run.json("currents.json"):
+        blocks.append(Section("Currents", [_currents(run, found)], folded=True))
     return Section("What was fitted on what", blocks) if blocks else None
+
+
+def _currents(run: RunFiles, found: Any) -> Table:
+    """Return the estimated current of each log, in the unit of speeds."""
+    unit, factor = run.unit("u")
+
+    def component(row: Content, key: str, place: int) -> Cell:
+        error = number(factor * row["standard_error"][place], 2)
+        return Cell(f"{number(factor * row[key], 2)} ± {error}")
+
+    return table_of(
+        found,
+        [
+            ("log", lambda row: row["log"]),
+            (f"north [{unit}]", lambda row: component(row, "current_north", 0)),
+            (f"east [{unit}]", lambda row: component(row, "current_east", 1)),
+            ("coefficients", lambda row: "fitted with it" if row["fitted"] else "of other logs"),
+        ],
+        caption="Every log ran in a constant current of its own, which was estimated, with one"
+        " standard error: as far as the two halves of a log agree. Errors of this page are those of"
+        " the motion through the water.",
+    )
 
 
 def _data(run: RunFiles) -> str:
