@@ -320,7 +320,8 @@ def carry_out(block: Block, folder: Path) -> None:
     if block.kind == "python":
         # of the run that it begins, too, the shortened form
         run = f"functools.partial(residnet.run, overrides={short_runs()['quickstart']})"
-        text = f"import functools, residnet\nresidnet.run = {run}\n{text}"
+        page = f"exec(compile({text!r}, {str(block)!r}, 'exec'))"
+        text = f"import functools, residnet\nresidnet.run = {run}\n{page}"
     source = Path(residnet.__file__).parents[1]
     programs = (str(folder / "bin"), str(Path(sys.executable).parent), os.environ["PATH"])
     env = {**os.environ, "PATH": os.pathsep.join(programs), "PYTHONPATH": str(source)}
