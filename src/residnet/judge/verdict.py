@@ -109,13 +109,13 @@ def level(evidence: Evidence) -> str:
         return USELESS
     if evidence.selected not in evidence.rows:
         return ""
-    entries = _horizons(evidence)
+    entries = horizons(evidence)
     if entries and all(entry["windows"] < _FEWEST for entry in entries):
         return UNKNOWN
     return GOOD if good_until(evidence) else LIMITED
 
 
-def _horizons(evidence: Evidence) -> list[Content]:
+def horizons(evidence: Evidence) -> list[Content]:
     """Return the horizons at which the errors of the selected model are known, the nearest first.
 
     They are those of the protocol of the rows, each by the protocol of which most windows last so
@@ -146,7 +146,7 @@ def good_until(evidence: Evidence) -> float:
     if row.get("diverged") and evidence.split in UNSEEN:
         return 0.0
     plants = {name for name, row in evidence.rows.items() if row.get("kind") == "truth"}
-    for entry in _horizons(evidence):
+    for entry in horizons(evidence):
         models = entry["models"]
         own, ends = models[evidence.selected], models[evidence.selected]["intervals"]
         # what the plant itself leaves, started from measured states, is noise too
@@ -167,7 +167,7 @@ def good_until(evidence: Evidence) -> float:
 
 def ahead(evidence: Evidence) -> list[str]:
     """Return how far off the selected model is after the times that matter, beside others."""
-    entries = _horizons(evidence)
+    entries = horizons(evidence)
     if not entries:
         return [compared(evidence)]
     enough = [entry for entry in entries if entry["windows"] >= _FEWEST]
