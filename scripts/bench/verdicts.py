@@ -81,8 +81,8 @@ def main() -> None:
                 flush=True,
             )
     print(
-        f"called good: {called} vessels; within the interval {sum(all_holds)} of"
-        f" {len(all_holds)} errors; flattered {flatteries}"
+        f"called good: {called} vessels; of {len(found)} errors {found.count(0)} within the"
+        f" interval, {found.count(1)} above; flattered {flatteries}"
     )
 
 
