@@ -241,6 +241,7 @@ SMALL = (
 )
 """A linear hull and a small network in place of the portfolio of the recipe."""
 COMMAND = """#!{python}
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -255,6 +256,11 @@ def residnet(*words):
         sys.exit(code)
 
 
+if words[0] == "new":
+    # another page's draft of the same name, and its run
+    out = Path(words[words.index("--out") + 1])
+    out.unlink(missing_ok=True)
+    shutil.rmtree(Path("runs", out.stem), ignore_errors=True)
 if words[0] == "autopilot":
     residnet(*words, "--draft")
     words = ["run", words[words.index("--out") + 1]]
@@ -298,7 +304,15 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     carry_out(Block("", 0, "sh", "residnet demo demo"), folder)
     (folder / "demo" / "two_files").rename(folder / "trips")
     zigzags = sorted((folder / "demo" / "csv").glob("zigzag_*.csv"))
-    for name in (".", "trials", "my_logs", "my_logs/zigzag", "more_logs", "new_logs"):
+    for name in (
+        ".",
+        "trials",
+        "my_logs",
+        "my_logs/zigzag",
+        "my_recordings",
+        "more_logs",
+        "new_logs",
+    ):
         (folder / name).mkdir(exist_ok=True)
         # of runs at constant commands nothing is learned; five are divided by the log
         for log in zigzags[: 6 if name == "new_logs" else 5]:
