@@ -64,6 +64,8 @@ class AotiExporter(Exporter):
                 "layout": "Give contiguous tensors: the package does not look at strides.",
                 "safety": "The package holds machine code that runs when loaded: load only what"
                 " you trust. It is for the kind of machine that it was made on.",
+                "needs": "In Python: torch and setuptools, which torch imports to load a package."
+                " In C++: libtorch.",
                 "parity": parity,
             }
             file.parent.mkdir(parents=True, exist_ok=True)
