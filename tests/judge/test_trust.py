@@ -95,8 +95,10 @@ def test_errors_of_the_pose_are_told_after_the_times_that_matter(
     assert first["models"]["zero"]["position"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_intervals_hold_the_mean_over_as_many_new_windows(logs: list[Prepared]) -> None:
-    """Ten sets of windows are judged, and ten others fall into the intervals as often as told."""
+@pytest.mark.parametrize("count", [3, 4, 6])
+def test_intervals_hold_the_mean_over_as_many_new_logs(logs: list[Prepared], count: int) -> None:
+    """Forty sets of logs are judged, and forty others fall into the intervals as often as told."""
+    logs = logs[:count]
     random, hits = np.random.default_rng(0), 0
     protocol = Windows(length=20.0, first=0.0, history=0.0)
     windows = [w for i, prepared in enumerate(logs) for w in protocol.windows(prepared, i, STEP)]

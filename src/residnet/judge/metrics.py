@@ -102,6 +102,32 @@ def intervals(values: np.ndarray, blocks: Blocks | None) -> list[list[float] | N
     ]
 
 
+def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]:
+    """Return 95 % intervals of the means of columns [W, C] over as many new logs, [low, high].
+
+    The windows of a log have its manoeuvre, weather and speed in common, so that the means of logs
+    are what scatters. Errors are positive and their size is drawn: Student's t holds for the
+    logarithms of these means, twice over, for the logs seen and the new ones.
+
+    Args:
+        values: errors of windows, none negative.
+        logs: number [W] of the log that each window is of.
+
+    Returns:
+        An interval for each column; None where there are fewer than three logs.
+    """
+    names, places = np.unique(logs, return_inverse=True)
+    count = len(names)
+    if count < _FEW_LOGS:
+        return [None] * values.shape[1]
+    sums = np.stack([np.bincount(places, column, count) for column in values.T], axis=1)
+    sizes = np.log(np.maximum(sums / np.bincount(places)[:, None], 1e-12))
+    wide = scipy.stats.t.ppf(0.5 + _LEVEL / 2, count - 1) * math.sqrt(2 / count)
+    factor = np.exp(wide * sizes.std(axis=0, ddof=1))
+    means = values.mean(0)
+    return np.stack((means / factor, means * factor), axis=1).tolist()
+
+
 def tail(count: int) -> float:
     """Return the share of resampled means left out at either end, for at least 2 blocks.
 
@@ -295,9 +321,8 @@ class Judged:
             window: `seconds`; `windows` and `logs` that last so long, `slowest` and `fastest` of
             them (mean speeds, m/s) and the mean way `sailed` in m; `floor` (position and heading):
             what integrated measured velocities are off; and by model `position` and `heading`: the
-            mean over the windows, with `interval`s that hold the mean over as many new windows in
-            95 % of cases, None where there are too few blocks. Of position and heading only what
-            the live velocities move is told.
+            mean over the windows, with `intervals` for as many new logs, see `new_trials`. Of
+            position and heading only what the live velocities move is told.
         """
         counts, speeds = (
             np.array([part.stop - part.start for _, part in self.parts]),
@@ -313,17 +338,12 @@ class Judged:
             there[there] = [bool(log.usable[end]) for log, end in zip(logs, ends, strict=True)]
             if not there.any():
                 continue
-            drawn = blocks(self.numbers[there])
+            numbers = self.numbers[there]
 
-            def off(error: np.ndarray, drawn: Blocks | None = drawn) -> dict[str, Any]:
+            def off(error: np.ndarray, numbers: np.ndarray = numbers) -> dict[str, Any]:
                 """Return means and intervals of errors of the pose [W, 3]."""
                 values = np.column_stack((np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])))
-                means = values.mean(0)
-                new: list[list[float] | None] = []
-                for mean, found in zip(means, intervals(values, drawn), strict=True):
-                    # the mean of new windows scatters as much as that of those seen
-                    wide = None if found is None else mean + np.sqrt(2.0) * (np.array(found) - mean)
-                    new.append(None if wide is None else np.maximum(wide, 0.0).tolist())
+                means, new = values.mean(0), new_trials(values, numbers)
                 names = [(column - 4, name) for column, name in self._ends]
                 return {
                     **{name: float(means[k]) for k, name in names},
@@ -345,7 +365,7 @@ class Judged:
                 {
                     "seconds": k * step,
                     "windows": int(there.sum()),
-                    "logs": len(set(self.numbers[there].tolist())),
+                    "logs": len(set(numbers.tolist())),
                     "slowest": float(speeds[there].min()),
                     "fastest": float(speeds[there].max()),
                     "sailed": float(np.mean(sailed)),
