@@ -125,7 +125,7 @@ def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]
     wide = scipy.stats.t.ppf(0.5 + _LEVEL / 2, count - 1) * math.sqrt(2 / count)
     factor = np.exp(wide * sizes.std(axis=0, ddof=1))
     means = values.mean(0)
-    return np.stack((means / factor, means * factor), axis=1).tolist()
+    return [[float(mean / f), float(mean * f)] for mean, f in zip(means, factor, strict=True)]
 
 
 def tail(count: int) -> float:
