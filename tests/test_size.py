@@ -16,7 +16,7 @@ import residnet
 
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
-    "api": (723, 83),
+    "api": (724, 84),
     "baselines": (845, 126),
     "control": (3264, 355),
     "core": (1400, 208),
@@ -26,16 +26,16 @@ STATEMENTS_AND_FUNCTIONS = {
     "export": (2260, 267),
     "heads": (1267, 190),
     "identification": (2174, 224),
-    "judge": (1990, 217),
+    "judge": (2016, 221),
     "manoeuvres": (897, 136),
     "physics": (2022, 252),
     "regression": (1814, 204),
-    "report": (2875, 318),
+    "report": (2884, 320),
     "runs": (395, 50),
     "simulators": (355, 44),
     "tasks": (3043, 254),
     "testing": (499, 33),
-    "training": (1203, 145),
+    "training": (1221, 147),
     "": (457, 54),
 }
 
