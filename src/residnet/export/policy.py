@@ -301,7 +301,7 @@ class ExportedController(Exported):
         metrics: Sequence[Mapping[str, Any]],
     ) -> None:
         self.name, self.policy, self.safe = name, policy, safe
-        self.what = f"{self.kind} {name}"
+        self.what = name if name == self.kind else f"{self.kind} {name}"
         self.about, self.metrics, self.dt = about, metrics, policy.dt
         memory = self.controller(self.precisions[-1]).memory_low.numel()
         self.arguments = (("y", len(self.measured)), *self._given(), ("s", memory))

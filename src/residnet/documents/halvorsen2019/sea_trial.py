@@ -311,7 +311,7 @@ class SeaTrialTaskConfig(Study, ComputingTask):
         for name, trial in results["trials"].items():
             where = next(iter(trial["rows"]))
             each = [
-                f"{row['model']} for {axis} ({number(row['rmse'])})"
+                f"{row['model']} for {axis} ({number(row['rmse'])} {_UNITS[axis]})"
                 for axis, row in _best(trial["rows"][where]).items()
             ]
             sentences.append(
@@ -346,7 +346,11 @@ class SeaTrialTaskConfig(Study, ComputingTask):
                 for row in rows
                 if row is best[row["axis"]] or (row["model"] == STANDARD and row["on"] == where)
             ),
-            [("acceleration", "axis"), ("model", "model"), ("RMSE", "rmse", number)],
+            [
+                ("acceleration", "axis"),
+                ("model", "model"),
+                ("RMSE", lambda row: f"{number(row['rmse'])} {_UNITS[row['axis']]}", str),
+            ],
             caption=f"Trial {name}, {SET_NAMES[where]}",
             selected=lambda row: row is best[row["axis"]],
             rule=lambda row: row["axis"],
