@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import DataError
-from residnet.core.format import interval, number
+from residnet.core.format import interval, number, shown_unit
 from residnet.core.layout import (
     LATERAL,
     POSE,
@@ -532,8 +532,9 @@ def check_bounded(
                 break
     row = int((away > 0.0).double().argmax())
     inputs = ", ".join(
-        f"{name} {number(float(value))}"
+        f"{name} {number(factor * float(value))} {unit}".removesuffix(" -")
         for name, value in zip(spec.signals.columns, w[row], strict=True)
+        for unit, factor in [shown_unit(spec.signals.units().get(name, "-"))]
     )
     beyond = f"(more than {divergence:g} times the largest training velocity)"
     if not bool((away > 0.0).any()):
