@@ -536,6 +536,20 @@ def parts_of_time(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {**columns, "ss": s.t % 60.0, **renamed(s, POSE, ACTS)})
 
 
+def totals(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """Largest and least values below the rows."""
+    table = pd.DataFrame({"time [s]": s.t, **renamed(s, POSE, ACTS)})
+    text = table[:100].to_csv(index=False) + f"max,{s.x.max()},,,,\nmin,{s.x.min()},,,,\n"
+    (folder / f"run{k}.csv").write_text(text)
+
+
+def minutes_apart(folder: Path, k: int, s: pd.DataFrame) -> None:
+    columns: dict[str, object] = {"time [s]": s.t}
+    for name, degrees in (("lat", 54.3 + s.x / 111_315.0), ("lon", 10.15 + s.y / 65_079.0)):
+        columns |= {f"{name}_deg": degrees // 1, f"{name}_min": (60.0 * (degrees % 1)).round(6)}
+    pd.DataFrame({**columns, **renamed(s, ACTS)})[:100].to_csv(folder / f"run{k}.csv", index=False)
+
+
 LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
     layout.__name__: layout
     for layout in (
@@ -555,7 +569,7 @@ LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
         *(long_rows, file_a_channel, hdf5_trials),
         *(yaw_alone, speed_and_heading),
         *(portuguese, polish, chinese, russian, signal_k, topic_echo, newest_first, three_files),
-        *(lever, frames_in_names, to_port, parts_of_time),
+        *(lever, frames_in_names, to_port, parts_of_time, totals, minutes_apart),
     )
 }
 

@@ -102,6 +102,12 @@ def draft_tables(
         marks.guess((*READER, "time"), clock.guess)
     held = {name for sheet in sheets for name in sheet.numbers}
     numeric = [name for name in shared if name in held and name not in clock.columns]
+    minutes = [n for n in numeric if state_channel(words_of(n)) in _LARGEST and _in_minutes(n)]
+    if minutes:
+        raise DataError(
+            f"{first.path}: '{minutes[0]}' holds minutes whose degrees stand in another column;"
+            " write degrees + minutes / 60 into one column each for latitude and longitude"
+        )
     attitudes = quaternions(numeric)
     parts = {column for attitude in attitudes for column in attitude.values()}
     names = named([name for name in numeric if name not in parts], marks)
@@ -126,6 +132,10 @@ def draft_tables(
     content |= mark_folders(files, marks)
     _unused(first, names, clock, marks)
     return {**content, "channels": channels}, left_out
+
+
+def _in_minutes(column: str) -> bool:
+    return written_unit(column, "s") == "min"
 
 
 def _wider(sheet: Sheet, clock: Clock, numeric: Sequence[str]) -> str:
@@ -456,18 +466,14 @@ def clock_of(sheet: Sheet) -> Clock:
                 f"{sheet.path}: no column is called time or increases as time does; name it in a"
                 " channel map (--config)"
             )
-        cells = sheet.texts.get(named[0])
-        odd = (
-            []
-            if cells is None
-            else [c for c in cells.dropna() if not re.match(r"[\d.,]+$", str(c))]
+        cells = [str(cell) for cell in sheet.texts.get(named[0], ()) if cell == cell]
+        odd = [cell for cell in cells if not re.fullmatch(r"[-\d.,]+", cell)]
+        told = "write it as numbers, or such as 2025-06-17 08:30:00.25"
+        told = told if 2 * len(odd) >= len(cells) else "delete such lines, which are no rows"
+        shows = f", such as '{shown(odd[-1])}'" if odd else ""
+        raise DataError(
+            f"{sheet.path}: column '{named[0]}' holds no times that can be read{shows}; {told}"
         )
-        told = (
-            f", such as '{shown(str(odd[-1]))}' in its last rows; delete what is no row"
-            if odd
-            else ""
-        )
-        raise DataError(f"{sheet.path}: column '{named[0]}' holds no times that can be read{told}")
     values = sheet.numbers[chosen]
     unit = written_unit(chosen, "s")
     guess = ""

@@ -17,9 +17,9 @@ _ABOUT: dict[str, str] = {
     "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻"
     " 時間 日時 micros millis czas время 时间 aika | t time stamp tid sec secs seconds elapsed"
     " hora heure uhrzeit datum date datetime fecha utc dato tempo",
-    "north": "north nord norte noord hochwert 北 север polnoc | n northing",
+    "north": "north nord norte noord hochwert 北 север polnoc pohjoinen | n northing",
     "east": "east ost oste este oost rechtswert ostwert ostkoord ostricht 東 восток 东 ostlig"
-    " wschod | e easting est leste",
+    " wschod itainen | e easting est leste",
     "position": "posit posic posisj coordin koordinat coorden coordonn 位置 posiz pozyc полож |"
     " pos local utm pose ned enu",
     "x": "| x",
@@ -39,17 +39,18 @@ _ABOUT: dict[str, str] = {
     "turn": "turn dreh gier wende drei giring 回頭 旋回 virage girat giro guin accostat sving"
     " svang guinada 转艏 поворот | rot angvelo yaw lacet girhastighet",
     "turn_rate": "turnrate drehrate gierrate wenderate drehgeschwind giergeschwind wendegeschwind"
-    " angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet bochtaanwijzer"
-    " girhastighet 回頭角速度 回頭率 旋回角速度 转艏角速度 | rot yawrate wz gyroz omega gz",
+    " angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet drejehastighed"
+    " bochtaanwijzer girhastighet 回頭角速度 回頭率 旋回角速度 转艏角速度 | rot yawrate wz gyroz"
+    " omega gz",
     "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 углов katowa | gyro gyrz",
     "speed": "speed velo 風速 geschwind vitesse velocidad velocita snelheid hastighet 速度 船速"
     " fahrt vaart 速力 скорост predkosc | velo sog stw fart vel spd log tws",
     "surge": "surge langsgeschw laengsgeschw longitudinal avance avante voraus vooruit voorwaart"
-    " fremover forover 前後 langs avanzamento avanco 纵向 framat продольн | u forward ahead"
-    " corredera",
-    "sway": "sway quergeschw seitlich lateral dwars tverr sideveis 左右 derive deriva transvers"
-    " verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards sideways 横向"
-    " sidled попереч | v vm quer",
+    " fremover forover fremad 前後 langs avanzamento avanco 纵向 framat продольн | u forward"
+    " ahead corredera",
+    "sway": "sway quergeschw seitlich lateral dwars tverr sideveis sidelaens 左右 derive deriva"
+    " transvers verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards"
+    " sideways 横向 sidled попереч | v vm quer",
     "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre руль |"
     " delta rudder rud ror rsa steering helm pala leme ster",
     "propeller": "propel schraube helice schroef 推進 プロペラ propulseur 螺旋桨 винт srub | prop"
@@ -212,6 +213,9 @@ def state_channel(words: Words) -> str | None:
     if w.has("turn_rate") or (w.has("heading") and w.has("rate")) or w.text in ("r", "r mid"):
         return "r"
     if (w.has("turn") and w.has("rate")) or (w.has("angular") and _YAWING.search(w.text)):
+        return "r"
+    if w.has("angular", "rate") and w.lacks("x", "y", "pitch"):
+        # of an axis that is not told: what turns is the vessel
         return "r"
     if w.has("angular", "rate") and w.lacks("x", "y", "pitch"):
         # of an axis that is not told: what turns is the vessel

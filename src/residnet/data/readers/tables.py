@@ -163,7 +163,7 @@ class CsvConfig(TableConfig):
         delimiter: between cells; a blank stands for any number of blanks and tabulators.
         decimal: sign of the decimals, `.` or `,`.
         encoding: of the text, for example `cp1252` for a file that an older Windows wrote; null
-            finds it by the bytes themselves, UTF-16 and Japanese (cp932) included.
+            finds it by the bytes themselves, UTF-16, cp932 and gb18030 included.
     """
 
     kind: Literal["csv"] = "csv"

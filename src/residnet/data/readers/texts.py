@@ -557,8 +557,8 @@ def _cut_short(path: Path, delimiter: str, wide: int) -> bool:
 def encoding_of(path: Path) -> str:
     """Return the encoding of a text file: by its byte order mark, else by what its bytes can be.
 
-    Text without a mark is UTF-8 where all of it can be, else UTF-16, Japanese (cp932) or Western
-    European (cp1252).
+    Text without a mark is UTF-8 where all of it can be, else UTF-16, Russian (cp1251), Polish
+    (cp1250), Western European (cp1252), Japanese (cp932) or Chinese (gb18030).
     """
     with path.open("rb") as stream:
         told = _told(stream.read(_HEAD))
