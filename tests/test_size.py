@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (845, 126),
     "control": (3264, 355),
     "core": (1400, 208),
-    "data": (9026, 815),
+    "data": (9035, 816),
     "documents": (2497, 229),
     "dynamics": (971, 129),
     "export": (2260, 267),
