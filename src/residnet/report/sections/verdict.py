@@ -79,8 +79,10 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     limits = (run.limits.get("splits") or {}).get(run.focus, {}).get(run.main, {})
     first = [run.lead, run.selected, run.baseline, "zero"]
     table: list[Content] = [rows[one] for one in dict.fromkeys(first) if one in rows]
-    if floor := limits.get("kinematics"):
-        ends = {f"{of}_error_end": floor[f"{of}_mean"] for of in run.ends}
+    floor = limits.get("kinematics") or {}
+    ends = {f"{of}_error_end": floor[f"{of}_mean"] for of in run.ends if floor}
+    # a pose that was integrated from the velocities has no floor but rounding
+    if measured := any(end > 1e-9 for end in ends.values()):
         table.append({"model": _MEASURED, "diverged": 0, **ends})
     table += sorted(
         (row for one, row in rows.items() if one not in first),
@@ -110,7 +112,7 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         ),
         "" if run.focus in UNSEEN else "These data are not unseen: read with care.",
         "Zero: no model at all, the first velocities are held." if "zero" in rows else "",
-        "Measurements: where the measured velocities themselves lead." if floor else "",
+        "Measurements: where the measured velocities themselves lead." if measured else "",
     ]
     shown = table_of(
         table,
