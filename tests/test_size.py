@@ -30,7 +30,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "manoeuvres": (897, 136),
     "physics": (2022, 252),
     "regression": (1814, 204),
-    "report": (2884, 320),
+    "report": (2885, 320),
     "runs": (395, 50),
     "simulators": (355, 44),
     "tasks": (3043, 254),
