@@ -13,6 +13,8 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 import torch
 
+from residnet.dynamics.c_code import literal
+from residnet.dynamics.lowering import lowered
 from residnet.dynamics.store import BandTable
 from residnet.export.base import (
     Exported,
@@ -23,8 +25,7 @@ from residnet.export.base import (
     name_of,
     write_card,
 )
-from residnet.export.c_code import CFunction, c_files, compile_shared, identifier, literal
-from residnet.export.lowering import lowered
+from residnet.export.c_code import CFunction, c_files, compile_shared, identifier
 from residnet.export.policy import ExportedController
 from residnet.export.vessel import ExportedVessel
 

@@ -11,7 +11,7 @@ import casadi as ca
 import torch
 
 from residnet.export.base import Exported, Exporter, Loaded, Numbers, write_card
-from residnet.export.lowering import in_numbers, lowered
+from residnet.dynamics.lowering import in_numbers, lowered
 
 
 class CasadiModel(Loaded):

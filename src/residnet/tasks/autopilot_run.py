@@ -31,7 +31,7 @@ from residnet.control.heading.vessels import SteeredPlant, fly
 from residnet.core.progress import begin, report, say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.store import rebuilt
-from residnet.export.closed_loop import CompiledLoop
+from residnet.dynamics.compiled import CompiledRollout
 from residnet.export.policy import ExportedHeading
 from residnet.judge.autopilots import (
     QUANTITIES,
@@ -157,7 +157,7 @@ def _complete(
     assert stated is not None
     started = time.time()
     steering = steering._replace(vessel=_in_weather(config, stated))
-    found = tune(peer, steering, stated.stated, stated.evolution, config.seed + 11, CompiledLoop)
+    found = tune(peer, steering, stated.stated, stated.evolution, config.seed + 11, CompiledRollout)
     constants = ", ".join(f"{key} {value:.4g}" for key, value in found.parameters.items())
     say(f"  tuned {name}: {constants}, cost {found.cost:.3f} s")
     complete = type(peer).model_validate(peer.model_dump() | found.parameters)
@@ -214,7 +214,7 @@ def _policy(
     notes, started = store.finished_module(name, policy), time.time()
     if notes is None:
         begin(f"training {name}")
-        compiler = partial(CompiledLoop, most=wanted.training.outlying)
+        compiler = partial(CompiledRollout, most=wanted.training.outlying)
         notes = train_policy(
             name,
             policy,
@@ -315,7 +315,7 @@ def _judge(
     for place, (name, (kind, policy)) in enumerate(controllers.items()):
         report("judging", place, len(controllers))
         run = ConditionedRun(
-            vessel, policy.double(), stated.stated.dt, compiler=CompiledLoop, longest=longest
+            vessel, policy.double(), stated.stated.dt, compiler=CompiledRollout, longest=longest
         )
         for protocol, (conditions, changes) in flown.items():
             found, table = judged(name, kind, protocol, run, conditions, changes)

@@ -16,7 +16,7 @@ from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ExportError
 from residnet.core.frames import wrap
-from residnet.dynamics.rollout import Rollout, Source
+from residnet.dynamics.rollout import FreeRun, Rollout, Source
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.steering_variation import PushedSteering
 from residnet.physics.environment import JonswapSpectrum
@@ -292,9 +292,7 @@ QUANTITIES = {
 }
 """Of a flight, with units: the cost, its three parts, and the integral of the absolute error."""
 
-Flying = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Flights from states [B, nx], inputs [B, T, m] and memory [B, n]: states and what acted."""
-Compiler = Callable[[Rollout, Tensor, Tensor, Tensor], Flying]
+Compiler = Callable[[Rollout, Tensor, Tensor, Tensor], FreeRun]
 """Makes the flights of a closed loop quick, given examples of what they are flown with; it raises
 ExportError where it cannot."""
 
@@ -434,7 +432,7 @@ class ConditionedRun:
         self.vessel, self.dtype, self.dt = vessel, dtype, dt
         self.columns = vessel.column("psi"), vessel.column("r")
         self.policy, self.compiler, self.longest = policy, compiler, longest
-        self._flying: dict[int, Flying] = {}
+        self._flying: dict[int, FreeRun] = {}
         self.model = PushedSteering(vessel.model(dt, integrator), len(vessel.inputs))
         self.model.to(dtype).requires_grad_(False)
 
@@ -477,7 +475,7 @@ class ConditionedRun:
             if longest not in self._flying:
                 x, w, s = (part[:2] for part in given)
                 self._flying[longest] = quickly(self.rollout(longest), self.compiler, (x, w, s))
-            return self.flights(changes, *self._flying[longest](*given))
+            return self.flights(changes, *self._flying[longest](*given)[:2])
 
 
 def quickly(
@@ -485,7 +483,7 @@ def quickly(
     compiler: Compiler | None,
     given: tuple[Tensor, Tensor, Tensor],
     failed: Callable[[ExportError], None] = lambda error: None,
-) -> Flying:
+) -> FreeRun:
     """Return the flights of a closed loop, compiled where a compiler is given and works.
 
     Args:
@@ -499,12 +497,7 @@ def quickly(
             return compiler(rollout, *given)
         except ExportError as error:
             failed(error)
-
-    def fly(x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        states, inputs, _ = rollout(x, w, s)
-        return states, inputs
-
-    return fly
+    return rollout
 
 
 _AFTER, _FOR = 10.0 / 7.0, 5.0 / 7.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from residnet.control.heading.conditions import (
 from residnet.control.heading.controllers import Steering, TunableConfig
 from residnet.core.config import Config
 from residnet.core.errors import ExportError, FitError
-from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.compiled import CompiledRollout
 
 _ROWS = 4096
 """Flights that are flown side by side."""
@@ -45,31 +45,6 @@ class TuningConfig(Config):
     tolerance: float = Field(default=1e-4, ge=0)
 
 
-class RowsFlying(Protocol):
-    """Flights of a closed loop whose rows have numbers of their own."""
-
-    def of(self, rollout: Rollout) -> RowsFlying:
-        """Return the flights of a closed loop that differs in its numbers alone."""
-
-    def __call__(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return states and what acted."""
-
-
-class RowsCompiler(Protocol):
-    """Makes flights quick whose rows have numbers of their own; raises ExportError if it cannot."""
-
-    def __call__(
-        self,
-        rollout: Rollout,
-        x: Tensor,
-        w: Tensor,
-        s: Tensor,
-        *,
-        own: Sequence[str],
-    ) -> RowsFlying:
-        """Return the flights, given examples of what they are flown with."""
-
-
 @dataclass(frozen=True)
 class TuningResult:
     """Tuned parameters, their mean cost [s] over the tuning flights, and the candidates tried."""
@@ -85,7 +60,7 @@ def tune(
     conditions: ConditionsConfig,
     settings: TuningConfig,
     seed: int,
-    compiler: RowsCompiler | None = None,
+    compiler: type[CompiledRollout] | None = None,
 ) -> TuningResult:
     """Return the missing parameters of least mean cost, by differential evolution.
 
@@ -162,11 +137,11 @@ class Trials:
         steering: Steering,
         conditions: ConditionsConfig,
         changes: HeadingChanges,
-        compiler: RowsCompiler | None = None,
+        compiler: type[CompiledRollout] | None = None,
     ) -> None:
         self.config, self.steering, self.conditions = config, steering, conditions
         self.changes, self.compiler = changes, compiler
-        self.loop: RowsFlying | None = None
+        self.loop: CompiledRollout | None = None
 
     def costs(self, candidates: dict[str, Tensor]) -> Tensor:
         """Return the mean cost [C] in s of candidates, parameters [C] by name.
@@ -201,4 +176,4 @@ class Trials:
             # what cannot be compiled is flown as it is
             self.compiler = None
             return run.fly(changes)
-        return run.flights(changes, *self.loop.of(rollout)(*given))
+        return run.flights(changes, *self.loop.of(rollout)(*given)[:2])

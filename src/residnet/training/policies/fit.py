@@ -15,7 +15,6 @@ from residnet.control.heading.conditions import (
     ConditionedFlights,
     ConditionedRun,
     ConditionsConfig,
-    Flying,
     HeadingChanges,
     SteadyTest,
     nominal,
@@ -27,6 +26,7 @@ from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.errors import ExportError
 from residnet.core.progress import say
 from residnet.data.module import EpochDataModule
+from residnet.dynamics.rollout import FreeRun
 from residnet.training.policies.config import PolicyTraining
 from residnet.training.trainer import EpochTraining, run_epochs
 
@@ -72,7 +72,7 @@ class PolicyFit(EpochTraining):
         lengths = {"hold": min(settings.hold, conditions.hold), "duration": duration}
         self.drawn = conditions.model_copy(update=lengths)
         self.vessel, self.compiler = vessel, compiler
-        self._loops: dict[float, tuple[ConditionedRun, Flying]] = {}
+        self._loops: dict[float, tuple[ConditionedRun, FreeRun]] = {}
         self._at(settings.dt)
         random = torch.Generator().manual_seed(seed + 1_000_003)
         self.unseen = conditions.draw(settings.validation, conditions.dt, random)
@@ -162,7 +162,7 @@ class PolicyFit(EpochTraining):
             group["lr"] = rate * (settings.final + (1.0 - settings.final) * cosine)
         quiet = round(settings.quiet * settings.batch)
         loop, fly = self._loops[self.step_size]
-        flown = loop.flights(changes, *fly(*loop.given(changes)))
+        flown = loop.flights(changes, *fly(*loop.given(changes))[:2])
         found = flown.measured(self.conditions)
         loss: Tensor = (
             found["cost"].mean() + math.degrees(settings.guiding(progress)) * found["iae"].mean()

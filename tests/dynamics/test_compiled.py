@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -12,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
+from residnet.dynamics import c_code, compiled
 from residnet.dynamics.base import Dynamics
+from residnet.dynamics.compiled import CompiledRollout, _held
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.export import c_code, closed_loop
-from residnet.export.closed_loop import CompiledLoop, _held
 
 DT = 0.1
 
@@ -63,8 +62,8 @@ def loop() -> tuple[Rollout, tuple[Tensor, Tensor, Tensor]]:
 
 def test_flights_and_gradient_are_those_of_torch() -> None:
     rollout, given = loop()
-    fast = CompiledLoop(rollout, *given)
-    flown = [fast(*given), rollout(*given)[:2]]
+    fast = CompiledRollout(rollout, *given)
+    flown = [run(*given)[:2] for run in (fast, rollout)]
     (states, inputs), (wanted, acted) = flown
     assert torch.allclose(states, wanted, atol=2e-5)
     assert torch.allclose(inputs, acted, atol=2e-5)
@@ -78,10 +77,10 @@ def test_flights_and_gradient_are_those_of_torch() -> None:
 
 def test_the_number_of_threads_changes_nothing() -> None:
     rollout, given = loop()
-    alone = CompiledLoop(rollout, *given)
+    alone = CompiledRollout(rollout, *given)
     weights = list(rollout.parameters())
     one = torch.autograd.grad(alone(*given)[0].sum(), weights)
-    alone.pool = ThreadPoolExecutor(4)
+    alone.threads = 4
     assert all(map(torch.equal, one, torch.autograd.grad(alone(*given)[0].sum(), weights)))
 
 
@@ -98,12 +97,12 @@ class Cut(Helm):
 def test_what_a_loop_detaches_has_no_gradient_and_a_steep_one_is_compiled() -> None:
     rollout, given = loop()
     rollout.source = Cut()
-    fast = CompiledLoop(rollout, *given)
+    fast = CompiledRollout(rollout, *given)
     short = (given[0], given[1][:, :3], given[2])
     weights = list(rollout.parameters())
     found, known = (
         torch.autograd.grad(x.square().mean() + w.sum() * 0.01, weights)
-        for x, w in (fast(*short), rollout(*short)[:2])
+        for x, w, _ in (fast(*short), rollout(*short))
     )
     for one, other in zip(found, known, strict=True):
         assert torch.allclose(one, other, rtol=2e-3, atol=2e-4)
@@ -111,11 +110,11 @@ def test_what_a_loop_detaches_has_no_gradient_and_a_steep_one_is_compiled() -> N
 
 def test_a_loop_that_is_off_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     rollout, given = loop()
-    wrong = closed_loop.BACK.replace("AT(gx, N_X, k)[i * width + l] +=", "(void)")
-    assert wrong != closed_loop.BACK
-    monkeypatch.setattr(closed_loop, "BACK", wrong)
+    wrong = compiled.BACK.replace("AT(gx, N_X, k + 1)", "AT(gx, N_X, k)")
+    assert wrong != compiled.BACK
+    monkeypatch.setattr(compiled, "BACK", wrong)
     with pytest.raises(ExportError, match="is off by"):
-        CompiledLoop(rollout, *given)
+        CompiledRollout(rollout, *given)
 
 
 def test_a_missing_compiler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,7 +122,7 @@ def test_a_missing_compiler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CC", raising=False)
     rollout, given = loop()
     with pytest.raises(ExportError, match="no C compiler"):
-        CompiledLoop(rollout, *given)
+        CompiledRollout(rollout, *given)
 
 
 SOURCE = "double twice(double x) { return 2.0 * x; }\n"
@@ -174,4 +173,3 @@ def test_a_flight_whose_gradient_explodes_does_not_drown_the_others() -> None:
     assert torch.equal(held[3], torch.zeros(2))
     for row in (0, 1, 4):
         assert torch.equal(held[row], gradients[row])
-    assert _held(gradients, asked, float("inf")) is gradients

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import operator
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import casadi as ca
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.fx import GraphModule, Node
 from torch.utils import _pytree as tree
 
@@ -96,8 +97,6 @@ def lowered(
     results: Sequence[str],
     what: str,
     examples: Sequence[Tensor] | None = None,
-    *,
-    detached: bool = False,
 ) -> ca.Function:
     """Return the CasADi function of a step for one row in float64.
 
@@ -107,8 +106,6 @@ def lowered(
         results: names.
         what: is lowered, for messages.
         examples: arguments to record with; zeros where not given.
-        detached: whether what the step detaches is an argument more, `detached_<k>`, and a
-            result more, `detached_<k>_value`, so that derivatives leave it out.
 
     Raises:
         ExportError: where an operation is not known, by its name, or Python decides by values.
@@ -116,32 +113,239 @@ def lowered(
     if examples is None:
         examples = [torch.zeros(1, size, dtype=torch.float64) for _, size in arguments]
     columns = [ca.MX.sym(name, size) for name, size in arguments]
-    values: dict[Node, Any] = {}
-    apart: list[tuple[ca.MX, ca.MX]] = []
-    given = iter(map(_Value, examples, columns))
-    graph = _recorded(step, examples, what)
+    graph = recorded(step, examples, what)
+    values = dict(zip(_placeholders(graph), map(_Value, examples, columns), strict=True))
+    found = _columns(graph, values, what)
+    return ca.Function("step", columns, found, [name for name, _ in arguments], list(results))
+
+
+def _placeholders(graph: GraphModule) -> list[Node]:
+    return [node for node in graph.graph.nodes if node.op == "placeholder"]
+
+
+def _columns(
+    graph: GraphModule,
+    values: dict[Node, Any],
+    what: str,
+    instead: Callable[[Node, Any], Any] | None = None,
+) -> list[Any]:
+    """Return the columns of a graph's results.
+
+    Args:
+        graph: recorded.
+        values: what is known of nodes already, to which all others are added.
+        what: is lowered, for messages.
+        instead: takes a node and its arguments, and returns its value, None for the usual one.
+    """
     for node in graph.graph.nodes:
-        if node.op == "placeholder":
-            values[node] = next(given)
-        elif node.op == "get_attr":
+        if node in values:
+            continue
+        if node.op == "get_attr":
             values[node] = _Value(operator.attrgetter(str(node.target))(graph).detach())
         elif node.op == "output":
-            found = [values[output].column for output in tree.tree_leaves(node.args[0])]
+            return [values[output].column for output in tree.tree_leaves(node.args[0])]
         else:
             args, settings = torch.fx.node.map_arg((node.args, node.kwargs), values.__getitem__)
-            values[node] = value = _called(node.target, args, settings, what)
-            if detached and node.target is torch.ops.aten.detach.default and not value.constant:
-                symbol = ca.MX.sym(f"detached_{len(apart)}", value.column.numel())
-                apart.append((symbol, value.column))
-                values[node] = _Value(value.example, symbol)
-    more = [f"detached_{k}" for k in range(len(apart))]
-    return ca.Function(
-        "step",
-        [*columns, *(symbol for symbol, _ in apart)],
-        [*found, *(column for _, column in apart)],
-        [*(name for name, _ in arguments), *more],
-        [*results, *(f"{name}_value" for name in more)],
+            value = instead(node, args) if instead else None
+            values[node] = _called(node.target, args, settings, what) if value is None else value
+    raise AssertionError("a graph without results")
+
+
+@dataclass(frozen=True)
+class Product:
+    """A product of numbers of each row with a matrix that all rows share.
+
+    Attributes:
+        rows: times that each row is multiplied with the matrix, with other numbers each time.
+        taken, given: numbers of a row, and of the result; the matrix is [taken, given].
+        place: number of the matrix among `Parts.prepared`.
+    """
+
+    rows: int
+    taken: int
+    given: int
+    place: int
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A step, taken apart into what rows share, products with matrices, and all the rest.
+
+    Attributes:
+        function: of the arguments of a row, of `theta`, of `product_<k>`, the results of the
+            products, and of `detached_<k>`, what the step detaches. It gives `factor_<k>`, what is
+            multiplied, then the results of the step, then `detached_<k>_value`. A factor depends on
+            no product but those before it.
+        prepare: takes the shared numbers, and gives what follows from them alone.
+        plain: numbers of what `prepare` gives whose entries make `theta`, one after the other.
+        products: in the order in which they are found.
+    """
+
+    function: ca.Function
+    prepare: GraphModule
+    plain: Sequence[int]
+    products: Sequence[Product]
+
+
+_LEAST: Final = 64
+"""Least numbers of a matrix whose products are loops; smaller ones are written out."""
+
+
+def in_parts(
+    step: Callable[..., Any],
+    rows: Sequence[tuple[str, Tensor]],
+    shared: Sequence[Tensor],
+    results: Sequence[str],
+    what: str,
+) -> Parts:
+    """Return a step in parts; see `Parts`.
+
+    Args:
+        step: of the rows' arguments, then of the shared numbers; in float64.
+        rows: names and examples [1, size] of the rows' arguments.
+        shared: numbers of any shape that all rows share.
+        results: names of what the step returns.
+        what: is lowered, for messages.
+
+    Raises:
+        ExportError: as of `lowered`.
+    """
+    graph = recorded(step, [*(example for _, example in rows), *shared], what)
+    places = _placeholders(graph)
+    alone: dict[Node, None] = dict.fromkeys(places[len(rows) :])
+    constant: dict[Node, None] = {}
+    for node in graph.graph.nodes:
+        given = node.all_input_nodes
+        if node.op == "get_attr" or (node.op == "call_function" and _name(node.target) in _LIKE):
+            constant[node] = None
+        elif node.op == "call_function":
+            if all(one in constant for one in given):
+                constant[node] = None
+            elif all(one in alone or one in constant for one in given):
+                alone[node] = None
+
+    def matrix(node: Node) -> Node | None:
+        """Return the shared matrix that rows are multiplied with."""
+        if node in alone or node.target not in _PRODUCTS or node.kwargs:
+            return None
+        bias, a, b = (None, *node.args) if len(node.args) == 2 else node.args
+        inside = b in alone and a not in alone and (bias is None or isinstance(bias, Node))
+        return b if inside and b.meta["size"] >= _LEAST else None
+
+    edge = [node for node in alone if any(user not in alone for user in node.users)]
+    found_constant = _subgraph(graph, places, list(constant))
+    with torch.no_grad():
+        known = found_constant(*(example for _, example in rows), *shared)
+        prepare = _subgraph(
+            graph, places[len(rows) :], edge, dict(zip(constant, known, strict=True))
+        )
+        prepared = prepare(*shared)
+    for node, example in zip(edge, prepared, strict=True):
+        node.meta["size"] = example.numel()
+    plain = [
+        k
+        for k, node in enumerate(edge)
+        if any(user not in alone and matrix(user) is not node for user in node.users)
+    ]
+    columns = [ca.MX.sym(name, example.shape[1]) for name, example in rows]
+    theta = ca.MX.sym("theta", sum(prepared[k].numel() for k in plain))
+    values: dict[Node, Any] = {
+        place: _Value(example, column)
+        for place, (_, example), column in zip(places, rows, columns, strict=False)
+    }
+    # what shared numbers make of themselves is not evaluated here
+    values.update(dict.fromkeys(alone))
+    begin = 0
+    for k, (node, example) in enumerate(zip(edge, prepared, strict=True)):
+        if k in plain:
+            values[node] = _Value(example, theta[begin : begin + example.numel()])
+            begin += example.numel()
+        else:
+            values[node] = _Value(example)
+    symbols: list[tuple[Any, Any]] = []
+    factors: list[Any] = []
+    products: list[Product] = []
+    apart: list[tuple[Any, Any]] = []
+
+    def instead(node: Node, args: Any) -> _Value | None:
+        if (shared_matrix := matrix(node)) is not None:
+            bias, a, b = (None, *args) if len(args) == 2 else args
+            example = a.example @ b.example
+            made = Product(*a.example.shape, b.example.shape[1], edge.index(shared_matrix))
+            symbol = ca.MX.sym(f"product_{len(products)}", example.numel())
+            products.append(made)
+            symbols.append(symbol)
+            factors.append(a.column)
+            found = _Value(example, symbol)
+            return found if bias is None else _each("add", example + bias.example, found, bias)
+        if node.target is torch.ops.aten.detach.default and not args[0].constant:
+            symbol = ca.MX.sym(f"detached_{len(apart)}", args[0].column.numel())
+            apart.append((symbol, args[0].column))
+            return _Value(args[0].example, symbol)
+        return None
+
+    found = _columns(graph, values, what, instead)
+    names = [f"detached_{k}" for k in range(len(apart))]
+    return Parts(
+        ca.Function(
+            "step",
+            [*columns, theta, *symbols, *(symbol for symbol, _ in apart)],
+            [*factors, *found, *(column for _, column in apart)],
+            [
+                *(name for name, _ in rows),
+                "theta",
+                *(f"product_{k}" for k in range(len(products))),
+                *names,
+            ],
+            [
+                *(f"factor_{k}" for k in range(len(products))),
+                *results,
+                *(f"{name}_value" for name in names),
+            ],
+        ),
+        prepare,
+        plain,
+        products,
     )
+
+
+_PRODUCTS: Final = (torch.ops.aten.mm.default, torch.ops.aten.addmm.default)
+
+
+def _name(target: Any) -> str:
+    """Return the name of an operation of torch, as tables here have it."""
+    schema = getattr(target, "_schema", None)
+    return schema.name.removeprefix("aten::").removesuffix("_copy") if schema else ""
+
+
+def _subgraph(
+    graph: GraphModule,
+    given: Sequence[Node],
+    results: Sequence[Node],
+    constant: Mapping[Node, Any] = MappingProxyType({}),
+) -> GraphModule:
+    """Return the part of a graph that makes some of its nodes from others, and constants."""
+    part, owner = torch.fx.Graph(), nn.Module()
+    copies: dict[Node, Node] = {}
+
+    def copied(node: Node) -> Node:
+        if node not in copies:
+            if node in constant:
+                name = f"constant_{len(copies)}"
+                owner.register_buffer(name, constant[node])
+                copies[node] = part.get_attr(name)
+            elif node.op == "get_attr":
+                name = f"constant_{len(copies)}"
+                owner.register_buffer(name, operator.attrgetter(str(node.target))(graph).detach())
+                copies[node] = part.get_attr(name)
+            else:
+                copies[node] = part.node_copy(node, copied)
+        return copies[node]
+
+    for node in given:
+        copies[node] = part.placeholder(node.name)
+    part.output(tuple(copied(node) for node in results))
+    return GraphModule(owner, part)
 
 
 def in_numbers(function: ca.Function) -> ca.Function:
@@ -154,7 +358,12 @@ def in_numbers(function: ca.Function) -> ca.Function:
     return ca.Function("step", symbols, found, function.name_in(), function.name_out())
 
 
-def _recorded(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -> GraphModule:
+def recorded(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -> GraphModule:
+    """Return the graph of the operations of torch that a step makes of examples.
+
+    Raises:
+        ExportError: where Python decides by values.
+    """
     from torch._decomp import core_aten_decompositions
     from torch.func import functionalize
     from torch.fx.experimental.proxy_tensor import make_fx
@@ -234,7 +443,7 @@ def _each(op: str, example: Tensor, *given: Any) -> _Value:
 def _called(target: Any, args: Any, settings: Any, what: str) -> Any:
     if target is operator.getitem:
         return args[0][args[1]]
-    name = target._schema.name.removeprefix("aten::").removesuffix("_copy")
+    name = _name(target)
     leaves = [leaf for leaf in tree.tree_leaves((args, settings)) if isinstance(leaf, _Value)]
 
     def plain(part: Any) -> Any:

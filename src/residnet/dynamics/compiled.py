@@ -1,0 +1,766 @@
+"""Rollouts and their gradients as compiled C: many free runs at once, and training through them.
+
+One step of a rollout becomes a CasADi function of single numbers, beside products with the matrices
+that all rows share. It and the product of its Jacobian with a gradient are written for blocks of
+rows by the vector types that gcc and clang know, compiled for this machine and called for all steps
+of a run. Gradients of matrices follow from what the steps leave, in one product each.
+"""
+
+from __future__ import annotations
+
+import copy
+import ctypes
+import math
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import accumulate, pairwise
+from typing import Any, final
+
+import casadi as ca
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from residnet.core.errors import ExportError
+from residnet.dynamics.c_code import FUNCTIONS, Body, Tables, compiled_library, literal
+from residnet.dynamics.lowering import Parts, in_numbers, in_parts
+from residnet.dynamics.rollout import Rollout
+
+_VISITED, _ROWS, _STEPS = 40, 16, 3
+"""The compiled rollout is checked over so many steps from every state that some runs visit in their
+first steps: long enough that a step hands all on, too short for rounding to grow in a steep law.
+"""
+_SAME, _ROUNDED = 1e-6, 5e-3
+"""How far it may be off: in double precision, and the median row in the precision of runs."""
+_LONGEST = 20_000
+"""Most operations on single numbers of a step: more take a compiler minutes."""
+_HANDED_ON = ("x", "s", "q")
+"""State, memory of the vessel and memory of the source, which a step hands on."""
+_WHAT = "rollout"
+_TWO = ("atan2", "hypot", "pow", "fmod", "copysign")
+
+
+_PRELUDE = (
+    "#include <math.h>\n#include <string.h>\n"
+    "#if defined(__AVX512F__)\n#define BYTES 64\n#elif defined(__AVX__)\n#define BYTES 32\n"
+    "#else\n#define BYTES 16\n#endif\n"
+    "#define LANES ((long)(BYTES / sizeof(REAL)))\n"
+    "const long lanes = BYTES / sizeof(REAL);\n"
+    "#define ZERO ((REAL)0)\n#define ONE ((REAL)1)\n"
+    "typedef REAL V __attribute__((vector_size(BYTES)));\n"
+    "typedef REAL U __attribute__((vector_size(BYTES), aligned(4), may_alias));\n"
+    "typedef INT I __attribute__((vector_size(BYTES)));\n"
+    "#define ALL(number) ((V){0} + (REAL)(number))\n"
+    "#define EACH for (int l = 0; l < LANES; l++)\n"
+    "static inline V pick(I c, V a, V b) { return (V)((c & (I)a) | (~c & (I)b)); }\n"
+    + "".join(
+        f"static __attribute__((noinline)) V v_{name}"
+        + ("(V a, V b)" if name in _TWO else "(V a)")
+        + f" {{ V o; EACH o[l] = R({name})(a[l]{', b[l]' if name in _TWO else ''}); return o; }}\n"
+        for name in sorted(set(FUNCTIONS.values()))
+    )
+)
+_SIDE_BY_SIDE = 8
+"""Sums of a product that are in registers at once, each an entry of its result."""
+
+
+def _sums(count: int, entry: str) -> str:
+    """Return C that adds up so many entries of a product from j on, side by side."""
+    each = range(count)
+    cells = "".join(f" V c{q} = {{0}};" for q in each)
+    added = "".join(f" c{q} += v * {entry.format(q)};" for q in each)
+    stored = "".join(f" *(U *)(to + (j + {q}) * to_room) = c{q};" for q in each)
+    return (
+        f"    for (; j + {count} <= to_count; j += {count}) {{\n       {cells}\n"
+        f"        for (long i = 0; i < count; i++) {{ V v = *(const U *)(from + i * room);{added} }}"
+        f"\n       {stored}\n    }}\n"
+    )
+
+
+_PRODUCT = "".join(
+    f"static __attribute__((noinline)) void {name}(const REAL *restrict table, long count,"
+    " long to_count, const REAL *restrict from, long room, REAL *restrict to, long to_room) {\n"
+    "    long j = 0;\n" + _sums(_SIDE_BY_SIDE, entry) + _sums(1, entry) + "}\n"
+    for name, entry in (
+        ("times", "table[i * to_count + j + {0}]"),
+        ("back_times", "table[(j + {0}) * count + i]"),
+    )
+)
+"""Numbers [count] of a row times a matrix [count, to_count], and times the transposed of one."""
+
+
+def _prelude(dtype: torch.dtype) -> str:
+    """Return what stands at the top of a file in this precision."""
+    single = dtype == torch.float32
+    words = {
+        "REAL": "float" if single else "double",
+        "INT": "int" if single else "long long",
+        "R(name)": "name##f" if single else "name",
+    }
+    return "".join(f"#define {name} {text}\n" for name, text in words.items()) + _PRELUDE + _PRODUCT
+
+
+Calls = Mapping[str, tuple[str, str]]
+
+
+class _Lanes(Body):
+    """Writes a function of single numbers for a block of `LANES` rows.
+
+    An entry of an argument or result stands so many numbers behind the one before it as `strides`
+    says, and the rows of an entry stand side by side. Numbers `theta` are shared by all rows.
+
+    Args:
+        function: to be written.
+        strides: of arguments and results, by name; `LANES` where not given.
+        calls: which argument is made from a result once this is complete, and by which statement;
+            by the result's name.
+    """
+
+    REAL, FLAG = "V", "I"
+    unrolled = math.inf
+    joined: Mapping[int, str] = {
+        ca.OP_NOT: "~{0}", ca.OP_AND: "{0} & {1}", ca.OP_OR: "{0} | {1}"
+    }  # fmt: skip
+
+    def __init__(
+        self, function: ca.Function, strides: Mapping[str, str], calls: Calls
+    ) -> None:
+        self.strides, self.calls = strides, calls
+        self.given = list(function.name_out())
+        super().__init__(function, Tables(""), _WHAT)
+
+    def literal(self, value: float) -> str:
+        return f"ALL({literal(value)})"
+
+    def place(self, name: str, place: int) -> str:
+        """Return where an entry stands."""
+        return f"(U *)({name} + {place} * {self.strides.get(name, 'LANES')})"
+
+    def argument(self, name: str, place: int) -> str:
+        return f"ALL({name}[{place}])" if name == "theta" else f"(*{self.place(name, place)})"
+
+    def put(self, result: int, column: Any) -> None:
+        super().put(result, column)
+        name, cells = self.given[result], self.results[result]
+        if name in self.calls and len(cells) == self.function.numel_out(result):
+            stored = [f"*{self.place(name, i)} = {cell};" for i, cell in enumerate(cells)]
+            made, text = self.calls[name]
+            self.lines.append((made, " ".join((*stored, text))))
+
+    def real(self, cell: str, flag: bool) -> str:
+        return f"pick({cell}, ALL(ONE), ALL(ZERO))" if flag else cell
+
+    def truth(self, cell: str, flag: bool) -> str:
+        return cell if flag else f"({cell} != ZERO)"
+
+    def pick(self, condition: str, value: str, alternative: str) -> str:
+        return f"pick({condition}, {value}, {alternative})"
+
+    def call(self, name: str, row: Sequence[str]) -> str:
+        return f"v_{name}({', '.join(row)})"
+
+
+def _function(
+    name: str,
+    function: ca.Function,
+    strides: Mapping[str, str],
+    calls: Calls,
+    begun: Mapping[str, str],
+    added: Sequence[str] = (),
+) -> str:
+    """Return the C function of a step for a block of rows.
+
+    Args:
+        name: of the function.
+        function: of single numbers.
+        strides, calls: as `_Lanes` has them.
+        begun: arguments and results that stand elsewhere, and the statement that says where.
+        added: results that are added to what stands there.
+    """
+    body = _Lanes(function, strides, calls)
+    ends = [f"(void){made};" for made, _ in calls.values()]
+    for result, cells in zip(function.name_out(), body.results, strict=True):
+        if result not in calls:
+            sign = "+=" if result in added else "="
+            ends += [
+                f"*{body.place(result, i)} {sign} {cell};"
+                for i, cell in enumerate(cells)
+                if result not in added or cell != body.zero
+            ]
+    given = [f"const REAL *restrict {one}" for one in body.names if one not in begun]
+    taken = [f"REAL *restrict {one}" for one in function.name_out() if one not in begun]
+    apart = "const REAL *tables, REAL *held, REAL *pulled, const long stride, const long room"
+    head = f"static void {name}({', '.join((*given, *taken, apart))})"
+    return head + " {\n" + "\n".join((*begun.values(), *body.read(ends))) + "\n}\n"
+
+
+def _source(
+    parts: Parts, sizes: Mapping[str, int], trained: Sequence[int] | None, dtype: torch.dtype
+) -> str:
+    """Return the source file with the functions `fly` and, where there is a gradient, `back`.
+
+    Args:
+        parts: of a step.
+        sizes: number of entries of each of its arguments, and `a` of what acts.
+        trained: places in `theta` that have a gradient; None where nothing has one.
+        dtype: precision of the file.
+    """
+    step = in_numbers(parts.function)
+    if not step.is_a("SXFunction") or step.n_instructions() > _LONGEST:
+        raise ExportError("a step too long, or with tables too long, to be written for many rows")
+    products = parts.products
+    taken, given = ([one.rows * getattr(one, way) for one in products] for way in _WAYS)
+    tables = [0, *accumulate(one.taken * one.given for one in products)]
+    held = [0, *accumulate((*given, *taken))]
+    numbers = dict(enumerate(products))
+
+    def calls(way: str, start: str, end: str, rooms: tuple[str, str]) -> dict[str, tuple[str, str]]:
+        found = {}
+        for k, one in numbers.items():
+            here, there = (one.taken, one.given) if way == "times" else (one.given, one.taken)
+            found[start.format(k)] = end.format(k), " ".join(
+                f"{way}(tables + {tables[k]}, {here}, {there},"
+                f" {start.format(k)} + {r * here} * {rooms[0]}, {rooms[0]},"
+                f" {end.format(k)} + {r * there} * {rooms[1]}, {rooms[1]});"
+                for r in range(one.rows)
+            )
+        return found
+
+    at = {f"product_{k}": f"REAL *product_{k} = held + {held[k]} * room;" for k in numbers}
+    forward = at | {
+        f"factor_{k}": f"REAL *factor_{k} = held + {held[k + len(products)]} * room;"
+        for k in numbers
+    }
+    kept = dict.fromkeys(forward, "room")
+    rows = dict.fromkeys(("x", "w", "s", "q", "own", "x_after", "s_after", "q_after", "a"), "stride")
+    functions = [
+        _function(
+            "step",
+            _flowing(step, len(products)),
+            rows | kept,
+            calls("times", "factor_{}", "product_{}", ("room", "room")),
+            forward,
+        )
+    ]
+    if trained is not None:
+        slopes = {
+            f"product_{k}_slope": f"REAL *product_{k}_slope = pulled + {held[k]} * room;"
+            for k in numbers
+        }
+        own = {
+            f"factor_{k}_slope": f"REAL factor_{k}_slope[{taken[k]} * LANES];" for k in numbers
+        }
+        outside = dict.fromkeys(("x_slope", "a_slope", "x_before"), "stride")
+        functions.append(
+            _function(
+                "slope",
+                _slope(step, sizes, len(products), trained),
+                rows | kept | outside | dict.fromkeys(slopes, "room"),
+                calls("back_times", "product_{}_slope", "factor_{}_slope", ("room", "LANES")),
+                at | slopes | own,
+                ("x_before", "total"),
+            )
+        )
+    counts = sizes | {
+        "held": held[-1], "pulled": held[len(products)], "total": len(trained or ())
+    }  # fmt: skip
+    text = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in counts.items())
+    return "".join((_prelude(dtype), text, _AT, *functions, FLY, "" if trained is None else BACK))
+
+
+_WAYS = ("taken", "given")
+_GIVEN = ("x", "w", "s", "q", "own", "theta")
+
+
+def _symbols(step: ca.Function) -> list[ca.SX]:
+    return [ca.SX.sym(name, step.numel_in(name)) for name in step.name_in()]
+
+
+def _known(found: ca.SX, apart: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.SX:
+    """Return an expression with what a step detaches put in."""
+    # what is detached may hang on what was detached before it
+    for symbol, value in zip(reversed(apart), reversed(values), strict=True):
+        found = ca.substitute(found, symbol, value)
+    return ca.densify(found)
+
+
+def _flowing(step: ca.Function, products: int) -> ca.Function:
+    """Return a step that computes what it detaches."""
+    given = _symbols(step)
+    inside = len(_GIVEN) + products
+    names = step.name_out()[: products + len(_HANDED_ON) + 1]
+    found = step.call(given)
+    parts = [_known(one, given[inside:], found[len(names) :]) for one in found[: len(names)]]
+    return ca.Function("step", given[:inside], ca.cse(parts), step.name_in()[:inside], names)
+
+
+def _slope(
+    step: ca.Function, sizes: Mapping[str, int], products: int, trained: Sequence[int]
+) -> ca.Function:
+    """Return the product of a step's Jacobian with the slopes of what it gives.
+
+    The slopes of a product need those of the factors of later ones alone, and stand in that order.
+    """
+    given = _symbols(step)
+    inside = len(_GIVEN) + products
+    x, _, s, q, _, theta, *made = given[:inside]
+    found = step.call(given)
+    factors, results = found[:products], found[products : products + len(_HANDED_ON) + 1]
+    slopes = [ca.SX.sym(f"{name}_slope", sizes[name]) for name in (*_HANDED_ON, "a")]
+    inner = [ca.SX.sym(f"factor_{k}_slope", one.numel()) for k, one in enumerate(factors)]
+    known = [*made, x, s, q, theta[list(trained)]]
+    pulled = ca.jtimes(
+        ca.vertcat(*results, *factors), ca.vertcat(*known), ca.vertcat(*slopes, *inner), True
+    )
+    pulled = _known(pulled, given[inside:], found[products + len(results) :])
+    places = np.cumsum([0, *(one.numel() for one in known)]).tolist()
+    parts = [pulled[a:b] for a, b in pairwise(places)]
+    order = [*range(products)[::-1], *range(products, len(parts))]
+    names = [f"product_{k}_slope" for k in range(products)]
+    names += [*(f"{name}_before" for name in _HANDED_ON), "total"]
+    return ca.Function(
+        "slope",
+        [*given[:inside], *slopes, *inner],
+        ca.cse([parts[k] for k in order]),
+        [
+            *step.name_in()[:inside],
+            *(f"{name}_slope" for name in (*_HANDED_ON, "a")),
+            *(f"factor_{k}_slope" for k in range(products)),
+        ],
+        [names[k] for k in order],
+    )
+
+
+_AT = """
+#define AT(array, n, k) (array + (n) * (k) * width + at)
+#define ROOM(n) (((n) ? (n) : 1) * LANES)
+#define BLOCKS for (long at = first * LANES; at < last * LANES; at += LANES)
+"""
+FLY = """
+void fly(const REAL *theta, const REAL *tables, const REAL *own, REAL *x, const REAL *w, REAL *s,
+         REAL *q, REAL *a, REAL *held, long keep, long steps, long width, long first, long last)
+{
+    BLOCKS {
+        REAL here[ROOM(N_HELD)];
+        for (long k = 0; k < steps; k++) {
+            /* without a gradient memories and products of the last step are all that is kept */
+            const long from = keep ? k : k & 1, to = keep ? k + 1 : ~k & 1;
+            step(AT(x, N_X, k), AT(w, N_W, k), AT(s, N_S, from), AT(q, N_Q, from),
+                 AT(own, N_OWN, 0), theta,
+                 AT(x, N_X, k + 1), AT(s, N_S, to), AT(q, N_Q, to), AT(a, N_A, k),
+                 tables, keep ? AT(held, N_HELD, k) : here, 0, width, keep ? width : LANES);
+        }
+    }
+}
+"""
+BACK = """
+void back(const REAL *theta, const REAL *tables, const REAL *own, const REAL *x, const REAL *w,
+          const REAL *s, const REAL *q, REAL *held, REAL *gx, const REAL *ga, REAL *gs,
+          REAL *pulled, REAL *total, long steps, long width, long first, long last) {
+    BLOCKS {
+        REAL slope_s[2][ROOM(N_S)], slope_q[2][ROOM(N_Q)];
+        memset(slope_q, 0, sizeof slope_q);
+        for (long i = 0; i < N_S; i++) EACH
+            slope_s[(steps - 1) & 1][i * LANES + l] = AT(gs, N_S, 0)[i * width + l];
+        for (long k = steps - 1; k >= 0; k--)
+            slope(AT(x, N_X, k), AT(w, N_W, k), AT(s, N_S, k), AT(q, N_Q, k), AT(own, N_OWN, 0),
+                  theta, AT(gx, N_X, k + 1), slope_s[k & 1], slope_q[k & 1], AT(ga, N_A, k),
+                  AT(gx, N_X, k), slope_s[~k & 1], slope_q[~k & 1], total + at * N_TOTAL,
+                  tables, AT(held, N_HELD, k), AT(pulled, N_PULLED, k), width, width);
+        for (long i = 0; i < N_S; i++) EACH
+            AT(gs, N_S, 0)[i * width + l] = slope_s[1][i * LANES + l];
+    }
+}
+"""
+"""The slope of the state at a step's end is what came from outside and from the steps after it.
+
+What a step leaves stands where the one before it looks: for step 0 that is place ~0 & 1.
+"""
+
+
+class _Step(nn.Module):
+    """One step of a rollout."""
+
+    def __init__(self, rollout: Rollout) -> None:
+        super().__init__()
+        self.rollout = rollout
+
+    def forward(self, x: Tensor, w: Tensor, s: Tensor, q: Tensor) -> tuple[Tensor, ...]:
+        """Return state, memory of the vessel, memory of the source, and what acted.
+
+        Inputs that are given are not told again.
+        """
+        acting, q = self.rollout.source(x, w, 0, q)
+        x, s = self.rollout.model.step(x, acting, s)
+        return x, s, q, acting[:, :0] if self.rollout.source.given else acting
+
+
+@final
+class CompiledRollout:
+    """The free runs of a rollout, with a gradient for what is trained, the start and the memory.
+
+    There is none where torch's gradients are switched off while this is made, or nothing is
+    trained.
+
+    Args:
+        rollout: whose source does not count steps. Its numbers may change between runs.
+        x, w, s: examples of its arguments, [B, nx], [B, T, m] and [B, n], in the precision of runs.
+        own: names of parameters and buffers [B, ...] that every row has for itself; there is no
+            gradient for them.
+        most: how much of what is asked of a row reaches its gradient, as a multiple of the median
+            over rows. A loop that is at the edge of swinging has flights whose gradients are
+            millions of times as large as those of others.
+
+    Raises:
+        ExportError: where a step cannot be recorded or written, or no C compiler does its work.
+    """
+
+    def __init__(
+        self,
+        rollout: Rollout,
+        x: Tensor,
+        w: Tensor,
+        s: Tensor,
+        *,
+        own: Sequence[str] = (),
+        most: float = math.inf,
+    ) -> None:
+        self.rollout, self.dtype, self.own = rollout, x.dtype, tuple(own)
+        self.most, self.threads = math.inf, max(torch.get_num_threads(), 1)
+        alone = copy.deepcopy(rollout).double()
+        held = _numbers(alone)
+        self.shared = [
+            name
+            for name, part in held.items()
+            if name not in self.own and part.is_floating_point()
+        ]
+        trained = torch.is_grad_enabled() and any(held[name].requires_grad for name in self.shared)
+        one = _Step(alone)
+        own_names = [f"rollout.{name}" for name in self.own]
+        own_shapes = [held[name][:1].shape for name in self.own]
+        shared_names = [f"rollout.{name}" for name in self.shared]
+
+        def step(
+            x: Tensor, w: Tensor, s: Tensor, q: Tensor, own: Tensor, *shared: Tensor
+        ) -> Any:
+            weights = dict(zip(shared_names, shared, strict=True))
+            pieces = own[0].split([shape.numel() for shape in own_shapes])
+            for name, shape, piece in zip(own_names, own_shapes, pieces, strict=True):
+                weights[name] = piece.reshape(shape)
+            return torch.func.functional_call(one, weights, (x, w, s, q))
+
+        rows = [("x", x[:1].double()), ("w", w[:1, 0].double()), ("s", s[:1].double())]
+        with torch.no_grad():
+            # a source whose rows have numbers of their own flies as many rows
+            q = alone.source.initial(x.double())
+            acting = alone.source(x.double(), w[:, 0].double(), 0, q)[0]
+        rows += [("q", q[:1]), ("own", self._own(alone, 1).double())]
+        shared = [held[name].detach() for name in self.shared]
+        names = [f"{name}_after" for name in _HANDED_ON]
+        self.parts = in_parts(step, rows, shared, [*names, "a"], _WHAT)
+        self.sizes = {name: example.shape[1] for name, example in rows}
+        self.sizes["a"] = 0 if rollout.source.given else acting.shape[1]
+        self.trained: list[int] | None = None
+        if trained:
+            # what follows from numbers that are not trained has no gradient
+            self.trained, begin = [], 0
+            with torch.enable_grad():
+                found = self.parts.prepare(*(held[name] for name in self.shared))
+            for part in (found[k] for k in self.parts.plain):
+                self.trained += range(begin, begin + part.numel()) if part.requires_grad else ()
+                begin += part.numel()
+        self._made(x.dtype)
+        self._check(alone, x[:_ROWS], w[:_ROWS], s[:_ROWS])
+        self.most = most
+
+    def _made(self, dtype: torch.dtype, *, quick: bool = False) -> None:
+        source = _source(self.parts, self.sizes, self.trained, dtype)
+        self.dtype, self.library = dtype, compiled_library(source, quick=quick)
+        self.lanes = ctypes.c_long.in_dll(self.library, "lanes").value
+
+    def of(self, rollout: Rollout) -> CompiledRollout:
+        """Return the free runs of a rollout that differs in its numbers alone."""
+        other = copy.copy(self)
+        other.rollout = rollout
+        return other
+
+    def _own(self, rollout: Rollout, count: int) -> Tensor:
+        """Return the numbers [count, n] that every row has for itself."""
+        held = _numbers(rollout)
+        parts = [held[name].detach()[:count].reshape(count, -1) for name in self.own]
+        return torch.cat([torch.zeros(count, 0), *parts], dim=1)
+
+    def prepared(self, held: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return what follows from the shared numbers: `theta`, and the tables of products."""
+        found = self.parts.prepare(*(held[name].double() for name in self.shared))
+        return _flat([found[k] for k in self.parts.plain]).to(self.dtype), _flat(
+            [found[one.place] for one in self.parts.products]
+        ).to(self.dtype)
+
+    def __call__(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return states, inputs that acted and the last memory, as the rollout does."""
+        rows = self._own(self.rollout, len(x) if self.own else 1).expand(len(x), -1)
+        q = self.rollout.source.initial(x)
+        with torch.set_grad_enabled(self.trained is not None and torch.is_grad_enabled()):
+            theta, tables = self.prepared(_numbers(self.rollout))
+            states, acted, after = self.flown(theta, tables, x, s, rows, w, q)
+        return states, w if self.rollout.source.given else acted, after
+
+    def flown(self, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return states, inputs and the last memory; the arguments are those of `_Flight`."""
+        if not torch.is_grad_enabled():
+            return self.fly(*given, keep=False)[0]
+        apply: Any = _Flight.apply
+        found: tuple[Tensor, Tensor, Tensor] = apply(*given, self)
+        return found
+
+    def fly(
+        self,
+        theta: Tensor,
+        tables: Tensor,
+        x: Tensor,
+        s: Tensor,
+        own: Tensor,
+        w: Tensor,
+        q: Tensor,
+        *,
+        keep: bool,
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], list[Tensor]]:
+        """Return states, inputs and the last memory of runs, and all that is known of each step.
+
+        The latter stand with the rows last, padded to whole blocks: `theta`, tables, own numbers,
+        states, inputs, both memories, and what goes into products and comes from them.
+        """
+        count, steps = w.shape[:2]
+        blocks = -(-count // self.lanes)
+        width = blocks * self.lanes
+        # rows that fill up the last block repeat the last one
+        places = torch.arange(width).clamp(max=count - 1)
+
+        def filled(part: Tensor) -> Tensor:
+            part = part.detach().to(self.dtype)
+            return part if width == count else part[places]
+
+        def room(*sizes: int) -> Tensor:
+            return torch.empty(*sizes, width, dtype=self.dtype)
+
+        states = room(steps + 1, self.sizes["x"])
+        memories = [room(steps + 1 if keep else 2, self.sizes[name]) for name in ("s", "q")]
+        for whole, start in zip((states, *memories), (x, s, q), strict=True):
+            whole[0] = filled(start).T
+        inputs = filled(w).permute(1, 2, 0).contiguous()
+        acting = room(steps, self.sizes["a"])
+        inside = sum(one.rows * (one.taken + one.given) for one in self.parts.products)
+        held = room(steps if keep else 0, inside)
+        rows = filled(own).T.contiguous()
+        known = [theta.detach(), tables.detach(), rows, states, inputs, *memories]
+        self.run("fly", blocks, *known, acting, held, int(keep), steps, width)
+        last = memories[0][steps if keep else steps & 1]
+        found = (
+            states.permute(2, 0, 1)[:count],
+            acting.permute(2, 0, 1)[:count],
+            last.T[:count],
+        )
+        return found, [*known, held]
+
+    def run(self, name: str, blocks: int, *arguments: Tensor | int) -> None:
+        """Call a function of the library for all blocks of rows, in as many threads as torch."""
+        function = getattr(self.library, name)
+        given = [
+            ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_long(a)
+            for a in arguments
+        ]
+        parts = min(self.threads, blocks)
+        ends = [ctypes.c_long(blocks * k // parts) for k in range(parts + 1)]
+        if parts == 1:
+            function(*given, *ends)
+            return
+        with ThreadPoolExecutor(parts) as pool:
+            list(pool.map(lambda part: function(*given, *part), pairwise(ends)))
+
+    def _check(self, alone: Rollout, x: Tensor, w: Tensor, s: Tensor) -> None:
+        """Compare a few steps from all that runs visit, and their gradient, with the rollout's own.
+
+        Rounding doubles from step to step where a law is steep, and tells nothing then: the text of
+        the library is compared in double precision, from equal states.
+
+        Args:
+            alone: the rollout in double precision.
+            x, w, s: of some runs.
+
+        Raises:
+            ExportError: where they differ by more than the precision explains.
+        """
+        step = _Step(alone)
+        held = {name: part.detach() for name, part in _numbers(alone).items()}
+        for name in self.own:
+            held[name] = held[name][: len(x)]
+
+        def flown(*start: Tensor, taken: Tensor, numbers: dict[str, Tensor]) -> list[Any]:
+            """Return x, s and q at every step, and what acted."""
+            states, acted = [tuple(start)], []
+            numbers = {f"rollout.{name}": part for name, part in numbers.items()}
+            for k in range(taken.shape[1]):
+                x, s, q = states[-1]
+                *after, acting = torch.func.functional_call(step, numbers, (x, taken[:, k], s, q))
+                states.append(tuple(after))
+                acted.append(acting)
+            return [*zip(*states, strict=True), acted]
+
+        count = min(_VISITED, w.shape[1])
+        w, x, s = w[:, :count].double(), x.double(), s.double()
+        with torch.no_grad():
+            seen = flown(x, s, alone.source.initial(x), taken=w, numbers=held)
+        # the rows of a visited step are one run each, under the inputs that came next
+        last = max(count - _STEPS, 0) + 1
+        starts = [torch.cat(parts[:last]) for parts in seen[:3]]
+        taken = torch.cat([w[:, k : k + _STEPS] for k in range(last)])
+        many = {name: held[name].repeat(last, *[1] * (held[name].dim() - 1)) for name in self.own}
+        wanted = {name: p for name, p in alone.named_parameters() if p.requires_grad}
+        weights = {name: held[name].requires_grad_() for name in self.shared if name in wanted}
+        rows = torch.cat(
+            [torch.zeros(len(taken), 0), *(part.reshape(len(taken), -1) for part in many.values())],
+            dim=1,
+        )
+
+        def offs(fly: Any) -> tuple[list[Tensor], list[Tensor]]:
+            """Return states, inputs and the gradient by the rollout's own steps, and by others."""
+            states, memory, _, acted = flown(*starts, taken=taken, numbers=held | many | weights)
+            pair = []
+            for found in ((torch.stack(states, 1), torch.stack(acted, 1), memory[-1]), fly()):
+                parts = list(found)
+                if self.trained is not None:
+                    cost = sum(part.double().square().mean() for part in parts if part.numel())
+                    slopes = torch.autograd.grad(
+                        torch.as_tensor(cost), list(weights.values()), allow_unused=True
+                    )
+                    parts += [slope for slope in slopes if slope is not None]
+                pair.append([part.detach().double() for part in parts])
+            return pair[0], pair[1]
+
+        def fly(loop: CompiledRollout) -> tuple[Tensor, Tensor, Tensor]:
+            theta, tables = loop.prepared(held | weights)
+            x, s, q, taken_, own = (
+                part.to(loop.dtype) for part in (starts[0], starts[1], starts[2], taken, rows)
+            )
+            return loop.flown(theta, tables, x, s, own, taken_, q)
+
+        with torch.set_grad_enabled(self.trained is not None):
+            slow, quick = offs(lambda: fly(self))
+            if _off(quick, slow) <= (_SAME if self.dtype == torch.float64 else _CLOSE):
+                return
+            exact = copy.copy(self)
+            exact._made(torch.float64, quick=True)
+            slow, fast = offs(lambda: fly(exact))
+            # rounding moves single rows far, a fault most of them
+            usual = [
+                ((a - b).abs().flatten(1).amax(1).median() / _size(b)).item()
+                for a, b in zip(quick[:2], fast[:2], strict=True)
+                if b.numel()
+            ]
+        off = max(_off(fast, slow), max(usual) * (_SAME / _ROUNDED))
+        if not off <= _SAME:
+            raise ExportError(f"the compiled rollout is off by {off:.2g} of its size")
+
+
+_CLOSE = 1e-4
+"""How far single precision may be off without a look at the same in double precision."""
+
+
+def _size(wanted: Tensor) -> Tensor:
+    return wanted.abs().max().clamp(min=1e-9)
+
+
+def _off(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
+    """Return the largest difference in shares of what is wanted; gradients are one of them."""
+    pairs = [(a, b) for a, b in zip(found[:3], wanted[:3], strict=True) if b.numel()]
+    if found[3:]:
+        pairs.append((_flat(found[3:]), _flat(wanted[3:])))
+    offs = [float((a - b).abs().max() / _size(b)) for a, b in pairs]
+    return max((math.inf if math.isnan(one) else one for one in offs), default=0.0)
+
+
+class _Flight(torch.autograd.Function):
+    """Free runs in C, and their gradient for shared numbers, start and memory."""
+
+    @staticmethod
+    def forward(ctx: Any, *given: Any) -> tuple[Tensor, Tensor, Tensor]:
+        """Return states [B, T+1, nx], inputs [B, T, m] and the last memory [B, n].
+
+        The arguments are theta, tables, x, s, own numbers, w, q, and the compiled rollout.
+        """
+        *parts, loop = given
+        found, known = loop.fly(*parts, keep=True)
+        ctx.loop, ctx.rows = loop, len(found[0])
+        ctx.save_for_backward(*known)
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the gradient of theta, tables, x and s."""
+        known, loop, count = ctx.saved_tensors, ctx.loop, ctx.rows
+        products = loop.parts.products
+        steps, _, width = known[4].shape
+        given = []
+        for grad in (grads[0], grads[1], grads[2][:, None]):
+            whole = torch.zeros(*grad.shape[1:], width, dtype=loop.dtype)
+            whole[:, :, :count] = grad.permute(1, 2, 0)
+            given.append(whole)
+        sizes = [one.rows * one.given for one in products]
+        pulled = torch.empty(steps, sum(sizes), width, dtype=loop.dtype)
+        # each row adds up for itself, so that the sum does not depend on the number of threads
+        blocks = width // loop.lanes
+        total = torch.zeros(blocks, len(loop.trained), loop.lanes, dtype=loop.dtype)
+        loop.run("back", blocks, *known, *given, pulled, total, steps, width)
+        plain = total.transpose(1, 2).reshape(width, -1)[:count]
+        held = known[-1].split([*sizes, *(one.rows * one.taken for one in products)], dim=1)
+        pairs = [
+            (factor.unflatten(1, (one.rows, -1)), slope.unflatten(1, (one.rows, -1)))
+            for one, factor, slope in zip(
+                products, held[len(products) :], pulled.split(sizes, dim=1), strict=True
+            )
+        ]
+        if math.isinf(loop.most):
+            by_table = [
+                a.permute(2, 0, 1, 3).flatten(1) @ b.permute(2, 0, 1, 3).flatten(1).T
+                for a, b in pairs
+            ]
+            found, tables = plain.sum(0), _flat(by_table)
+        else:
+            each = [
+                (a.permute(3, 2, 0, 1).flatten(2) @ b.permute(3, 0, 1, 2).flatten(1, 2)).flatten(1)
+                for a, b in pairs
+            ]
+            asked = sum(grad.flatten(1).square().sum(1) for grad in grads)
+            rows = torch.cat([plain, *(part[:count] for part in each)], dim=1)
+            whole = _held(rows, torch.as_tensor(asked).sqrt(), loop.most).sum(0)
+            found, tables = whole[: plain.shape[1]], whole[plain.shape[1] :]
+        theta = torch.zeros(len(known[0]), dtype=loop.dtype)
+        theta[loop.trained] = found
+        x, s = given[0][0].T[:count], given[2][0].T[:count]
+        return theta, tables, x, s, *[None] * 4
+
+
+def _held(gradients: Tensor, asked: Tensor, most: float) -> Tensor:
+    """Return gradients [B, n] of rows, none larger than a multiple of what the median row has.
+
+    Args:
+        gradients: of each row.
+        asked: size [B] of the gradient that each row was given.
+        most: the multiple; infinity leaves all as they are.
+    """
+    size = gradients.norm(dim=1)
+    share = size / asked.clamp(min=1e-30)
+    usual = share[asked > 0].nanmedian() if bool((asked > 0).any()) else share.new_zeros(())
+    kept = (most * usual * asked / size.clamp(min=1e-30)).clamp(max=1.0)
+    # what is no number says nothing
+    return torch.where(torch.isfinite(size)[:, None], gradients * kept[:, None], 0.0)
+
+
+def _numbers(rollout: Rollout) -> dict[str, Tensor]:
+    """Return the parameters and buffers of a rollout by name."""
+    return {**dict(rollout.named_parameters()), **dict(rollout.named_buffers())}
+
+
+def _flat(parts: Sequence[Tensor]) -> Tensor:
+    return torch.cat([torch.zeros(0), *(part.reshape(-1) for part in parts)])
