@@ -17,8 +17,9 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_json
 from residnet.core.names import STATE
+from residnet.dynamics.compiled import compiled
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model
 from residnet.export import exporter
 from residnet.export.base import released
@@ -120,7 +121,7 @@ class Model:
         states, inputs = self._rows(("x0", x0, 1), ("w", w, 2))
         memory = self._memory(s, len(states))
         with torch.no_grad():
-            found, _, _ = scripted(Rollout(self._double()), inputs.shape[1])(states, inputs, memory)
+            found, _, _ = compiled(Rollout(self._double()), inputs.shape[1])(states, inputs, memory)
         return _back(found, np.ndim(x0) == 1)
 
     def warmup(self, y_history: Any, w_history: Any) -> np.ndarray:

@@ -201,4 +201,3 @@ def compile_shared(sources: Sequence[Path], out: Path, flags: Sequence[str] = ()
         said = next((line for line in lines if "error" in line), "no message")
         raise ExportError(f"{sources[0].name}: does not compile ({said})")
     return out
-

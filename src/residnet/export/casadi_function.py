@@ -10,8 +10,8 @@ from typing import Any, ClassVar, final
 import casadi as ca
 import torch
 
-from residnet.export.base import Exported, Exporter, Loaded, Numbers, write_card
 from residnet.dynamics.lowering import in_numbers, lowered
+from residnet.export.base import Exported, Exporter, Loaded, Numbers, write_card
 
 
 class CasadiModel(Loaded):

@@ -28,8 +28,9 @@ from residnet.core.errors import DataError
 from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE, Live
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
+from residnet.dynamics.compiled import compiled
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import live_of
@@ -279,7 +280,7 @@ def innovations(
             [y[:, 0] + shown(one.sensor, y[:, 0], begin, one.size) for one in all_changes]
         )
         changed = ChangedDynamics(model, all_changes, rows, w.shape[2])
-        path, _, _ = scripted(Rollout(changed), steps)(
+        path, _, _ = compiled(Rollout(changed), steps)(
             x0, w.repeat(count, 1, 1), memory.repeat(count, 1)
         )
     path = path.reshape(count, rows, steps + 1, -1)

@@ -14,8 +14,9 @@ from residnet.core.layout import ALIVE, HEADING, POSE, POSITION, VELOCITIES, Liv
 from residnet.core.names import STATE, VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
+from residnet.dynamics.compiled import compiled
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.rollout import Rollout
 from residnet.judge.band import Band
 from residnet.judge.protocol import Window
 
@@ -296,7 +297,7 @@ def _simulated(
     )
     with torch.no_grad():
         s = _memory(model, windows, logs, tables, dtype)
-        states, _, _ = scripted(Rollout(model), longest)(
+        states, _, _ = compiled(Rollout(model), longest)(
             torch.from_numpy(x0).to(dtype), torch.from_numpy(ahead).to(dtype), s
         )
     found: torch.Tensor = states

@@ -39,9 +39,10 @@ from residnet.core.layout import (
 from residnet.core.names import STATE, VELOCITY
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
+from residnet.dynamics.compiled import compiled
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
 from residnet.physics.environment import WIND_INPUTS
 from residnet.physics.symmetry import channel_parity, pair_parity, partners_of
@@ -518,7 +519,7 @@ def check_bounded(
     alone = copy.deepcopy(model)
     alone.positions = False
     steps = round(max(_LONG_RUN, recorded.longest) / model.dt)
-    run, held = scripted(Rollout(alone), steps), w.unsqueeze(1).expand(-1, pause, -1)
+    run, held = compiled(Rollout(alone), steps), w.unsqueeze(1).expand(-1, pause, -1)
     away = torch.zeros(len(x))
     with torch.no_grad():
         for k in range(pause, steps + 1, pause):

@@ -30,8 +30,8 @@ from residnet.control.heading.tuning import tune
 from residnet.control.heading.vessels import SteeredPlant, fly
 from residnet.core.progress import begin, report, say
 from residnet.documents.gouletas2020.autopilot import predictive
-from residnet.dynamics.store import rebuilt
 from residnet.dynamics.compiled import CompiledRollout
+from residnet.dynamics.store import rebuilt
 from residnet.export.policy import ExportedHeading
 from residnet.judge.autopilots import (
     QUANTITIES,

@@ -18,8 +18,9 @@ from residnet.core.samples import Samples
 from residnet.data.module import Windows, WindowsDataModule
 from residnet.data.windows import WindowStore
 from residnet.dynamics.base import Integrator
+from residnet.dynamics.compiled import compiled
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import MANY, FreeRun, Rollout, scripted
+from residnet.dynamics.rollout import MANY, FreeRun, Rollout
 from residnet.heads.recurrent import RecurrentHead
 from residnet.physics.signals import Signals
 from residnet.physics.symmetry import mirrored_channels
@@ -303,7 +304,7 @@ class HeadTraining(EpochTraining):
         """Return the free run of the model as the training has it now."""
         if self._compiled is None:
             # not before: by now the model is on its device and in training
-            self._compiled = scripted(self.rollout, MANY)
+            self._compiled = compiled(self.rollout, MANY)
         return self._compiled
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
