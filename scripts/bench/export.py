@@ -28,9 +28,9 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "support"))
 import exported_models  # noqa: E402
 
+from residnet.dynamics.c_code import compiler  # noqa: E402
 from residnet.export import exporter, vessel  # noqa: E402
 from residnet.export.aoti import AotiModel  # noqa: E402
-from residnet.dynamics.c_code import compiler  # noqa: E402
 from residnet.export.casadi_function import CasadiModel  # noqa: E402
 from residnet.export.guard import GuardedDynamics  # noqa: E402
 from residnet.export.onnx_file import OnnxModel  # noqa: E402

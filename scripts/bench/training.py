@@ -5,6 +5,8 @@
   network alone, which no implementation can do without.
 - `ahead`: free runs of 64 rows, and the gradient of 64 windows of 40 steps, by networks of 24 units
   on a linear baseline: what no state decides found for many steps at once, against step by step.
+- `compiled`: free runs of 1, 64 and 1,024 rows, and the gradient of 64 windows of 40 steps, by
+  LSTMs on a linear baseline: as compiled C against TorchScript with what it finds ahead.
 - `epoch`: 25 teacher-forced batches of 64 windows of 100 samples for an LSTM, with gradients and
   optimiser, against a Dataset whose DataLoader collates windows and a cell that is called step by
   step. Both have the same network, data and loss.
@@ -12,7 +14,7 @@
 Times are CPU seconds of this process, the least of `--repeats`, so that a busy machine matters
 little; one thread, with the memory settings of a run (`keep_freed_memory`).
 
-    python scripts/bench/training.py [--parts rollout ahead epoch] [--repeats 5]
+    python scripts/bench/training.py [--parts rollout ahead compiled epoch] [--repeats 5]
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from torch.utils.data import DataLoader, Dataset
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.processes import keep_freed_memory
 from residnet.data.windows import WindowBatches
+from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import MANY, FreeRun, Playback, Rollout, Source, scripted
 from residnet.heads.base import ResidualHead
@@ -138,6 +141,33 @@ def ahead(repeats: int) -> None:
         )
 
 
+def compiled_runs(repeats: int) -> None:
+    """Print what free runs and their gradient cost as compiled C."""
+    steps, window = 200, 40
+    for hidden in (24, 100):
+        model = model_of(LstmConfig(hidden_size=hidden)).requires_grad_(False)
+        model.positions = False
+        x0, w = torch.randn(_BATCH, 6), torch.randn(_BATCH, steps, 2)
+        memory, told = model.initial_state(_BATCH), []
+        with torch.no_grad():
+            runs = (scripted(Rollout(model), MANY), CompiledRollout(Rollout(model), x0, w, memory))
+            for rows in (1, 64, _BATCH):
+                given = (x0[:rows], w[:rows], memory[:rows])
+                each = [1e6 * least(partial(run, *given), repeats) / steps for run in runs]
+                told.append(f"{rows} rows {each[0]:.0f} us a step, in C {each[1]:.1f} us")
+        model.head.requires_grad_(True)
+        given = (x0[:64], w[:64, :window], memory[:64])
+        found = []
+        for run in (scripted(Rollout(model), MANY), CompiledRollout(Rollout(model), *given)):
+
+            def gradient(run: FreeRun = run, given: tuple[Tensor, ...] = given) -> None:
+                run(*given)[0].square().mean().backward()
+
+            found.append(1e3 * least(gradient, repeats))
+        told.append(f"gradient of {window} steps {found[0]:.1f} ms, in C {found[1]:.1f} ms")
+        print(f"compiled, LSTM of {hidden}: {'; '.join(told)}")
+
+
 class Windows(Dataset[tuple[Tensor, Tensor]]):
     """Windows as a Dataset returns them, one at a time."""
 
@@ -210,14 +240,15 @@ def epochs(repeats: int) -> None:
 def main() -> None:
     """Print the parts that were asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", nargs="+", default=["rollout", "ahead", "epoch"])
+    parser.add_argument("--parts", nargs="+", default=["rollout", "ahead", "compiled", "epoch"])
     parser.add_argument("--repeats", type=int, default=5)
     given = parser.parse_args()
     torch.set_num_threads(1)
     keep_freed_memory()
     print(f"torch {torch.__version__}, {platform.platform()}, load {os.getloadavg()[0]:.1f}")
     for part in given.parts:
-        {"rollout": rollouts, "ahead": ahead, "epoch": epochs}[part](given.repeats)
+        parts = {"rollout": rollouts, "ahead": ahead, "compiled": compiled_runs, "epoch": epochs}
+        parts[part](given.repeats)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import pytest
 import torch
 import written_logs
 import written_recorders
+from torch import Tensor
 
 from residnet.baselines import BaselineConfig
 from residnet.core.config import validate
@@ -21,6 +22,7 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.registry import kinds
 from residnet.data.readers import ReaderConfig
+from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.rollout import Rollout, scripted
 from residnet.export import FORMATS, exporter, vessel
 from residnet.export.vessel import ExportedVessel
@@ -103,6 +105,49 @@ def test_head(kind: str) -> None:
     if kind == "genetic":
         pytest.importorskip("deap", reason="genetic programming needs the extra gp")
     check_head(validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here"))
+
+
+@pytest.mark.parametrize("kind", sorted({*kinds(HeadConfig)} - {"sklearn"}))
+def test_a_head_flies_in_c_as_it_does_in_torch(kind: str) -> None:
+    if kind == "genetic":
+        pytest.importorskip("deap", reason="genetic programming needs the extra gp")
+    config = validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here")
+    model, z = example_model(example_spec(config)).eval(), example_samples().z
+    model.positions = False
+    z = z[torch.arange(3)[:, None] * 100 + torch.arange(100)]
+    given = (
+        torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :3]), dim=1),
+        z[..., 3 : 3 + model.signals.inputs].repeat(1, 6, 1),
+        0.1 * torch.rand(3, model.n_state).double(),
+    )
+    trained = [p for p in model.head.parameters() if p.requires_grad]
+    exact: Sequence[Tensor] = ()
+    for dtype, share in ((torch.float64, 1e-9), (torch.float32, 1e-5)):
+        x, w, s = (part.to(dtype) for part in given)
+        slow = Rollout(model.to(dtype))
+        with torch.no_grad():
+            fast = CompiledRollout(slow, x, w, s)
+            found, wanted = fast(x, w, s), slow(x, w, s)
+            exact = wanted if dtype == torch.float64 else exact
+        for one, other, true in zip(found, wanted, exact, strict=True):
+            assert one.shape == other.shape
+            # of what each channel reaches; a heading of many turns is rounded in torch as in C
+            size, rounded = (
+                part.flatten(0, -2).abs().amax(0) for part in (true, other.double() - true)
+            )
+            assert bool(((one - true).abs() <= share * (size + 1e-3) + 2.0 * rounded).all())
+        if trained:
+            fast, w = CompiledRollout(slow, x, w, s), w[:, :40]
+            slopes = []
+            for run in (fast, slow):
+                start = (x.clone().requires_grad_(), s.clone().requires_grad_())
+                states, _, after = run(start[0], w, start[1])
+                cost = states[..., 3:].square().mean() + after.square().sum()
+                slopes.append(torch.autograd.grad(cost, (*trained, *start), allow_unused=True))
+            for one, other in zip(*slopes, strict=True):
+                if other is not None and other.numel():
+                    largest = float(other.abs().max())
+                    assert float((one - other).abs().max()) <= 100 * share * largest
 
 
 @pytest.mark.parametrize("kind", kinds(BaselineConfig))

@@ -281,7 +281,7 @@ def _source(
                 ("x_before", "total"),
             )
         )
-    counts = sizes | {
+    counts = dict(sizes) | {
         "held": held[-1], "pulled": held[len(products)], "total": len(trained or ())
     }  # fmt: skip
     text = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in counts.items())
@@ -711,6 +711,7 @@ class _Flight(torch.autograd.Function):
         The arguments are theta, tables, x, s, own numbers, w, q, and the compiled rollout.
         """
         *parts, loop = given
+        found: tuple[Tensor, Tensor, Tensor]
         found, known = loop.fly(*parts, keep=True)
         ctx.loop, ctx.rows = loop, len(found[0])
         ctx.save_for_backward(*known)

@@ -228,9 +228,9 @@ def in_parts(
         """Return the shared matrix that rows are multiplied with."""
         if node in alone or node.target not in _PRODUCTS or node.kwargs:
             return None
-        bias, a, b = (None, *node.args) if len(node.args) == 2 else node.args
-        inside = b in alone and a not in alone and (bias is None or isinstance(bias, Node))
-        return b if inside and b.meta["size"] >= _LEAST else None
+        a, b = node.args[-2:]
+        inside = isinstance(b, Node) and b in alone and a not in alone
+        return b if isinstance(b, Node) and inside and b.meta["size"] >= _LEAST else None
 
     edge = [node for node in alone if any(user not in alone for user in node.users)]
     found_constant = _subgraph(graph, places, list(constant))
@@ -262,7 +262,7 @@ def in_parts(
             begin += example.numel()
         else:
             values[node] = _Value(example)
-    symbols: list[tuple[Any, Any]] = []
+    symbols: list[Any] = []
     factors: list[Any] = []
     products: list[Product] = []
     apart: list[tuple[Any, Any]] = []
@@ -271,7 +271,8 @@ def in_parts(
         if (shared_matrix := matrix(node)) is not None:
             bias, a, b = (None, *args) if len(args) == 2 else args
             example = a.example @ b.example
-            made = Product(*a.example.shape, b.example.shape[1], edge.index(shared_matrix))
+            (times, taken), given = a.example.shape, b.example.shape[1]
+            made = Product(times, taken, given, edge.index(shared_matrix))
             symbol = ca.MX.sym(f"product_{len(products)}", example.numel())
             products.append(made)
             symbols.append(symbol)
