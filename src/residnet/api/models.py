@@ -17,7 +17,7 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_json
 from residnet.core.names import STATE
-from residnet.dynamics.compiled import compiled
+from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model

@@ -470,11 +470,6 @@ def compiled_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
             return ctypes.CDLL(str(out))
 
 
-def is_kept(source: str) -> bool:
-    """Return whether a C source is in the cache as a library."""
-    return _kept(compiler(), source, _flags(False)).is_file()
-
-
 def _flags(quick: bool) -> tuple[str, ...]:
     return ("-O0", *_FLAGS[1:]) if quick else _FLAGS
 

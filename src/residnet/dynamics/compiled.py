@@ -10,13 +10,9 @@ from __future__ import annotations
 
 import copy
 import ctypes
-import hashlib
-import io
 import math
-import pickle
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from itertools import accumulate, pairwise
 from typing import Any, final
 
@@ -26,18 +22,15 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
-from residnet.core.progress import say
 from residnet.dynamics.c_code import (
     FUNCTIONS,
     Body,
-    CompilerError,
     Tables,
     compiled_library,
-    is_kept,
     literal,
 )
 from residnet.dynamics.lowering import Parts, in_numbers, in_parts
-from residnet.dynamics.rollout import FreeRun, Rollout, scripted
+from residnet.dynamics.rollout import Rollout
 
 _VISITED, _ROWS, _STEPS = 40, 16, 3
 """The compiled rollout is checked over so many steps from every state that some runs visit in their
@@ -45,11 +38,6 @@ first steps: long enough that a step hands all on, too short for rounding to gro
 """
 _SAME, _ROUNDED = 1e-6, 5e-3
 """How far it may be off: in double precision, and the median row in the precision of runs."""
-_WORTH, _MAKING = 1_000, 2
-"""Steps of a free run that take as long as writing it in C, and those that take as long as
-compiling one line of a step (.5 s, and .4 ms a line, where a step in
-torch takes .15 to .5 ms).
-"""
 _LONGEST = 20_000
 """Most operations on single numbers of a step: more take a compiler minutes."""
 _HANDED_ON = ("x", "s", "q")
@@ -430,7 +418,6 @@ class CompiledRollout:
         most: how much of what is asked of a row reaches its gradient, as a multiple of the median
             over rows. A loop that is at the edge of swinging has flights whose gradients are
             millions of times as large as those of others.
-        steps: of free runs, that compiling may take as long as.
 
     Raises:
         ExportError: where a step cannot be recorded or written, or no C compiler does its work.
@@ -445,7 +432,6 @@ class CompiledRollout:
         *,
         own: Sequence[str] = (),
         most: float = math.inf,
-        steps: float = math.inf,
     ) -> None:
         self.rollout, self.dtype, self.own = rollout, x.dtype, tuple(own)
         self.most, self.threads = math.inf, max(torch.get_num_threads(), 1)
@@ -487,15 +473,12 @@ class CompiledRollout:
             for part in (found[k] for k in self.parts.plain):
                 self.trained += range(begin, begin + part.numel()) if part.requires_grad else ()
                 begin += part.numel()
-        self._made(x.dtype, steps=steps)
+        self._made(x.dtype)
         self._check(alone, x[:_ROWS], w[:_ROWS], s[:_ROWS])
         self.most = most
 
-    def _made(self, dtype: torch.dtype, *, quick: bool = False, steps: float = math.inf) -> None:
+    def _made(self, dtype: torch.dtype, *, quick: bool = False) -> None:
         source = _source(self.parts, self.sizes, self.trained, dtype)
-        takes = _MAKING * source.count("\n")
-        if takes > steps and not is_kept(source):
-            raise _DearError(takes)
         self.dtype, self.library = dtype, compiled_library(source, quick=quick)
         self.lanes = ctypes.c_long.in_dll(self.library, "lanes").value
 
@@ -761,90 +744,6 @@ class _Flight(torch.autograd.Function):
         theta[loop.trained] = found
         x, s = given[0][0].T[:count], given[2][0].T[:count]
         return theta, tables, x, s, *[None] * 4
-
-
-class _Structure(pickle.Pickler):
-    """Writes all of a rollout but the numbers of its parameters and buffers."""
-
-    def persistent_id(self, obj: Any) -> Any:
-        """Return what a tensor is known by."""
-        if not isinstance(obj, Tensor):
-            return None
-        if obj.is_floating_point():
-            return str(obj.dtype), tuple(obj.shape), obj.requires_grad
-        return obj.tolist()
-
-
-_KNOWN: dict[bytes, CompiledRollout | float] = {}
-"""Rollouts by structure: compiled, or the steps from which on that pays."""
-_ASKED: dict[bytes, int] = {}
-"""Steps that have been asked for, by structure."""
-
-
-def compiled(rollout: Rollout, steps: int) -> FreeRun:
-    """Return the rollout as compiled C where that pays and can be done.
-
-    Rollouts that differ in their numbers alone are compiled once. It pays once as many steps have
-    been asked for as take as long as compiling does. Elsewhere it is as `scripted` has it.
-
-    Args:
-        rollout: on its device, in its type, in training or in evaluation, as it is run.
-        steps: that will be run with it altogether.
-    """
-    chosen: dict[bool, FreeRun] = {}
-
-    def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        graded = torch.is_grad_enabled()
-        if graded not in chosen:
-            chosen[graded] = _chosen(rollout, steps, x0, w, s)
-        return chosen[graded](x0, w, s)
-
-    return run
-
-
-def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> FreeRun:
-    if x0.device.type != "cpu" or not rollout.source.given or not w.numel():
-        return scripted(rollout, steps)
-    out = io.BytesIO()
-    try:
-        _Structure(out).dump((rollout, x0.dtype, torch.is_grad_enabled()))
-    except Exception:
-        # parts of somebody else's that cannot be pickled
-        return scripted(rollout, steps)
-    key = hashlib.sha256(out.getvalue()).digest()
-    known = _KNOWN.get(key, _WORTH)
-    if isinstance(known, CompiledRollout):
-        return known.of(rollout)
-    _ASKED[key] = asked = _ASKED.get(key, 0) + steps
-    if known <= asked:
-        try:
-            _KNOWN[key] = made = CompiledRollout(rollout, x0, w, s, steps=asked)
-            return made
-        except _DearError as dear:
-            _KNOWN[key] = dear.steps
-        except Exception as error:
-            _tell(error)
-            _KNOWN[key] = math.inf
-    return scripted(rollout, steps)
-
-
-class _DearError(ExportError):
-    """Compiling takes as long as so many steps of a free run."""
-
-    def __init__(self, steps: float) -> None:
-        super().__init__(f"compiling pays from {steps:.0f} steps on")
-        self.steps = steps
-
-
-@cache
-def _tell_once(reason: str) -> None:
-    say(f"  free runs are not compiled, and take longer: {reason}")
-
-
-def _tell(error: Exception) -> None:
-    """Say once why free runs are not compiled, where that can be mended."""
-    if isinstance(error, CompilerError):
-        _tell_once(str(error))
 
 
 def _held(gradients: Tensor, asked: Tensor, most: float) -> Tensor:

@@ -28,7 +28,7 @@ from residnet.core.errors import DataError
 from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE, Live
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.compiled import compiled
+from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec

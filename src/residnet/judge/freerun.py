@@ -14,7 +14,7 @@ from residnet.core.layout import ALIVE, HEADING, POSE, POSITION, VELOCITIES, Liv
 from residnet.core.names import STATE, VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.compiled import compiled
+from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.judge.band import Band

@@ -39,8 +39,8 @@ from residnet.core.layout import (
 from residnet.core.names import STATE, VELOCITY
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
-from residnet.dynamics.compiled import compiled
 from residnet.dynamics.ensemble import MeanOfTrajectories
+from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec

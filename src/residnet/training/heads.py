@@ -18,7 +18,7 @@ from residnet.core.samples import Samples
 from residnet.data.module import Windows, WindowsDataModule
 from residnet.data.windows import WindowStore
 from residnet.dynamics.base import Integrator
-from residnet.dynamics.compiled import compiled
+from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import MANY, FreeRun, Rollout
 from residnet.heads.recurrent import RecurrentHead

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import torch
@@ -20,7 +20,9 @@ from residnet.control.heading.conditions import (
 from residnet.control.heading.controllers import Steering, TunableConfig
 from residnet.core.config import Config
 from residnet.core.errors import ExportError, FitError
-from residnet.dynamics.compiled import CompiledRollout
+
+if TYPE_CHECKING:
+    from residnet.dynamics.compiled import CompiledRollout
 
 _ROWS = 4096
 """Flights that are flown side by side."""

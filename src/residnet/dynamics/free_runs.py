@@ -1,0 +1,102 @@
+"""How a rollout is run where its numbers are wanted quickly: as compiled C, or by TorchScript."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor
+
+from residnet.core.progress import say
+from residnet.dynamics.rollout import FreeRun, Rollout, scripted
+
+if TYPE_CHECKING:
+    from residnet.dynamics.compiled import CompiledRollout
+
+_WORTH = 500
+"""Steps from which on a run is compiled: its own alone, so that numbers do not hang on what ran
+before. Writing and compiling a step takes .7 s, once for all models of a structure; a step in torch
+takes .15 to 1.3 ms.
+"""
+
+
+class _Structure(pickle.Pickler):
+    """Writes all of a rollout but the numbers of its parameters and buffers."""
+
+    def persistent_id(self, obj: Any) -> Any:
+        """Return what a tensor is known by."""
+        if not isinstance(obj, Tensor):
+            return None
+        if obj.is_floating_point():
+            return str(obj.dtype), tuple(obj.shape), obj.requires_grad
+        return obj.tolist()
+
+
+_KNOWN: dict[bytes, CompiledRollout | Literal[False]] = {}
+"""Rollouts by structure: compiled, or that they cannot be."""
+
+
+def compiled(rollout: Rollout, steps: int) -> FreeRun:
+    """Return the rollout as compiled C where that pays and can be done.
+
+    Rollouts that differ in their numbers alone are compiled once. Elsewhere it is as `scripted` has
+    it.
+
+    Args:
+        rollout: on its device, in its type, in training or in evaluation, as it is run.
+        steps: that will be run with it altogether.
+    """
+    chosen: dict[bool, FreeRun] = {}
+
+    def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        graded = torch.is_grad_enabled()
+        if graded not in chosen:
+            chosen[graded] = _chosen(rollout, steps, x0, w, s)
+        return chosen[graded](x0, w, s)
+
+    return run
+
+
+def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> FreeRun:
+    apart = x0.device.type != "cpu" or not rollout.source.given or not w.numel()
+    if steps < _WORTH or apart:
+        return scripted(rollout, steps)
+    out = io.BytesIO()
+    try:
+        _Structure(out).dump((rollout, x0.dtype, torch.is_grad_enabled()))
+    except Exception:
+        # parts of somebody else's that cannot be pickled
+        return scripted(rollout, steps)
+    key = hashlib.sha256(out.getvalue()).digest()
+    known = _KNOWN.get(key)
+    if known:
+        return known.of(rollout)
+    if known is not None:
+        return scripted(rollout, steps)
+    from residnet.dynamics.compiled import CompiledRollout
+
+    try:
+        _KNOWN[key] = made = CompiledRollout(rollout, x0, w, s)
+        return made
+    except Exception as error:
+        # no compiler, or a step that C does not hold
+        _KNOWN[key] = False
+        _tell(error)
+        return scripted(rollout, steps)
+
+
+@cache
+def _tell_once(reason: str) -> None:
+    say(f"  free runs are not compiled, and take longer: {reason}")
+
+
+def _tell(error: Exception) -> None:
+    """Say once why free runs are not compiled, where that can be mended."""
+    from residnet.dynamics.c_code import CompilerError
+
+    if isinstance(error, CompilerError):
+        _tell_once(str(error))
