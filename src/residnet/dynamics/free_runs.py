@@ -33,7 +33,7 @@ class _Structure(pickle.Pickler):
             return None
         if obj.is_floating_point():
             return str(obj.dtype), tuple(obj.shape), obj.requires_grad
-        return obj.tolist()
+        return str(obj.dtype), obj.tolist()
 
 
 _KNOWN: dict[bytes, CompiledRollout | Literal[False]] = {}
