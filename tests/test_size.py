@@ -16,17 +16,17 @@ import residnet
 
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
-    "api": (724, 84),
+    "api": (725, 84),
     "baselines": (845, 126),
-    "control": (3264, 355),
+    "control": (3255, 351),
     "core": (1400, 208),
     "data": (9035, 816),
     "documents": (2497, 229),
-    "dynamics": (971, 129),
-    "export": (2260, 267),
+    "dynamics": (2032, 258),
+    "export": (1479, 169),
     "heads": (1267, 190),
-    "identification": (2174, 224),
-    "judge": (2016, 221),
+    "identification": (2175, 224),
+    "judge": (2018, 221),
     "manoeuvres": (897, 136),
     "physics": (2022, 252),
     "regression": (1814, 204),
@@ -35,7 +35,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "simulators": (355, 44),
     "tasks": (3043, 254),
     "testing": (499, 33),
-    "training": (1221, 147),
+    "training": (1223, 147),
     "": (457, 54),
 }
 
