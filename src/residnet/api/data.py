@@ -12,9 +12,9 @@ from residnet.api.values import PartGiven, PathGiven, described, hearing, part, 
 from residnet.core.arrays import paged
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import Live
+from residnet.core.layout import ROLL, Live
 from residnet.core.log import Log
-from residnet.core.names import VELOCITY, nearest
+from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback, report, say
 from residnet.data.doctor import inspect as examine
 from residnet.data.doctor import inspect_together
@@ -286,7 +286,8 @@ def prepare(
     values; step and derivative by the sampling interval and by how long the yaw rate stays alike;
     models are judged over back-to-back windows of the length that most of the logs for judging
     hold, and of about a third of it; scales are the standard deviations of u, v and r over training
-    and validation logs. Where logs tell some of u, v and r alone, models are of these.
+    and validation logs. Where logs tell some of u, v and r alone, models are of these; where all
+    tell a roll angle, models roll.
 
     Args:
         logs: a list of logs (of each five, in the order of their manoeuvres, the third is for
@@ -304,7 +305,7 @@ def prepare(
             `selection` the first of `protocols` chooses between models.
 
     Returns:
-        The data: y, smooth [T, 6], nu_dot [T, 3], w [T, m] of each log, float64, SI.
+        The data: y, smooth [T, 3 + n], nu_dot [T, n], w [T, m] of each log, float64, SI.
 
     Raises:
         ConfigError: where a setting is wrong.
@@ -321,9 +322,7 @@ def prepare(
         splits, source = _splits(logs)
         given = settings.get("velocities")
         told = [Live.told(log.channels) for members in splits.values() for log in members]
-        # velocities that every log tells
-        shared = [n for n in VELOCITY if all(n in one.velocities for one in told)]
-        live = Live(tuple(shared) or VELOCITY) if given is None else _named_live(given)
+        live = Live.shared(told) if given is None else _named_live(given)
         whole = {
             name: [complete_motion(log, MotionConfig(), live) for log in members]
             for name, members in splits.items()
@@ -372,9 +371,9 @@ def prepare(
 def _named_live(given: Any) -> Live:
     names = [given] if isinstance(given, str) else list(given)
     for name in names:
-        if name not in VELOCITY:
-            raise UsageError(f"prepare: velocities: no velocity '{name}'{nearest(name, VELOCITY)}")
-    return Live(tuple(name for name in VELOCITY if name in names))
+        if name not in (known := ROLL.velocities):
+            raise UsageError(f"prepare: velocities: no velocity '{name}'{nearest(name, known)}")
+    return Live(tuple(name for name in ROLL.velocities if name in names))
 
 
 def _prepared(

@@ -17,7 +17,7 @@ from residnet.api.values import PartGiven, described, hearing, named_parts, part
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
-from residnet.core.names import STATE, nearest
+from residnet.core.names import nearest
 from residnet.core.processes import spread
 from residnet.core.progress import ProgressCallback
 from residnet.identification.fit import fit as identify
@@ -25,9 +25,10 @@ from residnet.identification.identified import Evaluation, Identified, candidate
 from residnet.identification.prepared import require_window, through_currents, velocity_limit
 from residnet.identification.settings import FitSettings, Parts
 from residnet.judge.metrics import metrics_table
+from residnet.judge.rollout_files import columns_of
 from residnet.judge.selection import Selection
 from residnet.judge.verdict import Evidence, by_windows, verdict
-from residnet.report.run_reader import COLUMNS, StoredWindow
+from residnet.report.run_reader import StoredWindow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,7 +62,8 @@ class FreeRuns:
     @cached_property
     def windows(self) -> list[StoredWindow]:
         """Every window, as `residnet.report.run_reader.RunFiles` reads them of a run."""
-        order, out = [STATE.index(name) for name in COLUMNS], []
+        live = self.evaluation.logs[0].live
+        order, out = [live.states.index(name) for name in columns_of(live)], []
         for run in self.evaluation.runs:
             counted = dict.fromkeys(range(len(self.logs)), 0)
             for i, window in sorted(enumerate(run.windows), key=lambda pair: pair[1].log):
@@ -97,8 +99,8 @@ class FreeRuns:
             pd.DataFrame(
                 {"log": one.log, "protocol": one.protocol, "model": model, "window": one.number}
                 | {"diverged": one.diverged[model], "t": one.t, "usable": one.usable}
-                | dict(zip(COLUMNS, one.measured.T, strict=True))
-                | dict(zip((f"{name}_hat" for name in COLUMNS), states.T, strict=True))
+                | dict(zip(columns_of(one.live), one.measured.T, strict=True))
+                | dict(zip((f"{name}_hat" for name in columns_of(one.live)), states.T, strict=True))
             )
             for one in self.windows
             for model, states in one.predicted.items()
@@ -215,7 +217,7 @@ def free_run(
             )
     logs = data.logs(split or ("test" if "test" in data.splits else next(iter(data.splits))))
     spec, divergence = found[0].spec, data.evaluation.divergence
-    limit = velocity_limit(np.array(spec.low), np.array(spec.high), divergence)
+    limit = velocity_limit(np.array(spec.low), np.array(spec.high), divergence, spec.signals.live)
     with hearing(progress):
         judged = candidates([model.fitted for model in found], data.source)
         return FreeRuns(evaluate(judged, logs, data.evaluation, step, limit))

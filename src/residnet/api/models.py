@@ -16,7 +16,6 @@ from residnet.api.values import PathGiven, described, path
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_json
-from residnet.core.names import STATE
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
@@ -46,7 +45,8 @@ if TYPE_CHECKING:
 class Model:
     """A fitted model of a vessel: what it is, how it was fitted, and how it moves.
 
-    States are x, y [m], psi [rad], u, v [m/s], r [rad/s]; inputs are named by `inputs`. Arrays may
+    States are x, y [m], psi [rad], u, v [m/s], r [rad/s], and of a vessel that rolls p [rad/s] and
+    phi [rad]; inputs are named by `inputs`. Arrays may
     be of one vessel (no batch axis) or of B; results have the axes that were given.
 
     Example:
@@ -69,7 +69,7 @@ class Model:
         self.fitted, self.name, self.module = fitted, fitted.name, fitted.model
         self.spec: ModelSpec = fitted.spec
         self.kind, self.dt = str(self.spec.role), self.spec.dt
-        self.states, self.inputs = STATE, self.spec.signals.columns
+        self.states, self.inputs = self.spec.signals.live.states, self.spec.signals.columns
         self.units = self.spec.signals.units()
         self.notes = dict(fitted.notes)
 

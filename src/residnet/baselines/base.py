@@ -18,7 +18,7 @@ from residnet.regression.estimator import Coefficient, Solution
 
 
 class Baseline(nn.Module, ABC):
-    """A baseline: accelerations [..., 3] from channels z [..., nz], without memory.
+    """A baseline: accelerations [..., n] from channels z [..., nz], without memory.
 
     They are in m/s^2, m/s^2 and rad/s^2.
 
@@ -32,18 +32,18 @@ class Baseline(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, z: Tensor) -> Tensor:
-        """Return nu_dot [..., 3] at channels z [..., nz] (see `residnet.physics.signals`)."""
+        """Return nu_dot [..., n] at channels z [..., nz] (see `residnet.physics.signals`)."""
 
     def ahead(self, p: Tensor) -> tuple[Tensor, list[Tensor]]:
         """Return what velocities do not decide, for `at`: rows [..., q], and what all rows share.
 
         Args:
-            p: channels behind the velocities [..., nz - 3].
+            p: channels behind the velocities [..., nz - n].
         """
         return p, []
 
     def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
-        """Return nu_dot [B, 3] at velocities nu [B, 3], by what `ahead` found.
+        """Return nu_dot [B, n] at velocities nu [B, n], by what `ahead` found.
 
         Where the baseline is `linear` that is row + nu held[0].
         """
@@ -86,13 +86,13 @@ class ParametricBaseline(Baseline, ABC):
 
     @abstractmethod
     def sensitivity(self, z: Tensor) -> Tensor:
-        """Return the derivatives [B, 3, P] of nu_dot with respect to the free parameters.
+        """Return the derivatives [B, n, P] of nu_dot with respect to the free parameters.
 
         They are taken at channels z [B, nz].
         """
 
     def along(self, z: Tensor, ahead: Tensor) -> Tensor:
-        """Return the derivatives of nu_dot [D, B, 3] along directions.
+        """Return the derivatives of nu_dot [D, B, n] along directions.
 
         Args:
             z: channels [B, nz].
@@ -187,12 +187,17 @@ class IdentifiedConfig(Config, ABC):
 
 
 def require(names: Sequence[str], wanted: Sequence[str], who: str) -> None:
-    """Check that channels exist, and velocities live.
+    """Check that channels exist, velocities live, and nothing rolls.
 
     Raises:
         ConfigError: naming the first that does not.
     """
     live = live_of(names)
+    if live.rolls:
+        raise ConfigError(
+            f"{who} knows no roll, but signals.velocities are {', '.join(live.velocities)}; take a"
+            " baseline of kind 'regressors' or 'still', or leave p out"
+        )
     for name in wanted:
         if name in live.dead:
             raise ConfigError(

@@ -18,6 +18,7 @@ from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
 from residnet.core.samples import Samples
 from residnet.physics.hull import HullConfig, OdinConfig
 from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.symmetry import live_of
 from residnet.physics.terms import SplitTerms, TermLibrary, parse_term, read_rows
 from residnet.physics.vessel import load_vessel
 from residnet.regression.estimator import Solution
@@ -27,10 +28,10 @@ Row = dict[str, float]
 
 @final
 class GivenBaseline(Baseline):
-    """A baseline nu_dot = theta [3, J] phi(z) [..., J] whose numbers stay as they were given.
+    """A baseline nu_dot = theta [n, J] phi(z) [..., J] whose numbers stay as they were given.
 
     Args:
-        rows: coefficients of u_dot, v_dot and r_dot by term.
+        rows: coefficients of u_dot, v_dot and r_dot by term; what else moves has none.
         names: channels of the model.
         fitted: whether the numbers were fitted, if to other data (correction E9 of document 000).
     """
@@ -39,21 +40,24 @@ class GivenBaseline(Baseline):
         super().__init__()
         terms = list(dict.fromkeys(term for row in rows for term in row))
         self.library = TermLibrary(terms, names)
-        self.split = SplitTerms(terms, names[len(VELOCITY) :])
+        moving = live_of(names).moving
+        self.dof = len(moving)
+        self.split = SplitTerms(terms, names[self.dof :], moving)
         self.linear = self.split.linear
         self.fitted = fitted
-        theta = [[row.get(term, 0.0) for term in terms] for row in rows]
+        beside = [dict[str, float]()] * (self.dof - len(rows))
+        theta = [[row.get(term, 0.0) for term in terms] for row in (*rows, *beside)]
         # a baseline without terms has nothing to store
         self.register_buffer(
             "theta",
-            torch.tensor(theta, dtype=torch.float64).reshape(3, len(terms)),
+            torch.tensor(theta, dtype=torch.float64).reshape(self.dof, len(terms)),
             persistent=len(terms) > 0,
         )
         self.theta: Tensor
 
     def forward(self, z: Tensor) -> Tensor:
         if self.library.count == 0:
-            return zero_acceleration(z)
+            return zero_acceleration(z, self.dof)
         phi: Tensor = self.library(z)
         return phi @ self.theta.to(z.dtype).T
 
@@ -63,7 +67,7 @@ class GivenBaseline(Baseline):
         return row, [own]
 
     def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
-        """Return nu_dot [B, 3] at velocities nu [B, 3], by what `ahead` found."""
+        """Return nu_dot [B, n] at velocities nu [B, n], by what `ahead` found."""
         found: Tensor = self.split(nu, row, held[0])
         return found
 
@@ -74,11 +78,11 @@ class GivenBaseline(Baseline):
     def mass(self) -> Tensor | None:
         """Return the inertia [3, 3], the inverse of what forces do to accelerations.
 
-        None where that has no inverse.
+        None where that has no inverse, or the vessel rolls.
         """
         terms = self.library.terms
         columns = [terms.index(name) for name in FORCE_CHANNELS if name in terms]
-        if len(columns) < len(FORCE_CHANNELS):
+        if len(columns) < len(FORCE_CHANNELS) or self.dof > len(FORCE_CHANNELS):
             return None
         by_force = self.theta[:, columns].to(torch.float64)
         apart = float(torch.linalg.cond(by_force / by_force.abs().amax(0))) < 1e6
@@ -104,7 +108,7 @@ class StillConfig(GivenConfig):
 
     def build(self, names: Sequence[str]) -> GivenBaseline:
         """Return the module; it has no parameters."""
-        return GivenBaseline([{}, {}, {}], names)
+        return GivenBaseline([], names)
 
 
 class EquationsConfig(GivenConfig):
@@ -152,6 +156,7 @@ class EquationsConfig(GivenConfig):
         return value
 
     def build(self, names: Sequence[str]) -> GivenBaseline:
+        require(names, (), "baseline 'equations'")
         rows = [
             {term: self._in_si(axis, term, value, names) for term, value in row.items()}
             for axis, row in zip(VELOCITY, (self.u, self.v, self.r), strict=True)

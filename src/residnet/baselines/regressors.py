@@ -17,10 +17,13 @@ from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres
 from residnet.baselines.sets import Roles, SetName, expand, merged
-from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.core.errors import ConfigError
+from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
 from residnet.physics.signals import VelocityBound
 from residnet.physics.symmetry import (
+    ChannelNames,
+    axis_parities,
     dissipates,
     live_of,
     living,
@@ -34,13 +37,13 @@ from residnet.regression.least_squares import LeastSquares
 
 _BEYOND = 0.5
 """Share of a channel's training range, on either side, in which a bounded model is as fitted."""
-RowTerms = dict[Literal["u", "v", "r"], tuple[str, ...]]
+RowTerms = dict[Literal["u", "v", "r", "p"], tuple[str, ...]]
 Penalty = Annotated[float, Field(ge=0)]
 
 
 @final
 class RegressorBaseline(ParametricBaseline):
-    """A baseline that is linear in its coefficients, nu_dot [..., 3] = theta [3, J] phi(z).
+    """A baseline that is linear in its coefficients, nu_dot [..., n] = theta [n, J] phi(z).
 
     A term that an axis does not have keeps a zero.
     """
@@ -59,7 +62,9 @@ class RegressorBaseline(ParametricBaseline):
         are pulled back.
         """
         terms = list(dict.fromkeys(term for row in rows for term in row))
-        super().__init__(torch.zeros(3, len(terms), dtype=torch.float64))
+        live = live_of(names)
+        super().__init__(torch.zeros(live.size, len(terms), dtype=torch.float64))
+        self.dof, self.axes, self.outputs = live.size, live.moving, live.rates
         self.library = TermLibrary(terms, names)
         allowed = torch.tensor(
             [[term in row for term in terms] for row in rows], dtype=torch.float64
@@ -68,9 +73,11 @@ class RegressorBaseline(ParametricBaseline):
         self.allowed: Tensor
         self.held = tuple((axis, terms.index(term)) for axis, term in held)
         self.dissipative = dissipative
-        self.names = tuple(names)
-        self.bound: VelocityBound | None = VelocityBound(_BEYOND, len(names)) if bounded else None
-        self.split = SplitTerms(terms, names[len(VELOCITY) :])
+        self.names = names if isinstance(names, ChannelNames) else tuple(names)
+        self.bound: VelocityBound | None = None
+        if bounded:
+            self.bound = VelocityBound(_BEYOND, len(names), live.size)
+        self.split = SplitTerms(terms, names[live.size :], live.moving)
         self.linear = self.split.linear and not bounded
 
     def forward(self, z: Tensor) -> Tensor:
@@ -90,11 +97,12 @@ class RegressorBaseline(ParametricBaseline):
             row, own = self.split.ahead(p, weights)
             return row, [own]
         low, high = self.bound.low.to(p.dtype), self.bound.high.to(p.dtype)
-        row, own = self.split.ahead(torch.clamp(p, low[3:], high[3:]), weights)
-        return row, [own, low[:3], high[:3], self.bound.rate.to(p.dtype)]
+        n = self.dof
+        row, own = self.split.ahead(torch.clamp(p, low[n:], high[n:]), weights)
+        return row, [own, low[:n], high[:n], self.bound.rate.to(p.dtype)]
 
     def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
-        """Return nu_dot [B, 3] at velocities nu [B, 3], by what `ahead` found."""
+        """Return nu_dot [B, n] at velocities nu [B, n], by what `ahead` found."""
         if self.bound is None:
             free: Tensor = self.split(nu, row, held[0])
             return free
@@ -119,15 +127,15 @@ class RegressorBaseline(ParametricBaseline):
     def free_names(self) -> list[tuple[str, str]]:
         terms = self.library.terms
         return [
-            (ACCELERATION[i // len(terms)], terms[i % len(terms)])
+            (self.outputs[i // len(terms)], terms[i % len(terms)])
             for i in self.free_indices().tolist()
         ]
 
     def sensitivity(self, z: Tensor) -> Tensor:
-        """Return d nu_dot / d theta [B, 3, P]: a coefficient moves its own axis by its term."""
+        """Return d nu_dot / d theta [B, n, P]: a coefficient moves its own axis by its term."""
         free = self.free_indices()
         axis, column = free // self.library.count, free % self.library.count
-        own = nn.functional.one_hot(axis, 3).T.to(z.dtype)
+        own = nn.functional.one_hot(axis, self.dof).T.to(z.dtype)
         seen = z if self.bound is None else self.bound.held(z)
         out: Tensor = self.library(seen).index_select(1, column).unsqueeze(1) * own
         return out
@@ -149,7 +157,7 @@ class RegressorBaseline(ParametricBaseline):
         phi, variance = self._residual(samples)
         gram = phi.T @ phi / len(samples)
         free = self.free_indices()
-        blocks = [gram / variance[axis] for axis in range(3)]
+        blocks = [gram / variance[axis] for axis in range(self.dof)]
         whole: Tensor = torch.block_diag(*blocks)
         return whole[free][:, free]
 
@@ -164,15 +172,15 @@ class RegressorBaseline(ParametricBaseline):
         images = mirrored_terms(terms, samples.names)
         if images is None:
             # of single terms some parity may be known where that of all channels is not
-            wrong = [wrong_parity(t, i, samples.names) for i in range(3) for t in terms]
+            wrong = [wrong_parity(t, i, samples.names) for i in range(self.dof) for t in terms]
             images = {}
         else:
-            wrong = [False] * (3 * len(terms))
-        out = torch.diag(torch.tensor(wrong, dtype=torch.float64) * energy.repeat(3))
-        for axis, turned in enumerate((1, -1, -1)):
+            wrong = [False] * (self.dof * len(terms))
+        out = torch.diag(torch.tensor(wrong, dtype=torch.float64) * energy.repeat(self.dof))
+        for axis, turned in enumerate(axis_parities(samples.names)):
             for place, (other, sign) in images.items():
                 # a quarter: the image of a term of the wrong parity is the term with minus
-                apart = torch.zeros(3 * len(terms), dtype=torch.float64)
+                apart = torch.zeros(self.dof * len(terms), dtype=torch.float64)
                 apart[axis * len(terms) + place] += 0.5
                 apart[axis * len(terms) + other] -= 0.5 * sign * turned
                 out += energy[place] * torch.outer(apart, apart)
@@ -199,15 +207,15 @@ class RegressorBaseline(ParametricBaseline):
             return []
         free = self.free_indices().tolist()
         slopes, theta = _own_slopes(self.library, samples), self.theta.detach()
-        found = [(axis, _undamped(theta[axis], slopes[axis])) for axis in range(3)]
+        found = [(axis, _undamped(theta[axis], slopes[axis])) for axis in range(self.dof)]
         places = [axis * self.library.count + term for axis, term in found if term is not None]
         return [free.index(place) for place in places if place in free]
 
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
         terms = self.library.terms
         rows = {
-            f"{name}_dot": dict(zip(terms, self.theta[axis].tolist(), strict=True))
-            for axis, name in enumerate(VELOCITY)
+            name: dict(zip(terms, self.theta[axis].tolist(), strict=True))
+            for axis, name in enumerate(self.outputs)
         }
         known = dict(zip(self.free_names(), errors.tolist(), strict=True))
         return [
@@ -222,7 +230,7 @@ class RegressorBaseline(ParametricBaseline):
         ]
 
     def _residual(self, samples: Samples) -> tuple[Tensor, Tensor]:
-        """Return the terms [N, J], and the variance [3] of what they leave."""
+        """Return the terms [N, J], and the variance [n] of what they leave."""
         phi = self.library(samples.z)
         left = samples.target - phi @ (self.theta * self.allowed).detach().T
         return phi, left.square().mean(0)
@@ -238,11 +246,15 @@ class RegressorBaseline(ParametricBaseline):
 
 
 def living_rows(rows: Sequence[Sequence[str]], names: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the terms of u, v and r that are not zero at all times; none where an axis is."""
-    live = live_of(names).velocities
+    """Return the terms of what moves that are not zero at all times.
+
+    An axis has none where it is zero itself, is an angle whose rate is known, or is behind `rows`.
+    """
+    live = live_of(names)
+    given = [*rows, *[()] * (live.size - len(rows))]
     return [
-        tuple(term for term in row if living(term, names)) if axis in live else ()
-        for axis, row in zip(VELOCITY, rows, strict=True)
+        tuple(term for term in row if living(term, names)) if axis in live.learned else ()
+        for axis, row in enumerate(given)
     ]
 
 
@@ -250,10 +262,11 @@ _POINTS = 400
 
 
 def _own_slopes(library: TermLibrary, samples: Samples) -> Tensor:
-    """Return the slopes [3, K, J] of the terms along u, v and r at samples spread evenly."""
+    """Return the slopes [n, K, J] of the terms along what moves at samples spread evenly."""
     z = samples.z[:: max(1, len(samples) // _POINTS)].double()
-    ahead = z.new_zeros(len(VELOCITY), *z.shape)
-    for axis, name in enumerate(VELOCITY):
+    moving = live_of(samples.names).moving
+    ahead = z.new_zeros(len(moving), *z.shape)
+    for axis, name in enumerate(moving):
         ahead[axis, :, samples.names.index(name)] = 1.0
     return library.along(z, ahead)
 
@@ -292,8 +305,8 @@ class RegressorsConfig(IdentifiedConfig):
             rudder); `abkowitz` (third-order Taylor series about straight ahead); `astern` (what
             tells a propeller that turns astern); `wind`; `polynomial_1`, `polynomial_2` (all
             products of velocities and inputs, the ridge models of document 001 section 2.2).
-        terms: further regressors of every axis, or of each axis `u`, `v`, `r`; with neither sets
-            nor terms: the constant and every channel.
+        terms: further regressors of every axis, or of each axis `u`, `v`, `r` (and `p` of a
+            roll); with neither sets nor terms: the constant and every channel.
         drive: channels that the sets take as thrust; empty: n, or tau_x where the model makes
             forces.
         steer: channels that the sets take as steering; empty: delta, or tau_n where the model makes
@@ -322,7 +335,7 @@ class RegressorsConfig(IdentifiedConfig):
 
     @model_validator(mode="after")
     def _rows(self) -> RegressorsConfig:
-        if isinstance(self.terms, dict) and set(self.terms) != set(VELOCITY):
+        if isinstance(self.terms, dict) and not {*VELOCITY} <= set(self.terms):
             raise ValueError(f"terms per axis need all of u, v, r; given {sorted(self.terms)}")
         if (self.drive or self.steer) and not self.sets:
             raise ValueError(
@@ -340,10 +353,18 @@ class RegressorsConfig(IdentifiedConfig):
 
     def _named(self, names: Sequence[str]) -> list[tuple[str, ...]]:
         """Return the regressors of each axis as the settings name them."""
+        axes = live_of(names).layout.velocities
+        if isinstance(self.terms, dict) and set(self.terms) != set(axes):
+            raise ConfigError(
+                f"terms: the axes of the model are {', '.join(axes)}; given {sorted(self.terms)}"
+            )
         given = (
-            [tuple(self.terms[axis]) for axis in ("u", "v", "r")]
+            [
+                tuple(row)
+                for _, row in sorted(self.terms.items(), key=lambda one: axes.index(one[0]))
+            ]
             if isinstance(self.terms, dict)
-            else [tuple(self.terms)] * 3
+            else [tuple(self.terms)] * len(axes)
         )
         if self.sets:
             shared = expand(self.sets, Roles.of(names, self.drive, self.steer))
@@ -371,11 +392,11 @@ class RegressorsConfig(IdentifiedConfig):
                 picked.target[:, [axis]],
                 picked.group,
                 names=[terms[j] for j in columns],
-                outputs=(ACCELERATION[axis],),
+                outputs=(baseline.outputs[axis],),
             )
 
-        # an axis that is zero at all times has nothing to fit
-        live = live_of(picked.names).axes
+        # an axis that is zero at all times, or whose rate is known, has nothing to fit
+        live = live_of(picked.names).learned
         fits = {}
         slopes = _own_slopes(baseline.library, picked) if self.dissipative else None
         for axis in live:
@@ -398,7 +419,7 @@ class RegressorsConfig(IdentifiedConfig):
         ]
         if not self.bounded:
             return found
-        bound = VelocityBound(_BEYOND, len(picked.names))
+        bound = VelocityBound(_BEYOND, len(picked.names), baseline.dof)
         bound.calibrate(picked)
         state = {f"bound.{name}": value for name, value in bound.state_dict().items()}
         return [replace(one, state={**one.state, **state}) for one in found]

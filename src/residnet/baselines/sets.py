@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY, nearest
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
-from residnet.physics.symmetry import meaning
+from residnet.physics.symmetry import live_of, meaning
 from residnet.physics.terms import Factor, polynomial_terms
 
 SetName = Literal["linear", "fossen", "abkowitz", "astern", "wind", "polynomial_1", "polynomial_2"]
@@ -23,14 +23,14 @@ class Roles(NamedTuple):
     """The roles of a model's channels.
 
     Attributes:
-        names: all channels.
+        moving: velocities, and the angles that forces depend on.
         drives: those that push.
         steers: those that turn.
         others: inputs of which neither is known.
         wind: whether there is wind.
     """
 
-    names: tuple[str, ...]
+    moving: tuple[str, ...]
     drives: tuple[str, ...]
     steers: tuple[str, ...]
     others: tuple[str, ...]
@@ -52,12 +52,13 @@ class Roles(NamedTuple):
         acting = [
             name
             for name in names
-            if name not in (*VELOCITY, *WIND_CHANNELS) and (not forces or name in FORCE_CHANNELS)
+            if name not in (*live_of(names).moving, *WIND_CHANNELS)
+            and (not forces or name in FORCE_CHANNELS)
         ]
         drives = tuple(drive) or tuple(name for name in acting if name in _DRIVES)
         steers = tuple(steer) or tuple(name for name in acting if name in _STEERS)
         others = tuple(name for name in acting if name not in (*drives, *steers) and not forces)
-        return cls(tuple(names), drives, steers, others, "wind_u" in names)
+        return cls(live_of(names).moving, drives, steers, others, "wind_u" in names)
 
     def known(self, who: str) -> Roles:
         """Return the same, where every input has a role.
@@ -79,7 +80,7 @@ class Roles(NamedTuple):
 
 
 def _linear(roles: Roles) -> list[str]:
-    return ["1", *VELOCITY, *roles.drives, *roles.steers, *roles.others]
+    return ["1", *roles.moving, *roles.drives, *roles.steers, *roles.others]
 
 
 def _thrust(drive: str) -> list[str]:
@@ -112,10 +113,13 @@ def _fossen(roles: Roles) -> list[str]:
     """Return the terms of Fossen's manoeuvring model.
 
     Coriolis products, linear and quadratic damping (document 002 eq. (2.4), document 003 eqs.
-    (7)-(9)).
+    (7)-(9)). Of a roll its damping, what speed does to damping and restoring, and a restoring that
+    is not linear (document 004).
     """
     hull = ["u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|"]
-    return ["1", *VELOCITY, *hull, *_controls(roles.known("fossen"))]
+    if "p" in roles.moving:
+        hull += ["u p", "p|p|", "u|u| phi", "phi^3"]
+    return ["1", *roles.moving, *hull, *_controls(roles.known("fossen"))]
 
 
 def _abkowitz(roles: Roles) -> list[str]:
@@ -127,12 +131,14 @@ def _abkowitz(roles: Roles) -> list[str]:
     even = [" ".join(c) for c in combinations_with_replacement(sideways, 2)]
     odd = [" ".join(c) for c in combinations_with_replacement(sideways, 3)]
     speed = ["u", "u^2", "u^3", *(f"u {name}" for name in sideways)]
+    rolling = [t for name in roles.moving[len(VELOCITY) :] for t in (name, f"u {name}")]
     return [
         "1",
         *speed,
         *sideways,
         *even,
         *odd,
+        *rolling,
         *(t for drive in roles.drives for t in _thrust(drive)),
     ]
 
@@ -172,7 +178,9 @@ def _polynomial(roles: Roles, degree: int) -> list[str]:
     wind = ("wind_u", "wind_v") if roles.wind else ()
     return [
         "1",
-        *polynomial_terms((*VELOCITY, *roles.drives, *roles.steers, *roles.others, *wind), degree),
+        *polynomial_terms(
+            (*roles.moving, *roles.drives, *roles.steers, *roles.others, *wind), degree
+        ),
     ]
 
 

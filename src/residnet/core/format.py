@@ -11,7 +11,13 @@ DASH = "–"
 """Stands where there is no number."""
 SHOWN_UNITS = {"rad": ("deg", DEG), "rad/s": ("deg/s", DEG)}
 """SI units that are shown in another one, with the factor to it."""
-_TITLES = {"u": "surge u", "v": "sway v", "r": "yaw rate r", "p": "roll rate p"}
+_TITLES = {
+    "u": "surge u",
+    "v": "sway v",
+    "r": "yaw rate r",
+    "p": "roll rate p",
+    "phi": "roll angle phi",
+}
 _COMMON = (-4, 6)
 """Powers of ten between which a number is written without an exponent."""
 

@@ -1,7 +1,8 @@
 """Which states and degrees of freedom a model has, and where they stand in its tensors.
 
 The columns below are those of the planar model, three degrees of freedom; no other module counts
-them. Functions serve code that TorchScript compiles, which takes no global slices.
+them. A model with roll keeps them, with p and phi behind. Functions serve code that TorchScript
+compiles, which takes no global slices; n is the number of what moves (`Live.size`).
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,20 +19,31 @@ from residnet.core import names
 
 @dataclass(frozen=True)
 class StateLayout:
-    """The states of a model in the order of its tensors: pose, velocities, then its actuators'.
+    """The states of a model in the order of its tensors: pose, what moves it, then its actuators'.
+
+    What moves are the velocities and, behind them, those angles that forces depend on. The rates of
+    the angles follow from the velocities, and everything else about them is as with velocities:
+    they stand first among the channels, they have ranges, limits, scales and errors.
 
     Attributes:
         pose: names of the pose.
         velocities: names of the velocities, one for each degree of freedom.
+        attitude: names of the angles that forces depend on.
     """
 
     pose: tuple[str, ...]
     velocities: tuple[str, ...]
+    attitude: tuple[str, ...] = ()
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Names of the velocities and of the angles that forces depend on."""
+        return (*self.velocities, *self.attitude)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of pose and velocities."""
-        return (*self.pose, *self.velocities)
+        """Names of pose, velocities and angles."""
+        return (*self.pose, *self.moving)
 
     @property
     def dof(self) -> int:
@@ -44,12 +57,12 @@ class StateLayout:
 
     @property
     def velocity_columns(self) -> slice:
-        """Columns of the velocities."""
+        """Columns of the velocities and of the angles behind them."""
         return slice(len(self.pose), len(self.names))
 
     @property
     def motion_columns(self) -> slice:
-        """Columns of pose and velocities."""
+        """Columns of pose, velocities and angles."""
         return slice(0, len(self.names))
 
     @property
@@ -60,48 +73,112 @@ class StateLayout:
 
 PLANAR = StateLayout(names.POSE, names.VELOCITY)
 """Three degrees of freedom: x, y, psi, u, v, r."""
+ROLL = StateLayout(names.POSE, (*names.VELOCITY, "p"), ("phi",))
+"""Four degrees of freedom: x, y, psi, u, v, r, p, phi."""
+_RATES = {"phi": "p"}
+"""The velocity that is the rate of an angle."""
 
 
 @dataclass(frozen=True)
 class Live:
-    """Which velocities of the planar state live, where only some were recorded.
+    """Which velocities a model moves: those of u, v and r that were recorded, and p of the roll.
 
-    The others are zero at all times: they have no equation, no term and no error. The pose is what
-    the live ones lead to, a straight line from surge alone, a turn on the spot from yaw alone; so
-    the time loop, exports and windows are those of the planar state.
+    Of u, v and r the others are zero at all times: they have no equation, no term and no error. The
+    pose is what the live ones lead to, a straight line from surge alone, a turn on the spot from
+    yaw alone; so the time loop, exports and windows are those of the planar state. With p the
+    states are those of `ROLL`.
 
     Attributes:
-        velocities: names of those that live, of u, v and r.
+        velocities: names of those that live, of u, v, r and p.
     """
 
     velocities: tuple[str, ...] = PLANAR.velocities
 
     @classmethod
     def told(cls, channels: Iterable[str]) -> Live:
-        """Return the velocities that channels of a log tell; all where they tell none.
+        """Return the velocities that channels of a log tell; u, v and r where they tell none.
 
-        They are measured, or follow from a heading (r) or from position and heading (all).
+        They are measured, or follow from a heading (r), from position and heading (all) or from a
+        roll angle (p, which nothing tells without it).
         """
         held = set(channels)
-        if held.issuperset(PLANAR.pose):
-            return cls()
+        held |= set(PLANAR.velocities) if held.issuperset(PLANAR.pose) else set()
         held |= {"r"} if "psi" in held else set()
-        return cls(tuple(name for name in PLANAR.velocities if name in held) or PLANAR.velocities)
+        found = [name for name in PLANAR.velocities if name in held] or [*PLANAR.velocities]
+        return cls((*found, *(["p"] if "phi" in held else [])))
+
+    @classmethod
+    def shared(cls, told: Iterable[Live]) -> Live:
+        """Return the velocities that each of several tells; u, v and r where they share none."""
+        sets = [one.velocities for one in told]
+        found = [name for name in ROLL.velocities if all(name in one for one in sets)]
+        planar = any(name in PLANAR.velocities for name in found)
+        return cls(tuple(found) if planar else PLANAR.velocities)
+
+    @property
+    def layout(self) -> StateLayout:
+        """The states of the model."""
+        return ROLL if "p" in self.velocities else PLANAR
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Names of what moves: velocities, living or not, and the angles that forces depend on."""
+        return self.layout.moving
+
+    @property
+    def rates(self) -> tuple[str, ...]:
+        """Names of the derivatives of what moves."""
+        return tuple(f"{name}_dot" for name in self.moving)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states: pose and what moves."""
+        return self.layout.names
+
+    @property
+    def size(self) -> int:
+        """Number of what moves."""
+        return len(self.moving)
+
+    @property
+    def columns(self) -> slice:
+        """Columns of what moves among the states."""
+        return self.layout.velocity_columns
+
+    @property
+    def rolls(self) -> bool:
+        """Whether the vessel rolls."""
+        return self.layout is ROLL
 
     @property
     def whole(self) -> bool:
-        """Whether all velocities live."""
+        """Whether all velocities of the layout live."""
+        return self.velocities == self.layout.velocities
+
+    @property
+    def planar(self) -> bool:
+        """Whether u, v and r live, and nothing else does."""
         return self.velocities == PLANAR.velocities
 
     @property
     def dead(self) -> tuple[str, ...]:
         """Names of those that do not."""
-        return tuple(name for name in PLANAR.velocities if name not in self.velocities)
+        return tuple(name for name in self.layout.velocities if name not in self.velocities)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of what lives of what moves, and so has errors."""
+        return tuple(name for name in self.moving if name not in self.dead)
 
     @property
     def axes(self) -> list[int]:
-        """Places of the live ones among u, v, r."""
-        return [PLANAR.velocities.index(name) for name in self.velocities]
+        """Places of what lives among what moves."""
+        return [self.moving.index(name) for name in self.channels]
+
+    @property
+    def learned(self) -> list[int]:
+        """Places of the live velocities among what moves: what has an equation to find."""
+        return [self.moving.index(name) for name in self.velocities]
 
     @property
     def moves(self) -> bool:
@@ -115,9 +192,9 @@ class Live:
 
     @property
     def text(self) -> str:
-        """What follows from some velocities not living, for a reader; empty where all live."""
+        """What follows from the velocities not being u, v and r, for a reader; empty for these."""
         if self.whole:
-            return ""
+            return "surge, sway, yaw and roll, with the roll angle" if self.rolls else ""
         text = f"the logs tell {' and '.join(self.velocities)} alone, and"
         text += f" {' and '.join(self.dead)} {'are' if len(self.dead) > 1 else 'is'} taken as zero"
         if not self.moves:
@@ -127,13 +204,27 @@ class Live:
         return f"{text}: the vessel moves over ground where it points, without drift"
 
     def mask(self) -> Tensor:
-        """Return 1 for each of u, v, r that lives and 0 for the others, [3] float64."""
-        alive = [float(name in self.velocities) for name in PLANAR.velocities]
-        return torch.tensor(alive, dtype=torch.float64)
+        """Return 1 for each that has an equation of its own and 0 for the others, [n] float64."""
+        out = torch.zeros(self.size, dtype=torch.float64)
+        out[self.learned] = 1.0
+        return out
+
+    def alive(self) -> Tensor:
+        """Return 0 for each velocity that is zero at all times and 1 for the others, [n]."""
+        out = torch.zeros(self.size, dtype=torch.float64)
+        out[self.axes] = 1.0
+        return out
+
+    def known_rates(self) -> Tensor:
+        """Return K [n, n] with nu K the rates of the angles, from what moves nu [..., n]."""
+        out = torch.zeros(self.size, self.size, dtype=torch.float64)
+        for angle in self.layout.attitude:
+            out[self.moving.index(_RATES[angle]), self.moving.index(angle)] = 1.0
+        return out
 
 
 ALIVE = Live()
-"""All of u, v and r."""
+"""All of u, v and r, and no other."""
 
 POSE = PLANAR.pose_columns
 VELOCITIES = PLANAR.velocity_columns
@@ -162,19 +253,19 @@ def pose(x: Tensor) -> Tensor:
     return x[..., :3]
 
 
-def velocities(x: Tensor) -> Tensor:
-    """Return the velocities (u, v, r) [..., 3] of states [..., nx]."""
-    return x[..., 3:6]
+def velocities(x: Tensor, n: int = 3) -> Tensor:
+    """Return what moves [..., n] of states [..., nx]: u, v, r, and p and phi of a roll."""
+    return x[..., 3 : 3 + n]
 
 
-def motion(x: Tensor) -> Tensor:
-    """Return pose and velocities [..., 6] of states [..., nx]."""
-    return x[..., :6]
+def motion(x: Tensor, n: int = 3) -> Tensor:
+    """Return pose and what moves [..., 3 + n] of states [..., nx]."""
+    return x[..., : 3 + n]
 
 
-def actuators(x: Tensor) -> Tensor:
-    """Return the states of actuators [..., nx - 6] of states [..., nx]."""
-    return x[..., 6:]
+def actuators(x: Tensor, n: int = 3) -> Tensor:
+    """Return the states of actuators [..., nx - 3 - n] of states [..., nx]."""
+    return x[..., 3 + n :]
 
 
 def accelerations(x: Tensor) -> Tensor:
@@ -212,6 +303,28 @@ def yaw_rate(x: Tensor) -> Tensor:
     return x[..., 5]
 
 
-def zero_acceleration(z: Tensor) -> Tensor:
-    """Return accelerations of zero [..., 3], alike in type to channels [..., nz]."""
-    return torch.zeros_like(z[..., :3])
+def roll_angle(x: Tensor) -> Tensor:
+    """Return the roll angle [...] in rad of states [..., nx] with roll."""
+    return x[..., 7]
+
+
+def turning(nu: Tensor, n: int = 3) -> Tensor:
+    """Return the rate of the heading [..., 1] in rad/s from what moves [..., n]."""
+    r = nu[..., 2:3]
+    return r if n == 3 else r * torch.cos(nu[..., 4:5])
+
+
+def levelled(nu: np.ndarray) -> np.ndarray:
+    """Return what moves a pose [..., 3], u, v cos phi and r cos phi, from what moves [..., n].
+
+    Source: document 004, without heave and pitch.
+    """
+    if nu.shape[-1] == PLANAR.dof:
+        return nu
+    level = np.cos(nu[..., ROLL.moving.index("phi")])
+    return np.stack((nu[..., 0], nu[..., 1] * level, nu[..., 2] * level), axis=-1)
+
+
+def zero_acceleration(z: Tensor, n: int = 3) -> Tensor:
+    """Return accelerations of zero [..., n], alike in type to channels [..., nz]."""
+    return torch.zeros_like(z[..., :n])

@@ -18,7 +18,7 @@ class Samples:
 
     Attributes:
         z: channels [N, nz], float64 (columns named by `names`).
-        target: what a fit explains, [N, 3]: accelerations in m/s^2, m/s^2, rad/s^2, or what a
+        target: what a fit explains, [N, n]: accelerations in m/s^2, m/s^2, rad/s^2, or what a
             baseline leaves of them.
         group: number of the manoeuvre of each sample, [N], ascending.
         t: time since the manoeuvre's start [N] in s.
@@ -55,7 +55,7 @@ class Samples:
         )
 
     def with_target(self, target: Tensor) -> Samples:
-        """Return the same samples with another target [N, 3]."""
+        """Return the same samples with another target [N, n]."""
         return Samples(self.z, target, self.group, self.t, self.kinds, self.names)
 
     def tally(self) -> tuple[Tally, Tally]:

@@ -69,7 +69,7 @@ class MotionConfig(Config):
 
 
 def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
-    """Return the log with x, y, psi, u, v, r at every sample, measured or smoothed.
+    """Return the log with the states of a model at every sample, measured or smoothed.
 
     What was smoothed stands in `meta["smoothed"]`, and as a note in `meta["findings"]`.
 
@@ -77,13 +77,14 @@ def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
         log: in SI.
         config: settings of the smoother.
         live: velocities that the log tells; the others are zero, and so is what of the pose they
-            alone would move.
+            alone would move. With p the roll angle is told, and p by it where it is not measured.
 
     Raises:
-        UsageError: where the log lacks position or heading.
+        UsageError: where the log lacks position or heading, or the roll angle of a roll.
         DataError: where these hold hardly a value.
     """
     log = _turning(log if live.whole else _still(log, live))
+    log = _rolling(log) if live.rolls else log
     told = without_held(log)
     lacking = [name for name in STATE if name not in log.channels]
     made = {name for name in STATE if name in lacking or not _dense(told[name])}
@@ -141,7 +142,7 @@ def _turning(log: Log) -> Log:
     known = np.isfinite(psi)
     if known.sum() < 5:
         return log
-    rate = _turned_by(log, psi)[1]
+    rate = _turned_by(log, psi, "r")[1]
     note = remark("note", "smoothed_motion", "r comes from a smoother of the heading", channels=1)
     return log.replace(
         channels={
@@ -154,11 +155,45 @@ def _turning(log: Log) -> Log:
     )
 
 
-def _turned_by(log: Log, psi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smoothed heading [T] in rad and yaw rate [T] in rad/s, from both or the first."""
-    r = log.channels.get("r", np.full(psi.size, np.nan))
-    ratio = max(noise_of(r), 1e-7) / max(noise_of(psi), 1e-7)
-    turning = smooth_track(log.t, np.stack((psi, r), axis=1)[:, :, None], (1.0, ratio))
+def _rolling(log: Log) -> Log:
+    """Return a log with roll angle and roll rate at every sample, from both or the first."""
+    phi = log.channels.get("phi", np.full(len(log), np.nan))
+    known = np.isfinite(phi)
+    if known.sum() < 5:
+        raise UsageError(
+            f"log {log.name}: no roll angle phi, which signals.velocities with p need; name its"
+            " column, or leave p out"
+        )
+    lacking = [n for n in ("phi", "p") if n not in log.channels or not _dense(log[n])]
+    if not lacking:
+        return log
+    near = _near(log.t, log.t[known])
+    made = dict(zip(("phi", "p"), _turned_by(log, phi, "p"), strict=True))
+    note = remark(
+        "note",
+        "smoothed_motion",
+        f"{', '.join(lacking)} come from a smoother of the roll: "
+        + ", ".join(f"{name} {_told(log, name)}" for name in lacking),
+        channels=len(lacking),
+    )
+    return log.replace(
+        channels={**log.channels, **{n: np.where(near, made[n], np.nan) for n in lacking}},
+        units={**log.units, **{n: CHANNEL_UNITS[n] for n in lacking}},
+        meta={**log.meta, "findings": [*log.meta.get("findings", ()), note]},
+    )
+
+
+def _turned_by(log: Log, angle: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return a smoothed angle [T] in rad and its rate [T] in rad/s, from both or the first.
+
+    Args:
+        log: that may hold the rate.
+        angle: as measured, [T].
+        name: channel of the rate.
+    """
+    rate = log.channels.get(name, np.full(angle.size, np.nan))
+    ratio = max(noise_of(rate), 1e-7) / max(noise_of(angle), 1e-7)
+    turning = smooth_track(log.t, np.stack((angle, rate), axis=1)[:, :, None], (1.0, ratio))
     return turning[:, 0, 0], turning[:, 1, 0]
 
 
@@ -265,7 +300,7 @@ def _smoothed(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
             " each are needed to tell the motion; leave the log out"
         )
     u, v = (log.channels.get(name, np.full(t.size, np.nan)) for name in ("u", "v"))
-    heading, rate = _turned_by(log, psi)
+    heading, rate = _turned_by(log, psi, "r")
     # positions belong to times between the samples where they are older than their row
     seen_at = t[fixes] - config.delay
     clock = np.union1d(t, seen_at) if config.delay else t

@@ -13,9 +13,8 @@ from pydantic import Field
 from residnet.core.arrays import paged
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import ALIVE, POSE, VELOCITIES, Live
+from residnet.core.layout import ALIVE, POSE, Live
 from residnet.core.log import Log
-from residnet.core.names import STATE
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretch_numbers
 from residnet.data.align import GridConfig, align
@@ -67,9 +66,9 @@ class Prepared:
     Attributes:
         log: the aligned log with its masks.
         split: train, validation, test or external.
-        y: measured states [T, 6].
-        smooth: states with smoothed velocities [T, 6].
-        nu_dot: accelerations [T, 3].
+        y: measured states [T, 3 + n], the pose and what moves (`Live.moving`).
+        smooth: states with smoothed velocities [T, 3 + n].
+        nu_dot: rates of what moves [T, n].
         w: inputs held over the step that follows each sample [T, m].
         recorded: inputs at the samples themselves [T, m].
         piece: number of the stretch that nothing crosses, [T]; -1 where there is none.
@@ -116,7 +115,7 @@ def prepare(
 
     Args:
         log: canonical log; needs the channels x, y, psi and `columns`; u, v, r come from a
-            smoother where it lacks them.
+            smoother where it lacks them. A roll needs phi.
         split: which split it belongs to.
         columns: input channels, in the order of w.
         config: grid, masks, derivative.
@@ -128,10 +127,10 @@ def prepare(
     """
     large = paged.lies_on_disk(log.t)
     # a channel that the model does not use changes nothing
-    needed = {*STATE, *columns}
-    log = without_spikes(_plausible(log, columns), needed)
+    needed = {*live.states, *columns}
+    log = without_spikes(_plausible(log, columns, live), needed)
     log = align(_masked(log, columns, config, live), config.grid, needed)
-    y, w = log.stack(STATE), log.stack(tuple(columns))
+    y, w = log.stack(live.states), log.stack(tuple(columns))
     piece = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), segments(log), -1)
     usable = scored(log) & (piece >= 0)
     if not usable.any():
@@ -145,14 +144,17 @@ def prepare(
         )
         raise DataError(
             f"log {log.name}: no sample is usable ({reasons}); check the masks and the channels"
-            f" {', '.join((*STATE, *columns))}"
+            f" {', '.join((*live.states, *columns))}"
         )
     # derivatives must not see masked samples, so a piece ends at each of them
     clean = stretch_numbers(np.where(log.usable & usable, piece, -1))
-    smooth_nu, nu_dot, valid = config.derivative.derive(y[:, VELOCITIES], config.grid.step, clean)
-    smooth = np.concatenate(
-        (y[:, POSE], np.where(valid[:, None], smooth_nu, y[:, VELOCITIES])), axis=1
-    )
+    nu = y[:, live.columns]
+    smooth_nu, nu_dot, valid = config.derivative.derive(nu, config.grid.step, clean)
+    smooth = np.concatenate((y[:, POSE], np.where(valid[:, None], smooth_nu, nu)), axis=1)
+    if live.rolls:
+        # the rate of an angle is what its velocity says
+        known = smooth[:, live.columns] @ live.known_rates().numpy()
+        nu_dot = np.where(live.mask().numpy() > 0.0, nu_dot, known)
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
     held = _means(w, piece) if config.hold == "mean" else w
     good = usable & valid & trimmed
@@ -160,13 +162,13 @@ def prepare(
     return prepared.on_disk() if large else prepared
 
 
-def _plausible(log: Log, columns: Sequence[str]) -> Log:
+def _plausible(log: Log, columns: Sequence[str], live: Live) -> Log:
     """Return the log.
 
     Raises:
         DataError: where a channel that a model needs has a value that no vessel can have.
     """
-    for name in (*STATE, *columns):
+    for name in (*live.states, *columns):
         if name in log.channels:
             bad = np.flatnonzero(beyond_belief(log[name], log.units[name]))
             if bad.size:
@@ -181,11 +183,11 @@ def _plausible(log: Log, columns: Sequence[str]) -> Log:
 def _masked(log: Log, columns: Sequence[str], config: PrepareConfig, live: Live) -> Log:
     """Return the log with its whole motion and the masks of the config."""
     whole = complete_motion(log, config.motion, live)
-    filled = fill_sparse(whole, (*STATE, *columns), config.grid.held)
+    filled = fill_sparse(whole, (*live.states, *columns), config.grid.held)
     # masks look at the samples as recorded: interpolation hides a frozen sensor
     recorded = filled if whole is log else whole.replace(channels=whole.channels | log.channels)
     # what is zero at all times, or follows from it, is no sensor that stands still
-    asked = {*STATE, *columns} if live.whole else {*live.velocities, *columns}
+    asked = {*(live.states if live.whole else live.channels), *columns}
     asked |= {name for mask in config.masks for name in mask.model_dump().get("channels", ())}
     seen = {name: values for name, values in recorded.channels.items() if name in asked}
     masks = apply_masks(recorded.replace(channels=seen), config.masks).masks
@@ -234,13 +236,19 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
         )
     counts = [int(p.good.sum()) for p in logs]
     total = sum(counts)
-    z, target, time = paged.rows(total, len(signals.names)), paged.rows(total, 3), paged.rows(total)
+    live = logs[0].live
+    z, target, time = (
+        paged.rows(total, *width) for width in ((len(signals.names),), (live.size,), ())
+    )
     group = paged.rows(total, dtype=torch.int64)
     begin = 0
     for number, (p, count) in enumerate(zip(logs, counts, strict=True)):
         rows = slice(begin, begin + count)
         z[rows] = channels(p, signals, p.good)
         target[rows] = torch.from_numpy(p.nu_dot[p.good])
+        if live.rolls:
+            # what is known of an angle's rate is nothing to learn
+            target[rows] *= live.mask()
         group[rows] = number
         time[rows] = torch.from_numpy(p.log.t[p.good] - p.log.t[0])
         begin += count
@@ -250,14 +258,14 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
 
 
 def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest measured velocities and inputs, [3 + m] each.
+    """Return the lowest and highest measured velocities and inputs, [n + m] each.
 
     Only usable samples count, and velocities no further beyond the quantiles of 0.5 % and 99.5 %
     than these lie apart.
     """
     bounds = []
     # one column at a time: of large data all of them would fill the memory
-    for column in range(VELOCITIES.start, VELOCITIES.stop):
+    for column in range(*logs[0].live.columns.indices(logs[0].y.shape[1])):
         values = np.concatenate([p.y[p.usable, column] for p in logs])
         low, high = values.min(), values.max()
         # a few bad samples must not widen the range in which a free run counts as sound

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from residnet.core.arrays import paged
 from residnet.core.errors import DataError
+from residnet.core.layout import POSITION
 from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
 
@@ -20,9 +21,9 @@ class WindowStore:
     """All logs end to end.
 
     Attributes:
-        y: measured states [N, 6].
-        smooth: states with smoothed velocities [N, 6].
-        nu_dot: accelerations [N, 3].
+        y: measured states [N, 3 + n].
+        smooth: states with smoothed velocities [N, 3 + n].
+        nu_dot: rates of what moves [N, n].
         w: inputs held over the step that follows each sample [N, m].
         recorded: inputs at the samples themselves [N, m].
         usable: samples that may be scored [N].
@@ -53,13 +54,17 @@ class WindowStore:
         lengths = [len(p) for p in logs]
         total, inputs = sum(lengths), logs[0].w.shape[1]
         labels = np.empty(total, dtype=np.int64)
-        y, smooth, nu_dot = (paged.rows(total, width, dtype=dtype) for width in (6, 6, 3))
+        y, smooth, nu_dot = (
+            paged.rows(total, width, dtype=dtype)
+            for width in (logs[0].y.shape[1], logs[0].y.shape[1], logs[0].nu_dot.shape[1])
+        )
         w, recorded = (paged.rows(total, inputs, dtype=dtype) for _ in range(2))
         usable, good = (paged.rows(total, dtype=torch.bool) for _ in range(2))
         begin = 0
         for number, (p, length) in enumerate(zip(logs, lengths, strict=True)):
             rows = slice(begin, begin + length)
-            start = p.y[0] * [1, 1, 0, 0, 0, 0]
+            start = np.zeros_like(p.y[0])
+            start[POSITION] = p.y[0, POSITION]
             for whole, part in (
                 (y, p.y - start),
                 (smooth, p.smooth - start),

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
 from residnet.baselines.given import StillConfig
-from residnet.core.layout import PLANAR, pose, velocities, zero_acceleration
+from residnet.core.layout import pose, velocities, zero_acceleration
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import FARTHEST, HybridDynamics
 from residnet.heads.base import ResidualHead
@@ -26,12 +26,12 @@ from residnet.heads.zero import ZeroHead
 class MeanBaseline(Baseline):
     """A baseline that is the mean acceleration of several baselines."""
 
-    def __init__(self, members: Sequence[nn.Module]) -> None:
+    def __init__(self, members: Sequence[nn.Module], dof: int) -> None:
         super().__init__()
-        self.members = nn.ModuleList(members)
+        self.members, self.dof = nn.ModuleList(members), dof
 
     def forward(self, z: Tensor) -> Tensor:
-        total = zero_acceleration(z)
+        total = zero_acceleration(z, self.dof)
         for member in self.members:
             total = total + member(z)
         return total / len(self.members)
@@ -47,12 +47,13 @@ class MeanHead(ResidualHead):
 
     def __init__(self, members: Sequence[ResidualHead]) -> None:
         super().__init__()
+        self.dof = members[0].dof
         self.members = nn.ModuleList(members)
         self.widths = [member.n_state for member in members]
         self.n_state = sum(self.widths)
 
     def _each(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the members' residuals [K, B, 3] and their memories side by side."""
+        """Return the members' residuals [K, B, n] and their memories side by side."""
         residuals: list[Tensor] = []
         memory: list[Tensor] = []
         begin = 0
@@ -64,7 +65,7 @@ class MeanHead(ResidualHead):
         return torch.stack(residuals), torch.cat(memory, dim=-1)
 
     def _sequences(self, z: Tensor) -> Tensor:
-        """Return the members' residuals [K, B, T, 3] along channels [B, T, nz]."""
+        """Return the members' residuals [K, B, T, n] along channels [B, T, nz]."""
         residuals: list[Tensor] = []
         for member in self.members:
             residuals.append(member.sequence(z))  # type: ignore[operator]
@@ -105,12 +106,10 @@ def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
     first = members[0]
     baselines = [member.head.effective_baseline(member.baseline) for member in members]
     head = MeanHead([member.head for member in members])
-    return HybridDynamics(first.signals, MeanBaseline(baselines), head, first.dt, first.integrator)
+    known = MeanBaseline(baselines, first.dof)
+    return HybridDynamics(first.signals, known, head, first.dt, first.integrator)
 
 
-_DOF = PLANAR.dof
-_KNOWN = 1 + _DOF
-"""Entries of a mean's memory before those of its members: whether there is a prediction, and it."""
 _TOLD = 1e-3
 """Share of a velocity's training range by which a measurement differs from a prediction.
 
@@ -130,8 +129,8 @@ class MeanOfTrajectories(HybridDynamics):
 
     Args:
         members: with the same signals and step. Each weighs the same, whatever its copies.
-        low: least u, v, r of the training data [3].
-        high: their largest [3].
+        low: least of what moves in the training data [n].
+        high: their largest [n].
     """
 
     def __init__(
@@ -141,7 +140,7 @@ class MeanOfTrajectories(HybridDynamics):
         super().__init__(
             first.signals,
             StillConfig().build(first.signals.names),
-            ZeroHead(),
+            ZeroHead(first.signals.names),
             first.dt,
             first.integrator,
         )
@@ -150,10 +149,11 @@ class MeanOfTrajectories(HybridDynamics):
             # the pose follows from the mean
             member.positions = False
         self.copies = [member.head.copies for member in members]
-        self.widths = [_DOF + member.n_state for member in members]
+        self.widths = [self.dof + member.n_state for member in members]
         *self.begins, self.n_state = accumulate(
             (copies * width for copies, width in zip(self.copies, self.widths, strict=True)),
-            initial=_KNOWN,
+            # whether there is a prediction, and it
+            initial=1 + self.dof,
         )
         small = [_TOLD * max(b - a, 1e-6) for a, b in zip(low, high, strict=True)]
         self.register_buffer("small", torch.tensor(small, dtype=torch.float64), persistent=False)
@@ -179,8 +179,8 @@ class MeanOfTrajectories(HybridDynamics):
             rows.append([])
         shared: list[list[Tensor]] = []
         for i, member in enumerate(self.members):
-            given, part = w.repeat(self.copies[i], 1, 1), self._part(s, i)[..., 3:]
-            own, kept = member.ahead(given, part.reshape(given.shape[0], self.widths[i] - 3))
+            given, part = w.repeat(self.copies[i], 1, 1), self._part(s, i)[..., self.dof :]
+            own, kept = member.ahead(given, part.reshape(given.shape[0], self.widths[i] - self.dof))
             shared.extend(kept)
             for k in range(len(own)):
                 rows[k].extend(own[k])
@@ -203,11 +203,11 @@ class MeanOfTrajectories(HybridDynamics):
 
     def _kept(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the share [B, 1] of their distances from the mean that members keep."""
-        missed = (velocities(x) - s[:, 1:4]) / self.small.to(x.dtype)
+        missed = (velocities(x, self.dof) - s[:, 1 : 1 + self.dof]) / self.small.to(x.dtype)
         return s[:, :1] / (1.0 + missed.square().sum(dim=-1, keepdim=True))
 
     def _part(self, s: Tensor, i: int) -> Tensor:
-        """Return a member's share of the memory [K, B, 3 + n_state]."""
+        """Return a member's share of the memory [K, B, n + n_state]."""
         copies, width = self.copies[i], self.widths[i]
         own = s[:, self.begins[i] : self.begins[i] + copies * width]
         return own.reshape(s.shape[0], copies, width).transpose(0, 1)
@@ -215,24 +215,25 @@ class MeanOfTrajectories(HybridDynamics):
     def _own(self, x: Tensor, s: Tensor, kept: Tensor, i: int) -> tuple[Tensor, Tensor]:
         """Return the states and memories [K B, ...] that a member steps from."""
         copies, rows, part = self.copies[i], x.shape[0], self._part(s, i)
-        moved = velocities(x) + kept * part[..., :3]
+        moved = velocities(x, self.dof) + kept * part[..., : self.dof]
         at = torch.cat((pose(x).expand(copies, rows, 3), moved), dim=-1)
-        width = self.widths[i] - 3
-        return at.reshape(copies * rows, -1), part[..., 3:].reshape(copies * rows, width)
+        width = self.widths[i] - self.dof
+        own = part[..., self.dof :].reshape(copies * rows, width)
+        return at.reshape(copies * rows, -1), own
 
     def _joined(
         self, x: Tensor, states: list[Tensor], memories: list[Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return the mean's state and memory from those of the members, [K B, ...] each."""
-        nu, rows = velocities(x), x.shape[0]
+        nu, rows = velocities(x, self.dof), x.shape[0]
         total = torch.zeros_like(nu)
         own: list[Tensor] = []
         memory: list[Tensor] = []
         for i in range(len(states)):
-            reached = velocities(states[i]).reshape(self.copies[i], rows, 3)
+            reached = velocities(states[i], self.dof).reshape(self.copies[i], rows, self.dof)
             total = total + reached.mean(dim=0)
             own.append(reached)
-            memory.append(memories[i].reshape(self.copies[i], rows, self.widths[i] - 3))
+            memory.append(memories[i].reshape(self.copies[i], rows, self.widths[i] - self.dof))
         mean = total / len(self.widths)
         parts = [torch.ones_like(mean[:, :1]), mean]
         for i in range(len(own)):
@@ -254,28 +255,29 @@ class MeanOfTrajectories(HybridDynamics):
         return s
 
     def known(self, z: Tensor) -> Tensor:
-        total = zero_acceleration(z)
+        total = zero_acceleration(z, self.dof)
         for member in self.members:
             total = total + member.baseline(z)
         return total / len(self.widths)
 
     def one_step(self, z: Tensor) -> Tensor:
-        total = zero_acceleration(z)
+        total = zero_acceleration(z, self.dof)
         for member in self.members:
             total = total + member.one_step(z)
         return total / len(self.widths)
 
     def acceleration(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
-        """Return the mean change of the velocities [B, 3] over a step, by its length."""
-        return (velocities(self.step(x, w, s)[0]) - velocities(x)) / self.dt
+        """Return the mean change of what moves [B, n] over a step, by its length."""
+        after = velocities(self.step(x, w, s)[0], self.dof)
+        return (after - velocities(x, self.dof)) / self.dt
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
-        limit = torch.full((_KNOWN,), FARTHEST, dtype=torch.float64)
+        limit = torch.full((1 + self.dof,), FARTHEST, dtype=torch.float64)
         limit[0] = 1.0
         low, high = [torch.cat((0.0 * limit[:1], -limit[1:]))], [limit]
         for copies, member in zip(self.copies, self.members, strict=True):
             least, most = member.memory_range()
-            apart = torch.full((_DOF,), FARTHEST, dtype=torch.float64)
+            apart = torch.full((self.dof,), FARTHEST, dtype=torch.float64)
             low.append(torch.cat((-apart, least.double())).repeat(copies))
             high.append(torch.cat((apart, most.double())).repeat(copies))
         return torch.cat(low), torch.cat(high)

@@ -18,10 +18,9 @@ from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
 from residnet.core.config import Config, validate
-from residnet.core.errors import UsageError
+from residnet.core.errors import ConfigError, UsageError
 from residnet.core.files import read_json, whole
-from residnet.core.layout import RANGE_VELOCITIES
-from residnet.core.names import VELOCITY, nearest
+from residnet.core.names import nearest
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
@@ -103,7 +102,7 @@ class ModelSpec(Stored):
         integrator: explicit scheme.
         hold: whether an input is the sample at a step's start or the mean of the samples at its
             ends.
-        low: smallest u, v, r and inputs of the training data, SI, [3 + m].
+        low: smallest of what moves and of the inputs in the training data, SI, [n + m].
         high: their largest.
         band: how far free runs may be off; None where none was calibrated.
         disturbance: unknown force that is estimated from the measured past; None for none.
@@ -140,18 +139,29 @@ class ModelSpec(Stored):
 
     def mean(self, members: Sequence[HybridDynamics]) -> MeanOfTrajectories:
         """Return the mean of the trajectories of single models as this one."""
-        return MeanOfTrajectories(members, self.low[RANGE_VELOCITIES], self.high[RANGE_VELOCITIES])
+        n = self.signals.live.size
+        return MeanOfTrajectories(members, self.low[:n], self.high[:n])
 
     def single(self) -> HybridDynamics:
         """Return the model in whose rows all networks of its head stand one after the other."""
         if self.members:
             return mean_of([member.build() for member in self.members])
         signals = self.signals.build()
-        head = ZeroHead() if self.head is None else self.head.build(signals.names)
+        live = self.signals.live
+        head = ZeroHead(signals.names) if self.head is None else self.head.build(signals.names)
+        if head.dof != live.size:
+            raise ConfigError(
+                f"model {self.name}: its head tells {head.dof} accelerations, and the model moves"
+                f" {', '.join(live.moving)}; a head gives these to ResidualHead as its channels"
+            )
         known = self.baseline.build(signals.names)
         head.set_mass(known.mass())
-        unknown = None if self.disturbance is None else self.disturbance.build(self.dt)
-        return HybridDynamics(signals, known, head, self.dt, self.integrator, unknown)
+        unknown = None if self.disturbance is None else self.disturbance.build(self.dt, live)
+        model = HybridDynamics(signals, known, head, self.dt, self.integrator, unknown)
+        if self.role == "zero":
+            # all is held, angles too
+            model.known_rates.zero_()
+        return model
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -159,7 +169,7 @@ class ModelSpec(Stored):
         return {
             name: (low, high)
             for name, low, high in zip(
-                VELOCITY + self.signals.columns, self.low, self.high, strict=True
+                self.signals.live.moving + self.signals.columns, self.low, self.high, strict=True
             )
         }
 

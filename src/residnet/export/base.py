@@ -7,10 +7,10 @@ format, a bad input gives a flag and a finite output, and the next good sample r
 A stepped vessel keeps this contract, with batches of rows B in all tensors:
 
 - `initial_state(batch) -> s`: the memory [B, n_state] without a past, zeros.
-- `warmup(y_history, w_history) -> s`: the memory that a measured past leaves, states [B, T, 6] and
+- `warmup(y_history, w_history) -> s`: the memory that a measured past leaves, states [B, T, nx] and
   inputs [B, T, m], oldest first. A sample that is no measurement is left out.
-- `step(x, w, s) -> (x, s, outside)`: state [B, 6], memory and flag [B] one step of `dt` later.
-- `rollout(x0, w, s) -> (x, s, outside)`: states [B, T+1, 6] from x0 on under inputs w [B, T, m],
+- `step(x, w, s) -> (x, s, outside)`: state [B, nx], memory and flag [B] one step of `dt` later.
+- `rollout(x0, w, s) -> (x, s, outside)`: states [B, T+1, nx] from x0 on under inputs w [B, T, m],
   the memory after the last step, and the flag of each step [B, T].
 - `band(k) -> half widths [5]` of u, v, r, heading and position k steps after a measured state,
   where a format has methods; the table that it reads stands in every card as `band`.
@@ -66,7 +66,7 @@ class Loaded(ABC):
     def memory(self, *past: Numbers) -> Numbers | None:
         """Return the memory that a past leaves; None where the format has only steps.
 
-        It is measured states [T, 6] and inputs [T, m] of a vessel, and the first measurement of a
+        It is measured states [T, nx] and inputs [T, m] of a vessel, and the first measurement of a
         controller.
         """
         return None

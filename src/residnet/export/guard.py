@@ -55,7 +55,8 @@ _TURN = 2.0 * math.pi
 class GuardedDynamics(Dynamics):
     """A model behind the rules above, whose step is defined and finite whatever it is given.
 
-    The state is x [B, 7]: that of the model and, behind it, the flag of the step that led there.
+    The state is x [B, 3 + n + 1]: that of the model and, behind it, the flag of the step that led
+    there.
 
     Args:
         model: in the precision that it shall run in, float32 in exports.
@@ -67,6 +68,7 @@ class GuardedDynamics(Dynamics):
         self.model = model
         self.largest = _LARGEST
         self.n_state = model.n_state
+        self.dof, self.rolls = model.dof, model.rolls
         low, high, reach = (
             torch.tensor(part, dtype=torch.float64) for part in (spec.low, spec.high, _reach(spec))
         )
@@ -93,19 +95,23 @@ class GuardedDynamics(Dynamics):
         self.memory_high: Tensor
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, 7] of the model at a stage; the flag has none."""
+        """Return x_dot [B, nx] of the model at a stage; the flag has none."""
         return torch.cat(
-            (self.model.rate(motion(x), p, rho), torch.zeros_like(actuators(x))), dim=-1
+            (
+                self.model.rate(motion(x, self.dof), p, rho),
+                torch.zeros_like(actuators(x, self.dof)),
+            ),
+            dim=-1,
         )
 
     def measured(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return which samples [...] are measurements in all entries, x [..., 6], w [..., m]."""
+        """Return which samples [...] are measurements in all entries of x and w [..., m]."""
         seen = torch.cat((x, w), dim=-1)
         # comparisons with what is no number are false
         return ((seen >= self.least) & (seen <= self.most)).all(dim=-1)
 
     def accept(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return state [B, 6], inputs [B, m] and memory as they are used, and the flag [B]."""
+        """Return state [B, 3 + n], inputs [B, m] and memory as they are used, and the flag [B]."""
         seen = torch.cat((x, w), dim=-1)
         used = replaced(seen, self.low, self.high, self.least, self.most, self.middle)
         inside = ((seen >= self.low) & (seen <= self.high)).all(dim=-1)
@@ -114,17 +120,17 @@ class GuardedDynamics(Dynamics):
             remembers = self.remembers(s)
             inside = inside & remembers
             s = torch.where(remembers.unsqueeze(-1), s, torch.zeros_like(s))
-        return motion(used), actuators(used), s, ~inside
+        return motion(used, self.dof), actuators(used, self.dof), s, ~inside
 
     def accept_state(self, x: Tensor) -> Tensor:
-        """Return a state [B, 6] as it is used."""
+        """Return a state [B, 3 + n] as it is used."""
         return replaced(
             x,
-            motion(self.low),
-            motion(self.high),
-            motion(self.least),
-            motion(self.most),
-            motion(self.middle),
+            motion(self.low, self.dof),
+            motion(self.high, self.dof),
+            motion(self.least, self.dof),
+            motion(self.most, self.dof),
+            motion(self.middle, self.dof),
         )
 
     def remembers(self, s: Tensor) -> Tensor:
@@ -135,14 +141,14 @@ class GuardedDynamics(Dynamics):
         """Return state and memory after a step as they are given out, and the flag [B].
 
         Args:
-            x: state before the step [B, 6], accepted.
-            after: what the model made of it [B, 6].
+            x: state before the step [B, 3 + n], accepted.
+            after: what the model made of it [B, 3 + n].
             s: memory after the step [B, n_state].
         """
-        least, most = motion(self.least), motion(self.most)
+        least, most = motion(self.least, self.dof), motion(self.most, self.dof)
         kept = ((after >= least) & (after <= most)).all(dim=-1, keepdim=True)
         new = velocities_on(after)
-        held = torch.where(torch.isnan(new), velocities(x), new)
+        held = torch.where(torch.isnan(new), velocities(x, self.dof), new)
         coasting = torch.cat((pose(x) + self.dt * self.kinematics(x), held), dim=-1)
         coasting = torch.minimum(torch.maximum(coasting, least), most)
         if self.n_state == 0:
@@ -154,14 +160,14 @@ class GuardedDynamics(Dynamics):
         return torch.where(kept, after, coasting), s, ~(kept & known).squeeze(-1)
 
     def flagged_step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the state [B, 6] and the memory one step later, and the flag [B]."""
+        """Return the state [B, 3 + n] and the memory one step later, and the flag [B]."""
         x, w, s, outside = self.accept(x, w, s)
         after, s = self.model.step(x, w, s)
         after, s, left = self.settle(x, after, s)
         return after, s, outside | left
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        after, s, outside = self.flagged_step(motion(x), w, s)
+        after, s, outside = self.flagged_step(motion(x, self.dof), w, s)
         return torch.cat((after, outside.to(x.dtype).unsqueeze(-1)), dim=-1), s
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
@@ -171,7 +177,7 @@ class GuardedDynamics(Dynamics):
         that is, or else the first one behind it. Without any the memory is that without a past.
 
         Args:
-            y_history: states [B, T, 6], oldest first; T may be 0.
+            y_history: states [B, T, 3 + n], oldest first; T may be 0.
             w_history: inputs [B, T, m].
         """
         if y_history.shape[1] == 0:

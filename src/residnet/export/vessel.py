@@ -16,8 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
-from residnet.core.layout import RANGE_INPUTS, SURGE, motion
-from residnet.core.names import STATE
+from residnet.core.layout import SURGE, motion
 from residnet.core.version import __version__
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted
@@ -62,7 +61,7 @@ class ExportedModel(nn.Module):
         self.guarded = GuardedDynamics(model, spec)
         self.simulate = Rollout(self.guarded)
         self.inputs = len(spec.signals.columns)
-        self.states = len(STATE)
+        self.states = len(spec.signals.live.states)
         self.n_state = model.n_state
         known = spec.band
         self.register_buffer("band_steps", torch.tensor([1.0] if known is None else known.steps))
@@ -102,7 +101,7 @@ class ExportedModel(nn.Module):
         Samples that are no measurements are left out: the last one before them stands for them.
 
         Args:
-            y_history: states [B, T, 6], oldest first.
+            y_history: states [B, T, 3 + n], oldest first.
             w_history: inputs [B, T, m], oldest first.
         """
         rows, steps = size(y_history, 3, 0), size(y_history, 3, 1)
@@ -113,7 +112,7 @@ class ExportedModel(nn.Module):
 
     @torch.jit.export
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the state [B, 6] and memory after one step under inputs w [B, m], and a flag.
+        """Return the state [B, 3 + n] and memory after one step under inputs w [B, m], and a flag.
 
         `outside` [B] is True where a velocity or an input is beyond the training range, an entry or
         the memory is not finite, or the step was held.
@@ -126,7 +125,7 @@ class ExportedModel(nn.Module):
 
     @torch.jit.export
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the states [B, T+1, 6] from x0 [B, 6] on under inputs w [B, T, m].
+        """Return the states [B, T+1, 3 + n] from x0 [B, 3 + n] on under inputs w [B, T, m].
 
         Behind them stand the memory [B, n_state] after the last step and `outside` [B, T], the flag
         of each step.
@@ -187,8 +186,8 @@ class ExportedVessel(Exported):
         self.spec, self.metrics = spec, metrics
         self.model = copy.deepcopy(model).eval().requires_grad_(False)
         self.name, self.what, self.dt = spec.name, f"model {spec.name}", spec.dt
-        inputs = len(spec.signals.columns)
-        self.arguments = (("x", len(STATE)), ("w", inputs), ("s", model.n_state))
+        self.states, inputs = spec.signals.live.states, len(spec.signals.columns)
+        self.arguments = (("x", len(self.states)), ("w", inputs), ("s", model.n_state))
 
     def at(self, dtype: torch.dtype) -> HybridDynamics:
         """Return the model in a precision."""
@@ -230,7 +229,7 @@ class ExportedVessel(Exported):
         return {
             "schema": "residnet.card/1",
             "model": spec.name,
-            "states": [{"name": name, "unit": units[name]} for name in STATE],
+            "states": [{"name": name, "unit": units[name]} for name in self.states],
             "inputs": [
                 {
                     "name": name,
@@ -248,7 +247,7 @@ class ExportedVessel(Exported):
             "integrator": spec.integrator,
             "frame": _FRAME,
             # of a model of all velocities there is nothing to say
-            **({} if live.whole else {"velocities": list(live.velocities), "about": live.text}),
+            **({} if live.planar else {"velocities": list(live.velocities), "about": live.text}),
             "training_range": {name: list(limits) for name, limits in spec.ranges.items()},
             "bad_inputs": {
                 "rules": _RULES,
@@ -287,7 +286,7 @@ class ExportedVessel(Exported):
         return {"steps": PARITY_STEPS, "share_of_range": shares}
 
     def drive(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Return states of the past [1, 50, 6] and inputs [1, 50 + steps, m] of the parity check.
+        """Return states of the past [1, 50, nx] and inputs [1, 50 + steps, m] of the parity check.
 
         Inputs sweep the training range as slow sines, so that the run passes through what the model
         knows.
@@ -295,12 +294,13 @@ class ExportedVessel(Exported):
         spec = self.spec
         low, high = torch.tensor(spec.low, dtype=dtype), torch.tensor(spec.high, dtype=dtype)
         steps = torch.arange(PARITY_STEPS + PAST, dtype=dtype)
-        phase = torch.arange(low.numel() - 3, dtype=dtype)
+        n = self.model.dof
+        phase = torch.arange(low.numel() - n, dtype=dtype)
         sweep = 0.5 + 0.4 * torch.sin(
             0.02 * (1 + 0.37 * phase)[None] * steps[:, None] + phase[None]
         )
-        w = (low[RANGE_INPUTS] + sweep * (high - low)[RANGE_INPUTS]).unsqueeze(0)
-        y = torch.zeros(1, PAST, len(STATE), dtype=dtype)
+        w = (low[n:] + sweep * (high - low)[n:]).unsqueeze(0)
+        y = torch.zeros(1, PAST, len(self.states), dtype=dtype)
         y[:, :, SURGE] = 0.5 * (low[0] + high[0])
         return y, w
 
@@ -311,7 +311,7 @@ class ExportedVessel(Exported):
             ExportError: that names the first step and channel beyond what exports accept.
         """
         guard = GuardedDynamics(self.model, self.spec)
-        least, most = motion(guard.least), motion(guard.most)
+        least, most = (motion(part, guard.dof) for part in (guard.least, guard.most))
         wrong = ~((states[0] >= least) & (states[0] <= most))
         if not bool(wrong.any()):
             return
@@ -319,7 +319,7 @@ class ExportedVessel(Exported):
         i = int(wrong[k].to(torch.int).argmax())
         raise ExportError(
             f"{self.what}: diverges in the export's free run, though its inputs stay within the"
-            f" training range: {STATE[i]} is {float(states[0, k, i]):.3g} after"
+            f" training range: {self.states[i]} is {float(states[0, k, i]):.3g} after"
             f" {k * self.spec.dt:g} s, accepted {float(least[i]):.3g} to {float(most[i]):.3g}; not"
             " exported, choose another model"
         )
@@ -352,7 +352,7 @@ class ExportedVessel(Exported):
         if together is not None:
             off = np.maximum(off, np.abs(together - states))
         worst = off.max(axis=0) / span
-        shares = dict(zip(STATE, worst.tolist(), strict=True))
+        shares = dict(zip(self.states, worst.tolist(), strict=True))
         if not bool((worst <= tolerance).all()):
             raise RoundingError(
                 f"{self.what}: {what} differs from the model by {shares} of each channel's range"
@@ -361,7 +361,7 @@ class ExportedVessel(Exported):
         return shares
 
     def memory(self, loaded: Loaded, y: Numbers, w: Numbers, what: str) -> Numbers:
-        """Return the memory that states [T, 6] and inputs [T, m] of a measured past leave.
+        """Return the memory that states [T, 3 + n] and inputs [T, m] of a measured past leave.
 
         Where a format has only steps, these are taken. In the place of a sample that is no
         measurement stands the last one before it that is, or else the first one behind it.
@@ -404,14 +404,15 @@ class ExportedVessel(Exported):
         low, high = (torch.tensor(bound, dtype=dtype) for bound in (self.spec.low, self.spec.high))
         places = (_TRACKS, PARITY_STEPS // _HELD + 1, low.numel())
         seen = low + torch.rand(places, generator=generator).to(dtype) * (high - low)
-        w = seen[:, :, 3:].repeat_interleave(_HELD, dim=1)[:, :PARITY_STEPS]
+        n = guard.dof
+        w = seen[:, :, n:].repeat_interleave(_HELD, dim=1)[:, :PARITY_STEPS]
         # the last column is the guard's flag
-        x0 = torch.cat((torch.zeros(_TRACKS, 3), seen[:, 0, :3], torch.zeros(_TRACKS, 1)), dim=1)
+        x0 = torch.cat((torch.zeros(_TRACKS, 3), seen[:, 0, :n], torch.zeros(_TRACKS, 1)), dim=1)
         x0, s0 = x0.to(dtype), guard.initial_state(_TRACKS).to(dtype)
         with torch.no_grad():
             wanted = scripted(Rollout(guard), PARITY_STEPS)(x0, w, s0)[0]
-        states = wanted[..., : len(STATE)].numpy()
-        x, s = x0[:, : len(STATE)].numpy(), s0.numpy()
+        states = wanted[..., : len(self.states)].numpy()
+        x, s = x0[:, : len(self.states)].numpy(), s0.numpy()
         path = [x]
         for k in range(PARITY_STEPS):
             x, s, _ = loaded.rows(x, w[:, k].numpy(), s)
@@ -435,8 +436,8 @@ class ExportedVessel(Exported):
         memory = guarded.warmup(y, w[:, :PAST])[0]
         good = torch.cat((y[0, -1], w[0, PAST], memory))
         columns = self.spec.signals.columns
-        names = [*STATE, *columns, *(f"memory {i}" for i in range(memory.numel()))]
-        measured = len(STATE) + len(columns)
+        names = [*self.states, *columns, *(f"memory {i}" for i in range(memory.numel()))]
+        measured = len(self.states) + len(columns)
         # a long memory is wrong in its first, its middle and its last entry
         ends = {measured, len(names) // 2, len(names) - 1}
         places = [i for i in range(len(names)) if i < measured or i in ends]
@@ -445,7 +446,7 @@ class ExportedVessel(Exported):
         rows = good.repeat(len(cases), 1)
         for row, (i, value) in zip(rows, cases, strict=True):
             row[i] = value
-        x0, w0, s0 = rows.split([len(STATE), len(columns), memory.numel()], dim=1)
+        x0, w0, s0 = rows.split([len(self.states), len(columns), memory.numel()], dim=1)
         with torch.no_grad():
             wanted = guarded.flagged_step(x0, w0, s0)
         for k, (i, value) in enumerate(cases):

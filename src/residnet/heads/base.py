@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from residnet.core.arrays import paged
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
-from residnet.core.names import ACCELERATION, VELOCITY, nearest
+from residnet.core.layout import PLANAR
+from residnet.core.names import ACCELERATION, nearest
 from residnet.core.samples import Samples
-from residnet.physics.symmetry import without_dead
+from residnet.physics.symmetry import live_of, without_dead
 from residnet.regression.estimator import Solution
 from residnet.regression.shrinkage import CONSTANT
 
@@ -25,7 +26,7 @@ _LEAST_STD = 1e-9
 
 
 class ResidualHead(nn.Module, ABC):
-    """A head: the residual rho [B, 3] from channels z [B, nz] and memory s [B, n_state].
+    """A head: the residual rho [B, n] from channels z [B, nz] and memory s [B, n_state].
 
     It is in m/s^2, m/s^2 and rad/s^2, on top of the baseline.
 
@@ -34,13 +35,17 @@ class ResidualHead(nn.Module, ABC):
 
     Attributes:
         copies: number of networks that it holds; rows are then those of one after the other.
-        settle: time in s over which it wants to know how wrong accelerations were predicted: three
+        settle: time in s over which it wants to know how wrong accelerations were predicted: n
             channels more, behind the others; 0 for none.
         refusal: why no format of export can hold it; empty where they can.
+
+    Args:
+        names: channels of the model, which say what moves; u, v and r where they say nothing.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, names: Sequence[str] = ()) -> None:
         super().__init__()
+        self.dof = live_of(names).size
         self.n_state = 0
         self.copies = 1
         self.settle = 0.0
@@ -51,7 +56,7 @@ class ResidualHead(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] at channels z [B, nz], and the memory for the next step.
+        """Return the residual [B, n] at channels z [B, nz], and the memory for the next step.
 
         Called once per step; the memory is [B, n_state].
         """
@@ -60,43 +65,43 @@ class ResidualHead(nn.Module, ABC):
         """Return what velocities do not decide, for `at`: rows [B, T, q], and what all share.
 
         Args:
-            p: channels behind the velocities, of T steps [B, T, nz - 3].
+            p: channels behind the velocities, of T steps [B, T, nz - n].
             s: memory before them [B, n_state].
         """
         return p, []
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] and the memory for the next step, by what `ahead` found.
+        """Return the residual [B, n] and the memory for the next step, by what `ahead` found.
 
         Of a memory that inputs alone decide only that after the last step is told.
 
         Args:
-            nu: velocities [B, 3], behind them what was predicted wrong where there is `settle`.
+            nu: velocities [B, n], behind them what was predicted wrong where there is `settle`.
             row: of the step [B, q].
             s: memory [B, n_state].
             held: what all steps share.
         """
-        z = torch.cat((nu[:, :3], row, nu[:, 3:]), dim=-1)
+        z = torch.cat((nu[:, : self.dof], row, nu[:, self.dof :]), dim=-1)
         found: tuple[Tensor, Tensor] = self.forward(z, s)
         return found
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory.
+        """Return residuals [B, T, n] along measured channels [B, T, nz], from an empty memory.
 
         In other words, teacher forcing.
         """
         return self.forward(z, z[..., :0])[0]
 
     def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:
-        """Return nu_dot [..., 3] from the baseline's `known` and this head's residual, [..., 3]."""
+        """Return nu_dot [..., n] from the baseline's `known` and this head's residual, [..., n]."""
         return known + rho
 
     def residual_target(self, samples: Samples, known: Tensor) -> Samples:
         """Return the samples with what the baseline leaves as target, in this head's space.
 
-        The baseline's accelerations are `known` [N, 3].
+        The baseline's accelerations are `known` [N, n].
         """
-        left = paged.rows(len(samples), 3)
+        left = paged.rows(len(samples), samples.target.shape[1])
         for rows in paged.row_pieces(len(samples)):
             torch.sub(samples.target[rows], known[rows], out=left[rows])
         return samples.with_target(left)
@@ -137,15 +142,15 @@ class ResidualHead(nn.Module, ABC):
         """Take scales and ranges from the training samples; called once, before the fit."""
 
     def residual_std(self) -> Tensor:
-        """Return the standard deviation of the residual on the training samples, [3], float64.
+        """Return the standard deviation of the residual on the training samples, [n], float64.
 
         A one-step loss is measured in it; ones where a head keeps none.
         """
-        return torch.ones(3, dtype=torch.float64)
+        return torch.ones(self.dof, dtype=torch.float64)
 
     def parameter_count(self) -> list[float]:
         """Return the number of fitted parameters of each axis, all trained ones for each."""
-        return [float(sum(parameter.numel() for parameter in self.parameters()))] * 3
+        return [float(sum(parameter.numel() for parameter in self.parameters()))] * self.dof
 
 
 class ClosedFormHead(ResidualHead):
@@ -160,7 +165,7 @@ class ClosedFormHead(ResidualHead):
 
     @abstractmethod
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Fit samples whose target is the residual [N, 3].
+        """Fit samples whose target is the residual [N, n].
 
         The solution that one-step errors choose stands first, then those that free runs may prefer.
 
@@ -177,15 +182,15 @@ class ClosedFormHead(ResidualHead):
     def parameter_count(self) -> list[float]:
         """Return the number of fitted parameters of each axis.
 
-        Coefficients [J, 3] and intercepts [3] that are not zero, where a head does not count
+        Coefficients [J, n] and intercepts [n] that are not zero, where a head does not count
         otherwise.
         """
         fitted = [
-            numbers.reshape(-1, 3)
+            numbers.reshape(-1, self.dof)
             for name, numbers in self.named_buffers()
             if name in ("coefficients", "intercept")
         ]
-        return [float((torch.cat(fitted)[:, axis] != 0).sum()) for axis in range(3)]
+        return [float((torch.cat(fitted)[:, axis] != 0).sum()) for axis in range(self.dof)]
 
 
 class EquationHead(ClosedFormHead):
@@ -254,7 +259,8 @@ class Features(nn.Module):
 
     def __init__(self, chosen: Sequence[str], names: Sequence[str], margin: float) -> None:
         super().__init__()
-        self.names = tuple(chosen)
+        moving = live_of(names).moving
+        self.names, self.dof = tuple(chosen), len(moving)
         self.count = len(self.names)
         self.margin = margin
         self.register_buffer(
@@ -267,13 +273,13 @@ class Features(nn.Module):
         self.register_buffer("low", torch.full((self.count,), -torch.inf, dtype=torch.float64))
         self.register_buffer("high", torch.full((self.count,), torch.inf, dtype=torch.float64))
         # velocities decide some of them, the channels behind these the others
-        near = [place for place, name in enumerate(chosen) if name in VELOCITY]
-        far = [place for place, name in enumerate(chosen) if name not in VELOCITY]
+        near = [place for place, name in enumerate(chosen) if name in moving]
+        far = [place for place, name in enumerate(chosen) if name not in moving]
         for name, places in (
             ("near", near),
-            ("axis", [VELOCITY.index(chosen[place]) for place in near]),
+            ("axis", [moving.index(chosen[place]) for place in near]),
             ("far", far),
-            ("column", [list(names).index(chosen[place]) - len(VELOCITY) for place in far]),
+            ("column", [list(names).index(chosen[place]) - self.dof for place in far]),
         ):
             self.register_buffer(name, torch.tensor(places, dtype=torch.long), persistent=False)
         self.index: Tensor
@@ -290,15 +296,15 @@ class Features(nn.Module):
         """Return the features that velocities do not decide, held in their range [..., F'].
 
         Args:
-            p: channels behind the velocities [..., nz - 3].
+            p: channels behind the velocities [..., nz - n].
         """
         low, high = self.low.index_select(0, self.far), self.high.index_select(0, self.far)
         chosen = p.index_select(-1, self.column)
         return torch.clamp(chosen, low.to(p.dtype), high.to(p.dtype))
 
     def reach(self, like: Tensor) -> list[Tensor]:
-        """Return the least and the largest u, v and r [3], zero for what is no feature."""
-        none = torch.zeros(3, dtype=like.dtype, device=like.device)
+        """Return the least and the largest of what moves [n], zero for what is no feature."""
+        none = torch.zeros(self.dof, dtype=like.dtype, device=like.device)
         low, high = self.low.to(like.dtype), self.high.to(like.dtype)
         return [
             none.index_copy(0, self.axis, low.index_select(0, self.near)),
@@ -309,10 +315,10 @@ class Features(nn.Module):
         """Return what a layer of the features makes of all but velocities, and what of these.
 
         The layer is a matrix product of the features; with v the velocities within `reach` it is
-        the first of what is returned, rows [..., H], plus v times the second [..., 3, H].
+        the first of what is returned, rows [..., H], plus v times the second [..., n, H].
 
         Args:
-            p: channels behind the velocities [..., nz - 3].
+            p: channels behind the velocities [..., nz - n].
             weight: of the layer [..., H, F].
             bias: of the layer [..., H].
         """
@@ -321,7 +327,7 @@ class Features(nn.Module):
         shift = bias - whole @ mean
         row = self.inputs(p) @ whole.index_select(-1, self.far).transpose(-1, -2) + shift
         near = whole.index_select(-1, self.near).transpose(-1, -2)
-        own = near.new_zeros((3, near.shape[-1])).index_copy(0, self.axis, near)
+        own = near.new_zeros((self.dof, near.shape[-1])).index_copy(0, self.axis, near)
         return row, own
 
     def calibrate(self, samples: Samples) -> None:
@@ -360,9 +366,9 @@ class ResidualScale(nn.Module):
     It is the standard deviation of the residual on the training samples.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, dof: int = PLANAR.dof) -> None:
         super().__init__()
-        self.register_buffer("spread", torch.ones(3, dtype=torch.float64))
+        self.register_buffer("spread", torch.ones(dof, dtype=torch.float64))
         self.spread: Tensor
 
     def calibrate(self, samples: Samples) -> None:
@@ -370,5 +376,5 @@ class ResidualScale(nn.Module):
         self.spread.copy_(samples.tally()[1].std().clamp(min=_LEAST_STD))
 
     def forward(self, out: Tensor) -> Tensor:
-        """Return residual accelerations [..., 3] for outputs [..., 3] near one."""
+        """Return residual accelerations [..., n] for outputs [..., n] near one."""
         return out * self.spread.to(out.dtype)

@@ -14,9 +14,10 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.arrays.paged import row_pieces
-from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
+from residnet.physics.symmetry import live_of
 from residnet.physics.terms import SplitTerms, TermLibrary, polynomial_terms
 from residnet.regression.estimator import (
     Estimator,
@@ -70,22 +71,23 @@ class BasisHead(ClosedFormHead):
     """
 
     def __init__(self, config: BasisConfig, names: Sequence[str]) -> None:
-        super().__init__()
-        chosen = config.chosen(names)
+        super().__init__(names)
+        chosen, moving = config.chosen(names), live_of(names).moving
+        self.outputs = live_of(names).rates
         self.features = Features(chosen, names, config.margin)
-        magnitudes = [name for name in ("u", "v", "r") if name in chosen]
+        magnitudes = [name for name in moving if name in chosen]
         self.library = TermLibrary(
             config.terms or polynomial_terms(chosen, config.degree, magnitudes=magnitudes), chosen
         )
         self.split = SplitTerms(
-            self.library.terms, [name for name in chosen if name not in VELOCITY]
+            self.library.terms, [name for name in chosen if name not in moving], moving
         )
         self.folds = config.folds
         self.by_free_run = config.choose == "free_run"
         self.register_buffer(
-            "coefficients", torch.zeros(self.library.count, 3, dtype=torch.float64)
+            "coefficients", torch.zeros(self.library.count, self.dof, dtype=torch.float64)
         )
-        self.register_buffer("intercept", torch.zeros(3, dtype=torch.float64))
+        self.register_buffer("intercept", torch.zeros(self.dof, dtype=torch.float64))
         self.coefficients: Tensor
         self.intercept: Tensor
 
@@ -109,7 +111,8 @@ class BasisHead(ClosedFormHead):
         row, own = self.split.ahead(
             self.features.inputs(p) / std.index_select(0, far), self.coefficients.to(p.dtype)
         )
-        row = torch.cat((row[..., :3] + self.intercept.to(p.dtype), row[..., 3:]), dim=-1)
+        n = self.dof
+        row = torch.cat((row[..., :n] + self.intercept.to(p.dtype), row[..., n:]), dim=-1)
         low, high = self.features.reach(p)
         scale = torch.ones_like(low).index_copy(
             0, self.features.axis, std.index_select(0, self.features.near)
@@ -117,7 +120,7 @@ class BasisHead(ClosedFormHead):
         return row, [low, high, scale, own]
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] at velocities nu [B, 3], by what `ahead` found."""
+        """Return the residual [B, n] at velocities nu [B, n], by what `ahead` found."""
         rho: Tensor = self.split(torch.clamp(nu, held[0], held[1]) / held[2], row, held[3])
         return rho, s
 
@@ -139,11 +142,11 @@ class BasisHead(ClosedFormHead):
             samples.target,
             samples.group,
             names=self.library.terms,
-            outputs=ACCELERATION,
+            outputs=self.outputs,
         )
 
     def coefficient_table(self) -> dict[str, list[float]]:
-        """Return the coefficients (u, v, r axis) by basis function, for the report.
+        """Return the coefficients (of each axis) by basis function, for the report.
 
         Features are in units of their standard deviation.
         """

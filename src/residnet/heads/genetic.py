@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
+from residnet.physics.symmetry import live_of
 from residnet.regression.estimator import Solution
 from residnet.regression.expressions import ExpressionLibrary, Weights
 from residnet.regression.genetic import EquationSearchConfig, GeneticEquations
@@ -45,11 +45,12 @@ class GeneticHead(EquationHead):
     """
 
     def __init__(self, config: GeneticConfig, names: Sequence[str]) -> None:
-        super().__init__()
+        super().__init__(names)
+        self.outputs = live_of(names).rates
         self.features = Features(config.chosen(names), names, config.margin)
         self.config = config
         self.library = ExpressionLibrary(config.evolution.nesting)
-        self.weights = Weights()
+        self.weights = Weights(self.dof)
 
     def calibrate(self, samples: Samples) -> None:
         self.features.calibrate(samples)
@@ -89,5 +90,5 @@ class GeneticHead(EquationHead):
             samples.target,
             samples.group,
             names=self.features.names,
-            outputs=ACCELERATION,
+            outputs=self.outputs,
         )

@@ -12,9 +12,9 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.errors import FitError
-from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
+from residnet.physics.symmetry import live_of
 from residnet.physics.terms import TermLibrary
 from residnet.regression.equation_rows import step_of, unbroken_stretches
 from residnet.regression.estimator import Solution, fold_numbers, usual_folds
@@ -96,19 +96,20 @@ class TermFeatures(nn.Module):
 
 @final
 class KernelHead(ClosedFormHead):
-    """A head rho [..., 3] = f(standardised features), f in the space of a kernel."""
+    """A head rho [..., n] = f(standardised features), f in the space of a kernel."""
 
     def __init__(self, config: KernelConfig, names: Sequence[str]) -> None:
-        super().__init__()
+        super().__init__(names)
+        self.outputs = live_of(names).rates
         chosen = config.chosen(names)
         self.features = Features(chosen, names, config.margin)
         self.terms = TermFeatures(config.terms, chosen)
-        self.kernel = config.kernel.build(len(chosen) + self.terms.count)
+        self.kernel = config.kernel.build(len(chosen) + self.terms.count, self.dof)
         self.penalties = tuple(sorted(config.penalties))
         self.folds = config.folds
         self.by_free_run = config.choose == "free_run"
         self.by_recursion = config.choose == "recursion"
-        self.register_buffer("effective", torch.zeros(3, dtype=torch.float64))
+        self.register_buffer("effective", torch.zeros(self.dof, dtype=torch.float64))
         self.effective: Tensor
 
     def calibrate(self, samples: Samples) -> None:
@@ -146,7 +147,7 @@ class KernelHead(ClosedFormHead):
         )
         with torch.no_grad():
             x = self.columns(samples.z)
-        found = estimator.fit(x, samples.target, samples.group, outputs=ACCELERATION)
+        found = estimator.fit(x, samples.target, samples.group, outputs=self.outputs)
         return [self._named(solution) for solution in found]
 
     def _named(self, solution: Solution) -> Solution:
@@ -159,11 +160,11 @@ class KernelHead(ClosedFormHead):
         return replace(out, state=state, neighbours=neighbours)
 
     def _recursion_errors(self, recursion: Recursion, paths: Sequence[Path]) -> Tensor:
-        """Return mean square errors of velocities that run alone, [settings, penalties, 3]."""
+        """Return mean square errors of velocities that run alone, [settings, penalties, n]."""
         count = len(self.penalties)
-        out = torch.zeros(len(paths), count, 3, dtype=torch.float64)
+        out = torch.zeros(len(paths), count, self.dof, dtype=torch.float64)
         for i, path in enumerate(paths):
-            for axis in range(3):
+            for axis in range(self.dof):
                 weights = path.coefficients[:, :, axis]
 
                 def predicted(z: Tensor, path: Path = path, weights: Tensor = weights) -> Tensor:
@@ -184,5 +185,5 @@ def _recursion(samples: Samples) -> Recursion:
     group, t = samples.group.numpy(), samples.t.numpy()
     step = step_of(group, t)
     stretch = torch.from_numpy(unbroken_stretches(group, t, step))
-    columns = [samples.names.index(name) for name in VELOCITY]
+    columns = [samples.names.index(name) for name in live_of(samples.names).moving]
     return Recursion(samples.z, samples.target, stretch, step, columns)

@@ -10,11 +10,12 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.core.names import VELOCITY
+from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead, Tanh, quick_tanh
 from residnet.physics.signals import VelocityBound
+from residnet.physics.symmetry import live_of
 
 _FARTHEST = 1e3
 """Largest cell state that a memory may hold: a gain of at most one each step, the gates open."""
@@ -79,9 +80,14 @@ class LstmConfig(FeatureConfig):
     def networks(self, names: Sequence[str]) -> list[tuple[tuple[str, ...], int]]:
         """Return (features, number of outputs) of each network."""
         if not self.per_axis:
-            return [(self.chosen(names), 3)]
+            return [(self.chosen(names), live_of(names).size)]
+        if live_of(names).rolls:
+            raise ConfigError(
+                "per_axis: there is one network for each of surge, sway and yaw, and none for the"
+                " roll of this model; leave per_axis out"
+            )
         if self.axis_features is None:
-            return [(self.chosen(names), 1)] * 3
+            return [(self.chosen(names), 1)] * live_of(names).size
         return [
             (FeatureConfig(features=self.axis_features[axis]).chosen(names), 1)
             for axis in ("u", "v", "r")
@@ -179,7 +185,7 @@ class LstmNetwork(nn.Module):
         )
         self.seen: Tensor
         # a memory of inputs alone
-        self.fed = self.partial and not any(name in VELOCITY for name in seen)
+        self.fed = self.partial and not any(name in live_of(names).moving for name in seen)
         softsign = config.activation == "softsign"
         self.core = LstmCore(len(seen), config.hidden_size, softsign)
         self.encoder: LstmCore | None = (
@@ -230,7 +236,7 @@ class LstmNetwork(nn.Module):
             held.append(near)
         if self.fed:
             # velocities, which the memory does not see, may be anything
-            z = torch.cat((p.new_zeros(p.shape[:-1] + (3,)), p), dim=-1)  # noqa: RUF005
+            z = torch.cat((p.new_zeros(p.shape[:-1] + (self.features.dof,)), p), dim=-1)  # noqa: RUF005
             h, s = self.core.along(self.remembered(self.features(z)), s)
             held.append(s)
             return row + self.dropout(h) @ own.T, held
@@ -244,7 +250,7 @@ class LstmNetwork(nn.Module):
         return torch.cat((gates, row), dim=-1), held
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return [B, outputs] and the memory at velocities nu [B, 3], by what `ahead` found."""
+        """Return [B, outputs] and the memory at velocities nu [B, n], by what `ahead` found."""
         v = torch.clamp(nu, held[0], held[1])
         if self.fed:
             out, s = torch.addmm(row, v, held[2]), held[3]
@@ -279,7 +285,7 @@ class LstmHead(ResidualHead):
     """A head with memory; s packs (h, c) of each network."""
 
     def __init__(self, config: LstmConfig, names: Sequence[str]) -> None:
-        super().__init__()
+        super().__init__(names)
         self.networks: Sequence[LstmNetwork] = nn.ModuleList(  # type: ignore[assignment]
             [
                 LstmNetwork(config, chosen, outputs, names)
@@ -288,8 +294,10 @@ class LstmHead(ResidualHead):
         )
         self.width = 2 * config.hidden_size
         self.n_state = self.width * len(self.networks)
-        self.scale = ResidualScale()
-        self.restoring: VelocityBound | None = VelocityBound() if config.restoring else None
+        self.scale = ResidualScale(self.dof)
+        self.restoring: VelocityBound | None = None
+        if config.restoring:
+            self.restoring = VelocityBound(channels=self.dof, dof=self.dof)
 
     def calibrate(self, samples: Samples) -> None:
         if self.restoring is not None:
@@ -325,7 +333,7 @@ class LstmHead(ResidualHead):
         return rows[0] if len(rows) == 1 else torch.cat(rows, dim=-1), held
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] and the memory for the next step, by what `ahead` found."""
+        """Return the residual [B, n] and the memory for the next step, by what `ahead` found."""
         out: list[Tensor] = []
         memory: list[Tensor] = []
         rows, many = row.shape[-1] // len(self.networks), len(held) // len(self.networks)

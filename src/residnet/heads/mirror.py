@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
 from residnet.heads.base import ResidualHead
-from residnet.physics.symmetry import mirrored_channels
+from residnet.physics.symmetry import axis_parities, mirrored_channels
 
 
 def quick_tanh(x: Tensor, many: int = 8_192) -> Tensor:
@@ -54,7 +54,7 @@ class MirroredHead(ResidualHead):
     """
 
     def __init__(self, inner: ResidualHead, names: Sequence[str]) -> None:
-        super().__init__()
+        super().__init__(names)
         mirror = mirrored_channels(names)
         if mirror is None:
             raise ConfigError(
@@ -67,7 +67,9 @@ class MirroredHead(ResidualHead):
         self.register_buffer("index", torch.tensor(mirror[0], dtype=torch.long), persistent=False)
         self.register_buffer("sign", torch.tensor(mirror[1], dtype=torch.float64), persistent=False)
         self.register_buffer(
-            "turned", torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64), persistent=False
+            "turned",
+            torch.tensor(axis_parities(names), dtype=torch.float64),
+            persistent=False,
         )
         self.index: Tensor
         self.sign: Tensor
@@ -97,7 +99,7 @@ class MirroredHead(ResidualHead):
         return torch.cat((z, z.index_select(-1, self.index) * self.sign.to(z.dtype)), dim=0)
 
     def mean(self, rho: Tensor) -> Tensor:
-        """Return the mean of residuals [2 B, ..., 3] and their mirror images, [B, ..., 3]."""
+        """Return the mean of residuals [2 B, ..., n] and their mirror images, [B, ..., n]."""
         half = rho.shape[0] // 2
         return 0.5 * (rho[:half] + rho[half:] * self.turned.to(rho.dtype))
 

@@ -53,9 +53,9 @@ class MlpHead(ResidualHead):
     """A head rho = std * net(features)."""
 
     def __init__(self, config: MlpConfig, names: Sequence[str]) -> None:
-        super().__init__()
+        super().__init__(names)
         self.features = Features(config.chosen(names), names, config.margin)
-        self.scale = ResidualScale()
+        self.scale = ResidualScale(self.dof)
         layers: list[nn.Module] = []
         width = self.features.count
         for units in config.hidden:
@@ -63,7 +63,7 @@ class MlpHead(ResidualHead):
             if config.dropout > 0:
                 layers.append(nn.Dropout(config.dropout))
             width = units
-        out = nn.Linear(width, 3)
+        out = nn.Linear(width, self.dof)
         with torch.no_grad():
             out.weight.mul_(0.1)
             out.bias.zero_()
@@ -88,7 +88,7 @@ class MlpHead(ResidualHead):
         return row, [low, high, own]
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] at velocities nu [B, 3], by what `ahead` found."""
+        """Return the residual [B, n] at velocities nu [B, n], by what `ahead` found."""
         out = torch.addmm(row, torch.clamp(nu, held[0], held[1]), held[2])
         for i, layer in enumerate(self.net):
             if i > 0:

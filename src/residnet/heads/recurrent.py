@@ -54,20 +54,22 @@ class RecurrentConfig(FeatureConfig):
 class RecurrentHead(ResidualHead):
     """K networks with leading axes of weights; rows are those of one network after the other.
 
-    Rows of z [K B, nz (+ 3)] and s [K B, H] belong to the network that their K-th part belongs to.
+    Rows of z [K B, nz (+ n)] and s [K B, H] belong to the network that their K-th part belongs to.
     Behind the channels may stand the errors of accelerations that the past was predicted with.
     """
 
     def __init__(self, config: RecurrentConfig, names: Sequence[str]) -> None:
-        super().__init__()
+        super().__init__(names)
         self.copies, self.n_state = config.members, config.hidden_size
         self.coarse, self.settle = config.step, 2.0 * config.step
         self.share, self.far, self.least = 1.0, _FAR, _LEAST
         self.channels = len(names)
         self.features = Features(config.chosen(names), names, config.margin)
-        self.scale = ResidualScale()
-        self.restoring: VelocityBound | None = VelocityBound() if config.restoring else None
-        self.seen = seen = self.features.count + 3
+        self.scale = ResidualScale(self.dof)
+        self.restoring: VelocityBound | None = None
+        if config.restoring:
+            self.restoring = VelocityBound(channels=self.dof, dof=self.dof)
+        self.seen = seen = self.features.count + self.dof
         hidden = config.hidden_size
 
         def drawn(*shape: int) -> nn.Parameter:
@@ -76,8 +78,8 @@ class RecurrentHead(ResidualHead):
 
         self.w_input, self.w_hidden = drawn(seen, 3 * hidden), drawn(hidden, 3 * hidden)
         self.bias, self.bias_hidden = drawn(1, 3 * hidden), drawn(1, hidden)
-        self.w_out, self.w_skip = drawn(hidden, 3), drawn(seen, 3)
-        self.bias_out = nn.Parameter(torch.zeros(config.members, 1, 3))
+        self.w_out, self.w_skip = drawn(hidden, self.dof), drawn(seen, self.dof)
+        self.bias_out = nn.Parameter(torch.zeros(config.members, 1, self.dof))
         with torch.no_grad():
             for weight in (self.w_out, self.w_skip):
                 weight.mul_(0.1)
@@ -95,19 +97,19 @@ class RecurrentHead(ResidualHead):
         return self.scale.spread
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals [K B, 3] at channels z [K B, nz (+ 3)] and memories for the next step.
+        """Return residuals [K B, n] at channels z [K B, nz (+ n)] and memories for the next step.
 
         Where no errors stand behind the channels they are zero.
         """
         if z.shape[-1] > self.channels:
-            z, wrong = z.split([self.channels, 3], dim=-1)
+            z, wrong = z.split([self.channels, self.dof], dim=-1)
             wrong = self.far * torch.tanh(wrong / (self.far * self.scale.spread.to(z.dtype)))
         else:
-            wrong = torch.zeros_like(z[..., :3])
+            wrong = torch.zeros_like(z[..., : self.dof])
         f = torch.cat((self.features(z), wrong), dim=-1).view(self.copies, -1, self.seen)
         h = self.gated(torch.baddbmm(self.bias, f, self.w_input), s)
         out = torch.baddbmm(torch.baddbmm(self.bias_out, f, self.w_skip), h, self.w_out)
-        rho: Tensor = self.scale(out.reshape(-1, 3))
+        rho: Tensor = self.scale(out.reshape(-1, self.dof))
         if self.restoring is not None:
             rho = rho + self.restoring(z)
         return rho, h.reshape(-1, self.n_state)
@@ -115,9 +117,9 @@ class RecurrentHead(ResidualHead):
     def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
         """Return what velocities do not decide; see `ResidualHead.ahead`."""
         hidden, count = self.n_state, self.features.count
-        # of gates and residual, one layer: [K, 3 H + 3, F]
+        # of gates and residual, one layer: [K, 3 H + n, F]
         weight = torch.cat((self.w_input, self.w_skip), dim=-1)
-        weight, wrong = weight.split([count, 3], dim=1)
+        weight, wrong = weight.split([count, self.dof], dim=1)
         bias = torch.cat((self.bias, self.bias_out), dim=-1)[:, 0]
         rows: list[Tensor] = []
         near: list[Tensor] = []
@@ -127,20 +129,22 @@ class RecurrentHead(ResidualHead):
             near.append(own)
         own = torch.cat((torch.stack(near), wrong), dim=1)
         held = self.features.reach(p)
-        held.extend(own.split([3 * hidden, 3], dim=-1))
+        held.extend(own.split([3 * hidden, self.dof], dim=-1))
         return torch.cat(rows), held
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [K B, 3] and the memories, by what `ahead` found."""
-        near, wrong = nu.split([3, 3], dim=-1)
+        """Return the residual [K B, n] and the memories, by what `ahead` found."""
+        near, wrong = nu.split([self.dof, self.dof], dim=-1)
         far = self.far * self.scale.spread.to(nu.dtype)
         seen = torch.cat(
             (torch.clamp(near, held[0], held[1]), self.far * torch.tanh(wrong / far)), dim=-1
-        ).view(self.copies, -1, 6)
-        gates, skip = row.view(self.copies, -1, row.shape[-1]).split([3 * self.n_state, 3], dim=-1)
+        ).view(self.copies, -1, 2 * self.dof)
+        gates, skip = row.view(self.copies, -1, row.shape[-1]).split(
+            [3 * self.n_state, self.dof], dim=-1
+        )
         h = self.gated(torch.baddbmm(gates, seen, held[2]), s)
         out = torch.baddbmm(torch.baddbmm(skip, seen, held[3]), h, self.w_out)
-        rho: Tensor = self.scale(out.reshape(-1, 3))
+        rho: Tensor = self.scale(out.reshape(-1, self.dof))
         if self.restoring is not None:
             rho = rho + self.restoring(near)
         return rho, h.reshape(-1, self.n_state)
@@ -159,7 +163,7 @@ class RecurrentHead(ResidualHead):
         return new + kept * (h - new)
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Return residuals [K B, T, 3] along measured channels [K B, T, nz], from no memory."""
+        """Return residuals [K B, T, n] along measured channels [K B, T, nz], from no memory."""
         s = torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
         residuals: list[Tensor] = []
         for k in range(z.shape[1]):

@@ -17,9 +17,9 @@ from pydantic import Field, field_validator
 from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features, ResidualScale
+from residnet.physics.symmetry import live_of
 from residnet.regression.estimator import Solution
 
 _REACH = 0.1
@@ -98,28 +98,30 @@ def _made(step: Any) -> Any:
 class _Fitted:
     """The fitted pipelines of the axes."""
 
-    def __init__(self) -> None:
+    def __init__(self, dof: int) -> None:
         self.axes: list[Any] = []
+        self.dof = dof
 
     def asked(self, x: np.ndarray) -> np.ndarray:
-        """Return standardised residuals [N, 3] at standardised features [N, F]."""
+        """Return standardised residuals [N, n] at standardised features [N, F]."""
         if not self.axes or not len(x):
-            return np.zeros((len(x), 3))
+            return np.zeros((len(x), self.dof))
         return np.stack([np.asarray(axis.predict(x)).reshape(-1) for axis in self.axes], axis=1)
 
 
 @final
 class SklearnHead(ClosedFormHead):
-    """A head rho [..., 3] that asks a fitted pipeline for each axis."""
+    """A head rho [..., n] that asks a fitted pipeline for each axis."""
 
     def __init__(self, config: SklearnConfig, names: Sequence[str]) -> None:
-        super().__init__()
+        super().__init__(names)
+        self.outputs = live_of(names).rates
         self.refusal = "scikit-learn predicts in Python, which no format of export holds"
         self.config = config
         self.features = Features(config.chosen(names), names, config.margin)
-        self.scale = ResidualScale()
-        self.learned = np.zeros((0, self.features.count + 3))
-        self.fitted = _Fitted()
+        self.scale = ResidualScale(self.dof)
+        self.learned = np.zeros((0, self.features.count + self.dof))
+        self.fitted = _Fitted(self.dof)
 
     def calibrate(self, samples: Samples) -> None:
         self.features.calibrate(samples)
@@ -143,11 +145,11 @@ class SklearnHead(ClosedFormHead):
         return [Solution({}, state, notes={"fitted_on": len(rows)})]
 
     def get_extra_state(self) -> Tensor:
-        """Return standardised features and targets [N, F + 3], which a load fits again."""
+        """Return standardised features and targets [N, F + n], which a load fits again."""
         return torch.from_numpy(self.learned)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Fit the pipelines on standardised features and targets [N, F + 3].
+        """Fit the pipelines on standardised features and targets [N, F + n].
 
         Raises:
             FitError: where scikit-learn refuses them.
@@ -158,10 +160,10 @@ class SklearnHead(ClosedFormHead):
         if np.array_equal(learned, self.learned):
             return
         axes = []
-        for i, axis in enumerate(ACCELERATION):
+        for i, axis in enumerate(self.outputs):
             whole = make_pipeline(*map(_made, self.config.pipeline))
             try:
-                whole.fit(learned[:, :-3], learned[:, i - 3])
+                whole.fit(learned[:, : -self.dof], learned[:, i - self.dof])
             except (TypeError, ValueError) as error:
                 first = (str(error).splitlines() or [""])[0]
                 raise FitError(f"scikit-learn cannot fit {axis}: {first}") from None
@@ -174,7 +176,7 @@ class SklearnHead(ClosedFormHead):
 
     def parameter_count(self) -> list[float]:
         """Return the numbers that each axis was fitted on: nothing else bounds its freedom."""
-        return [float(len(self.learned))] * 3
+        return [float(len(self.learned))] * self.dof
 
 
 class _Asked(torch.autograd.Function):
@@ -186,13 +188,13 @@ class _Asked(torch.autograd.Function):
         ctx.fitted = fitted
         ctx.save_for_backward(flat)
         answer = torch.from_numpy(fitted.asked(flat.double().numpy())).to(x)
-        return answer.reshape(*x.shape[:-1], 3)
+        return answer.reshape(*x.shape[:-1], fitted.dof)
 
     @staticmethod
     def backward(ctx: Any, *given: Tensor) -> tuple[Tensor, None]:
         (flat,) = ctx.saved_tensors
         grad = given[0]
-        flow = grad.reshape(-1, 3)
+        flow = grad.reshape(-1, ctx.fitted.dof)
         out = torch.zeros_like(flat)
         for i in range(flat.shape[1]):
             step = torch.zeros_like(flat)

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
-from residnet.core.names import ACCELERATION, nearest
+from residnet.core.names import nearest
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
-from residnet.physics.symmetry import wrong_parity
+from residnet.physics.symmetry import axis_parities, live_of, term_parity
 from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term, rated
 from residnet.regression.equation_rows import (
     Rows,
@@ -240,13 +240,14 @@ class SymbolicConfig(FeatureConfig):
 
 @final
 class SymbolicHead(EquationHead):
-    """A head rho [..., 3] = phi(features) coefficients, most of them zero.
+    """A head rho [..., n] = phi(features) coefficients, most of them zero.
 
     Over the baseline `still` it is the equation of the acceleration itself.
     """
 
     def __init__(self, config: SymbolicConfig, names: Sequence[str]) -> None:
-        super().__init__()
+        super().__init__(names)
+        self.outputs, self.parities = live_of(names).rates, axis_parities(names)
         chosen = config.chosen(names)
         self.features = Features(chosen, names, config.margin)
         self.line = DelayLine(config.delay, chosen)
@@ -259,7 +260,7 @@ class SymbolicHead(EquationHead):
         )
         self.library = TermLibrary([candidate.term for candidate in self.candidates], chosen)
         self.register_buffer(
-            "coefficients", torch.zeros(self.library.count, 3, dtype=torch.float64)
+            "coefficients", torch.zeros(self.library.count, self.dof, dtype=torch.float64)
         )
         self.coefficients: Tensor
 
@@ -275,7 +276,7 @@ class SymbolicHead(EquationHead):
         return values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] at channels z [B, nz], and the late inputs as memory."""
+        """Return the residual [B, n] at channels z [B, nz], and the late inputs as memory."""
         chosen, s = self.line(self.features.guarded(z), s)
         return self.basis(chosen) @ self.coefficients.to(z.dtype), s
 
@@ -337,7 +338,8 @@ class SymbolicHead(EquationHead):
         channels = self.features.names
         rows = self.config.estimator.rows(Rows(terms, past.target, past.stretch), past.step)
         odd = [
-            [wrong_parity(term, axis, channels) for axis in range(3)] for term in self.library.terms
+            [parity not in (None, own) for own in self.parities]
+            for parity in (term_parity(term, channels) for term in self.library.terms)
         ]
         estimator = SparseRegression(
             self.config.search,
@@ -347,7 +349,7 @@ class SymbolicHead(EquationHead):
             gammas=gammas,
         )
         x, y = torch.from_numpy(rows.x), torch.from_numpy(rows.y)
-        return estimator.fit(x, y, names=self.library.terms, outputs=ACCELERATION)
+        return estimator.fit(x, y, names=self.library.terms, outputs=self.outputs)
 
     def _delay(self, past: Past) -> tuple[int, dict[str, Any]]:
         """Return the delay in steps, and the notes about it.
@@ -358,7 +360,7 @@ class SymbolicHead(EquationHead):
         if self.line.count == 0:
             return 0, {}
         simple = [c.term for c in self.candidates if c.degree <= 1]
-        terms: list[list[str]] = [simple] * 3
+        terms: list[list[str]] = [simple] * self.dof
         tried: list[int] = []
         profile = np.zeros(0)
         while len(tried) < 2 or (tried[-1] != tried[-2] and len(tried) < _MOST_DELAYS):
@@ -367,7 +369,7 @@ class SymbolicHead(EquationHead):
             )
             tried.append(steps)
             table = self._fit(past.delayed(steps, self.line.index.numpy()))[0].table
-            found = [[c.term for c in table if c.axis == name] for name in ACCELERATION]
+            found = [[c.term for c in table if c.axis == name] for name in self.outputs]
             terms = [list(dict.fromkeys((*row, *simple))) for row in found]
         notes = {
             "steps": tried[-1],

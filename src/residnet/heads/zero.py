@@ -15,4 +15,4 @@ class ZeroHead(ResidualHead):
     """A head without a residual, rho = 0: the baseline alone."""
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return zero_acceleration(z), s
+        return zero_acceleration(z, self.dof), s

@@ -17,8 +17,6 @@ from residnet.baselines.base import ParametricBaseline
 from residnet.baselines.given import StillConfig
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
-from residnet.core.layout import VELOCITIES
-from residnet.core.names import VELOCITY
 from residnet.core.progress import say
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, samples
@@ -51,7 +49,7 @@ def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
         known: samples whose target is the measured acceleration.
     """
     with torch.no_grad():
-        explained = paged.rows(len(known), 3)
+        explained = paged.rows(len(known), known.target.shape[1])
         for rows in paged.row_pieces(len(known)):
             explained[rows] = model.baseline(known.z[rows])
             paged.forget()
@@ -65,7 +63,7 @@ class ValidationScore:
         logs: of the validation split.
         config: its `selection` protocol and scales are used.
         step: of the grid in s.
-        limit: of |u, v, r| [3] beyond which a free run has diverged.
+        limit: size of what moves [n] beyond which a free run has diverged.
         dense: windows overlap, so that few logs tell more.
 
     Raises:
@@ -102,11 +100,11 @@ class ValidationScore:
         axes = (errors.rmse.mean(0) / self.scales)[live.axes]
         window, states = self.windows[0], predictions["validated"][0].states
         measured = self.logs[window.log].y[window.start : window.start + len(states)]
-        pairs = (torch.from_numpy(part[:, VELOCITIES]).T for part in (measured, states))
-        columns = dict(zip(VELOCITY, zip(*pairs, strict=True), strict=True))
-        columns = {name: columns[name] for name in live.velocities}
+        pairs = (torch.from_numpy(part[:, live.columns]).T for part in (measured, states))
+        columns = dict(zip(live.moving, zip(*pairs, strict=True), strict=True))
+        columns = {name: columns[name] for name in live.channels}
         shown = Shown(self.step * torch.arange(len(states)), columns)
-        named = dict(zip(live.velocities, axes.tolist(), strict=True))
+        named = dict(zip(live.channels, axes.tolist(), strict=True))
         return Score(diverged, float(axes.mean()), named, shown)
 
 
@@ -206,7 +204,9 @@ class Fitter:
         self.train = logs["train"]
         self.signals = settings.signals.build()
         self.low, self.high = envelope(self.train)
-        self.limit = velocity_limit(self.low, self.high, settings.evaluation.divergence)
+        self.limit = velocity_limit(
+            self.low, self.high, settings.evaluation.divergence, settings.signals.live
+        )
         self.samples = samples(self.train, self.signals)
         self.held_back = samples(logs["validation"], self.signals)
         self.settings = settled(settings, self.samples, self.train) if settle else settings

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from residnet.core.arrays import paged
 from residnet.core.errors import UsageError
-from residnet.core.names import ACCELERATION
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared, channels
 from residnet.data.simulated import SimulatedTrials
@@ -85,7 +84,7 @@ def evaluate(
         logs: of one split, at least one.
         config: protocols, scales and groups.
         step: of the grid in s.
-        limit: of |u, v, r| [3] beyond which a free run has diverged.
+        limit: size of what moves [n] beyond which a free run has diverged.
     """
     return evaluate_splits(models, {logs[0].split: logs}, config, step, limit)[logs[0].split]
 
@@ -104,7 +103,7 @@ def evaluate_splits(
         splits: their logs, at least one each.
         config: protocols, scales and groups.
         step: of the grid in s.
-        limit: of |u, v, r| [3] beyond which a free run has diverged.
+        limit: size of what moves [n] beyond which a free run has diverged.
     """
     laid = {
         (split, name): [
@@ -288,7 +287,7 @@ class Identified(Mapping[str, FittedModel]):
     Attributes:
         settings: of the fit.
         models: by name.
-        limit: of |u, v, r| [3] beyond which a free run has diverged.
+        limit: size of what moves [n] beyond which a free run has diverged.
         train: the logs that fitted them.
         chosen: an earlier fit without the validation logs, which chooses a single model; None where
             this fit does.
@@ -404,8 +403,8 @@ class TeacherForced:
 
     Attributes:
         z: channels that baseline and head see [T, nz].
-        baseline: accelerations of the baseline [T, 3].
-        predicted: accelerations of baseline and head together [T, 3].
+        baseline: accelerations of the baseline [T, n].
+        predicted: accelerations of baseline and head together [T, n].
     """
 
     z: Tensor
@@ -509,7 +508,8 @@ def term_table(fitted: Iterable[FittedModel], logs: Sequence[Prepared]) -> pd.Da
 
 def _live(logs: Sequence[Prepared]) -> list[tuple[int, str]]:
     """Return number and name of each acceleration that logs tell."""
-    return [(axis, ACCELERATION[axis]) for axis in logs[0].live.axes]
+    live = logs[0].live
+    return [(axis, live.rates[axis]) for axis in live.learned]
 
 
 SPLITS = ("train", "test")
@@ -558,7 +558,7 @@ def _some(logs: Sequence[Prepared]) -> Sequence[Prepared]:
 
 
 def measured_stretches(log: Prepared) -> list[np.ndarray]:
-    """Return the measured accelerations [T, 3] of each stretch that may be learned from."""
+    """Return the measured accelerations [T, n] of each stretch that may be learned from."""
     return [log.nu_dot[begin:end] for begin, end in zip(*stretches(log.good), strict=True)]
 
 
@@ -576,7 +576,7 @@ def _parameter_counts(model: HybridDynamics) -> list[float]:
 
 
 def _residuals(model: HybridDynamics, log: Prepared) -> list[np.ndarray]:
-    """Measured minus predicted acceleration [T, 3] of each stretch; a head runs along the whole
+    """Measured minus predicted acceleration [T, n] of each stretch; a head runs along the whole
     log, as its memory needs.
     """
     predicted = teacher_forced(model, log).predicted

@@ -11,7 +11,7 @@ import numpy as np
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.arrays import paged
 from residnet.core.errors import DataError
-from residnet.core.layout import RANGE_VELOCITIES
+from residnet.core.layout import Live
 from residnet.core.log import Log
 from residnet.core.progress import say
 from residnet.data.masks import DEAD_COMMANDS
@@ -145,18 +145,16 @@ def require_window(log: Prepared, settings: FitSettings) -> None:
         )
 
 
-def velocity_limit(low: np.ndarray, high: np.ndarray, divergence: float) -> np.ndarray:
-    """Return the |u, v, r| [3] beyond which a free run has diverged.
+def velocity_limit(low: np.ndarray, high: np.ndarray, divergence: float, live: Live) -> np.ndarray:
+    """Return the size [n] of what moves beyond which a free run has diverged.
 
     Args:
-        low: smallest training velocities (and inputs, which are not used), [3 + m], from robust
+        low: smallest training velocities (and inputs, which are not used), [n + m], from robust
             quantiles (`residnet.data.prepare.envelope`).
-        high: largest ones, [3 + m].
+        high: largest ones, [n + m].
         divergence: the multiple of the largest training value.
     """
-    return np.asarray(
-        divergence * np.maximum(np.abs(low[RANGE_VELOCITIES]), np.abs(high[RANGE_VELOCITIES]))
-    )
+    return np.asarray(divergence * np.maximum(np.abs(low), np.abs(high))[: live.size])
 
 
 def through_currents(

@@ -12,7 +12,7 @@ import torch
 
 from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
-from residnet.core.names import VELOCITY
+from residnet.core.names import CHANNEL_UNITS
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
@@ -44,6 +44,7 @@ class Facts:
         history: measured past that a free run may look back on, s.
         stretch: half of the training samples lie in uninterrupted stretches at least so long, s.
         samples: of the training logs.
+        rolling: time in s in which a roll turns by a radian of its period; infinite without one.
     """
 
     names: tuple[str, ...]
@@ -54,6 +55,7 @@ class Facts:
     history: float
     stretch: float
     samples: int
+    rolling: float = math.inf
 
     @classmethod
     def supposed(cls, names: tuple[str, ...], step: float = 0.1) -> Facts:
@@ -85,10 +87,14 @@ class Facts:
         ]
         astern = [name for name in moving if _both_signs(z[:, names.index(name)])]
         length, history = _free_run(logs, evaluation, step)
-        stretch = _stretch(logs) * step
+        stretch, rolling = _stretch(logs) * step, math.inf
+        if "p" in names:
+            angle, rate = (float(spread[names.index(name)]) for name in ("phi", "p"))
+            rolling = angle / max(rate, 1e-9)
         return cls(
-            names, tuple(moving), tuple(astern), step, length, history, stretch, len(samples)
-        )
+            names, tuple(moving), tuple(astern), step, length, history, stretch, len(samples),
+            rolling,
+        )  # fmt: skip
 
     @property
     def longest(self) -> float:
@@ -111,7 +117,8 @@ def _acting(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(
         name
         for name in names
-        if name not in VELOCITY and (not forces or name in FORCE_CHANNELS or name in WIND_CHANNELS)
+        if name not in live_of(names).moving
+        and (not forces or name in FORCE_CHANNELS or name in WIND_CHANNELS)
     )
 
 
@@ -145,6 +152,7 @@ def _free_run(
 
 
 _HULL = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
+_ROLL = ("u p", "p|p|", "u|u| phi", "phi^3")
 _WIND = (
     "wind_u",
     "wind_v",
@@ -165,7 +173,7 @@ _MANY = 3
 def linear_terms(facts: Facts) -> list[str]:
     """Return the terms of a model that is linear in velocities, inputs and wind."""
     wind = ["wind_u", "wind_v"] if facts.wind else []
-    return ["1", *VELOCITY, *facts.inputs, *wind]
+    return ["1", *live_of(facts.names).moving, *facts.inputs, *wind]
 
 
 def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
@@ -183,7 +191,7 @@ def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
     kept = ("1", *(f"{name}|{name}|" for name in facts.inputs))
     return {
         axis: [t for t in terms if t in kept or not wrong_parity(t, number, facts.names)]
-        for number, axis in enumerate(VELOCITY)
+        for number, axis in enumerate(live_of(facts.names).layout.velocities)
     }
 
 
@@ -211,8 +219,9 @@ def _acting_terms(facts: Facts) -> tuple[list[str], list[str], list[str]]:
 def _terms(facts: Facts) -> list[str]:
     """Return the terms of all axes together."""
     forces, turning, driving = _acting_terms(facts)
+    moving = live_of(facts.names).moving
     return [
-        *("1", *VELOCITY, *_HULL, *forces),
+        *("1", *moving, *_HULL, *(_ROLL if "p" in moving else ()), *forces),
         *(term for name in driving for term in _propeller(name, name in facts.astern)),
         *(term for name in turning for term in _rudder(name, driving, facts)),
         *(_WIND if facts.wind else ()),
@@ -257,6 +266,8 @@ def _large_angles(name: str, driving: Sequence[str]) -> list[str]:
 
 _THROUGH = 100
 """Steps of the networks in a free run of the protocol's length."""
+_OF_ROLL = 0.5
+"""Steps of the networks in radians of a roll."""
 _REFIT = 200
 """Steps of the free runs of a refit, where its share of the protocol's length is less."""
 _BATCH = 32
@@ -314,8 +325,12 @@ def readable(value: float) -> float:
 
 
 def coarse_step(facts: Facts) -> float:
-    """Return the step of the networks in s: a free run is trained through in so many."""
-    return facts.step * max(1, round(facts.length / (_THROUGH * facts.step)))
+    """Return the step of the networks in s: a free run is trained through in so many.
+
+    A roll takes at least twelve a period, or what it does between them is lost.
+    """
+    steps = min(facts.length / _THROUGH, _OF_ROLL * facts.rolling) / facts.step
+    return facts.step * max(1, round(steps))
 
 
 def members(facts: Facts) -> int:
@@ -405,11 +420,14 @@ class Preparation:
         interval = float(np.median([np.median(np.diff(log.t)) for log in logs]))
         memories = [_memory(log) for log in logs]
         memory = float(np.median([m for m in memories if np.isfinite(m)] or [20.0 * interval]))
-        step = float(f"{interval * max(1, int(memory / 40.0 / interval)):.4g}")
-        samples = min(max(7, 2 * round(0.5 * memory / 5.0 / step) + 1), 41)
+        # a roll is quicker than the yaw
+        rolls = [_memory(log, ("phi",)) for log in logs] if live.rolls else []
+        quick = min(memory, float(np.median([m for m in rolls if np.isfinite(m)] or [memory])))
+        step = float(f"{interval * max(1, int(quick / 40.0 / interval)):.4g}")
+        samples = min(max(7, 2 * round(0.5 * quick / 5.0 / step) + 1), 41)
         held = tuple(name for name in inputs if _rests(logs, name))
         # a true wind acts from where the vessel points
-        wind = live.whole and all(
+        wind = not live.dead and all(
             set(WIND_INPUTS) <= set(log.channels) and "psi" not in log.meta.get("integrated", ())
             for log in logs
         )
@@ -468,12 +486,12 @@ def judging(
     return {"protocols": laid, **out}
 
 
-def _memory(log: Log) -> float:
+def _memory(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float:
     """Return the time in s after which the yaw rate is correlated by 1/e only.
 
-    Where it does not move that of the speed is taken.
+    Where it does not move that of the speed is taken; so with other names, the first that moves.
     """
-    values = next((log[n] for n in ("r", "u", "v") if n in log.channels and log[n].any()), log.t)
+    values = next((log[n] for n in names if n in log.channels and log[n].any()), log.t)
     known = np.isfinite(values)
     if known.sum() < 50:
         return float("nan")
@@ -515,9 +533,11 @@ def protocols(length: float) -> dict[str, Any]:
 
 
 def scales(logs: Sequence[Log], live: Live = ALIVE) -> dict[str, Any]:
-    """Return the standard deviations of the velocities that live, in units that read well."""
+    """Return the standard deviations of what lives of the motion, in units that read well."""
     least, out = 1e-4, {}
-    for name in live.velocities:
+    for name in live.channels:
         spread = max(float(np.nanstd(np.concatenate([log[name] for log in logs]))), least)
-        out[name] = f"{np.degrees(spread):.3g} deg/s" if name == "r" else f"{spread:.3g} m/s"
+        unit = CHANNEL_UNITS[name]
+        shown = np.degrees(spread) if unit.startswith("rad") else spread
+        out[name] = f"{shown:.3g} {unit.replace('rad', 'deg')}"
     return out

@@ -151,12 +151,12 @@ class FitSettings(Parts):
 
     @model_validator(mode="after")
     def _combination(self) -> FitSettings:
-        if self.current is not None and not self.signals.live.whole:
+        if self.current is not None and not self.signals.live.planar:
             raise ValueError(
                 "current: currents are told by u, v and r beside a position; leave `current` out of"
-                f" a model of {', '.join(self.signals.velocities)} alone"
+                f" a model of {', '.join(self.signals.velocities)}"
             )
-        given, wanted = tuple(self.evaluation.scales.named()), self.signals.velocities
+        given, wanted = tuple(self.evaluation.scales.named()), self.signals.live.channels
         if given != wanted:
             raise ValueError(
                 f"evaluation.scales: the velocities of the model are {', '.join(wanted)}"

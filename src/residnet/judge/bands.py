@@ -41,7 +41,7 @@ class RunErrors:
         log: name of the log.
         manoeuvre: its kind.
         error: absolute errors [L, 5] by channel, NaN where they are not scored.
-        states: predicted [L + 1, 6], from the initial state on.
+        states: predicted [L + 1, 3 + n], from the initial state on.
         spread: standard deviation between the members of a mean [L, 5]; None for a single model.
     """
 
@@ -226,13 +226,13 @@ def usual_spread(runs: Sequence[RunErrors], steps: np.ndarray) -> np.ndarray | N
 
 
 def limits(states: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper limits [L + 1, 6] of predicted states [L + 1, 6].
+    """Return the lower and upper limits [L + 1, 3 + n] of predicted states.
 
     The initial state is given, and has no width. Limits of x and y are those of the box about the
-    circle that holds the position.
+    circle that holds the position. A roll has no band.
 
     Args:
-        states: predicted x, y, psi, u, v, r, from the initial state on.
+        states: predicted [L + 1, 3 + n], from the initial state on.
         width: half widths [L, 5] after it.
     """
     reach = np.zeros_like(states)

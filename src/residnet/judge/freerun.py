@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from residnet.core.frames import wrap_array
-from residnet.core.layout import ALIVE, HEADING, POSE, POSITION, VELOCITIES, Live
-from residnet.core.names import STATE, VELOCITY
+from residnet.core.layout import ALIVE, HEADING, POSE, POSITION, VELOCITIES, Live, levelled
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.free_runs import compiled
@@ -36,8 +35,8 @@ class Candidate:
         name: unique in a run.
         kind: zero, baseline, head, truth or ensemble.
         model: the dynamics; float64 parameters are run in float64.
-        state: names of the columns of the model's state; what is not x, y, psi, u, v, r (roll,
-            actuators) starts from the log's channel.
+        state: names of the columns of the model's state; those of the prepared logs where empty.
+            What is not among these (actuators) starts from the log's channel.
         inputs: channels of the log that make w; None for the prepared inputs.
         idle: inputs after those that are held at zero (disturbances that the model is not told
             about).
@@ -52,7 +51,7 @@ class Candidate:
     name: str
     kind: str
     model: Dynamics
-    state: tuple[str, ...] = STATE
+    state: tuple[str, ...] = ()
     inputs: tuple[str, ...] | None = None
     idle: int = 0
     reference: str | None = None
@@ -65,9 +64,10 @@ class Candidate:
 class Prediction:
     """A prediction of one model for one window.
 
-    States [L, 6] hold the model's velocities and the pose integrated from them; `diverged` says
-    whether the free run ran away. `spread` [L - 1, 5] is the standard deviation of u, v, r, heading
-    and position between the members of a mean, from the first step on; None for a single model.
+    States [L, 3 + n] hold what moves in the model and the pose integrated from it; `diverged`
+    says whether the free run ran away. `spread` [L - 1, 5] is the standard deviation of u, v, r,
+    heading and position between the members of a mean, from the first step on; None for a single
+    model.
     """
 
     states: np.ndarray
@@ -92,14 +92,14 @@ class FreeRun:
 class Errors:
     """Errors of one model's free runs, the samples of all W windows one after the other.
 
-    u, v and the position are scored over usable samples; r and the heading, which no position
-    sensor disturbs, over all.
+    u, v and the position are scored over usable samples; r, the heading and the roll, which no
+    position sensor disturbs, over all.
 
     Attributes:
-        error: predicted minus measured x, y, psi, u, v, r [N, 6]; psi within half a turn.
+        error: predicted minus measured states [N, 3 + n]; psi within half a turn.
         usable: which samples are [N].
         counts: samples of each window [W].
-        live: velocities that the logs tell; the others are zero, and no error counts.
+        live: velocities that the logs tell; others are zero, and no error counts.
     """
 
     error: np.ndarray
@@ -140,28 +140,29 @@ class Errors:
 
     @property
     def scored(self) -> np.ndarray:
-        """Whether u, v and r of each sample count [N, 3]."""
-        return np.stack((self.usable, self.usable, np.ones_like(self.usable)), axis=1)
+        """Whether each of what moves counts at each sample [N, n]."""
+        turning = [np.ones_like(self.usable)] * (self.live.size - 2)
+        return np.stack((self.usable, self.usable, *turning), axis=1)
 
     @property
     def velocities(self) -> np.ndarray:
-        """Errors of u, v and r [N, 3], zero where they do not count."""
-        return np.asarray(np.where(self.scored, self.error[:, VELOCITIES], 0.0))
+        """Errors of what moves [N, n], zero where they do not count."""
+        return np.asarray(np.where(self.scored, self.error[:, self.live.columns], 0.0))
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean of values [N, 3] over each window's samples that count [W, 3]."""
+        """Return the mean of values [N, n] over each window's samples that count [W, n]."""
         with np.errstate(invalid="ignore"):
             sums = np.add.reduceat(values, self.begins)
             return np.asarray(sums / np.add.reduceat(self.scored.astype(float), self.begins))
 
     @property
     def rmse(self) -> np.ndarray:
-        """Root mean square errors of u, v and r of each window [W, 3]."""
+        """Root mean square errors of what moves of each window [W, n]."""
         return np.asarray(np.sqrt(self.mean(self.velocities**2)))
 
     @property
     def mae(self) -> np.ndarray:
-        """Mean absolute errors of u, v and r of each window [W, 3]."""
+        """Mean absolute errors of what moves of each window [W, n]."""
         return self.mean(np.abs(self.velocities))
 
     @property
@@ -190,7 +191,7 @@ def free_run(
 ) -> dict[str, list[Prediction]]:
     """Free-run every candidate over every window.
 
-    A window whose prediction is not finite, or whose velocities exceed both `limit` [3] and twice
+    A window whose prediction is not finite, or whose velocities exceed both `limit` [n] and twice
     what the vessel itself did in it, has diverged and holds the prediction of `zero`, velocities
     held, instead. Beyond a negative limit everything has diverged.
     """
@@ -209,14 +210,14 @@ def free_run(
         out[mean.name] = []
         for i, each in enumerate(beside):
             states = [one.states for one in each]
-            nu = np.mean(states, axis=0)[:, VELOCITIES]
+            nu = np.mean(states, axis=0)[:, logs[0].live.columns]
             own = next(found) if i in alone else _prediction(windows[i], nu, logs, step, limit)
             out[mean.name].append(replace(own, spread=spread_of(states)))
     return {candidate.name: out[candidate.name] for candidate in candidates}
 
 
 def spread_of(states: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the standard deviation [L, 5] between models' states [L + 1, 6] after the first.
+    """Return the standard deviation [L, 5] between models' states [L + 1, 3 + n] after the first.
 
     Its columns are u, v, r, heading and position; that of the position is per axis, mean over both.
     """
@@ -238,9 +239,11 @@ def _run(
     model = copy.deepcopy(candidate.model).to("cpu", dtype).eval()
     # the pose is integrated from the velocities below
     model.positions = False
-    columns = [candidate.state.index(name) for name in VELOCITY]
+    live = logs[0].live
+    names = candidate.state or live.states
+    columns = [names.index(name) for name in live.moving]
     out: dict[int, Prediction] = {}
-    width = len(candidate.state) + sum(table.shape[1] for table in list(tables.values())[:1])
+    width = len(names) + sum(table.shape[1] for table in list(tables.values())[:1])
     for rows in _batches(windows, width):
         members = [windows[row] for row in rows]
         x0 = np.stack([_initial(candidate, window, logs[window.log]) for window in members])
@@ -307,9 +310,9 @@ def _simulated(
 def _prediction(
     window: Window, nu: np.ndarray, logs: Sequence[Prepared], step: float, limit: np.ndarray
 ) -> Prediction:
-    """Return velocities [L, 3] with their pose, or those of `zero` where they ran away."""
+    """Return what moves [L, n] with its pose, or that of `zero` where it ran away."""
     log, rows = logs[window.log], slice(window.start, window.stop)
-    recorded = np.abs(log.y[rows, VELOCITIES][log.usable[rows]])
+    recorded = np.abs(log.y[rows, log.live.columns][log.usable[rows]])
     # short training logs may hold far less than the window, and then it is the vessel that exceeds
     own = _OWN * recorded.max(0, initial=0.0)
     limit = np.where(limit < 0.0, limit, np.maximum(limit, own))
@@ -352,14 +355,14 @@ def _inputs(candidate: Candidate, log: Prepared) -> np.ndarray:
 
 
 def _initial(candidate: Candidate, window: Window, log: Prepared) -> np.ndarray:
-    known = dict(zip(STATE, (*log.y[window.start, POSE], *window.nu), strict=True))
-    return np.array(
-        [known[name] if name in known else log.log[name][window.start] for name in candidate.state]
-    )
+    states = log.live.states
+    known = dict(zip(states, (*log.y[window.start, POSE], *window.nu), strict=True))
+    names = candidate.state or states
+    return np.array([known[n] if n in known else log.log[n][window.start] for n in names])
 
 
 def integrate(pose: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
-    """Return the pose [L, 3] from its first value [3] and velocities [L, 3].
+    """Return the pose [L, 3] from its first value [3] and what moves [L, n].
 
     By the trapezoidal rule, heading first, then position.
     """
@@ -367,6 +370,7 @@ def integrate(pose: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
     def trapezoid(start: float, rate: np.ndarray) -> np.ndarray:
         return start + np.concatenate(([0.0], np.cumsum(0.5 * step * (rate[1:] + rate[:-1]))))
 
+    nu = levelled(nu)
     psi = trapezoid(pose[2], nu[:, 2])
     north = nu[:, 0] * np.cos(psi) - nu[:, 1] * np.sin(psi)
     east = nu[:, 0] * np.sin(psi) + nu[:, 1] * np.cos(psi)

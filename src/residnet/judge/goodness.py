@@ -11,8 +11,8 @@ import numpy as np
 import scipy
 
 from residnet.core.frames import wrap_array
-from residnet.core.layout import HEADING, POSE, POSITION, RANGE_VELOCITIES, VELOCITIES
-from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.core.layout import HEADING, POSE, POSITION
+from residnet.core.names import ACCELERATION
 from residnet.data.prepare import Prepared
 from residnet.judge.metrics import tail
 from residnet.judge.protocol import ProtocolConfig, Window
@@ -54,18 +54,19 @@ def repeatability(
         protocol: whose windows.
         logs: on one grid.
         commands: number of columns of the inputs that are commanded.
-        scales: of u, v, r.
+        scales: of what moves.
         step: of the grid in s.
 
     Returns:
         tolerances; pairs, logs (how many take part); where there are pairs, means over them of the
-        root mean square differences u, v, r (SI), of position and heading at the end (m, rad; seen
-        from the start of each run), `nrmse` (mean over u, v, r of difference / scale), and the same
-        by kind of manoeuvre. Two independent runs differ by sqrt(2) times what each is off their
-        expectation.
+        root mean square differences of what moves (SI), of position and heading at the end (m,
+        rad; seen from the start of each run), `nrmse` (mean over these of difference / scale), and
+        the same by kind of manoeuvre. Two independent runs differ by sqrt(2) times what each is off
+        their expectation.
     """
-    divisor = np.array([scales.get(name, 1.0) for name in VELOCITY])
-    live = [VELOCITY.index(name) for name in scales]
+    moving = logs[0].live.moving
+    divisor = np.array([scales.get(name, 1.0) for name in moving])
+    live = [moving.index(name) for name in scales]
     found = list(find_pairs(protocol, logs, commands, divisor, step))
     out: dict[str, Any] = {
         "tolerance": {
@@ -80,10 +81,10 @@ def repeatability(
         kinds = np.array([logs[pair.first.log].log.manoeuvre for pair in found])
         by_kind = {
             str(kind): {"pairs": int((kinds == kind).sum())}
-            | _mean(apart[kinds == kind], divisor, live)
+            | _mean(apart[kinds == kind], moving, divisor, live)
             for kind in np.unique(kinds)
         }
-        out |= _mean(apart, divisor, live) | {"manoeuvres": by_kind}
+        out |= _mean(apart, moving, divisor, live) | {"manoeuvres": by_kind}
     return out
 
 
@@ -94,7 +95,7 @@ def find_pairs(
     scales: np.ndarray,
     step: float,
 ) -> Iterator[Pair]:
-    """Return pairs of repeated runs; scales [3] are of u, v, r.
+    """Return pairs of repeated runs; scales [n] are of what moves.
 
     Each window of the protocol with at most one stretch of each log from its own on. Without
     commands nothing says that two runs were to be the same, and there are none.
@@ -157,35 +158,39 @@ def _same_start(
         & (log.piece[starts] == log.piece[starts + length - 1])
         & log.usable[starts]
     )
-    near = (np.abs(log.smooth[starts, VELOCITIES] - window.nu) < _START * scales).all(1)
+    near = (np.abs(log.smooth[starts, log.live.columns] - window.nu) < _START * scales).all(1)
     return np.asarray(whole & near)
 
 
 def _apart(pair: Pair, logs: Sequence[Prepared]) -> list[float]:
-    """Differences of two runs: root mean square of u, v (samples usable in both) and r, then
-    position and heading at the end.
+    """Differences of two runs: root mean square of u, v (samples usable in both) and the rest of
+    what moves, then position and heading at the end.
     """
     first, second = logs[pair.first.log], logs[pair.log]
     a = slice(pair.first.start, pair.first.stop)
     b = slice(pair.start, pair.start + a.stop - a.start)
-    nu = first.y[a, VELOCITIES] - second.y[b, VELOCITIES]
+    columns = first.live.columns
+    nu = first.y[a, columns] - second.y[b, columns]
     good = first.usable[a] & second.usable[b]
     end_a, end_b = _end(first.y[a]), _end(second.y[b])
-    rms = [float(np.sqrt(np.mean(part**2))) for part in (nu[good, 0], nu[good, 1], nu[:, 2])]
+    parts = (*nu[good, :2].T, *nu[:, 2:].T)
+    rms = [float(np.sqrt(np.mean(part**2))) for part in parts]
     apart = end_a - end_b
     return [*rms, float(np.hypot(*apart[POSITION])), float(abs(wrap_array(apart[HEADING])))]
 
 
 def _end(y: np.ndarray) -> np.ndarray:
-    """The pose [3] at the end of a run [T, 6] in the axes of its start."""
+    """The pose [3] at the end of a run [T, 3 + n] in the axes of its start."""
     north, east, turned = y[-1, POSE] - y[0, POSE]
     c, s = np.cos(y[0, HEADING]), np.sin(y[0, HEADING])
     return np.array([c * north + s * east, c * east - s * north, turned])
 
 
-def _mean(apart: np.ndarray, scales: np.ndarray, live: list[int]) -> dict[str, float]:
-    mean = dict(zip((*VELOCITY, "position", "heading"), apart.mean(0).tolist(), strict=True))
-    shares = (apart[:, RANGE_VELOCITIES].mean(0) / scales)[live]
+def _mean(
+    apart: np.ndarray, moving: Sequence[str], scales: np.ndarray, live: list[int]
+) -> dict[str, float]:
+    mean = dict(zip((*moving, "position", "heading"), apart.mean(0).tolist(), strict=True))
+    shares = (apart[:, : len(moving)].mean(0) / scales)[live]
     return mean | {"nrmse": float(shares.mean())}
 
 
@@ -367,7 +372,7 @@ class OneStep:
         model: its name.
         kind: zero, baseline, head or ensemble.
         parameters: number of fitted parameters of each axis.
-        residuals: measured minus predicted acceleration, [T, 3] of each piece.
+        residuals: measured minus predicted acceleration, [T, n] of each piece.
         reference: name of the model that it is compared with; None for none.
     """
 
@@ -433,7 +438,7 @@ def table(
 
     Args:
         models: one-step residuals over the same pieces.
-        targets: measured accelerations, [T, 3] of each piece.
+        targets: measured accelerations, [T, n] of each piece.
         step: time between samples, s.
         axes: number and name of each acceleration that is looked at.
     """

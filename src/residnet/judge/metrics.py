@@ -13,7 +13,6 @@ import scipy
 
 from residnet.core.frames import wrap_array
 from residnet.core.layout import POSE, VELOCITIES
-from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.judge.bands import count_bands
 from residnet.judge.freerun import Candidate, Errors, FreeRun, integrate
@@ -197,7 +196,7 @@ class Judged:
         run: free runs of all models.
         candidates: the models.
         logs: that the windows belong to.
-        scales: of u, v, r, which nrmse divides by.
+        scales: of what moves, which nrmse divides by.
     """
 
     def __init__(
@@ -208,8 +207,8 @@ class Judged:
         scales: Mapping[str, float],
     ) -> None:
         self.run, self.candidates, self.logs = run, candidates, logs
-        self.scale = np.array([scales.get(name, 1.0) for name in VELOCITY])
         self.live = logs[0].live
+        self.scale = np.array([scales.get(name, 1.0) for name in self.live.moving])
         self.parts = [(logs[w.log], slice(w.start, w.stop)) for w in run.windows]
         self.numbers = np.array([window.log for window in run.windows])
         self.found = {
@@ -268,13 +267,14 @@ class Judged:
         by_window = np.column_stack(
             (found.rmse, self.nrmse[name], found.position_end, found.heading_end)
         )[chosen]
-        rmse, mae = by_window[:, :3].mean(0), found.mae[chosen].mean(0)
-        nrmse, live = rmse / self.scale, self.live
+        live = self.live
+        rmse, mae = by_window[:, : live.size].mean(0), found.mae[chosen].mean(0)
+        nrmse = rmse / self.scale
         spread = intervals(by_window, drawn)
         samples = found.samples[chosen]
 
         def named(values: np.ndarray) -> dict[str, float]:
-            return {VELOCITY[axis]: float(values[axis]) for axis in live.axes}
+            return {live.moving[axis]: float(values[axis]) for axis in live.axes}
 
         out = {
             "windows": len(samples),
@@ -287,8 +287,8 @@ class Judged:
             "rmse": named(rmse),
             "mae": named(mae),
             "nrmse": named(nrmse) | {"mean": float(nrmse[live.axes].mean())},
-            "rmse_ci95": {VELOCITY[axis]: spread[axis] for axis in live.axes},
-            "nrmse_mean_ci95": spread[3],
+            "rmse_ci95": {live.moving[axis]: spread[axis] for axis in live.axes},
+            "nrmse_mean_ci95": spread[live.size],
             "ci95_blocks": drawn.row() if drawn is not None else None,
         }
         for column, name in self._ends:
@@ -298,9 +298,12 @@ class Judged:
 
     @property
     def _ends(self) -> list[tuple[int, str]]:
-        """Columns and names of the errors at the end of a window that the velocities lead to."""
-        live = self.live
-        return [(4, "position")] * live.moves + [(5, "heading")] * live.turns
+        """Columns and names of the errors at the end of a window that the velocities lead to.
+
+        They stand behind the errors of what moves and their mean.
+        """
+        live, first = self.live, self.live.size + 1
+        return [(first, "position")] * live.moves + [(first + 1, "heading")] * live.turns
 
     def limits(self, step: float) -> dict[str, Any]:
         """Return the part of limits.json for one protocol and split; `step` of the grid in s."""
@@ -344,7 +347,7 @@ class Judged:
                 """Return means and intervals of errors of the pose [W, 3]."""
                 values = np.column_stack((np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])))
                 means, new = values.mean(0), new_trials(values, numbers)
-                names = [(column - 4, name) for column, name in self._ends]
+                names = [(column - self.live.size - 1, name) for column, name in self._ends]
                 return {
                     **{name: float(means[k]) for k, name in names},
                     "intervals": {name: new[k] for k, name in names},
@@ -356,7 +359,8 @@ class Judged:
                 if taken
             ]
             drift = [
-                integrate(y[0, POSE], y[:, VELOCITIES], step)[-1] - y[-1, POSE] for y in measured
+                integrate(y[0, POSE], y[:, self.live.columns], step)[-1] - y[-1, POSE]
+                for y in measured
             ]
             floor = np.array(drift)
             floor[:, 2] = wrap_array(floor[:, 2])
@@ -388,10 +392,12 @@ class Judged:
             ends of windows. A model that predicted the measured velocities exactly would have
             these errors. Empty where only some velocities were recorded.
         """
-        if not self.live.whole:
+        if self.live.dead:
             return {}
         measured = [log.y[part] for log, part in self.parts]
-        ends = [integrate(y[0, POSE], y[:, VELOCITIES], step)[-1] - y[-1, POSE] for y in measured]
+        ends = [
+            integrate(y[0, POSE], y[:, self.live.columns], step)[-1] - y[-1, POSE] for y in measured
+        ]
         error = np.array(ends)
         position, heading = np.hypot(error[:, 0], error[:, 1]), np.abs(wrap_array(error[:, 2]))
         out: dict[str, float] = {"windows": len(error)}
@@ -453,7 +459,9 @@ class Judged:
                 "manoeuvre": self.parts[i][0].log.manoeuvre,
                 "t": float(self.parts[i][0].log.t[self.run.windows[i].start]),
                 "nrmse": float(nrmse[i]),
-                "rmse": {VELOCITY[axis]: float(found.rmse[i, axis]) for axis in self.live.axes},
+                "rmse": {
+                    self.live.moving[axis]: float(found.rmse[i, axis]) for axis in self.live.axes
+                },
                 f"{end}_error_end": float(getattr(found, f"{end}_end")[i]),
             }
             for i in np.argsort(-nrmse, kind="stable")[:_WORST].tolist()
@@ -483,7 +491,9 @@ class Judged:
             return {}
         values = np.concatenate(
             [
-                np.concatenate((log.y[part, VELOCITIES], log.w[part]), axis=1)[log.usable[part]]
+                np.concatenate((log.y[part, log.live.columns], log.w[part]), axis=1)[
+                    log.usable[part]
+                ]
                 for log, part in self.parts
             ]
         )

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.config import Config, MetresPerSecond, RadiansPerSecond, Seconds
+from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import VELOCITIES
-from residnet.core.names import VELOCITY, nearest
+from residnet.core.layout import PLANAR, ROLL
+from residnet.core.names import nearest
 from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
 
@@ -28,7 +28,7 @@ class Window:
         start: sample of the initial state.
         stop: one past the last sample.
         past: first sample of the measured past that may warm up a memory.
-        nu: initial velocities [3].
+        nu: initially, what moves [n].
     """
 
     log: int
@@ -80,7 +80,9 @@ class Windows(Config):
             # a break ends the past that may warm up a memory
             past = max(start - round(self.history / step), int(np.searchsorted(end, end[start])))
             out.append(
-                Window(number, start, start + steps + 1, past, log.y[start, VELOCITIES].copy())
+                Window(
+                    number, start, start + steps + 1, past, log.y[start, log.live.columns].copy()
+                )
             )
             start += apart
         return out
@@ -122,7 +124,7 @@ class WholeManoeuvre(Config):
                         begin + lead,
                         stop,
                         begin,
-                        log.y[begin : begin + lead, VELOCITIES].mean(0),
+                        log.y[begin : begin + lead, log.live.columns].mean(0),
                     )
                 )
             begin = stop
@@ -184,19 +186,24 @@ class Scales(Config):
         u: of the surge velocity in m/s.
         v: of the sway velocity in m/s.
         r: of the yaw rate in rad/s.
+        p: of the roll rate in rad/s, for models that roll.
+        phi: of the roll angle in rad, with p.
     """
 
     u: Annotated[MetresPerSecond, Field(gt=0)] | None = None
     v: Annotated[MetresPerSecond, Field(gt=0)] | None = None
     r: Annotated[RadiansPerSecond, Field(gt=0)] | None = None
+    p: Annotated[RadiansPerSecond, Field(gt=0)] | None = None
+    phi: Annotated[Radians, Field(gt=0)] | None = None
 
     def array(self) -> np.ndarray:
-        """Return the scales of u, v, r as one array [3], in m/s, m/s, rad/s; 1 without a scale."""
-        return np.array([self.named().get(name, 1.0) for name in VELOCITY])
+        """Return the scales of what moves as one array [n], SI; 1 without a scale."""
+        layout = PLANAR if self.p is None else ROLL
+        return np.array([self.named().get(name, 1.0) for name in layout.moving])
 
     def named(self) -> dict[str, float]:
-        """Return the scales by the name of the velocity."""
-        found = {name: getattr(self, name) for name in VELOCITY}
+        """Return the scales by the name of what moves."""
+        found = {name: getattr(self, name) for name in ROLL.moving}
         return {name: float(value) for name, value in found.items() if value is not None}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from residnet.core.files import file_stem, whole
-from residnet.core.names import STATE
+from residnet.core.layout import PLANAR, Live
 from residnet.data.prepare import Prepared
 from residnet.judge.band import Bands
 from residnet.judge.bands import limits
@@ -17,7 +17,11 @@ from residnet.judge.freerun import FreeRun, Prediction
 INPUT = "input_"
 """Stands before the name of an input among the columns."""
 
-_ORDER = ("u", "v", "r", "psi", "x", "y")
+
+def columns_of(live: Live) -> tuple[str, ...]:
+    """Return the names of the columns of states: u, v, r, heading and position, then the rest."""
+    planar, beside = live.moving[: PLANAR.dof], live.moving[PLANAR.dof :]
+    return (*planar, "psi", "x", "y", *beside)
 
 
 def write_rollouts(
@@ -30,10 +34,10 @@ def write_rollouts(
     """Write one file per log of a split.
 
     Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi,
-    x, y as measured and with `_hat` as predicted (SI, rad), and the inputs that are held over the
-    step after each sample with `input_` before their names. Where there are bands, `_low` and
-    `_high` are their pointwise limits; those of x and y are the box about the circle that holds the
-    position, and a model without a band has NaN.
+    x, y (and p and phi of a roll) as measured and with `_hat` as predicted (SI, rad), and the
+    inputs that are held over the step after each sample with `input_` before their names. Where
+    there are bands, `_low` and `_high` are their pointwise limits; those of x and y are the box
+    about the circle that holds the position, and a model without a band has NaN.
 
     Args:
         folder: for the files.
@@ -81,12 +85,13 @@ def write_rollouts(
             continue
         columns = {name: np.concatenate(values) for name, values in parts.items()}
         y, y_hat = np.concatenate(measured), np.concatenate(predicted)
-        columns |= {name: y[:, STATE.index(name)] for name in _ORDER}
-        columns |= {f"{name}_hat": y_hat[:, STATE.index(name)] for name in _ORDER}
+        order = {name: log.live.states.index(name) for name in columns_of(log.live)}
+        columns |= {name: y[:, place] for name, place in order.items()}
+        columns |= {f"{name}_hat": y_hat[:, place] for name, place in order.items()}
         if any((bands or {}).values()):
             for ending, parts_of in (("low", low), ("high", high)):
                 reached = np.concatenate(parts_of)
-                columns |= {f"{name}_{ending}": reached[:, STATE.index(name)] for name in _ORDER}
+                columns |= {f"{n}_{ending}": reached[:, place] for n, place in order.items()}
         w = np.concatenate(given)
         columns |= {f"{INPUT}{name}": w[:, place] for place, name in enumerate(inputs)}
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
@@ -97,7 +102,7 @@ def write_rollouts(
 def _limits(
     prediction: Prediction, model: str, protocol: str, bands: Bands
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper limits [L, 6] of a prediction; NaN where it has no band."""
+    """Return the lower and upper limits [L, 3 + n] of a prediction; NaN where it has no band."""
     band = bands.get(model, {}).get(protocol)
     if band is None:
         unknown = np.full_like(prediction.states, np.nan)

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from residnet.core.format import number
-from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.judge.freerun import Errors, FreeRun
 
@@ -268,13 +267,13 @@ def shares(
         run: free runs over the windows.
         model: name of the model.
         logs: that the windows belong to.
-        scales: of u, v, r.
+        scales: of what moves.
         labels: number of the block of each sample of each window.
         count: number of blocks.
     """
     found = Errors.of(run.windows, run.predictions[model], logs)
     divisor = found.rmse * np.add.reduceat(found.scored, found.begins, dtype=float)
-    live = [VELOCITY.index(name) for name in scales]
+    live = [logs[0].live.moving.index(name) for name in scales]
     divisor = np.where(divisor > 0, divisor, 1.0).take(live, axis=1)
     divisor = divisor * np.array(list(scales.values()))
     errors = found.velocities.take(live, axis=1)

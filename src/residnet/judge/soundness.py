@@ -27,16 +27,7 @@ from torch import Tensor
 
 from residnet.core.errors import DataError
 from residnet.core.format import interval, number, shown_unit
-from residnet.core.layout import (
-    LATERAL,
-    POSE,
-    RANGE_INPUTS,
-    RANGE_VELOCITIES,
-    SURGE,
-    SWAY,
-    VELOCITIES,
-)
-from residnet.core.names import STATE, VELOCITY
+from residnet.core.layout import LATERAL, POSE, SURGE, SWAY, velocities_on
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
 from residnet.dynamics.ensemble import MeanOfTrajectories
@@ -45,7 +36,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
 from residnet.physics.environment import WIND_INPUTS
-from residnet.physics.symmetry import channel_parity, pair_parity, partners_of
+from residnet.physics.symmetry import axis_parities, channel_parity, pair_parity, partners_of
 
 SCHEMA = "residnet.sanity/1"
 DAMPING, STABILITY, SYMMETRY, BOUNDED = CHECKS = ("damping", "stability", "symmetry", "bounded")
@@ -92,7 +83,7 @@ class SteadyRun:
     Attributes:
         log: name of the log.
         seconds: that it lasts, its settling left out.
-        x: mean state [6] with the pose at zero.
+        x: mean state [3 + n] with the pose at zero.
         w: mean inputs [m].
         decay: how many times farther the lateral velocities lie from their last mean when the
             stretch begins than in the end.
@@ -115,7 +106,7 @@ class Recorded:
     """What training logs hold for the checks.
 
     Attributes:
-        x: recorded states [K, 6] with the pose at zero.
+        x: recorded states [K, 3 + n] with the pose at zero.
         w: inputs [K, m].
         longest: how long the longest log lasts in s.
         steady: stretches with held inputs.
@@ -168,7 +159,8 @@ def steady_runs(logs: Sequence[Prepared], step: float, shortest: float = 5.0) ->
         for begin, end in _held(log, tolerance, round(shortest / step)):
             rows = slice(begin + int(_SETTLING * (end - begin)), end)
             y = log.smooth[rows]
-            x = np.concatenate((np.zeros(VELOCITIES.start), y[:, VELOCITIES].mean(0)))
+            x = y.mean(0)
+            x[POSE] = 0.0
             lateral = y[:, LATERAL]
             third = max(len(lateral) // 3, 1)
             left = np.abs(lateral[-third:] - lateral[-third:].mean(0)).mean(0)
@@ -241,41 +233,41 @@ def _found(spec: ModelSpec, check: str, ok: bool, text: str, fault: str) -> Find
 
 
 def settled_memory(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
-    """Return the memory [B, n_state] after ten seconds in states x [B, 6] and inputs w [B, m]."""
+    """Return the memory [B, n_state] after ten seconds in states x [B, 3 + n], inputs w [B, m]."""
     steps = max(round(_PAUSE / model.dt), 1) if model.n_state else 0
     return model.warmup(x[:, None].expand(-1, steps, -1), w[:, None].expand(-1, steps, -1))
 
 
 def acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
-    """Return nu_dot [B, 3] of baseline and head together, the head's memory settled."""
+    """Return nu_dot [B, n] of baseline and head together, the head's memory settled."""
     return model.acceleration(x, w, settled_memory(model, x, w))
 
 
 def check_damping(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) -> Finding:
-    """Check that each velocity decays by itself: d u_dot/du, d v_dot/dv, d r_dot/dr, by autograd.
+    """Check that each velocity decays by itself: d u_dot/du, d v_dot/dv and so on, by autograd.
 
     None may be positive at more than half of the recorded points, unless it is negligible beside
     what it is elsewhere.
     """
-    x = recorded.x.clone().requires_grad_()
+    x, live = recorded.x.clone().requires_grad_(), spec.signals.live
     # a model may depend on no velocity at all
-    nu_dot = acceleration(model, x, recorded.w) + 0.0 * x[:, VELOCITIES]
+    nu_dot = acceleration(model, x, recorded.w) + 0.0 * velocities_on(x)
     slopes = np.stack(
         [
             torch.autograd.grad(nu_dot[:, i].sum(), x, retain_graph=True)[0][:, SURGE + i].numpy()
-            for i in range(len(VELOCITY))
+            for i in live.learned
         ],
         axis=1,
     )
     middle, size = np.median(slopes, axis=0), np.quantile(np.abs(slopes), 0.9, axis=0)
     said = [
         f"d{name}′/d{name} {middle[i]:+.2g} 1/s, positive at {(slopes[:, i] > 0).mean():.0%} of it"
-        for i, name in enumerate(VELOCITY)
+        for i, name in enumerate(live.velocities)
         if middle[i] > _NEGLIGIBLE * size[i]
     ]
     fault = f"its damping has the wrong sign in most of the data ({'; '.join(said)})"
     values = ", ".join(
-        f"d{name}′/d{name} {middle[VELOCITY.index(name)]:+.3g}" for name in spec.signals.velocities
+        f"d{name}′/d{name} {middle[i]:+.3g}" for i, name in enumerate(live.velocities)
     )
     text = f"medians over the training data: {values} 1/s"
     return _found(spec, DAMPING, True, text, fault if said else "")
@@ -283,7 +275,7 @@ def check_damping(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) ->
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Straight running at a speed: state x [6], inputs w [m], and whether the data reach it."""
+    """Straight running at a speed: state x [3 + n], inputs w [m], and whether the data reach it."""
 
     label: str
     speed: float
@@ -307,7 +299,8 @@ def operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPo
     is calm, as far as the ranges allow.
     """
     columns = spec.signals.columns
-    low, high = (_ranges(ends)[RANGE_INPUTS].clone() for ends in (spec.low, spec.high))
+    live = spec.signals.live
+    low, high = (_ranges(ends)[live.size :].clone() for ends in (spec.low, spec.high))
     partners = partners_of(columns)
     for name, other in partners.items():
         # both sides alike, over the range that they share
@@ -323,7 +316,7 @@ def operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPo
     out = []
     for fraction in _FRACTIONS if "u" in spec.signals.velocities else _FRACTIONS[:1]:
         speed = fraction * max(spec.high[0], 1e-6)
-        x = torch.zeros(len(drives), len(STATE), dtype=torch.float64)
+        x = torch.zeros(len(drives), len(live.states), dtype=torch.float64)
         x[:, SURGE] = speed
         with torch.no_grad():
             best = int(acceleration(model, x, drives)[:, 0].abs().argmin())
@@ -338,8 +331,8 @@ def _ranges(ends: Sequence[float]) -> Tensor:
 
 
 def check_stability(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) -> Finding:
-    """Check how small disturbances of sway, yaw and memory grow in straight running."""
-    words = {"v": "sway", "r": "yaw"}
+    """Check how small disturbances of sway, yaw, roll and memory grow in straight running."""
+    words = {"v": "sway", "r": "yaw", "p": "roll"}
     moved = " and ".join(words[name] for name in words if name in spec.signals.velocities)
     are = "are" if " " in moved else "is"
     points = operating_points(spec, model)
@@ -379,23 +372,23 @@ def check_stability(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) 
 
 
 def growth_rate(model: HybridDynamics, x: Tensor, w: Tensor) -> float:
-    """Return the largest growth rate [1/s] of a small disturbance of (v, r, memory) at a point.
+    """Return the largest growth rate [1/s] of a small disturbance of all but surge at a point.
 
     It is the logarithm of the step map's spectral radius over dt.
 
     Args:
         model: in float64 and evaluation mode.
-        x: state [6].
+        x: state [3 + n].
         w: inputs [m].
     """
     s = settled_memory(model, x[None], w[None])
-    start = torch.cat((x[LATERAL], s[0])).detach()
-    count = start.numel()
+    start = torch.cat((x[SWAY:], s[0])).detach()
+    count, wide = start.numel(), len(x) - SWAY
     z = start.expand(count, count).clone().requires_grad_()
-    states = torch.cat((x[:SWAY].expand(count, SWAY), z[:, :2]), dim=1)
-    after, memory = model.step(states, w.expand(count, -1), z[:, 2:])
+    states = torch.cat((x[:SWAY].expand(count, SWAY), z[:, :wide]), dim=1)
+    after, memory = model.step(states, w.expand(count, -1), z[:, wide:])
     # one row of the batch for each output: one backward pass gives the whole Jacobian
-    out = torch.cat((after[:, LATERAL], memory), dim=1)
+    out = torch.cat((after[:, SWAY:], memory), dim=1)
     jacobian = torch.autograd.grad(out.diagonal().sum(), z)[0]
     radius = float(torch.linalg.eigvals(jacobian).abs().max())
     return math.log(max(radius, 1e-12)) / model.dt
@@ -469,8 +462,10 @@ def check_symmetry(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) -
             " delta and *_port/*_stbd pairs are understood)"
         )
         return Finding(spec.name, SYMMETRY, None, text)
-    turned = x * torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, -1.0], dtype=x.dtype)
-    image = torch.cat((turned[:, VELOCITIES], other), dim=1)
+    live = spec.signals.live
+    parity = torch.tensor(axis_parities(model.signals.names), dtype=x.dtype)
+    turned = x * torch.cat((x.new_tensor([1.0, -1.0, -1.0]), parity))
+    image = torch.cat((velocities_on(turned), other), dim=1)
     inside = ((image >= _ranges(spec.low)) & (image <= _ranges(spec.high))).all(1)
     if not bool(inside.any()):
         text = "not checked: no recorded state has its mirror image within the training ranges"
@@ -478,15 +473,15 @@ def check_symmetry(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) -
     with torch.no_grad():
         plain = acceleration(model, x[inside], w[inside])
         mirrored = acceleration(model, turned[inside], other[inside])
-    mirrored = mirrored * torch.tensor([1.0, -1.0, -1.0], dtype=plain.dtype)
+    mirrored = mirrored * parity
     uneven = 0.5 * (plain - mirrored).abs()
     spread = torch.cat((plain, mirrored)).std(0).clamp(min=1e-12)
     typical, largest = uneven.square().mean(0).sqrt() / spread, uneven.amax(0) / spread
     ok = bool((typical <= _ASYMMETRY).all())
     parts = ", ".join(
         f"{name}′ {100 * float(t):.1f} % (largest {100 * float(m):.1f} %)"
-        for name, t, m in zip(VELOCITY, typical, largest, strict=True)
-        if name in spec.signals.velocities
+        for name, t, m in zip(live.moving, typical, largest, strict=True)
+        if name in live.velocities
     )
     reason = (
         "A single screw, an offset of the steering or too few turns one way may be the reason. "
@@ -507,13 +502,13 @@ def check_bounded(
     It starts from the recorded points with their inputs, and from rest with inputs at the edges of
     their ranges; each is held for 300 s, or as long as the longest log where that is longer.
     """
-    limit = torch.maximum(_ranges(spec.low).abs(), _ranges(spec.high).abs())[RANGE_VELOCITIES]
+    limit = torch.maximum(_ranges(spec.low).abs(), _ranges(spec.high).abs())[: model.dof]
     limit = limit.clamp(min=1e-9)
     corners = _corners(spec)
     known = len(recorded.x)
-    x = torch.cat((recorded.x, torch.zeros(len(corners), len(STATE), dtype=torch.float64)))
+    x = torch.cat((recorded.x, recorded.x.new_zeros(len(corners), recorded.x.shape[1])))
     w = torch.cat((recorded.w, corners))
-    s, before = model.initial_state(len(x)).double(), x[:, VELOCITIES]
+    s, before = model.initial_state(len(x)).double(), velocities_on(x)
     pause = max(round(_PAUSE / model.dt), 1)
     # where the vessel is says nothing of how fast it is
     alone = copy.deepcopy(model)
@@ -525,10 +520,10 @@ def check_bounded(
         for k in range(pause, steps + 1, pause):
             states, _, s = run(x, held, s)
             x = states[:, -1]
-            ratio = torch.nan_to_num(x[:, VELOCITIES].abs() / limit, nan=math.inf).amax(1)
+            ratio = torch.nan_to_num(velocities_on(x).abs() / limit, nan=math.inf).amax(1)
             away = torch.where((away == 0.0) & (ratio > divergence), k * model.dt, away)
-            moved = ((x[:, VELOCITIES] - before).abs() / limit).amax(1)
-            before = x[:, VELOCITIES]
+            moved = ((velocities_on(x) - before).abs() / limit).amax(1)
+            before = velocities_on(x)
             if bool((away[:known] > 0.0).any()) or bool(((moved < _SETTLED) | (away > 0)).all()):
                 break
     row = int((away > 0.0).double().argmax())
@@ -556,7 +551,7 @@ def check_bounded(
 
 def _corners(spec: ModelSpec) -> Tensor:
     """Inputs [K, m] at the edges of their ranges, every combination or 64 drawn ones."""
-    low, high = (_ranges(ends)[RANGE_INPUTS] for ends in (spec.low, spec.high))
+    low, high = (_ranges(ends)[spec.signals.live.size :] for ends in (spec.low, spec.high))
     count = low.numel()
     if 2**count <= _CORNERS:
         pick = (torch.arange(2**count)[:, None] >> torch.arange(count)) & 1

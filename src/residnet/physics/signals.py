@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
-from residnet.core.layout import PLANAR, Live, heading, surge, sway, velocities
-from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
+from residnet.core.layout import PLANAR, ROLL, Live, heading, surge, sway, velocities
+from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig
 from residnet.physics.environment import WIND_INPUTS
@@ -43,14 +43,17 @@ class SignalsConfig(Config):
             [[left, right]]; those that end in `_port` and `_stbd` are known without. Angles change
             their sign too.
         velocities: those of u, v and r that the logs tell and the model moves; the others are zero
-            at all times. A model of surge alone has [u].
+            at all times. A model of surge alone has [u]. With p behind them the model rolls: logs
+            need the roll angle phi, which is a state and a channel of it.
     """
 
     inputs: tuple[str, ...]
     exogenous: tuple[str, ...] = ()
     forces: str | DifferentialThrustConfig | None = None
     pairs: tuple[tuple[str, str], ...] = ()
-    velocities: tuple[Literal["u", "v", "r"], ...] = Field(default=("u", "v", "r"), min_length=1)
+    velocities: tuple[Literal["u", "v", "r", "p"], ...] = Field(
+        default=("u", "v", "r"), min_length=1
+    )
 
     @model_validator(mode="after")
     def _combination(self) -> SignalsConfig:
@@ -67,11 +70,13 @@ class SignalsConfig(Config):
             raise ValueError(
                 f"forces are made by two thrusters, but inputs are {list(self.inputs)}"
             )
-        if list(self.velocities) != [name for name in VELOCITY if name in self.velocities]:
+        if list(self.velocities) != [name for name in ROLL.velocities if name in self.velocities]:
             raise ValueError(
-                f"velocities are named once each, in the order u, v, r; given {self.velocities}"
+                f"velocities are named once each, in the order u, v, r, p; given {self.velocities}"
             )
-        if self.exogenous and not self.live.whole:
+        if not set(self.velocities) & set(PLANAR.velocities):
+            raise ValueError("velocities: a model moves at least one of u, v, r; [p] has none")
+        if self.exogenous and self.live.dead:
             raise ValueError(
                 "exogenous: the loads of a wind need u, v and r and a heading; leave it out, or"
                 " give logs with all of these"
@@ -88,7 +93,7 @@ class SignalsConfig(Config):
             if paired.count(name) > 1:
                 raise ValueError(f"pairs: '{name}' is named twice")
         computed = (
-            STATE
+            self.live.states
             + (FORCE_CHANNELS if self.forces is not None else ())
             + (WIND_CHANNELS if self.exogenous else ())
         )
@@ -133,7 +138,7 @@ class SignalsConfig(Config):
 
     def units(self) -> dict[str, str]:
         """Return SI unit of each state and input."""
-        return {name: CHANNEL_UNITS.get(name, "-") for name in STATE + self.columns}
+        return {name: CHANNEL_UNITS.get(name, "-") for name in self.live.states + self.columns}
 
     def build(self) -> Signals:
         """Build the module that computes the channels."""
@@ -159,7 +164,8 @@ class Signals(nn.Module):
         self.speed_column = columns.index("wind_speed") if self.wind else 0
         self.direction_column = columns.index("wind_dir") if self.wind else 0
         self.thrusters: nn.Module = nn.Identity() if thrusters is None else thrusters.build().forces
-        names = VELOCITY + config.inputs
+        names = config.live.moving + config.inputs
+        self.dof = config.live.size
         names += FORCE_CHANNELS if self.forces else ()
         names += WIND_CHANNELS if self.wind else ()
         self.names: tuple[str, ...] = ChannelNames(names, config.pairs, config.live)
@@ -185,29 +191,34 @@ class Signals(nn.Module):
         """Return the channels z [..., nz].
 
         Args:
-            x: state [..., nx] (x, y, psi, u, v, r first).
+            x: state [..., nx] (pose, then what moves).
             p: what `prepare` returned for the step's inputs.
         """
         if not self.wind:
-            return torch.cat((velocities(x), p), dim=-1)
+            return torch.cat((velocities(x, self.dof), p), dim=-1)
         known = p.shape[-1] - 2
         along, across = to_body(p[..., known], p[..., known + 1], x[..., 2])
         along, across = along - x[..., 3], across - x[..., 4]
         # the offset keeps the gradient finite in a calm
         magnitude = torch.sqrt(along * along + across * across + 1e-8)
         return torch.cat(
-            (velocities(x), p[..., :known], torch.stack((along, across, magnitude), dim=-1)), dim=-1
+            (
+                velocities(x, self.dof),
+                p[..., :known],
+                torch.stack((along, across, magnitude), dim=-1),
+            ),
+            dim=-1,
         )
 
     def slopes(self, x: Tensor, p: Tensor) -> Tensor:
-        """Return the derivatives of the channels by heading and velocities, [4, B, nz].
+        """Return the derivatives of the channels by heading and what moves, [1 + n, B, nz].
 
         Args:
             x: states [B, nx].
             p: what `prepare` returned for the step's inputs, [B, k].
         """
-        out = x.new_zeros(1 + PLANAR.dof, x.shape[0], self.count)
-        for place in range(PLANAR.dof):
+        out = x.new_zeros(1 + self.dof, x.shape[0], self.count)
+        for place in range(self.dof):
             out[1 + place, :, place] = 1.0
         if not self.wind:
             return out
@@ -232,7 +243,7 @@ _LEAST = 1e-9
 
 @final
 class VelocityBound(nn.Module):
-    """An acceleration [..., 3] that pulls velocities back which left their range, else zero.
+    """An acceleration [..., n] that pulls velocities back which left their range, else zero.
 
     Beyond the range of the training data a fitted model knows nothing: with nothing to damp it,
     what it last said would drive the vessel on for ever.
@@ -241,13 +252,16 @@ class VelocityBound(nn.Module):
         margin: share of the training range by which it is widened on either side.
         channels: number of channels, the velocities first, that `held` keeps in their range: what
             an input does far beyond it is as little known.
+        dof: number n of what moves.
     """
 
-    def __init__(self, margin: float = 0.0, channels: int = PLANAR.dof) -> None:
+    def __init__(
+        self, margin: float = 0.0, channels: int = PLANAR.dof, dof: int = PLANAR.dof
+    ) -> None:
         super().__init__()
         self.margin = margin
-        self.channels, self.dof = channels, PLANAR.dof
-        for name, count in (("low", channels), ("high", channels), ("rate", PLANAR.dof)):
+        self.channels, self.dof = channels, dof
+        for name, count in (("low", channels), ("high", channels), ("rate", dof)):
             self.register_buffer(name, torch.zeros(count, dtype=torch.float64))
         self.low: Tensor
         self.high: Tensor
@@ -262,7 +276,7 @@ class VelocityBound(nn.Module):
         self.high.copy_(high + self.margin * wide)
         spread = target.std()
         self.rate.copy_(
-            (_STRONG * spread / (0.5 * wide[: PLANAR.dof])).clamp(min=_SLOWEST, max=_FASTEST)
+            (_STRONG * spread / (0.5 * wide[: self.dof])).clamp(min=_SLOWEST, max=_FASTEST)
         )
 
     def held(self, z: Tensor) -> Tensor:
@@ -275,7 +289,7 @@ class VelocityBound(nn.Module):
 
     def back(self, held: Tensor, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz] whose held ones are known."""
-        return self.rate.to(z.dtype) * (held[..., :3] - z[..., :3])
+        return self.rate.to(z.dtype) * (held[..., : self.dof] - z[..., : self.dof])
 
     def along(self, z: Tensor, ahead: Tensor) -> Tensor:
         """Return directions [D, B, nz] from channels z [B, nz] as the held ones go along them."""

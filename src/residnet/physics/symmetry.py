@@ -6,12 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import final
 
 from residnet.core.layout import ALIVE, Live
-from residnet.core.names import VELOCITY
 from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 
-_PARITY = dict.fromkeys(("v", "r", "delta", "tau_y", "tau_n", "wind_v"), -1) | dict.fromkeys(
-    ("u", "n", "tau_x", "wind_u", "wind_mag"), 1
-)
+_PARITY = dict.fromkeys(
+    ("v", "r", "p", "phi", "delta", "tau_y", "tau_n", "wind_v"), -1
+) | dict.fromkeys(("u", "n", "tau_x", "wind_u", "wind_mag"), 1)
 _ANGLES = ("delta", "rudder", "azimuth")
 
 
@@ -97,10 +96,15 @@ def term_parity(term: str, names: Sequence[str]) -> int | None:
 def wrong_parity(term: str, axis: int, names: Sequence[str]) -> bool:
     """Return whether a mirror-symmetric vessel cannot have this term in an axis' acceleration.
 
-    The axes are 0 surge, 1 sway, 2 yaw.
+    The axes are those of what moves (`Live.moving`): 0 surge, 1 sway, 2 yaw.
     """
     parity = term_parity(term, names)
-    return parity is not None and parity != _PARITY[VELOCITY[axis]]
+    return parity is not None and parity != axis_parities(names)[axis]
+
+
+def axis_parities(names: Sequence[str]) -> list[int]:
+    """Return the sign that each of what moves among channels changes by in the mirror, [n]."""
+    return [_PARITY[name] for name in live_of(names).moving]
 
 
 def mirrored_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | None:
@@ -163,9 +167,9 @@ def dissipates(term: str, axis: int, names: Sequence[str]) -> bool:
 
     Args:
         term: a product of channels.
-        axis: 0 surge, 1 sway, 2 yaw.
+        axis: of what moves (`Live.moving`): 0 surge, 1 sway, 2 yaw.
         names: channels that may appear.
     """
     parts = meaning(term, names, {})
     odd = {thing.name for thing, _, changes in parts if changes}
-    return odd == {VELOCITY[axis]} and not any(thing.function for thing, _, _ in parts)
+    return odd == {live_of(names).moving[axis]} and not any(thing.function for thing, _, _ in parts)

@@ -225,13 +225,17 @@ class SplitTerms(nn.Module):
     Args:
         terms: of the sum.
         names: other channels than velocities that appear in them.
+        moves: the velocities, and what else moves with them.
 
     Attributes:
         linear: whether the sum is linear in the velocities.
     """
 
-    def __init__(self, terms: Sequence[str], names: Sequence[str]) -> None:
+    def __init__(
+        self, terms: Sequence[str], names: Sequence[str], moves: Sequence[str] = VELOCITY
+    ) -> None:
         super().__init__()
+        self.dof = len(moves)
         moving: list[str] = []
         beside: list[str] = []
         alone: list[str] = []
@@ -239,14 +243,14 @@ class SplitTerms(nn.Module):
         apart: list[int] = []
         for place, term in enumerate(terms):
             parts: list[list[str]] = [[], []]
-            for factor in parse_term(term, (*VELOCITY, *names)):
-                parts[factor.name in VELOCITY].append(factor.text)
+            for factor in parse_term(term, (*moves, *names)):
+                parts[factor.name in moves].append(factor.text)
             other, own = (" ".join(part) or "1" for part in parts)
             if parts[1]:
                 moving, beside, places = [*moving, own], [*beside, other], [*places, place]
             else:
                 alone, apart = [*alone, other], [*apart, place]
-        self.alone, self.moving = TermLibrary(alone, names), TermLibrary(moving, VELOCITY)
+        self.alone, self.moving = TermLibrary(alone, names), TermLibrary(moving, moves)
         # a term of velocities alone needs no factor
         self.coupled = any(other != "1" for other in beside)
         self.beside = TermLibrary(beside if self.coupled else (), names)
@@ -266,12 +270,12 @@ class SplitTerms(nn.Module):
         row = self.alone(p) @ weights.index_select(0, self.apart)
         own = weights.index_select(0, self.places)
         if self.linear:
-            slope = own.new_zeros(3, own.shape[1])
+            slope = own.new_zeros(self.dof, own.shape[1])
             return row, slope if len(own) == 0 else slope.index_add(0, self.moving.channel, own)
         return (torch.cat((row, self.beside(p)), dim=-1) if self.coupled else row), own
 
     def forward(self, nu: Tensor, row: Tensor, own: Tensor) -> Tensor:
-        """Return the sum [B, n] at velocities nu [B, 3], by what `ahead` found."""
+        """Return the sum [B, n] at velocities nu [B, d], by what `ahead` found."""
         if self.linear:
             return torch.addmm(row, nu, own)
         found: Tensor = self.moving(nu)

@@ -394,11 +394,11 @@ class ExpressionLibrary(nn.Module):
 
 
 class Weights(Table):
-    """The coefficients [J, 3] of the terms on each axis."""
+    """The coefficients [J, n] of the terms on each axis."""
 
-    def __init__(self) -> None:
+    def __init__(self, outputs: int) -> None:
         super().__init__()
-        self.register_buffer("values", torch.zeros(0, 3, dtype=torch.float64))
+        self.register_buffer("values", torch.zeros(0, outputs, dtype=torch.float64))
         self.values: Tensor
 
 

@@ -16,15 +16,14 @@ from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_table
 from residnet.core.format import SHOWN_UNITS, shown_unit
-from residnet.core.layout import ALIVE, RANGE_VELOCITIES, Live
-from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
+from residnet.core.layout import ALIVE, ROLL, Live
+from residnet.core.names import CHANNEL_UNITS, to_si
 from residnet.core.units import known_unit
-from residnet.judge.rollout_files import INPUT
+from residnet.judge.rollout_files import INPUT, columns_of
 from residnet.judge.verdict import by_windows
 
 Content = Mapping[str, Any]
 """What a JSON object holds."""
-COLUMNS = ("u", "v", "r", "psi", "x", "y")
 _FOCUS = ("test", "external", "validation", "train")
 """Splits by how much they say about data that no fit has seen."""
 
@@ -40,11 +39,11 @@ class StoredWindow:
         number: of the window in its log, from 0.
         t: [T] in s.
         usable: [T], whether u, v and the position are scored.
-        measured: [T, 6] of u, v, r, psi, x, y in SI and rad.
+        measured: [T, 3 + n] of the columns of `columns_of(live)` in SI and rad.
         predicted: the same by model.
         diverged: by model.
         inputs: values [T] by name, SI and rad; empty where the run has stored none.
-        low: lower limits of the band [T, 6] by model; empty where no model has one.
+        low: lower limits of the band [T, 3 + n] by model; empty where no model has one.
         high: upper limits likewise.
         live: velocities that the logs tell; the others are zero.
     """
@@ -64,12 +63,12 @@ class StoredWindow:
     live: Live = ALIVE
 
     def rmse(self, model: str) -> np.ndarray:
-        """Return the root mean square errors [3] of u, v (usable samples) and r (all samples)."""
-        error = self.predicted[model][:, RANGE_VELOCITIES] - self.measured[:, RANGE_VELOCITIES]
+        """Return the root mean square errors [n] of u, v (usable samples) and the rest (all)."""
+        places = [columns_of(self.live).index(name) for name in self.live.moving]
+        error = (self.predicted[model] - self.measured)[:, places]
         good = self.usable if self.usable.any() else np.ones_like(self.usable)
-        return np.sqrt(
-            [np.mean(error[good, 0] ** 2), np.mean(error[good, 1] ** 2), np.mean(error[:, 2] ** 2)]
-        )
+        parts = (*error[good, :2].T, *error[:, 2:].T)
+        return np.sqrt([np.mean(part**2) for part in parts])
 
 
 class RunFiles:
@@ -271,7 +270,7 @@ class RunFiles:
     @cached_property
     def live(self) -> Live:
         """The velocities that the logs tell; models leave the others at zero."""
-        return Live(tuple(name for name in VELOCITY if name in self.channels))
+        return Live(tuple(name for name in ROLL.velocities if name in self.channels))
 
     @property
     def place(self) -> str:
@@ -358,6 +357,7 @@ class RunFiles:
     def windows(self, split: str) -> list[StoredWindow]:
         """Return all stored free runs of a split, in the order of the file names."""
         out: list[StoredWindow] = []
+        names = columns_of(self.live)
         for path in sorted((self.path / "rollouts" / split).glob("*.parquet")):
             table = read_table(path)
             for (protocol, number), group in table.groupby(["protocol", "window"], sort=True):
@@ -371,9 +371,9 @@ class RunFiles:
                         number=int(str(number)),
                         t=first["t"].to_numpy(float),
                         usable=first["usable"].to_numpy(bool),
-                        measured=first[list(COLUMNS)].to_numpy(float),
+                        measured=first[list(names)].to_numpy(float),
                         predicted={
-                            model: part[[f"{name}_hat" for name in COLUMNS]].to_numpy(float)
+                            model: part[[f"{name}_hat" for name in names]].to_numpy(float)
                             for model, part in parts.items()
                         },
                         diverged={
@@ -384,17 +384,17 @@ class RunFiles:
                             for name in table.columns
                             if name.startswith(INPUT)
                         },
-                        low=_limits(parts, "low"),
-                        high=_limits(parts, "high"),
+                        low=_limits(parts, names, "low"),
+                        high=_limits(parts, names, "high"),
                         live=self.live,
                     )
                 )
         return out
 
 
-def _limits(parts: Mapping[str, Any], ending: str) -> dict[str, np.ndarray]:
-    """Return one limit of the bands [T, 6] of those models of a stored window that have any."""
-    names = [f"{name}_{ending}" for name in COLUMNS]
+def _limits(parts: Mapping[str, Any], columns: Sequence[str], ending: str) -> dict[str, np.ndarray]:
+    """Return one limit of the bands [T, 3 + n] of those models of a stored window that have any."""
+    names = [f"{name}_{ending}" for name in columns]
     return {
         model: part[names].to_numpy(float)
         for model, part in parts.items()

@@ -41,7 +41,7 @@ class JudgedRun(RunFiles):
         self.split = next(found, self.splits[-1])
         self.model = str(self.metrics["selected"])
         told = self.metrics["scales"]
-        self.scales = np.array([float(told[name]) for name in self.live.velocities])
+        self.scales = np.array([float(told[name]) for name in self.live.channels])
 
     @cached_property
     def series(self) -> dict[Window, tuple[np.ndarray, np.ndarray]]:
@@ -108,8 +108,8 @@ def judged_runs(paths: Sequence[Path]) -> list[JudgedRun]:
     for run in runs:
         if run.live != runs[0].live:
             raise UsageError(
-                f"compare: {run.name} predicts {', '.join(run.live.velocities)}, and"
-                f" {runs[0].name} {', '.join(runs[0].live.velocities)}; name runs of the same"
+                f"compare: {run.name} predicts {', '.join(run.live.channels)}, and"
+                f" {runs[0].name} {', '.join(runs[0].live.channels)}; name runs of the same"
                 " velocities (signals.velocities)"
             )
     return runs

@@ -14,9 +14,8 @@ import yaml
 
 from residnet.core.config import validate
 from residnet.core.errors import DataError, ResidnetError, UsageError
-from residnet.core.layout import Live
+from residnet.core.layout import ROLL, Live
 from residnet.core.log import Log
-from residnet.core.names import POSE, VELOCITY
 from residnet.core.progress import say
 from residnet.data.doctor import inspect
 from residnet.data.drafting.channels import CHANNELS
@@ -148,7 +147,7 @@ def drafted(
     live = read.live
     chosen = Preparation.of(list(read.whole.values()), inputs, live)
     signals = {"inputs": list(inputs)}
-    if not live.whole:
+    if not live.planar:
         signals["velocities"] = list(live.velocities)
         marks.guess(("signals", "velocities"), live.text)
     signals |= {"exogenous": list(chosen.exogenous)} if chosen.exogenous else {}
@@ -158,7 +157,7 @@ def drafted(
         marks.note(CHANNELS, "the wind is left out: its loads need u, v, r and a measured heading")
     preparation = chosen.content()
     if "frozen" in _findings(list(read.logs.values()), inputs, marks):
-        where = {} if live.whole else {"channels": list(live.velocities)}
+        where = {"channels": list(live.channels)} if live.dead else {}
         preparation |= {"masks": [{"kind": "frozen", **where}]}
     usable = read.usable((*inputs, *chosen.exogenous), preparation)
     split, splits = _split(usable, folder, marks)
@@ -244,7 +243,7 @@ class _Read:
             for name in inputs
         }
         if channels := self.reader.get("channels"):
-            state = [*POSE, *VELOCITY, "phi", "p", *WIND_INPUTS]
+            state = [*ROLL.names, *WIND_INPUTS]
             state += [] if "x" in channels else ["latitude", "longitude"]
             state += [] if "psi" in channels else QUATERNION
             self.reader["channels"] = {

@@ -12,7 +12,7 @@ import numpy as np
 from residnet.core.config import dump_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, STATE, nearest, si_unit
+from residnet.core.names import CHANNEL_UNITS, nearest, si_unit
 from residnet.core.progress import begin, say
 from residnet.data.doctor import inspect, inspect_together, inspection, summary
 from residnet.data.drafting.reading import log_files
@@ -155,7 +155,8 @@ def write_judged(
             folder.rollouts / split, part.runs, part.logs, config.signals.columns, part.bands
         )
     scales = config.evaluation.scales.named()
-    units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in STATE}
+    states = config.signals.live.states
+    units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in states}
     rows = [row for part in judged.values() for row in part.rows]
     folder.write_json(
         folder.metrics,
@@ -186,8 +187,8 @@ def write_judged(
                 reason: float(np.mean(mask)) for reason, mask in log.log.masks.items() if mask.any()
             },
             "largest": {
-                name: float(np.abs(log.y[log.usable, STATE.index(name)]).max())
-                for name in log.live.velocities
+                name: float(np.abs(log.y[log.usable, log.live.states.index(name)]).max())
+                for name in log.live.channels
             },
             **({"integrated": made} if (made := log.log.meta.get("integrated")) else {}),
         }
@@ -332,4 +333,9 @@ def external_logs(
 
 def limit_of(spec: ModelSpec, config: FitConfig) -> np.ndarray:
     """Return the |u, v, r| [3] beyond which a free run of a model has diverged."""
-    return velocity_limit(np.array(spec.low), np.array(spec.high), config.evaluation.divergence)
+    return velocity_limit(
+        np.array(spec.low),
+        np.array(spec.high),
+        config.evaluation.divergence,
+        spec.signals.live,
+    )

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from residnet.core.names import STATE
+from residnet.core.layout import PLANAR
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.guard import GuardedDynamics
@@ -57,12 +57,13 @@ def check_bad_inputs(
 def _good_samples(
     guard: GuardedDynamics, rows: int, random: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return states [B, 6] and inputs [B, T, m] in the training range, and a past of both."""
-    low, high = guard.low[len(STATE) // 2 :], guard.high[len(STATE) // 2 :]
+    """Return states [B, 3 + n] and inputs [B, T, m] in the training range, and a past of both."""
+    first, n = PLANAR.pose_columns.stop, guard.dof
+    low, high = guard.low[first:], guard.high[first:]
     share = 0.05 + 0.9 * torch.rand(rows, _PAST + _STEPS, low.numel(), generator=random)
     seen = low + share * (high - low)
     pose = 40.0 * torch.rand(rows, _PAST + _STEPS, 3, generator=random) - 20.0
-    y, w = torch.cat((pose, seen[..., :3]), dim=-1), seen[..., 3:]
+    y, w = torch.cat((pose, seen[..., :n]), dim=-1), seen[..., n:]
     return y[:, _PAST], w[:, _PAST:], y[:, :_PAST], w[:, :_PAST]
 
 

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.given import GivenBaseline
-from residnet.core.layout import POSE, VELOCITIES, velocities
-from residnet.core.names import VELOCITY
+from residnet.core.layout import pose, velocities, velocities_on
 from residnet.core.samples import Samples
 from residnet.data.module import Windows, WindowsDataModule
 from residnet.data.windows import WindowStore
@@ -23,7 +22,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import MANY, FreeRun, Rollout
 from residnet.heads.recurrent import RecurrentHead
 from residnet.physics.signals import Signals
-from residnet.physics.symmetry import mirrored_channels
+from residnet.physics.symmetry import axis_parities, mirrored_channels
 from residnet.training.config import TrainingConfig
 from residnet.training.score import Score
 from residnet.training.trainer import EpochTraining, run_epochs
@@ -52,16 +51,17 @@ def one_step_loss(
 
     Args:
         model: the hybrid model.
-        y: smoothed states [B, T, 6].
+        y: smoothed states [B, T, 3 + n].
         w: inputs at the same samples [B, T, m].
-        nu_dot: accelerations [B, T, 3].
+        nu_dot: accelerations [B, T, n].
         good: samples that count: acceleration known, memory filled [B, T].
-        spread: of the residual, [3].
+        spread: of the residual, [n].
         shared: over the processes of a training, whose mean loss is that of all windows.
     """
     error = (nu_dot - model.one_step(model.channels(y, w))) / spread
     weight = good.to(error.dtype).unsqueeze(-1)
-    return (error.square() * weight).sum() / shared(3.0 * weight.sum()).clamp(min=1.0)
+    count = float(error.shape[-1])
+    return (error.square() * weight).sum() / shared(count * weight.sum()).clamp(min=1.0)
 
 
 def rollout_loss(
@@ -81,27 +81,28 @@ def rollout_loss(
 
     Args:
         rollout: the free run of the model, as `Rollout` gives it.
-        x0: initial states [B, 6].
+        x0: initial states [B, 3 + n].
         w: inputs [B, T, m].
         s: initial memory [B, n_state].
-        y: measured states after each step [B, T, 6].
+        y: measured states after each step [B, T, 3 + n].
         usable: measured samples that may be scored [B, T].
-        scales: [3].
+        scales: [n].
         robust: 0 for the mean square; else windows count by sqrt(mean square + robust^2), as the
             metrics do, so that few bad ones do not rule.
         shared: over the processes of a training, whose mean loss is that of all windows.
     """
     states, _, _ = rollout(x0, w, s)
-    error = (velocities(states[:, 1:]) - velocities(y)) / scales
-    weight = usable.to(error.dtype).unsqueeze(-1)
+    n = scales.numel()
+    error = (velocities(states[:, 1:], n) - velocities(y, n)) / scales
+    weight, count = usable.to(error.dtype).unsqueeze(-1), float(n)
     if robust > 0:
-        square = (error.square() * weight).sum((1, 2)) / (3.0 * weight.sum((1, 2))).clamp(min=1.0)
+        square = (error.square() * weight).sum((1, 2)) / (count * weight.sum((1, 2))).clamp(min=1.0)
         return torch.sqrt(square + robust**2).sum() / shared(torch.ones_like(square).sum())
     # a rollout that runs away must pull back, not drown the batch
     square = 2.0 * torch.nn.functional.huber_loss(
         error, torch.zeros_like(error), reduction="none", delta=5.0
     )
-    return (square * weight).sum() / shared(3.0 * weight.sum()).clamp(min=1.0)
+    return (square * weight).sum() / shared(count * weight.sum()).clamp(min=1.0)
 
 
 Validate = Callable[[HybridDynamics], Score]
@@ -109,10 +110,10 @@ Validate = Callable[[HybridDynamics], Score]
 
 @dataclass(frozen=True)
 class Mirror:
-    """How states [..., 6] and inputs [..., m] look in the mirror.
+    """How states [..., 3 + n] and inputs [..., m] look in the mirror.
 
     Attributes:
-        state: signs of the states [6].
+        state: signs of the states [3 + n].
         index: column that each input is taken from [m].
         sign: and its sign [m].
     """
@@ -127,8 +128,9 @@ class Mirror:
         found = mirrored_channels(signals.names)
         if found is None:
             return None
-        index, sign = (part[len(VELOCITY) : len(VELOCITY) + signals.inputs] for part in found)
-        index = [place - len(VELOCITY) for place in index]
+        n = signals.dof
+        index, sign = (part[n : n + signals.inputs] for part in found)
+        index = [place - n for place in index]
         if signals.wind:
             # where an earth-fixed wind comes from is mirrored as headings are
             index = [*index, signals.speed_column, signals.direction_column]
@@ -137,7 +139,7 @@ class Mirror:
             index = [index[order.index(place)] for place in range(len(order))]
             sign = [sign[order.index(place)] for place in range(len(order))]
         return cls(
-            torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, -1.0]),
+            torch.tensor([1.0, -1.0, -1.0, *map(float, axis_parities(signals.names))]),
             torch.tensor(index, dtype=torch.long),
             torch.tensor(sign),
         )
@@ -266,14 +268,14 @@ class HeadTraining(EpochTraining):
             x0 = part.smooth[:, 0]
             if number == 1:
                 # at the beginning of a stretch the mean of what is known is all that is known
-                mean = part.past_y[..., VELOCITIES].mean(1)
-                x0 = torch.cat((x0[:, POSE], mean), dim=1)
+                mean = velocities_on(part.past_y).mean(1)
+                x0 = torch.cat((pose(x0), mean), dim=1)
             begins.append(x0)
         x0 = torch.cat(begins)
         if self.settings.start_noise > 0:
             drawn = self._drawn(stage).to(x0)
             noise = self.settings.start_noise * self.scales * drawn
-            x0 = torch.cat((x0[:, POSE], x0[:, VELOCITIES] + noise), dim=1)
+            x0 = torch.cat((pose(x0), velocities_on(x0) + noise), dim=1)
         w, y, usable = (
             torch.cat([getattr(part, name) for part in windows]) for name in ("w", "y", "usable")
         )
@@ -290,13 +292,15 @@ class HeadTraining(EpochTraining):
         )
 
     def _drawn(self, stage: int) -> Tensor:
-        """Return standard normal numbers [B, 3] for the windows of this process.
+        """Return standard normal numbers [B, n] for the windows of this process.
 
         They are drawn for the whole batch on the CPU: the same on every device, by any processes.
         """
         windows = self.stages[stage]
         assert windows is not None, "an epoch of a stage without windows"
-        drawn = torch.randn(windows.batch, 3, dtype=self.scales.dtype, device="cpu")
+        drawn = torch.randn(
+            windows.batch, self.scales.numel(), dtype=self.scales.dtype, device="cpu"
+        )
         sizes = [windows.batch - windows.begun, windows.begun]
         return torch.cat([part[self.rank :: self.world] for part in drawn.split(sizes)])
 
@@ -343,7 +347,7 @@ def train(
         samples: training samples whose target is the residual; give the scales.
         store: training windows, float64 where the training's precision is.
         config: stages.
-        scales: of the velocities, [3].
+        scales: of what moves, [n].
         validate: divergences and free-run error of a model on the validation data.
         seed: of weights and batches.
         folder: for checkpoints (`checkpoints/<name>/last.ckpt` is resumed from where it exists) and
@@ -391,7 +395,9 @@ def _train_coarse(
     turning = [signals.direction_column] if signals.wind else []
     # a baseline in steps so long asks for a scheme of second order; a residual alone is held
     alone = isinstance(model.baseline, GivenBaseline) and not model.baseline.library.count
-    scheme: Integrator = "euler" if alone else "heun"
+    # an oscillation of the roll grows under Euler's scheme
+    first: Integrator = "semi_implicit_euler" if model.rolls else "euler"
+    scheme: Integrator = first if alone else "heun"
     coarse = HybridDynamics(signals, model.baseline, head, steps * model.dt, scheme)
     coarse.positions = False
 

@@ -56,7 +56,7 @@ def left_open(
         samples: of the refit.
         store: training windows of the refit, float64.
         config: of the refit.
-        scales: of the velocities, [3].
+        scales: of what moves, [n].
         still: numbers of the free parameters that the refit has left at zero.
     """
     baseline = model.baseline
@@ -88,7 +88,7 @@ def without_logs(
         samples: of the refit.
         store: training windows of the refit, float64.
         config: of the refit.
-        scales: of the velocities, [3].
+        scales: of what moves, [n].
         fold: number of the fold of each log [L], from 0 on.
         still: numbers of the free parameters that the refit has left at zero.
 

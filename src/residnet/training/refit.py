@@ -21,15 +21,22 @@ from torch import Tensor
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
-from residnet.core.layout import HEADING, PLANAR, VELOCITIES, YAW_RATE, zero_acceleration
+from residnet.core.layout import (
+    HEADING,
+    YAW_RATE,
+    roll_angle,
+    velocities_on,
+    yaw_rate,
+    zero_acceleration,
+)
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.regression.least_squares import Descent, descend
 
-# sensitivities have a row for the heading and one for each velocity
+# sensitivities have a row for the heading and one for each of what moves
 _HEADING_ROW = slice(0, 1)
-_YAW_RATE_ROW = slice(YAW_RATE - HEADING, len(PLANAR.names) - HEADING)
+_YAW_RATE_ROW = slice(YAW_RATE - HEADING, YAW_RATE - HEADING + 1)
 
 
 def step_sensitivities(
@@ -39,7 +46,7 @@ def step_sensitivities(
     p: Tensor,
     s: Tensor,
 ) -> Tensor:
-    """Return the sensitivities of (psi, u, v, r) one step later, [B, 4, P].
+    """Return the sensitivities of heading and what moves one step later, [B, 1 + n, P].
 
     They are the exact derivative of `Dynamics.integrate` with the residual at zero, whatever the
     integrator.
@@ -47,27 +54,46 @@ def step_sensitivities(
     Args:
         model: that steps.
         baseline: its baseline.
-        x: states at the step's start [B, 6].
+        x: states at the step's start [B, 3 + n].
         p: prepared inputs, held over the step [B, k].
-        s: sensitivities at the step's start [B, 4, P].
+        s: sensitivities at the step's start [B, 1 + n, P].
     """
     stage_x, stage_s = x, s
     after, stage_rate = s, s
     for node, weight in zip(model.nodes, model.weights, strict=True):
         if node > 0.0:
             stage_s = torch.add(s, stage_rate, alpha=node * model.dt)
-            residual = zero_acceleration(x)
+            residual = zero_acceleration(x, model.dof)
             stage_x = x + node * model.dt * model.rate(stage_x, p, residual)
         z = model.signals(stage_x, p)
         slopes = baseline.along(z, model.signals.slopes(stage_x, p)).permute(1, 2, 0)
         nu_dot = torch.baddbmm(baseline.sensitivity(z), slopes, stage_s)
-        stage_rate = torch.cat((stage_s[:, _YAW_RATE_ROW], nu_dot), dim=1)
+        if model.rolls:
+            nu_dot = nu_dot * model.live[:, None] + model.known_rates.T @ stage_s[:, 1:]
+        stage_rate = torch.cat((_turned(model, stage_x, stage_s), nu_dot), dim=1)
         after = torch.add(after, stage_rate, alpha=weight * model.dt)
     if model.semi_implicit:
-        # the heading moves with the new yaw rate
-        turned = s[:, _HEADING_ROW] + model.dt * after[:, _YAW_RATE_ROW]
+        # angles move with the new velocities
+        new = x
+        if model.rolls:
+            angles = s[:, 1:] + model.dt * (model.known_rates.T @ after[:, 1:])
+            after = torch.cat(
+                (after[:, :1], torch.where(model.live[:, None] > 0.0, after[:, 1:], angles)), dim=1
+            )
+            new = _ahead(model, x, p)
+        turned = s[:, _HEADING_ROW] + model.dt * _turned(model, new, after)
         after = torch.cat((turned, after[:, _HEADING_ROW.stop :]), dim=1)
     return after
+
+
+def _turned(model: HybridDynamics, x: Tensor, s: Tensor) -> Tensor:
+    """Return the sensitivities of the heading's rate [B, 1, P] at states x, from those s."""
+    rate = s[:, _YAW_RATE_ROW]
+    if not model.rolls:
+        return rate
+    phi, r = roll_angle(x)[:, None, None], yaw_rate(x)[:, None, None]
+    # the roll angle stands last
+    return torch.cos(phi) * rate - r * torch.sin(phi) * s[:, -1:]
 
 
 _OWN = 1e-8
@@ -78,7 +104,7 @@ all others were known; it says where a parameter stays that the data leave open.
 
 @dataclass(frozen=True)
 class Problem:
-    """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale);
+    """Windows x0 [B, 3 + n], w [B, T, m], measured nu [B, T, n], weights [B, T, n] (0 or 1/scale);
     numbers of the free parameters [P]; precision [P, P] about where least squares put them, the
     part of it that each parameter has for itself, whatever the data say, and that point [P];
     pull to the mirror symmetry [P, P]; beliefs, mean and precision [P]; which parameters stay at
@@ -122,11 +148,13 @@ class Problem:
 
         The cost is `level`.
 
-        With c the mean square error of three channels of so many independent errors each, that
-        logarithm grows by 3 N / 2c for each unit of c, and the cost sqrt(c + robust^2) by 1 / (2
+        With c the mean square error of n channels of so many independent errors each, that
+        logarithm grows by n N / 2c for each unit of c, and the cost sqrt(c + robust^2) by 1 / (2
         cost).
         """
-        return (level.square() - self.robust**2).clamp(min=1e-12) / (6.0 * self.count * level)
+        return (level.square() - self.robust**2).clamp(min=1e-12) / (
+            2.0 * self.nu.shape[-1] * self.count * level
+        )
 
     def inverse(self, hessian: Tensor) -> Tensor:
         """Return the inverse of a Hessian [P, P], zero for what rests at zero."""
@@ -176,10 +204,11 @@ def problem_of(
     steps = round(config.horizon / model.dt)
     starts = free_run_starts(store, config, model.dt)
     take = store.take
-    nu = take(store.y, starts + 1, steps)[..., VELOCITIES]
+    nu = velocities_on(take(store.y, starts + 1, steps))
     usable = take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
     # r comes from a gyro, which a frozen position does not disturb
-    weight = torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / scales
+    turning = torch.ones_like(usable).expand(-1, -1, model.dof - 2)
+    weight = torch.cat((usable, usable, turning), dim=-1) / scales
     active = baseline.free_indices()
     covered = (starts[:, None] + torch.arange(1, steps + 1)).unique().numel()
     believed, belief = baseline.prior()
@@ -198,8 +227,8 @@ def problem_of(
         believed,
         belief,
         torch.zeros(active.numel(), dtype=torch.bool),
-        # errors are means over three channels, of which some may be zero at all times
-        max(covered * model.dt / config.correlation, 1.0) * float(model.live.mean()),
+        # errors are means over all channels, of which some may be zero at all times
+        max(covered * model.dt / config.correlation, 1.0) * float(model.living.mean()),
         config.robust,
         store.log[starts],
     )
@@ -285,7 +314,7 @@ def refit(
         samples: the samples of that fit.
         store: training windows, float64.
         config: settings.
-        scales: of the velocities, [3].
+        scales: of what moves, [n].
         begin: theta that the search begins at, where another refit has been near the minimum;
             None for the least-squares solution, which stays the prior in any case.
 
@@ -433,7 +462,7 @@ def _of_velocities(model: HybridDynamics) -> HybridDynamics:
 
 def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
     """The step of the rollout, without a residual."""
-    return model.advanced(x, model.signals(x, p), p, zero_acceleration(x))
+    return model.advanced(x, model.signals(x, p), p, zero_acceleration(x, model.dof))
 
 
 @torch.no_grad()
@@ -442,7 +471,7 @@ def level_of(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:
     x, total, moving = problem.x0, [], _of_velocities(model)
     for k in range(problem.w.shape[1]):
         x = _ahead(moving, x, model.signals.prepare(problem.w[:, k]))
-        total.append(x[:, VELOCITIES])
+        total.append(velocities_on(x))
     error = (torch.stack(total, dim=1) - problem.nu) * problem.weight
     squares = error.square().mean((1, 2))
     return torch.sqrt(squares + problem.robust**2).mean(), squares
@@ -465,16 +494,16 @@ def normal_equations(
     batch, steps = problem.w.shape[:2]
     count, moving = int(problem.active.numel()), _of_velocities(model)
     x = problem.x0
-    sensitivity = torch.zeros(batch, 4, count, dtype=x.dtype)
+    sensitivity = torch.zeros(batch, 1 + model.dof, count, dtype=x.dtype)
     hessian = torch.zeros(count, count, dtype=x.dtype)
     gradient = torch.zeros(count, dtype=x.dtype)
-    window = 0.5 / torch.sqrt(squares + problem.robust**2) / (3 * steps * batch)
+    window = 0.5 / torch.sqrt(squares + problem.robust**2) / (model.dof * steps * batch)
     root = window.sqrt()[:, None, None] * problem.weight
     for k in range(steps):
         p = model.signals.prepare(problem.w[:, k])
         sensitivity = step_sensitivities(moving, baseline, x, p, sensitivity)
         x = _ahead(moving, x, p)
-        error = (x[:, VELOCITIES] - problem.nu[:, k]) * root[:, k]
+        error = (velocities_on(x) - problem.nu[:, k]) * root[:, k]
         seen = sensitivity[:, 1:] * root[:, k].unsqueeze(-1)
         flat = seen.reshape(-1, count)
         hessian.addmm_(flat.T, flat)

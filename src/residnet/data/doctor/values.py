@@ -30,9 +30,9 @@ def channels(log: Record, found: Check) -> Iterator[Finding]:
 @check("values", "absent", "note")
 def absent(log: Record, found: Check) -> Iterator[Finding]:
     """Report what of the motion is not measured, and what is and no model takes."""
+    live = Live.told(log.log.channels)
     names = [name for name in STATE if name not in log]
     if names:
-        live = Live.told(log.log.channels)
         try:
             whole = complete_motion(log.log, MotionConfig(), live)
         except ResidnetError as error:
@@ -40,13 +40,13 @@ def absent(log: Record, found: Check) -> Iterator[Finding]:
         else:
             how = "follow from position and heading by a smoother"
             how = "are integrated from the velocities" if "integrated" in whole.meta else how
-            if live.whole:
+            if not live.dead:
                 yield found(f"no {', '.join(names)}: they {how}")
             else:
                 yield found(f"no {', '.join(names)}: {live.text}")
-    if rolling := [name for name in ("phi", "p") if name in log]:
-        text = f"{' and '.join(rolling)} of the roll are measured and not modelled: models are of"
-        yield found(f"{text} surge, sway and yaw", code="roll")
+    if "p" in log and not live.rolls:
+        text = "p of the roll is measured and not modelled: a model that rolls needs the angle phi"
+        yield found(text, code="roll")
 
 
 # one full circle in rad, and in degrees that were taken for rad

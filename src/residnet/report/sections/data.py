@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from residnet.core.format import DASH, DEG, minus, number
-from residnet.core.names import VELOCITY
 from residnet.report.blocks import (
     Block,
     Bullets,
@@ -136,7 +135,7 @@ def _model(run: RunFiles) -> list[tuple[str, str]]:
     if not card:
         return []
     signals = card.get("signals") or {}
-    names = [*VELOCITY, *(signals.get("inputs") or []), *(signals.get("exogenous") or [])]
+    names = [*run.live.moving, *(signals.get("inputs") or []), *(signals.get("exogenous") or [])]
     ranges = []
     for name, low, high in zip(names, card["low"], card["high"], strict=False):
         if name in run.live.dead:
@@ -187,7 +186,7 @@ def quality_tables(run: RunFiles) -> tuple[Table, Table]:
                 number,
                 factor,
             )
-            for name in run.live.velocities
+            for name in run.live.channels
             for unit, factor in [run.unit(name)]
         ),
     ]

@@ -31,7 +31,7 @@ from residnet.report.figure import BLUE, Case, Curve, Figure, Look, Panel, famil
 from residnet.report.run_reader import Content, RunFiles
 from residnet.report.sections.runs import model_looks, short_label
 
-_AXES = {"u_dot": "surge u′", "v_dot": "sway v′", "r_dot": "yaw r′"}
+_AXES = {"u_dot": "surge u′", "v_dot": "sway v′", "r_dot": "yaw r′", "p_dot": "roll p′"}
 _EXTRA_UNITS = {"wind_u": "m/s", "wind_v": "m/s", "wind_mag": "m/s"}
 """Units of factors of terms that are no channels of a log."""
 _NAMED = 8
@@ -339,7 +339,7 @@ def terms(run: RunFiles) -> Iterator[Figure]:
             looks,
             [
                 Panel(
-                    f"{_AXES[axis].split()[0]} [{'deg' if axis == 'r_dot' else 'm'}/s²]",
+                    f"{_AXES[axis].split()[0]} [{'deg' if axis in ('r_dot', 'p_dot') else 'm'}/s²]",
                     "time [s]" if axis == axes[-1] else "",
                     height=230,
                 )

@@ -11,8 +11,9 @@ import numpy as np
 
 from residnet.core.format import DEG, fixed, shown_unit
 from residnet.core.layout import Live
-from residnet.core.names import CHANNEL_UNITS, VELOCITY
+from residnet.core.names import CHANNEL_UNITS
 from residnet.core.stretches import stretches
+from residnet.judge.rollout_files import columns_of
 from residnet.report.figure import (
     BLUE,
     COLORS,
@@ -35,7 +36,7 @@ from residnet.report.figure import (
     names_of,
     whiskers,
 )
-from residnet.report.run_reader import COLUMNS, RunFiles, StoredWindow
+from residnet.report.run_reader import RunFiles, StoredWindow
 
 Units: TypeAlias = Mapping[str, tuple[str, str, float]]
 """By channel its SI unit, the unit in which it is shown, and the factor to that."""
@@ -48,14 +49,21 @@ _MOTION = {
     "v": "sway velocity\nv",
     "r": "yaw rate\nr",
     "psi": "heading\n",
+    "p": "roll rate\np",
+    "phi": "roll angle\nphi",
 }
-_ERRORS = {"u": "u", "v": "v", "r": "r", "x": "position", "psi": "heading"}
+_BANDED = ("u", "v", "r", "psi")
+"""What has a band, of the motion."""
+_ERRORS = {
+    "u": "u", "v": "v", "r": "r", "x": "position", "psi": "heading", "p": "p", "phi": "phi",
+}  # fmt: skip
 """Channel whose unit an error has, and the name of the error."""
 _SI: Units = {name: (unit, *shown_unit(unit)) for name, unit in CHANNEL_UNITS.items()}
 _AXES = (
     ("u_dot", "surge", "m/s²", 1.0),
     ("v_dot", "sway", "m/s²", 1.0),
     ("r_dot", "yaw", "deg/s²", DEG),
+    ("p_dot", "roll", "deg/s²", DEG),
 )
 # colour, line, order; the plant lies on the head that comes near it and shows it through its gaps
 _ROLES = {
@@ -197,7 +205,7 @@ def window_figure(window: StoredWindow, title: str) -> Figure:
 
 def units_of(run: RunFiles, names: Iterable[str] = ()) -> Units:
     """Return the units of the states, and of further channels of a run."""
-    return {name: (run.si(name), *run.unit(name)) for name in (*COLUMNS, *names)}
+    return {name: (run.si(name), *run.unit(name)) for name in (*columns_of(run.live), *names)}
 
 
 def _panel(text: str, unit: tuple[str, str, float], height: int = 165) -> Panel:
@@ -208,7 +216,7 @@ def _panel(text: str, unit: tuple[str, str, float], height: int = 165) -> Panel:
 
 def _moved(live: Live) -> set[str]:
     """Return the columns of a free run that the live velocities move, `x` for the position."""
-    return {*live.velocities, *["x"] * live.moves, *["psi"] * live.turns}
+    return {*live.channels, *["x"] * live.moves, *["psi"] * live.turns}
 
 
 def _panels(title: str, units: Units, live: Live) -> list[Panel]:
@@ -242,7 +250,7 @@ def _chosen(run: RunFiles, windows: Sequence[StoredWindow]) -> list[tuple[Stored
 def _ranked(run: RunFiles, windows: Sequence[StoredWindow]) -> list[StoredWindow]:
     """Return the runs of the leading model, the one of least error first."""
     scales = run.metrics.get("scales") or {}
-    divisor = np.array([float(scales.get(name, 1.0)) for name in VELOCITY])
+    divisor = np.array([float(scales.get(name, 1.0)) for name in run.live.moving])
     return sorted(
         (one for one in windows if run.lead in one.predicted),
         key=lambda one: (float((one.rmse(run.lead) / divisor).mean()), one.log, one.number),
@@ -254,7 +262,8 @@ def _curves(window: StoredWindow, lead: str, units: Units) -> list[dict[str, Cur
     time, usable = window.t - window.t[0], window.usable
     # headings begin within half a turn of north, tracks at their start
     turns = 2 * math.pi * math.floor((window.measured[0, 3] + math.pi) / (2 * math.pi))
-    origin = np.array([0.0, 0.0, 0.0, turns, *window.measured[0, 4:6]])
+    origin = np.zeros(window.measured.shape[1])
+    origin[3:6] = turns, *window.measured[0, 4:6]
     begin, end = stretches(~usable)
     masked = (time[begin], time[np.minimum(end, time.size - 1)])
 
@@ -269,10 +278,11 @@ def _curves(window: StoredWindow, lead: str, units: Units) -> list[dict[str, Cur
         | {model: track(states, all_good) for model, states in window.predicted.items()}
         | {"start": (np.zeros(1), np.zeros(1))}
     ] * ({"x", "psi"} <= moved)
-    for column, name in enumerate(_MOTION):
+    columns = columns_of(window.live)
+    for name in _MOTION:
         if name not in moved:
             continue
-        factor = units[name][2]
+        column, factor = columns.index(name), units[name][2]
         good = usable | (column >= 2)
         measured = factor * (window.measured - origin)[:, column]
         panel: dict[str, Curve] = {"measured": (time, np.where(good, measured, np.nan))}
@@ -280,7 +290,7 @@ def _curves(window: StoredWindow, lead: str, units: Units) -> list[dict[str, Cur
             panel["masked"] = masked
         for model, states in window.predicted.items():
             panel[model] = (time, factor * (states - origin)[:, column])
-        if lead in window.low:
+        if lead in window.low and name in _BANDED:
             low, high = (limit[lead] - origin for limit in (window.low, window.high))
             panel["band"] = band(time, factor * low[:, column], factor * high[:, column])
         out.append(panel)
@@ -295,18 +305,22 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
         model: whose errors are taken.
 
     Returns:
-        Middles of time bins [K] in s, and errors [K, 5] of u, v, r, position, heading in SI. Bins
-        that fewer than half of the windows reach are left out. u, v and position count where
-        usable.
+        Middles of time bins [K] in s, and errors [K, 2 + n] of u, v, r, position, heading and the
+        rest in SI. Bins that fewer than half of the windows reach are left out. u, v and position
+        count where usable.
     """
     of_model = [window for window in windows if model in window.predicted]
     longest = max(float(window.t[-1] - window.t[0]) for window in of_model)
     count = max(min(_BINS, max(window.t.size for window in of_model) // 2), 1)
-    squares, samples, reached = np.zeros((count, 5)), np.zeros((count, 5)), np.zeros(count)
+    wide = of_model[0].measured.shape[1] - 1
+    squares, samples, reached = np.zeros((count, wide)), np.zeros((count, wide)), np.zeros(count)
+    masked = np.isin(np.arange(wide), (0, 1, 3))
     for window in of_model:
         error = np.square(window.predicted[model] - window.measured)
-        columns = np.column_stack((error[:, :3], error[:, 4] + error[:, 5], error[:, 3]))
-        weight = np.where([True, True, False, True, False], window.usable[:, None], True)
+        columns = np.column_stack(
+            (error[:, :3], error[:, 4] + error[:, 5], error[:, 3], error[:, 6:])
+        )
+        weight = np.where(masked, window.usable[:, None], True)
         index = np.minimum((count * (window.t - window.t[0]) / longest).astype(int), count - 1)
         reached[np.unique(index)] += 1
         np.add.at(squares, index, np.where(weight, columns, 0.0))
@@ -320,10 +334,11 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
 def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the error of every model against the horizon, on a logarithmic scale."""
     cases, units, shown = [], units_of(run), _errors_of(run)
-    factors = [units[name][2] for name in _ERRORS]
+    named = [name for name in _ERRORS if name in units]
+    factors = [units[name][2] for name in named]
     for protocol in run.protocols:
         members = [window for window in windows if window.protocol == protocol]
-        curves: list[dict[str, Curve]] = [{} for _ in _ERRORS]
+        curves: list[dict[str, Curve]] = [{} for _ in named]
         for model in run.kinds:
             if any(model in window.predicted for window in members):
                 time, errors = growth(members, model)
@@ -373,7 +388,7 @@ def error_bars(run: RunFiles) -> Figure:
     thick = 0.8 / len(run.sides)
     curves = []
     panels: list[Panel] = []
-    for channel in run.live.velocities:
+    for channel in run.live.channels:
         text = _MOTION[channel].partition("\n")[0]
         unit, factor = run.unit(channel)
         group = bar_group(run, protocol, channel)
@@ -441,7 +456,7 @@ def residuals(run: RunFiles) -> Figure | None:
     models = [] if frame is None else [one for one in run.heads if (frame["model"] == one).any()]
     if not models:
         return None
-    axes = [_AXES[place] for place in run.live.axes]
+    axes = [_AXES[place] for place in run.live.learned]
     cases, reach = [], dict.fromkeys((axis for axis, *_ in axes), 0.0)
     for model in models:
         panels, explained = [], []
@@ -500,8 +515,10 @@ def bands(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the half width of the leading model's bands beside the errors that they are to hold."""
     model = run.lead
     known = (run.json("bands.json").get("models") or {}).get(model) or {}
-    cases, level, units, shown = [], 0.0, units_of(run), _errors_of(run)
-    factors = [units[name][2] for name in _ERRORS]
+    cases, level, units = [], 0.0, units_of(run)
+    banded = {"x", *_BANDED}
+    shown = {name: place for name, place in _errors_of(run).items() if name in banded}
+    factors = [units[name][2] for name in _ERRORS if name in banded]
     for protocol, found in known.items():
         members = [one for one in windows if one.protocol == protocol and model in one.low]
         if not members:

@@ -57,7 +57,7 @@ def window_nrmse(run: Path, model: str, split: str) -> dict[str, WindowErrors]:
     files = RunFiles(run)
     name = files.selected if model == "selected" else model
     live = files.live
-    scales = np.array([float(files.metrics["scales"][channel]) for channel in live.velocities])
+    scales = np.array([float(files.metrics["scales"][channel]) for channel in live.channels])
     found: dict[str, list[tuple[tuple[str, int], float, bool]]] = {}
     for window in files.windows(split):
         if name not in window.predicted:
