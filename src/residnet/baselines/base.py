@@ -191,13 +191,10 @@ def require(names: Sequence[str], wanted: Sequence[str], who: str) -> None:
 
     Raises:
         ConfigError: naming the first that does not.
+        UsageError: where the model rolls.
     """
     live = live_of(names)
-    if live.rolls:
-        raise ConfigError(
-            f"{who} knows no roll, but signals.velocities are {', '.join(live.velocities)}; take a"
-            " baseline of kind 'regressors' or 'still', or leave p out"
-        )
+    live.require_no_roll(who)
     for name in wanted:
         if name in live.dead:
             raise ConfigError(

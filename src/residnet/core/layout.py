@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from residnet.core import names
+from residnet.core.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -202,6 +203,18 @@ class Live:
         if not self.turns:
             return f"{text}: positions are the distance run on a straight line"
         return f"{text}: the vessel moves over ground where it points, without drift"
+
+    def require_no_roll(self, who: str) -> None:
+        """Check that the vessel does not roll, for what knows no roll.
+
+        Raises:
+            UsageError: where it does.
+        """
+        if self.rolls:
+            raise UsageError(
+                f"{who} knows no roll, but the model moves {', '.join(self.velocities)}; fit one"
+                " without p (signals.velocities: [u, v, r])"
+            )
 
     def mask(self) -> Tensor:
         """Return 1 for each that has an equation of its own and 0 for the others, [n] float64."""

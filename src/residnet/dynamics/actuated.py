@@ -17,6 +17,7 @@ from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.physics.plant import ROLLING, Plant
+from residnet.physics.symmetry import live_of
 
 _RATES = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
 
@@ -192,6 +193,7 @@ class ActuatedDynamics(Dynamics):
 
     Raises:
         ConfigError: where the actuators have nothing for an input of the model.
+        UsageError: where the model rolls.
     """
 
     def __init__(
@@ -202,6 +204,7 @@ class ActuatedDynamics(Dynamics):
         actuators: Actuators,
     ) -> None:
         super().__init__(model.dt, model.integrator)
+        live_of(model.signals.names).require_no_roll("a simulation by a learned model")
         self.model, self.actuators = model, actuators
         self.n_state = model.n_state
         self.state = (*STATE, *actuators.state)

@@ -779,6 +779,7 @@ class Watch:
         clean: Sequence[Sequence[Piece]],
         config: MonitorConfig,
     ) -> None:
+        spec.signals.live.require_no_roll("a monitor")
         self.model = model.to(torch.float64).eval()
         self.config = config
         self.dt = spec.dt

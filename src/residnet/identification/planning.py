@@ -267,6 +267,7 @@ def plan(
         DataError: where no candidate stays within the limits, or nothing is open.
     """
     spec, model = fitted.spec, fitted.model.double()
+    spec.signals.live.require_no_roll("a plan of trials")
     horizon = round(refit.horizon / spec.dt)
     divisor = torch.from_numpy(scales)
     flown = [

@@ -79,9 +79,10 @@ def learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
     Its commands are its inputs within their training ranges; it feels no wind.
 
     Raises:
-        UsageError: where the run has no such model.
+        UsageError: where the run has no such model, or it rolls.
     """
     spec, model = load_model(run / "models" / chosen_model(run, name))
+    spec.signals.live.require_no_roll("a simulator of a learned model")
     guarded = _Guarded(GuardedDynamics(model.float(), spec).float().eval().requires_grad_(False))
     commands = len(spec.signals.inputs)
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)

@@ -38,8 +38,16 @@ from residnet.heads.base import FeatureConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.physics.plant import Plant
+from residnet.physics.signals import SignalsConfig
+from residnet.physics.symmetry import live_of
 from residnet.physics.vessel import load_vessel
-from residnet.testing.examples import example_model, example_models, example_samples, example_spec
+from residnet.testing.examples import (
+    SIGNALS,
+    example_model,
+    example_models,
+    example_samples,
+    example_spec,
+)
 
 _ROWS, _STEPS = 4, 12
 _STEP = 0.1
@@ -97,7 +105,7 @@ def _read_back(config: Config, union: Any, who: str) -> None:
     require(type(known) is type(config), f"{who}: its name leads to {type(known).__name__} instead")
 
 
-def check_head(config: FeatureConfig) -> None:
+def check_head(config: FeatureConfig, signals: SignalsConfig = SIGNALS) -> None:
     """Check everything that residnet relies on in a head.
 
     Shapes and precision, a residual that is not zero, equal answers for equal questions, rows of a
@@ -107,15 +115,16 @@ def check_head(config: FeatureConfig) -> None:
 
     Args:
         config: of the head; it must work with the channels of `example_samples`.
+        signals: of the models; those of `examples.ROLLING` move roll too.
 
     Raises:
         AssertionError: one line that says which contract is broken.
     """
-    who, spec = f"head {kind_of(type(config))}", example_spec(config)
+    who, spec, n = f"head {kind_of(type(config))}", example_spec(config, signals), signals.live.size
     _read_back(config, HeadConfig, who)
-    model, samples = example_model(spec), example_samples().z
+    model, samples = example_model(spec), example_samples(signals=signals).z
     head = model.head.eval()
-    # channels [4, 12, 8] from the middle of the example samples
+    # channels [4, 12, nz] from the middle of the example samples
     begin = torch.arange(_ROWS) * (len(samples) // _ROWS) + 30
     z = samples[begin[:, None] + torch.arange(_STEPS)[None]]
 
@@ -133,11 +142,11 @@ def check_head(config: FeatureConfig) -> None:
         for dtype in (torch.float32, torch.float64):
             first, s = z[:, 0].to(dtype), empty(_ROWS, dtype)
             (rho, after), (again, _) = (head.to(dtype)(first, s) for _ in range(2))
-            shapes = {"residual": (rho.shape, 3), "memory": (after.shape, head.n_state)}
-            for name, (shape, n) in shapes.items():
-                wanted = "[B, 3]" if name == "residual" else f"[B, n_state = {n}]"
+            shapes = {"residual": (rho.shape, n), "memory": (after.shape, head.n_state)}
+            for name, (shape, size) in shapes.items():
+                wanted = f"[B, {n}]" if name == "residual" else f"[B, n_state = {size}]"
                 message = f"{who}: the {name} has the shape {shape}, not {wanted}"
-                require(shape == (_ROWS, n), message)
+                require(shape == (_ROWS, size), message)
             require(
                 rho.dtype == after.dtype == dtype,
                 f"{who}: answers {rho.dtype} and {after.dtype} where it is asked in {dtype}",
@@ -169,8 +178,8 @@ def check_head(config: FeatureConfig) -> None:
         rho, memory = head(far[None], empty(1, z.dtype))
         beyond, _ = head(further[None], empty(1, z.dtype))
         held = head.sequence(far.expand(1, 200, -1))
-        x = torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :3]), dim=-1)
-        w, s = z[..., 3 : 3 + model.signals.inputs], torch.rand(_ROWS, model.n_state).to(z)
+        x = torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :n]), dim=-1)
+        w, s = z[..., n : n + model.signals.inputs], torch.rand(_ROWS, model.n_state).to(z)
         free = Rollout(model.double())
         model.positions = False
         states, _, memory = (free if head.refusal else _scripted(free, who))(x, w, s)
@@ -197,12 +206,12 @@ def check_head(config: FeatureConfig) -> None:
     require(float(slope.abs().max()) > 0, f"{who}: its gradient is zero everywhere")
     counts, spread = head.parameter_count(), head.residual_std()
     require(
-        len(counts) == 3 and all(count >= 0 for count in counts),
-        f"{who}: parameter_count gives {counts}, not one number for each of three axes",
+        len(counts) == n and all(count >= 0 for count in counts),
+        f"{who}: parameter_count gives {counts}, not one number for each of {n} axes",
     )
     require(
-        spread.shape == (3,) and bool((spread > 0).all()),
-        f"{who}: residual_std gives {spread.tolist()}, not three positive numbers",
+        spread.shape == (n,) and bool((spread > 0).all()),
+        f"{who}: residual_std gives {spread.tolist()}, not {n} positive numbers",
     )
     model = example_model(spec)
     with tempfile.TemporaryDirectory() as folder:
@@ -227,7 +236,7 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
 
     Args:
         config: of the baseline.
-        samples: whose target is the measured acceleration [N, 3]; those of a catamaran with two
+        samples: whose target is the measured acceleration [N, n]; those of a catamaran with two
             propellers (`example_samples`) where None.
 
     Raises:
@@ -236,6 +245,7 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     who = f"baseline {kind_of(type(config))}"
     known = example_samples() if samples is None else samples
     resolved = config.resolved()
+    n = live_of(known.names).size
     baseline, again = (resolved.build(known.names) for _ in range(2))
     table = resolved.fit(baseline, known)
     require(resolved.fit(again, known) == table, f"{who}: two fits give different coefficients")
@@ -243,8 +253,8 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     with torch.no_grad():
         accelerations = baseline(z)
         require(
-            accelerations.shape == (len(z), 3),
-            f"{who}: the accelerations have the shape {accelerations.shape}, not [N, 3]",
+            accelerations.shape == (len(z), n),
+            f"{who}: the accelerations have the shape {accelerations.shape}, not [N, {n}]",
         )
         require_finite(accelerations, f"{who}: its accelerations are not finite")
         require_equal(again(z), accelerations, 0.0, f"{who}: two fits give different answers")
@@ -263,13 +273,13 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     compiled = _scripted(baseline, who)
     with torch.no_grad():
         require_equal(compiled(z), accelerations, 1e-9, f"{who}: scripted, it answers otherwise")
-        row, held = baseline.ahead(z[:, 3:])
+        row, held = baseline.ahead(z[:, n:])
         message = f"{who}: what it finds ahead of a free run changes its accelerations"
-        require_equal(baseline.at(z[:, :3], row, held), accelerations, 1e-9, message)
+        require_equal(baseline.at(z[:, :n], row, held), accelerations, 1e-9, message)
         if baseline.linear:
-            require_equal(row + z[:, :3] @ held[0], accelerations, 1e-9, f"{who}: is not linear")
+            require_equal(row + z[:, :n] @ held[0], accelerations, 1e-9, f"{who}: is not linear")
     counts = baseline.parameter_count()
-    require(len(counts) == 3, f"{who}: parameter_count gives {counts}, not one for each axis")
+    require(len(counts) == n, f"{who}: parameter_count gives {counts}, not one for each axis")
     empty = resolved.build(known.names)
     empty.load_state_dict(baseline.state_dict())
     with torch.no_grad():

@@ -7,7 +7,6 @@ import functools
 import torch
 
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.core.layout import RANGE_INPUTS, RANGE_VELOCITIES
 from residnet.core.samples import Samples
 from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.simulated import SimulatedTrials, fly_trials
@@ -21,6 +20,9 @@ from residnet.physics.signals import SignalsConfig
 SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolved()
 """Inputs of the example models: the revolutions of two propellers, and the forces they make."""
 
+ROLLING = SignalsConfig(inputs=("delta", "cmd_thrust"), velocities=("u", "v", "r", "p"))
+"""Inputs of example models of a patrol vessel that rolls."""
+
 STEP = 0.1
 """Step of the example models in s."""
 
@@ -30,21 +32,21 @@ _DERIVATIVE = {"kind": "savitzky_golay", "window": 1.1, "order": 2}
 
 @functools.cache
 def example_samples(
-    vessel: str = "wam_v_cal", signals: SignalsConfig = SIGNALS, duration: float = 20.0
+    vessel: str = "", signals: SignalsConfig = SIGNALS, duration: float = 20.0
 ) -> Samples:
-    """Return samples of simulated trials: channels z [N, nz], accelerations [N, 3], float64, SI.
+    """Return samples of simulated trials: channels z [N, nz], accelerations [N, n], float64, SI.
 
     Without arguments these are trials of a catamaran with the channels u, v, r, n_port, n_stbd,
     tau_x, tau_y, tau_n.
 
     Args:
-        vessel: name of the vessel.
+        vessel: name of the vessel; that catamaran, or a patrol vessel for signals with roll.
         signals: what drives the model; channels of the vessel's logs.
         duration: of each manoeuvre in s.
     """
     trials = SimulatedTrials.model_validate(
         {
-            "vessel": vessel,
+            "vessel": vessel or ("patrol_p06_linear" if signals.live.rolls else "wam_v_cal"),
             "step": STEP,
             "substeps": 1,
             "duration": duration,
@@ -79,15 +81,15 @@ def example_spec(head: FeatureConfig | None, signals: SignalsConfig = SIGNALS) -
         head: config of any head.
         signals: inputs, forces and velocities of the model.
     """
-    z = example_samples(signals=signals).z
-    seen = torch.cat((z[:, RANGE_VELOCITIES], z[:, RANGE_INPUTS][:, :2]), dim=1)
+    seen = example_samples(signals=signals).z[:, : signals.live.size + len(signals.inputs)]
+    forces = ("u", "v", "r", "tau_x", "tau_n")
     return ModelSpec.model_validate(
         {
             "schema": "residnet.model/1",
             "name": "example",
             "role": "baseline" if head is None else "head",
             "signals": signals.model_dump(),
-            "baseline": RegressorsConfig(terms=("u", "v", "r", "tau_x", "tau_n")).model_dump(),
+            "baseline": RegressorsConfig(terms=forces if signals.forces else ()).model_dump(),
             "head": None if head is None else head.model_dump(),
             "dt": STEP,
             "integrator": "rk4",

@@ -22,6 +22,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.steering_variation import VariedModel, VariedPlant
 from residnet.physics.plant import HullPlant, Plant
+from residnet.physics.symmetry import live_of
 
 _LONG_STEP = 0.4
 """Longest step in s by which a vessel's answer to its rudder is measured."""
@@ -284,6 +285,7 @@ class SteeredModel(SteeredVessel):
     def __init__(
         self, model: HybridDynamics, columns: tuple[str, ...], hold: str, vessel: SteeredPlant
     ) -> None:
+        live_of(model.signals.names).require_no_roll("heading control by a learned model")
         self.hull, self.vessel, self.mean = model, vessel, hold == "mean"
         self.state = STATE if vessel.rate is None else (*STATE, "delta")
         self.inputs, self.rate = vessel.inputs, vessel.rate
