@@ -28,6 +28,7 @@ from torch import Tensor
 from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.core.errors import DataError, FitError, ResidnetError
+from residnet.core.layout import HEADING
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
@@ -98,15 +99,28 @@ def test_windows_are_laid_every_so_often(smoothed: list[Prepared]) -> None:
     assert notes["horizon"] == 8.0
 
 
-def windy(integrator: Integrator = "rk4") -> tuple[HybridDynamics, Problem]:
+ROLLS = ("u", "v", "r", "p")
+
+
+def windy(
+    integrator: Integrator = "rk4", velocities: tuple[str, ...] = ROLLS[:3]
+) -> tuple[HybridDynamics, Problem]:
     """A model in true wind, whose heading matters to it, and windows with samples that do not
     count; everything moved off its start.
     """
-    signals = SignalsConfig(inputs=("tau_x", "tau_n"), exogenous=("wind_speed", "wind_dir")).build()
+    signals = SignalsConfig.model_validate(
+        {
+            "inputs": ("tau_x", "tau_n"),
+            "exogenous": ("wind_speed", "wind_dir"),
+            "velocities": velocities,
+        }
+    ).build()
+    n = signals.dof
     rows = [
         ("1", "u", "u|u|", "tau_x", "wind_u"),
         ("v", "u r", "wind_v wind_mag"),
         ("r", "v", "r|r|", "tau_n", "wind_v wind_mag"),
+        *[("p", "phi", "v", "u|u| phi"), ()][: n - 3],
     ]
     baseline = RegressorBaseline(rows, signals.names)
     random = np.random.default_rng(5)
@@ -114,9 +128,9 @@ def windy(integrator: Integrator = "rk4") -> tuple[HybridDynamics, Problem]:
         torch.from_numpy(random.normal(size=tuple(baseline.theta.shape)) * 0.1)
     )
     with torch.no_grad():
-        for axis, name in enumerate("uvr"):
+        for axis, name in enumerate(velocities):
             baseline.theta[axis, baseline.library.terms.index(name)] = -0.7
-    model = HybridDynamics(signals, baseline, ZeroHead(), STEP, integrator)
+    model = HybridDynamics(signals, baseline, ZeroHead(signals.names), STEP, integrator)
     active = torch.nonzero(baseline.allowed.flatten() > 0).squeeze(1)
     batch, steps, count = 5, 25, len(active)
     wind = torch.from_numpy(random.uniform([2, -3], [6, 3], size=(batch, 1, 2))).expand(
@@ -125,10 +139,11 @@ def windy(integrator: Integrator = "rk4") -> tuple[HybridDynamics, Problem]:
     usable = torch.from_numpy(random.random((batch, steps, 1)) < 0.8).double()
     half = torch.from_numpy(random.normal(size=(count, count)))
     problem = Problem(
-        x0=torch.from_numpy(random.normal(size=(batch, 6)) * [5, 5, 1, 0.5, 0.2, 0.2]),
+        x0=torch.from_numpy(random.normal(size=(batch, 3 + n)) * [5, 5, 1, 0.5, *[0.2] * (n - 1)]),
         w=torch.cat((inputs(batch, steps, 6), wind), dim=-1),
-        nu=torch.from_numpy(random.normal(size=(batch, steps, 3)) * 0.3),
-        weight=torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / SCALES,
+        nu=torch.from_numpy(random.normal(size=(batch, steps, n)) * 0.3),
+        weight=torch.cat((usable, usable, *[torch.ones_like(usable)] * (n - 2)), dim=-1)
+        / torch.cat((SCALES, SCALES.new_full((n - 3,), 0.2))),
         precision=0.01 * half @ half.T,
         own=torch.zeros(count, count, dtype=torch.float64),
         start=torch.from_numpy(random.normal(size=count) * 0.1),
@@ -159,9 +174,12 @@ def with_step(model: HybridDynamics, problem: Problem, place: int, step: float) 
 
 
 @pytest.mark.parametrize("integrator", get_args(Integrator))
-def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
+@pytest.mark.parametrize("velocities", [ROLLS[:3], ROLLS])
+def test_sensitivities_are_those_of_the_rollout(
+    integrator: Integrator, velocities: tuple[str, ...]
+) -> None:
     """Central differences of the one time loop, heading included: the wind makes it matter."""
-    model, problem = windy(integrator)
+    model, problem = windy(integrator, velocities)
     assert isinstance(model.baseline, RegressorBaseline)
     theta, count = model.baseline.theta.data.view(-1), len(problem.active)
     steps = problem.w.shape[1]
@@ -174,14 +192,14 @@ def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
         return states
 
     with torch.no_grad():
-        x, found = problem.x0, torch.zeros(len(problem.x0), 4, count, dtype=torch.float64)
+        x, found = problem.x0, torch.zeros(len(problem.x0), 1 + model.dof, count).double()
         for k in range(steps):
             p = model.signals.prepare(problem.w[:, k])
             found = step_sensitivities(model, model.baseline, x, p, found)
             x, _ = model.step(x, problem.w[:, k], memory)
         torch.testing.assert_close(x, rolled(0, 0.0)[:, -1], rtol=1e-12, atol=1e-12)
         for place in range(count):
-            central = (rolled(place, 1e-5) - rolled(place, -1e-5))[:, -1, 2:6] / 2e-5
+            central = (rolled(place, 1e-5) - rolled(place, -1e-5))[:, -1, HEADING:] / 2e-5
             torch.testing.assert_close(found[:, :, place], central, rtol=1e-6, atol=1e-8)
 
 
@@ -191,11 +209,12 @@ def normal_equations(model: HybridDynamics, problem: Problem) -> tuple[Tensor, T
     return module.normal_equations(model, problem, model.baseline, LEVEL, squares)
 
 
-def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
+@pytest.mark.parametrize("velocities", [ROLLS[:3], ROLLS])
+def test_normal_equations_hold_half_the_gradient_of_the_cost(velocities: tuple[str, ...]) -> None:
     """With m the mean square error of a window, d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)); the
     prior's d (t'Pt) = 2 P t: half of both is returned.
     """
-    model, problem = windy()
+    model, problem = windy(velocities=velocities)
     assert isinstance(model.baseline, RegressorBaseline)
     hessian, gradient = normal_equations(model, problem)
     step = 1e-5
