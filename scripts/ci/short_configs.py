@@ -153,6 +153,7 @@ SHORT: dict[str, Short] = {
     "simulate_wam_v": Short(("~programme.families", "programme.step=0.1 s")),
     "rudder_boat_trials": Short(_TRIALS),
     "patrol_identified": Short(_trained("mlp")),
+    "patrol_roll": Short((*_TRIALS, "refit={}", "bands=null", *_trained("network"))),
     "kvlcc2": Short(
         (
             "prepare.grid={step: 0.5 s, held: [n, delta]}",

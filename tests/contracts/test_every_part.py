@@ -280,10 +280,13 @@ def test_a_baseline_has_no_terms_of_dead_velocities(kind: str) -> None:
 
 @pytest.mark.parametrize("velocities", PARTIAL)
 def test_what_logs_tell(velocities: tuple[str, ...]) -> None:
-    live = Live.told([*velocities, "x", "phi"])
+    def told(*names: str) -> Live:
+        return Live.told({name: np.arange(99.0) for name in names})
+
+    live = told(*velocities, "x", "p")
     assert live.velocities == velocities
-    assert Live.told([*velocities, "x", "y", "psi"]).whole
-    assert Live.told({*velocities, "psi"} - {"r"}).turns
+    assert told(*velocities, "x", "y", "psi").whole
+    assert told(*({*velocities, "psi"} - {"r"})).turns
     assert live.text.endswith("drift") == (live.moves and live.turns)
     assert {*live.dead, *live.velocities} == {"u", "v", "r"}
     assert np.flatnonzero(live.mask()).tolist() == live.axes

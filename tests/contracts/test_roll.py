@@ -14,7 +14,9 @@ from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate
 from residnet.core.errors import ResidnetError, UsageError
 from residnet.core.layout import ROLL, Live, levelled
+from residnet.core.log import Log
 from residnet.core.registry import kinds
+from residnet.data.doctor import inspect
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec
@@ -93,7 +95,7 @@ def test_the_roll_angle_moves_by_the_roll_rate(integrator: Integrator, head: Any
         after, s = model.step(after, w[:, k], s)
         alone.append(after)
     torch.testing.assert_close(states, torch.stack(alone, dim=1), rtol=0, atol=1e-9)
-    moved = states[0].numpy()
+    moved = states[0].detach().numpy()
     rate = np.diff(moved[:, PHI]) / spec.dt
     ends = moved[:-1, P], moved[1:, P]
     # the angle's rate lies between the velocities at both ends of a step
@@ -122,9 +124,13 @@ def test_zero_holds_the_roll_angle() -> None:
 
 
 def test_what_logs_tell() -> None:
-    assert Live.told(["x", "y", "psi", "phi"]).velocities == ("u", "v", "r", "p")
-    assert Live.told(["x", "y", "psi", "p"]).planar
-    rolls, planar = Live.told(["u", "r", "phi", "p"]), Live()
+    def told(*names: str, moving: bool = True) -> Live:
+        return Live.told({name: moving * np.arange(99.0) for name in names})
+
+    assert told("x", "y", "psi", "phi").velocities == ("u", "v", "r", "p")
+    assert told("x", "y", "psi", "p").planar
+    assert told("x", "y", "psi", "phi", "p", moving=False).planar
+    rolls, planar = told("u", "r", "phi", "p"), Live()
     assert rolls.dead == ("v",)
     assert rolls.channels == ("u", "r", "p", "phi")
     assert Live.shared([rolls, planar]).velocities == ("u", "r")
@@ -162,3 +168,15 @@ def test_every_format_exports_it(
 ) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
     _exported(name, tmp_path)
+
+
+@pytest.mark.parametrize("gain", [1.0, -1.0, 57.3])
+def test_the_doctor_sets_the_roll_rate_against_the_roll_angle(gain: float) -> None:
+    random, t = np.random.default_rng(2), np.arange(0.0, 120.0, 0.1)
+    phi = 0.05 * np.sin(0.9 * t) + 0.001 * random.normal(size=t.size)
+    p = gain * 0.05 * 0.9 * np.cos(0.9 * t) + 0.001 * random.normal(size=t.size)
+    still = dict.fromkeys(("x", "y", "psi", "u", "v", "r"), 0.0 * t)
+    log = Log("rolls", t, {**still, "phi": phi, "p": p}, {"phi": "rad", "p": "rad/s"})
+    found = [one.text for one in inspect(log, []).findings if one.code == "roll_rate"]
+    assert len(found) == (gain != 1.0)
+    assert all(text.startswith(f"phi moves by {1.0 / gain:.2g} times") for text in found)

@@ -7,7 +7,7 @@ compiles, which takes no global slices; n is the number of what moves (`Live.siz
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +80,16 @@ _RATES = {"phi": "p"}
 """The velocity that is the rate of an angle."""
 
 
+def _moves(angle: np.ndarray) -> bool:
+    """Return whether an angle [T] is known at some samples and is not the same at all of them."""
+    known = angle[np.isfinite(angle)]
+    return known.size > _FEW and float(np.ptp(known)) > 0.0
+
+
+_FEW = 50
+"""Samples of an angle that tell nothing yet."""
+
+
 @dataclass(frozen=True)
 class Live:
     """Which velocities a model moves: those of u, v and r that were recorded, and p of the roll.
@@ -96,13 +106,16 @@ class Live:
     velocities: tuple[str, ...] = PLANAR.velocities
 
     @classmethod
-    def told(cls, channels: Iterable[str]) -> Live:
+    def told(cls, channels: Mapping[str, np.ndarray]) -> Live:
         """Return the velocities that channels of a log tell; u, v and r where they tell none.
 
         They are measured, or follow from a heading (r), from position and heading (all) or from a
-        roll angle (p, which nothing tells without it).
+        roll angle that moves (p, which nothing tells without it).
+
+        Args:
+            channels: by name, [T] each.
         """
-        held = set(channels)
+        held = {name for name in channels if name != "phi" or _moves(channels[name])}
         held |= set(PLANAR.velocities) if held.issuperset(PLANAR.pose) else set()
         held |= {"r"} if "psi" in held else set()
         found = [name for name in PLANAR.velocities if name in held] or [*PLANAR.velocities]

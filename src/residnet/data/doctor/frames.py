@@ -432,3 +432,23 @@ def causes_of_yaw(log: Record, found: Check) -> Iterator[Finding]:
     """Report gain and lag of r against psi."""
     if _yaw_is_one(log):
         yield from cause_findings(log.of(yaw_causes), YAW_LIMITS, log, found)
+
+
+_TIED = 0.8
+"""Correlation from which steps of an angle and integrals of its rate are measures of one motion."""
+
+
+@check("grid", "roll_rate", fix="correct the sign or the unit of one", needs=("phi", "p"))
+def roll_rate(log: Record, found: Check) -> Iterator[Finding]:
+    """Report a roll rate that is not the rate of the roll angle: another sign, or a unit."""
+    phi, p = bridged(log.t, log["phi"]), bridged(log.t, log["p"])
+    run = np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (p[1:] + p[:-1])))
+    every = slice(None, None, max(round(1.0 / log.step), 1))
+    moved, told = np.diff(phi[every]), np.diff(run[every])
+    size = float(np.linalg.norm(moved) * np.linalg.norm(told))
+    if moved.size < FEWEST or size == 0.0 or abs(float(moved @ told)) < _TIED * size:
+        return
+    gain = float(moved @ told) / float(told @ told)
+    # a mistaken sign makes it -1, a mistaken unit 57 or a 57th
+    if not 0.5 < gain < 2.0:
+        yield found(f"phi moves by {gain:.2g} times what its rate p says")
