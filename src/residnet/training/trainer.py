@@ -240,12 +240,13 @@ class ReportProgress(L.Callback):
         """Report the epoch, and now and then loss and the best validation."""
         assert isinstance(pl_module, EpochTraining)
         done, last = trainer.current_epoch + 1, pl_module.history[-1]
+        score = pl_module.best_score if math.isfinite(pl_module.best_score) else None
         line = (
             f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss"
-            f" {last.get('loss', math.nan):.4g}, best validation {pl_module.best_score:.4g}"
+            f" {last.get('loss', math.nan):.4g}"
+            + ("" if score is None else f", best validation {score:.4g}")
         )
         shown = done % max(self.epochs // 10, 1) == 0 or done == self.epochs
-        score = pl_module.best_score if math.isfinite(pl_module.best_score) else None
         report(f"training {self.name}", done, self.epochs, line if shown else "", score)
 
 
