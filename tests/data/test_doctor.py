@@ -99,6 +99,13 @@ TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
     (changed(r=-LOG["r"]), "follows_r", "will mislead", "opposite sign", {"correlation": -1}),
     (changed(r=np.degrees(LOG["r"])), "follows_r", "will mislead", "deg taken as rad", {}),
     (changed(r=RANDOM.normal(size=50).repeat(40) / 20), "follows_r", "fatal", "one motion", {}),
+    (
+        changed(phi=0.1 * np.sin(0.5 * T), p=-0.05 * np.cos(0.5 * T)),
+        "roll_rate",
+        "will mislead",
+        "phi moves by -1 times",
+        {},
+    ),
     # biases, arms, currents
     (changed(r=LOG["r"] - 0.002), "yaw_drift", "will mislead", "", {"bias": 0.002, "end": 0.4}),
     (

@@ -75,6 +75,19 @@ def test_flights_and_gradient_are_those_of_torch() -> None:
         assert torch.allclose(one, other, rtol=2e-3, atol=2e-4)
 
 
+def test_what_is_no_number_stays_so_and_subnormal_numbers_stay_numbers() -> None:
+    rollout, (x, w, s) = loop()
+    fast = CompiledRollout(rollout, x, w, s)
+    lost = x.clone()
+    lost[3, 0], lost[5, 1] = torch.nan, torch.inf
+    with torch.no_grad():
+        (found, *_), (wanted, *_) = fast(lost, w, s), rollout(lost, w, s)
+    assert torch.equal(found.isfinite(), wanted.isfinite())
+    assert not found[3].isfinite().all()
+    # nor does a library change how the process computes
+    assert float(torch.tensor(1e-310, dtype=torch.float64) * 0.5) == 5e-311
+
+
 def test_the_number_of_threads_changes_nothing() -> None:
     rollout, given = loop()
     alone = CompiledRollout(rollout, *given)
