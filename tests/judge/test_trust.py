@@ -95,6 +95,16 @@ def test_errors_of_the_pose_are_told_after_the_times_that_matter(
     assert first["models"]["zero"]["position"] == pytest.approx(0.0, abs=1e-9)
 
 
+def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[Prepared]) -> None:
+    pairs = list(zip(run.windows, run.predictions["mlp"], strict=True))
+    for window, prediction in pairs:
+        prediction.states[20, 2] += 0.5 * (window.log + 1)
+    entries = Judged(run, CANDIDATES, logs, SCALES).horizons(STEP)
+    for window, prediction in pairs:
+        prediction.states[20, 2] -= 0.5 * (window.log + 1)
+    assert entries[0]["models"]["mlp"]["intervals"]["heading"][1] == pytest.approx(np.pi)
+
+
 @pytest.mark.parametrize("count", [3, 4, 6])
 def test_intervals_hold_the_mean_over_as_many_new_logs(logs: list[Prepared], count: int) -> None:
     """Forty sets of logs are judged, and forty others fall into the intervals as often as told."""

@@ -347,6 +347,9 @@ class Judged:
                 """Return means and intervals of errors of the pose [W, 3]."""
                 values = np.column_stack((np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])))
                 means, new = values.mean(0), new_trials(values, numbers)
+                if new[1] is not None:
+                    # a heading is off by half a turn at most
+                    new[1][1] = min(new[1][1], math.pi)
                 names = [(column - self.live.size - 1, name) for column, name in self._ends]
                 return {
                     **{name: float(means[k]) for k, name in names},
