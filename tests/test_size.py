@@ -26,7 +26,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "export": (1481, 169),
     "heads": (1285, 190),
     "identification": (2187, 224),
-    "judge": (2034, 222),
+    "judge": (2036, 222),
     "manoeuvres": (897, 136),
     "physics": (2027, 253),
     "regression": (1814, 204),
