@@ -41,7 +41,7 @@ from residnet.testing import (
     check_vessel,
     example_samples,
 )
-from residnet.testing.examples import SIGNALS, example_model, example_spec
+from residnet.testing.examples import ROLLING, SIGNALS, example_model, example_spec
 
 # what makes a kind quick enough for a contract
 HEADS: dict[str, dict[str, Any]] = {
@@ -292,27 +292,36 @@ def test_what_logs_tell(velocities: tuple[str, ...]) -> None:
     assert np.flatnonzero(live.mask()).tolist() == live.axes
 
 
-def _exported(name: str, folder: Path) -> None:
-    spec, file = example_spec(RidgeConfig(), _drawn(name)), folder / f"model{exporter(name).suffix}"
+LAYOUTS = ("drawn", "roll")
+
+
+def _exported(name: str, layout: str, folder: Path) -> None:
+    signals = ROLLING if layout == "roll" else _drawn(name)
+    spec, file = example_spec(RidgeConfig(), signals), folder / f"model{exporter(name).suffix}"
     exported = ExportedVessel(spec, example_model(spec))
     if name in ("feed_forward", "parameters"):
         with pytest.raises(UsageError, match="fit a"):
             exporter(name).export(exported, file)
         return
     card = exporter(name).export(exported, file)
-    assert card["velocities"] == list(spec.signals.velocities)
+    assert [state["name"] for state in card["states"]] == [*signals.live.states]
+    assert card["velocities"] == list(signals.velocities)
 
 
-@pytest.mark.parametrize("name", ["torchscript", "c"])
-def test_a_format_exports_it(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("name", ["torchscript", "c", "parameters"])
+def test_a_format_holds_what_its_layout_names(
+    name: str, layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
-    _exported(name, tmp_path)
+    _exported(name, layout, tmp_path)
 
 
 @pytest.mark.exporters
+@pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("name", FORMATS.names())
-def test_every_format_exports_it(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_every_format_holds_what_its_layout_names(
+    name: str, layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
-    _exported(name, tmp_path)
+    _exported(name, layout, tmp_path)

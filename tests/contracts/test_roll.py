@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -20,8 +19,6 @@ from residnet.data.doctor import inspect
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec
-from residnet.export import FORMATS, exporter, vessel
-from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
@@ -141,33 +138,6 @@ def test_what_knows_no_roll_says_so() -> None:
     spec = example_spec(RidgeConfig(), ROLLING)
     with pytest.raises(UsageError, match=r"a monitor knows no roll.*\[u, v, r\]"):
         Watch(spec, example_model(spec), [], MonitorConfig())
-
-
-def _exported(name: str, folder: Path) -> None:
-    spec, file = example_spec(RidgeConfig(), ROLLING), folder / f"model{exporter(name).suffix}"
-    exported = ExportedVessel(spec, example_model(spec))
-    if name in ("feed_forward", "parameters"):
-        with pytest.raises(UsageError, match="fit a"):
-            exporter(name).export(exported, file)
-        return
-    card = exporter(name).export(exported, file)
-    assert [state["name"] for state in card["states"]] == [*ROLL.names]
-    assert card["velocities"] == ["u", "v", "r", "p"]
-
-
-@pytest.mark.parametrize("name", ["torchscript", "parameters"])
-def test_a_format_exports_it(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
-    _exported(name, tmp_path)
-
-
-@pytest.mark.exporters
-@pytest.mark.parametrize("name", FORMATS.names())
-def test_every_format_exports_it(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
-    _exported(name, tmp_path)
 
 
 @pytest.mark.parametrize("gain", [1.0, -1.0, 57.3])
