@@ -127,6 +127,10 @@ def test_what_logs_tell() -> None:
     assert told("x", "y", "psi", "phi").velocities == ("u", "v", "r", "p")
     assert told("x", "y", "psi", "p").planar
     assert told("x", "y", "psi", "phi", "p", moving=False).planar
+    motion, noise = 0.1 * np.sin(np.arange(0.0, 60.0, 0.1)), np.random.default_rng(0)
+    for size, moves in ((0.05, True), (0.2, False)):
+        phi = motion + size * noise.normal(size=motion.size)
+        assert Live.told({"u": motion, "phi": phi}).rolls == moves
     rolls, planar = told("u", "r", "phi", "p"), Live()
     assert rolls.dead == ("v",)
     assert rolls.channels == ("u", "r", "p", "phi")

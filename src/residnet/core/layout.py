@@ -81,9 +81,15 @@ _RATES = {"phi": "p"}
 
 
 def _moves(angle: np.ndarray) -> bool:
-    """Return whether an angle [T] is known at some samples and is not the same at all of them."""
+    """Return whether an angle [T] is a motion rather than a constant or the noise of a sensor.
+
+    Of a motion neighbouring samples are alike: their correlation is above a half where less of the
+    angle's variance is noise than is motion (von Neumann's ratio below 1; noise alone has 2).
+    """
     known = angle[np.isfinite(angle)]
-    return known.size > _FEW and float(np.ptp(known)) > 0.0
+    if known.size <= _FEW:
+        return False
+    return float(np.square(np.diff(known)).mean()) < float(known.var())
 
 
 _FEW = 50
