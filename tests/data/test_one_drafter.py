@@ -86,3 +86,16 @@ def test_every_door_keeps_roll(logs: list[Log], tmp_path: Path) -> None:
         assert reader == found["new"], door
         units = {name: reader["channels"][name]["unit"] for name in ("phi", "p")}
         assert units == {"phi": "deg", "p": "deg/s"}, door
+
+
+def test_no_log_is_lost_for_a_roll_that_not_all_of_them_hold(tmp_path: Path) -> None:
+    t = np.arange(0.0, 20.0, 0.1)
+    for number in range(3):
+        table = pd.DataFrame({"t": t, "surge [m/s]": 1.0 + 0.1 * np.sin(t), "rudder [deg]": t % 7})
+        table["roll [deg]"] = np.nan if number == 1 else 3.0 * np.sin(t)
+        table.to_csv(tmp_path / f"run_{number}.csv", index=False)
+    logs = residnet.read_logs(tmp_path)
+    assert [sorted(log.channels) for log in logs] == [["delta", "u"]] * 3
+    (tmp_path / "stopped.csv").write_text("t,surge [m/s],rudder [deg]\n")
+    with pytest.raises(residnet.DataError, match="no row of numbers below it"):
+        residnet.read_logs(tmp_path / "stopped.csv")

@@ -112,6 +112,10 @@ def draft_tables(
     parts = {column for attitude in attitudes for column in attitude.values()}
     names = named([name for name in numeric if name not in parts], marks)
     names = _pulsed(names, sheets)
+    # a vessel without roll is modelled too, so that no log is lost for it
+    rolls = [name for name in ("phi", "p") if name in names]
+    for name in [one for one in rolls if any(names[one] not in s.numbers for s in sheets)]:
+        marks.note(CHANNELS, f"empty in some files, left out: {names.pop(name)}")
     refuse_written_positions(first, names)
     if "psi" not in names:
         names |= levelled(attitudes, [one.numbers for one in sheets])

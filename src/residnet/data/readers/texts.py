@@ -286,6 +286,11 @@ def _delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]], tupl
         )
         if wide > 1 and 2 * alike > len(below):
             found.append((alike, wide, (sign, rows, place)))
+    if not found and sum(map(bool, map(str.strip, lines))) == 1:
+        raise DataError(
+            f"{path}: holds one line ('{shown(lines[0], 60)}') and no row of numbers below it; was"
+            " the recording stopped at once? Leave the file out"
+        )
     if not found:
         raise DataError(
             f"{path}: no line holds names of columns above its numbers; write one, with the sign"
