@@ -122,15 +122,15 @@ def test_unsound_models_and_divergences_are_named() -> None:
         ),
         # a tenth of the way is no use where the bow points elsewhere
         ([horizon(30, errors(3.0, 67.0))], "limited", "30 s ahead mlp is off by 3.0 m"),
-        # the upper end of the interval counts, and where there is none nothing is good
+        # the upper end of the interval counts, and where there is none nobody can say
         ([horizon(30, errors(5.0, 5.0, half=0.5))], "limited", "Good would be"),
-        ([horizon(30, errors(3.0, 5.0, half=None))], "limited", "from too few logs"),
+        ([horizon(30, errors(3.0, 5.0, half=None))], "too few windows", "5 of 3 logs are needed"),
         # nor is a model that errs far more than another one of the run
         ([horizon(30, errors(3.0, 5.0), best=errors(1.0, 4.0))], "limited", "Good would be"),
         (
             [horizon(60, errors(35.0, 160.0), windows=1)],
             "too few windows",
-            "1 window on test data cannot say",
+            "1 window of 4 logs on test data cannot say",
         ),
         # as near as the sensors tell is good, however short the way
         ([horizon(0.5, errors(0.15, 0.3))], "good", "Up to 0.5 s ahead"),

@@ -16,7 +16,7 @@ from residnet.core.layout import POSE, VELOCITIES
 from residnet.data.prepare import Prepared
 from residnet.judge.bands import count_bands
 from residnet.judge.freerun import Candidate, Errors, FreeRun, integrate
-from residnet.judge.verdict import diverged_note
+from residnet.judge.verdict import FEW_LOGS, diverged_note
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 _LEVEL = 0.95
 _RESAMPLES = 10_000
 _LOGS = 5
-_FEW_LOGS = 3
 _LEAST_BLOCKS = 5
 _WANTED_BLOCKS = 8
 
@@ -65,7 +64,7 @@ def blocks(logs: Sequence[int] | np.ndarray) -> Blocks | None:
     names, sizes = np.unique(numbers, return_counts=True)
     if len(names) >= _LOGS:
         return Blocks(np.searchsorted(names, numbers), "logs", len(names))
-    if len(names) < _FEW_LOGS:
+    if len(names) < FEW_LOGS:
         return None
     length = int(sizes.max())
     while length > 1 and sum(math.ceil(size / length) for size in sizes) < _WANTED_BLOCKS:
@@ -117,7 +116,7 @@ def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]
     """
     names, places = np.unique(logs, return_inverse=True)
     count = len(names)
-    if count < _FEW_LOGS:
+    if count < FEW_LOGS:
         return [None] * values.shape[1]
     sums = np.stack([np.bincount(places, column, count) for column in values.T], axis=1)
     sizes = np.log(np.maximum(sums / np.bincount(places)[:, None], 1e-12))

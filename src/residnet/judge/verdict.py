@@ -68,6 +68,8 @@ nobody can know. What they look like stands in the page's styles."""
 GOOD, LIMITED, USELESS, UNKNOWN = LEVELS
 _FEWEST = 5
 """Windows below which nothing is said of how good a model is."""
+FEW_LOGS = 3
+"""Logs below which there is no interval, and so nothing is said either."""
 _SHARE, _TURN = 0.10, math.radians(10.0)
 """What a good model is off at most: this share of the way sailed and so many radians of heading,
 at the upper end of the interval, or twice the noise floor. It is residnet's choice, and stands in
@@ -110,7 +112,7 @@ def level(evidence: Evidence) -> str:
     if evidence.selected not in evidence.rows:
         return ""
     entries = horizons(evidence)
-    if entries and all(entry["windows"] < _FEWEST for entry in entries):
+    if entries and not any(_enough(evidence, entry) for entry in entries):
         return UNKNOWN
     return GOOD if good_until(evidence) else LIMITED
 
@@ -134,6 +136,12 @@ def horizons(evidence: Evidence) -> list[Content]:
     return [most[seconds] for seconds in sorted(most)]
 
 
+def _enough(evidence: Evidence, entry: Content) -> bool:
+    """Return whether a horizon has windows, and logs for an interval, by which to judge a model."""
+    known = all(entry["models"][evidence.selected]["intervals"].values())
+    return known and entry["windows"] >= _FEWEST
+
+
 def _own(evidence: Evidence) -> Content:
     """Return what limits.json says under the protocol of the rows."""
     found: Content = evidence.limits.get(evidence.protocol) or {}
@@ -147,6 +155,8 @@ def good_until(evidence: Evidence) -> float:
         return 0.0
     plants = {name for name, row in evidence.rows.items() if row.get("kind") == "truth"}
     for entry in horizons(evidence):
+        if not _enough(evidence, entry):
+            return until
         models = entry["models"]
         own, ends = models[evidence.selected], models[evidence.selected]["intervals"]
         # what the plant itself leaves, started from measured states, is noise too
@@ -156,10 +166,9 @@ def good_until(evidence: Evidence) -> float:
             least = _SHARE * entry["sailed"] if of == "position" else _TURN
             others = [models[name][of] for name in rivals]
             twice = 2.0 * max(floor[of] for floor in floors)
-            known = ends[of] is not None and entry["windows"] >= _FEWEST
             near = own[of] <= max(twice, _OF_BEST * min(others, default=own[of]))
             beats = ZERO not in models or own[of] <= max(twice, models[ZERO][of])
-            if not (known and near and beats and ends[of][1] <= max(least, twice)):
+            if not (near and beats and ends[of][1] <= max(least, twice)):
                 return until
         until = float(entry["seconds"])
     return until
@@ -170,16 +179,16 @@ def ahead(evidence: Evidence) -> list[str]:
     entries = horizons(evidence)
     if not entries:
         return [compared(evidence)]
-    enough = [entry for entry in entries if entry["windows"] >= _FEWEST]
+    enough = [entry for entry in entries if _enough(evidence, entry)]
     until = good_until(evidence) if enough else 0.0
     chosen = next((e for e in entries if e["seconds"] == until), (enough or entries)[-1])
     off = _off(chosen, evidence.selected, chosen["sailed"])
     after, wanted = f"{chosen['seconds']:.4g} s ahead", []
     if not enough:
-        most = max(entry["windows"] for entry in entries)
         start = (
-            f"{plural(most, 'window')} on {evidence.split} data cannot say how good"
-            f" {evidence.selected} is ({_FEWEST} are needed); {after} it is off by {off}."
+            f"{plural(chosen['windows'], 'window')} of {plural(chosen['logs'], 'log')} on"
+            f" {evidence.split} data cannot say how good {evidence.selected} is ({_FEWEST} of"
+            f" {FEW_LOGS} logs are needed); {after} it is off by {off}."
         )
     elif until:
         start = f"Up to {after}: there {evidence.selected} is off by {off}."
