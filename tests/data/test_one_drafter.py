@@ -15,6 +15,7 @@ import yaml
 from foreign_tables import Style
 
 import residnet
+from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.tasks.inspection import inspect_logs
 
@@ -97,5 +98,5 @@ def test_no_log_is_lost_for_a_roll_that_not_all_of_them_hold(tmp_path: Path) -> 
     logs = residnet.read_logs(tmp_path)
     assert [sorted(log.channels) for log in logs] == [["delta", "u"]] * 3
     (tmp_path / "stopped.csv").write_text("t,surge [m/s],rudder [deg]\n")
-    with pytest.raises(residnet.DataError, match="no row of numbers below it"):
+    with pytest.raises(DataError, match="no row of numbers below it"):
         residnet.read_logs(tmp_path / "stopped.csv")
