@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
+from residnet.core.arrays.paged import row_pieces
 from residnet.core.log import Log
 from residnet.core.stretches import stretches
 from residnet.data.readers.base import unwrap
@@ -58,19 +60,18 @@ def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarr
         return out
     known = values[at]
     padded = np.pad(known, reach, mode="reflect", reflect_type="odd")
+    bent, median = np.empty(known.size), np.empty(known.size)
     # how far a sample lies from the straight lines between its neighbours on both sides
-    pairs = [
-        0.5
-        * (padded[reach - k : known.size + reach - k] + padded[reach + k : known.size + reach + k])
-        for k in range(1, reach + 1)
-    ]
-    bent = known - np.median(np.stack(pairs), axis=0)
-    windows = np.lib.stride_tricks.sliding_window_view(
-        np.pad(bent, half, mode="reflect"), 2 * half + 1
-    )
-    median = np.median(windows, axis=1)
+    for at_once in row_pieces(known.size):
+        around = sliding_window_view(
+            padded[at_once.start : at_once.stop + 2 * reach], 2 * reach + 1
+        )
+        pairs = 0.5 * (around[:, :reach] + around[:, : -reach - 1 : -1])
+        bent[at_once] = known[at_once] - np.median(pairs, axis=1)
+    windows = sliding_window_view(np.pad(bent, half, mode="reflect"), 2 * half + 1)
+    for at_once in row_pieces(known.size):
+        median[at_once] = np.median(windows[at_once], axis=1)
     distance = np.abs(bent - median)
-    spread = SIGMA_OF_MAD * np.median(np.abs(windows - median[:, None]), axis=1)
     # a coarse channel flickers by single steps of its resolution, a spread at the level of rounding
     # is none
     resolution = 2.0 * float(np.quantile(distance[distance > 0.0], 0.1)) if distance.any() else 0.0
@@ -78,7 +79,9 @@ def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarr
         SIGMA_OF_MAD * float(np.median(distance)), resolution, 1e-9 * float(np.abs(known).max())
     )
     # what a smooth channel bends by anyhow is no outlier where it stops bending
-    out[at] = distance > sigmas * np.maximum(np.maximum(floor, spread), np.abs(median))
+    far = np.flatnonzero(distance > sigmas * np.maximum(floor, np.abs(median)))
+    spread = SIGMA_OF_MAD * np.median(np.abs(windows[far] - median[far, None]), axis=1)
+    out[at[far]] = distance[far] > sigmas * spread
     return out
 
 

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -22,6 +22,9 @@ from residnet.core.log import Log
 from residnet.core.names import STATE, nearest
 from residnet.data.readers.base import files_of
 from residnet.data.readers.detect import LOG_ENDINGS, format_of, is_text_table
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 SPLITS = ("train", "validation", "test")
 _ENOUGH = 5
@@ -292,12 +295,28 @@ def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
 def without_copies(logs: Sequence[Log]) -> list[Log]:
     """Return the logs without those whose rows another one holds; the longest stay."""
     common = sorted(set.intersection(*(set(log.channels) for log in logs))) if logs else []
-    hashes = [set(measured_hashes(log, common).tolist()) if common else set() for log in logs]
-    kept: list[int] = []
+    if len(logs) < 2 or not common:
+        return [*logs]
+    shared = _shared_rows([np.unique(measured_hashes(log, common)) for log in logs])
+    kept = np.zeros(len(logs), dtype=bool)
     for i in sorted(range(len(logs)), key=lambda i: -len(logs[i])):
-        if all(len(hashes[i] & hashes[j]) <= _COPIED for j in kept):
-            kept.append(i)
-    return [logs[i] for i in sorted(kept)]
+        own = slice(shared.indptr[i], shared.indptr[i + 1])
+        kept[i] = not (kept[shared.indices[own]] & (shared.data[own] > _COPIED)).any()
+    return [log for log, stays in zip(logs, kept, strict=True) if stays]
+
+
+def _shared_rows(hashes: Sequence[np.ndarray]) -> csr_array:
+    """Return how many distinct rows logs have in common [L, L], by those that two of them hold."""
+    from scipy.sparse import coo_array, csr_array
+
+    owner = np.repeat(np.arange(len(hashes)), [part.size for part in hashes])
+    _, row, count = np.unique(np.concatenate(hashes), return_inverse=True, return_counts=True)
+    twice = count[row] > 1
+    place = owner[twice], row[twice]
+    holds = coo_array((np.ones(twice.sum()), place), (len(hashes), count.size)).tocsr()
+    shared = csr_array(holds @ holds.T)
+    shared.sort_indices()
+    return shared
 
 
 def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = _COPIED) -> None:
@@ -314,8 +333,6 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = _COPIED) -> None:
     Raises:
         DataError: naming the two logs that share most rows.
     """
-    from scipy.sparse import coo_array
-
     flat = [(split, log) for split, members in logs.items() for log in members]
     common = sorted(set.intersection(*(set(log.channels) for _, log in flat))) if flat else []
     one_of = sampling([log for _, log in flat])
@@ -323,15 +340,13 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = _COPIED) -> None:
     hashes = [np.unique(part[part % np.uint64(one_of) == 0]) for part in hashes]
     if len({split for split, _ in flat}) < 2 or not any(h.size for h in hashes):
         return
-    owner = np.repeat(np.arange(len(flat)), [h.size for h in hashes])
-    _, row = np.unique(np.concatenate(hashes), return_inverse=True)
-    holds = coo_array((np.ones(row.size), (row, owner))).tocsr()
+    shared = _shared_rows(hashes).tocoo()
     split_of = np.unique([split for split, _ in flat], return_inverse=True)[1]
-    shared = np.where(split_of[:, None] != split_of[None, :], (holds.T @ holds).toarray(), 0.0)
-    first, second = np.unravel_index(int(np.argmax(shared)), shared.shape)
-    (split_a, a), (split_b, b) = flat[first], flat[second]
-    if not shared[first, second]:
+    across = np.where(split_of[shared.row] != split_of[shared.col], shared.data, 0.0)
+    if not across.any():
         return
+    most = int(np.argmax(across))
+    (split_a, a), (split_b, b) = flat[shared.row[most]], flat[shared.col[most]]
     same = np.intersect1d(measured_hashes(a, common), measured_hashes(b, common)).size
     if same > rows:
         raise DataError(

@@ -23,7 +23,8 @@ from residnet.data.doctor.statistics import (
     blocks_of,
     fit,
     high,
-    regressors,
+    of_inputs,
+    of_motion,
 )
 
 _SURE = 6.0
@@ -331,10 +332,15 @@ def _steering(log: Record) -> tuple[str, np.ndarray]:
     return "", np.zeros(0)
 
 
+_MOST_ROWS = 10_000
+"""Blocks that a rudder's side is told by: more only overlap."""
+
+
 def _answers(
     log: Record, steer: np.ndarray, flow: np.ndarray, good: np.ndarray
 ) -> tuple[float, dict[int, Fit]]:
-    """Return what a yaw model leaves without steering, and fits with it by shift in samples.
+    """Return what a yaw model leaves without steering, and fits with it by shift in samples: that
+    without a shift, and the one that leaves least.
 
     Over blocks of a second or so: the change of r on the integrals of U^2, U r, r|r|, U v, v|v| and
     U^2 times the steering, with the latter shifted in time; nothing where that says nothing.
@@ -356,7 +362,8 @@ def _answers(
     reach = max(min(int(np.argmax(memory < 0.0)), r.size // 8, round(30.0 / log.step)), 3)
     gaps = ~good | (np.append(np.diff(log.t), log.step) > 3.0 * log.step)
     margin = reach + WINDOW
-    first = np.arange(margin, len(log) - margin - size, max(round(0.2 / log.step), 1))
+    stride = max(round(0.2 / log.step), len(log) // _MOST_ROWS, 1)
+    first = np.arange(margin, len(log) - margin - size, stride)
     blocks = Blocks(log.t, first, size)
     blocks = replace(blocks, first=first[blocks.clear_of(gaps)])
     if blocks.first.size < FEWEST or top - low < 4.0 * log.noise("r"):
@@ -364,8 +371,19 @@ def _answers(
     terms = np.stack((flow**2, flow * r, r * np.abs(r), flow * v, v * np.abs(v)), axis=-1)
     known, y = blocks.integrals(terms)(0), blocks.change(r)
     given = blocks.integrals((flow**2 * np.nan_to_num(steer))[:, None])
-    shifts = {round(float(shift)) for shift in np.linspace(-reach, reach, 61)}
-    fits = {shift: fit(np.column_stack((known, given(shift))), y) for shift in sorted(shifts)}
+    shifts = sorted({round(float(shift)) for shift in np.linspace(-reach, reach, 61)})
+    told = np.isfinite(known).all(axis=1) & np.isfinite(y)
+    if told.sum() < FEWEST:
+        return 0.0, {}
+    length = np.maximum(np.linalg.norm(known[told], axis=0), 1e-300)
+    side, sizes, _ = np.linalg.svd(known[told] / length, full_matrices=False)
+    side = side[:, sizes > 1e-5 * sizes[0]]
+    # what steers explains by the part of it that the other terms do not
+    tried = np.column_stack([given(shift)[told] for shift in shifts])
+    rest, own = (part - side @ (side.T @ part) for part in (y[told], tried))
+    gain = (rest @ own) ** 2 / np.maximum((own**2).sum(axis=0), 1e-300)
+    surest = shifts[int(np.argmax(gain))]
+    fits = {s: fit(np.column_stack((known, given(s))), y) for s in sorted({0, surest})}
     return fit(known, y).left, fits
 
 
@@ -424,15 +442,23 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     inside = (first >= reach) & (first + blocks.size + reach < len(log))
     blocks = replace(blocks, first=first[inside])
     other = [name for name in log if name in ("n", "delta", "wind_speed") and name not in names]
-    moving, fixed = ({n: log[n] for n in part} for part in (log.moving, other))
     y = blocks.change(log[answer])
     sums: dict[int, np.ndarray] = {}
+    # the flow over a rudder falls as the vessel turns: without their product in the fit the answer
+    # seems to come early
+    moving = {name: blocks.sampled(log[name]) for name in log.moving}
+    driving = [name for name in (*other, *names) if float(np.nanstd(log[name])) > 0.0]
+    linear = len(driving) > 4
+
+    def given(part: Sequence[str], shift: int) -> list[np.ndarray]:
+        inputs = [blocks.sampled(log[name], shift) for name in driving if name in part]
+        return of_inputs(inputs, moving.get("u"), linear=linear)
+
+    ones = np.ones((blocks.first.size, blocks.size + 1))
+    fixed = blocks.summed([ones, *of_motion(moving), *given(other, 0)])
 
     def terms(shift: int) -> np.ndarray:
-        # the flow over a rudder falls as the vessel turns: without their product in the fit the
-        # answer seems to come early
-        late = {name: np.roll(log[name], shift) for name in names}
-        return blocks.integrals(regressors(moving, {**fixed, **late}, len(log)))(0)
+        return np.column_stack((fixed, blocks.summed(given(names, shift))))
 
     def left(shift: int) -> np.ndarray:
         """Return the squares [K] that a fit leaves with the inputs shifted, NaN where unknown."""

@@ -192,6 +192,8 @@ def fit(x: np.ndarray, y: np.ndarray) -> Fit:
 _BLOCK_SAMPLES, _BLOCK_SECONDS = 16, 3.0
 # blocks begin so many times in the length of one
 _OVERLAP = 4
+# blocks and lags of a long log that are looked at, evenly spread: more tell the same
+_MOST_BLOCKS, _MOST_SAMPLES = 5_000, 50_000
 # over a block each velocity changes by so many standard deviations of its noise, where it can
 _OVER_NOISE = 10.0
 
@@ -240,6 +242,15 @@ class Blocks:
 
         return at
 
+    def sampled(self, values: np.ndarray, shift: int = 0) -> np.ndarray:
+        """Return values [T] at the samples of each block [K, size + 1], `shift` samples early."""
+        return np.asarray(values[self.first[:, None] + np.arange(-shift, self.size + 1 - shift)])
+
+    def summed(self, columns: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the integrals [K, k] of columns that were sampled, each [K, size + 1]."""
+        half = 0.5 * np.diff(self.sampled(self.t), axis=1)
+        return np.stack([((c[:, 1:] + c[:, :-1]) * half).sum(axis=1) for c in columns], axis=-1)
+
 
 def blocks_of(log: Record, *moving: str) -> Blocks:
     """Return blocks over which some velocities change by more than their noise."""
@@ -257,27 +268,39 @@ def blocks_of(log: Record, *moving: str) -> Blocks:
         if min(over, default=_OVER_NOISE) >= _OVER_NOISE:
             size = longer
             break
-    return Blocks(log.t, np.arange(0, len(log) - size, max(size // _OVERLAP, 1)), size)
+    stride = max(size // _OVERLAP, (len(log) - size) // _MOST_BLOCKS, 1)
+    return Blocks(log.t, np.arange(0, len(log) - size, stride), size)
 
 
 def regressors(
     velocity: Mapping[str, np.ndarray], inputs: Mapping[str, np.ndarray], count: int
 ) -> np.ndarray:
     """Return a polynomial [T, k] of second degree in velocities and inputs that knows no vessel."""
-    columns = [np.ones(count), *velocity.values()]
-    columns += [values * np.abs(values) for values in velocity.values()]
+    driving = [values for values in inputs.values() if np.nanstd(values) > 0.0]
+    columns = [np.ones(count), *of_motion(velocity)]
+    # beyond four inputs each enters linearly only
+    columns += of_inputs(driving, velocity.get("u"), linear=len(driving) > 4)
+    return np.stack(columns, axis=-1)
+
+
+def of_motion(velocity: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """Return the terms of the regressors that hold velocities alone."""
+    columns = [*velocity.values(), *(values * np.abs(values) for values in velocity.values())]
     if "u" in velocity:
         columns += [velocity["u"] * velocity[name] for name in ("v", "r") if name in velocity]
     if "v" in velocity and "r" in velocity:
         columns.append(velocity["v"] * velocity["r"])
-    driving = [values for values in inputs.values() if np.nanstd(values) > 0.0]
-    columns += driving
-    # beyond four inputs each enters linearly only
-    if len(driving) <= 4:
-        columns += [values * np.abs(values) for values in driving]
-        if "u" in velocity:
-            columns += [velocity["u"] * np.abs(velocity["u"]) * values for values in driving]
-    return np.stack(columns, axis=-1)
+    return columns
+
+
+def of_inputs(
+    driving: Sequence[np.ndarray], u: np.ndarray | None, *, linear: bool
+) -> list[np.ndarray]:
+    """Return the terms of the regressors that hold inputs; `u` is the speed ahead."""
+    if linear:
+        return [*driving]
+    flow = [] if u is None else [u * np.abs(u) * values for values in driving]
+    return [*driving, *(values * np.abs(values) for values in driving), *flow]
 
 
 class Agreement(NamedTuple):
@@ -309,6 +332,7 @@ def agreement(reference: np.ndarray, measured: np.ndarray, step: float) -> Agree
     at = np.flatnonzero(np.isfinite(reference[reach:-reach]) & known.all(axis=1)) + reach
     if at.size < FEWEST:
         return None
+    at = at[:: -(-at.size // _MOST_SAMPLES)]
     a, lags = reference[at], range(-reach, reach + 1)
     spread, std = float(a.std()), np.array([measured[at + k].std() for k in lags])
     if spread == 0.0 or std.min() <= 1e-12 * np.nanmax(np.abs(measured)):

@@ -480,12 +480,13 @@ def jumps(log: Record, found: Check) -> Iterator[Finding]:
         if np.isfinite(change).sum() < 50:
             continue
         change = np.nan_to_num(change)
-        around = np.lib.stride_tricks.sliding_window_view(np.pad(change, 4, mode="edge"), 9)
-        beside = np.sort(around, axis=1)[:, -2]
         low, high = np.nanquantile(values, (0.01, 0.99))
         # beyond noise, beyond what goes on beside it, and a good part of the whole range
         least = max(8.0 * noise_of(values), 0.3 * float(high - low))
-        over = change > np.maximum(least, 4.0 * beside)
+        over = change > least
+        if over.any():
+            around = np.lib.stride_tricks.sliding_window_view(np.pad(change, 4, mode="edge"), 9)
+            over[over] = change[over] > 4.0 * np.sort(around[over], axis=1)[:, -2]
         if over.any():
             at = int(np.argmax(np.where(over, change, 0.0)))
             text = (
