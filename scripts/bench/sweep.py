@@ -1,13 +1,14 @@
-"""Kill a sweep twice, resume it, and compare it with an undisturbed one; time its workers.
+"""Kill a sweep or its workers, and compare it with an undisturbed one; time its workers.
 
 A sweep of `--trials` small fits runs with two workers. It is killed by SIGKILL at two random
 moments and resumed with `--resume`. All trials have to be finished in the end, no process may
 outlive the one that was killed, and for grid and random search every value has to be that of an
-undisturbed sweep. Then the undisturbed sweep's throughput is compared with that of one worker in a
-process of its own (without the start of the processes, which both have).
+undisturbed sweep. With `--lose` one worker is killed at both moments instead, and the sweep has to
+come to its end by itself. Then the undisturbed sweep's throughput is compared with that of one
+worker in a process of its own (without the start of the processes, which both have).
 
     python scripts/bench/sweep.py [--trials 40] [--search grid random] [--runner processes]
-        [--seed 0] [--throughput] [--out FOLDER]
+        [--seed 0] [--lose] [--throughput] [--out FOLDER]
 """
 
 from __future__ import annotations
@@ -136,6 +137,24 @@ def killed(sweep: Path, out: Path, trials: int, chance: random.Random) -> tuple[
     return orphans, kills
 
 
+def workers_lost(sweep: Path, out: Path, trials: int, chance: random.Random) -> tuple[int, int]:
+    """Run a sweep and kill one of its workers twice; returns the sweep's exit code, and kills."""
+    running, kills = subprocess.Popen(command(sweep, out), stderr=subprocess.DEVNULL), 0
+    for share in sorted(chance.uniform(0.05, 0.9) for _ in range(2)):
+        while running.poll() is None and done(out) < share * trials:
+            time.sleep(chance.uniform(0.01, 0.2))
+        lines = [
+            (one, Path(f"/proc/{one}/cmdline").read_bytes())
+            for one in descendants(running.pid)
+            if alive(one)
+        ]
+        workers = [one for one, line in lines if b"spawn_main" in line or b"ray::carry" in line]
+        if workers:
+            os.kill(chance.choice(workers), signal.SIGKILL)
+            kills += 1
+    return running.wait(), kills
+
+
 def values(out: Path) -> list[tuple[Any, ...]]:
     """Return number, state, values and error of every trial."""
     rows = json.loads((out / "sweep.json").read_text())["trials"]
@@ -156,6 +175,7 @@ def main() -> int:
     parser.add_argument("--search", nargs="+", default=["grid", "random"])
     parser.add_argument("--runner", default="processes", choices=["processes", "ray"])
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--lose", action="store_true", help="kill workers, not the sweep")
     parser.add_argument("--throughput", action="store_true", help="time one worker and two")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
@@ -169,7 +189,8 @@ def main() -> int:
             sweep = config(folder, search, given.trials, given.runner, 2)
             calm, disturbed = folder / f"{search}_calm", folder / f"{search}_killed"
             two = rate(sweep, calm, given.trials)
-            orphans, kills = killed(sweep, disturbed, given.trials, chance)
+            disturb = workers_lost if given.lose else killed
+            orphans, kills = disturb(sweep, disturbed, given.trials, chance)
             finished = sum(state == "finished" for _, state, _, _ in values(disturbed))
             same = values(calm) == values(disturbed)
             best = min(value for *_, value in values(disturbed) if value is not None)

@@ -8,12 +8,15 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from tiny import SWEEP, TINY, call
+
+from residnet.core.processes import ApartProcesses
 
 pytest.importorskip("optuna")
 
@@ -176,6 +179,37 @@ def _alive(process: int) -> bool:
     except OSError:
         return False
     return state != "Z"
+
+
+def test_a_lost_process_costs_its_own_trial_alone(
+    sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from residnet.tasks import sweep as running
+
+    begun: list[int] = []
+
+    def lost(*words: Any) -> Any:
+        begun.append(words[3])
+        if words[3] == 1 or begun == [0]:
+            raise BrokenProcessPool("a process ended")
+        return running.Ended(float(words[3]), False, "", 0.0)
+
+    monkeypatch.setattr(running, "carry_out_trial", lost)
+    space = {**SWEEP["space"], WINDOW: {"choices": [0.9, 1.1, 1.3]}}
+    words = ["run", sweep, "--out", tmp_path / "out", "-s", f"space={json.dumps(space)}"]
+    assert call(monkeypatch, *words, "-s", "runner.workers=1") == 0
+    rows = _read(tmp_path / "out")["trials"]
+    assert [begun.count(row["number"]) for row in rows] == [2, 3, *[1] * (len(rows) - 2)]
+    failed = [row["number"] for row in rows if row["state"] == "failed"]
+    assert failed == [1]
+    assert "lost 3 times" in rows[1]["fault"]
+
+
+def test_a_process_that_is_killed_is_replaced() -> None:
+    with ApartProcesses(1) as pool:
+        with pytest.raises(BrokenProcessPool):
+            pool.submit(os._exit, 1).result()
+        assert pool.submit(abs, -2).result() == 2
 
 
 @pytest.mark.long

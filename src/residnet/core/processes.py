@@ -81,12 +81,7 @@ def processes(
     Raises:
         FitError: where the system ends one of the processes.
     """
-    with ProcessPoolExecutor(
-        workers,
-        mp_context=get_context("spawn"),
-        initializer=begin_worker,
-        initargs=(begin, given),
-    ) as pool:
+    with _pool(workers, begin, given) as pool:
         try:
             yield pool
         except BrokenProcessPool as error:
@@ -99,6 +94,54 @@ def processes(
             for process in active_children():
                 process.terminate()
             raise
+
+
+def _pool(
+    workers: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()
+) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(
+        workers, get_context("spawn"), initializer=begin_worker, initargs=(begin, given)
+    )
+
+
+class ApartProcesses(Executor):
+    """Processes of which one that the system ends loses its own work alone, and is replaced.
+
+    That work ends with a `BrokenProcessPool`. Leaving a `with` block by an exception ends all
+    processes at once.
+
+    Args:
+        workers: number of processes, and of the works that may be under way.
+    """
+
+    def __init__(self, workers: int) -> None:
+        # one pool for each: a lost process ends its whole pool
+        self._pools = [_pool(1) for _ in range(workers)]
+        self._last: list[Future[Any] | None] = [None] * workers
+
+    def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Hand work to a process that is free."""
+        free = next(i for i, last in enumerate(self._last) if last is None or last.done())
+        try:
+            future = self._pools[free].submit(work, *args, **kwargs)
+        except BrokenProcessPool:
+            self._pools[free].shutdown()
+            self._pools[free] = _pool(1)
+            future = self._pools[free].submit(work, *args, **kwargs)
+        self._last[free] = future
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes, after their work where it is waited for."""
+        for pool in self._pools:
+            pool.shutdown(wait, cancel_futures=cancel_futures)
+
+    def __exit__(self, kind: Any, value: Any, trace: Any) -> None:
+        if kind is not None:
+            self.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+        self.shutdown()
 
 
 class ThisProcess(Executor):

@@ -9,8 +9,10 @@ import itertools
 import json
 import logging
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, final
@@ -28,7 +30,7 @@ from residnet.core.errors import (
 )
 from residnet.core.files import read_json
 from residnet.core.names import nearest
-from residnet.core.processes import ThisProcess, processes, spread
+from residnet.core.processes import ApartProcesses, ThisProcess, spread
 from residnet.core.progress import Progress, listen, report, say
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.sweep import trials_table
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
 
 _MOST = 100_000
 """Most trials of a sweep."""
+_LOSSES = 3
+"""Times that a trial may lose its process before it has failed: twice is an accident."""
 _STALE = 10
 """Seconds after which the lock of a killed process is taken away."""
 _PRIME = 7_919
@@ -316,17 +320,18 @@ class ProcessesConfig(Config):
 
     @contextmanager
     def executor(self) -> Iterator[Executor]:
-        """Hold the processes; an interruption ends them all at once. One worker is this process.
-
-        Raises:
-            FitError: where the system ends one of them.
-        """
+        """Hold the processes; an interruption ends them all at once. One worker is this process."""
         if self.side_by_side == 1:
             with spread(1):
                 yield ThisProcess()
             return
-        with processes(self.side_by_side) as pool:
+        with ApartProcesses(self.side_by_side) as pool:
             yield pool
+
+    @property
+    def losses(self) -> tuple[type[Exception], ...]:
+        """Errors with which a trial ends whose process was lost."""
+        return (BrokenProcessPool,)
 
 
 class RayConfig(Config):
@@ -367,7 +372,7 @@ class RayConfig(Config):
         """Hold a connection to Ray, whose processes end with this one.
 
         Raises:
-            FitError: where the cluster cannot be reached or ends a process.
+            FitError: where the cluster cannot be reached, or ends a trial that was not lost.
         """
         self.check()
         import ray
@@ -393,11 +398,24 @@ class RayConfig(Config):
         finally:
             ray.shutdown()
 
+    @property
+    def losses(self) -> tuple[type[Exception], ...]:
+        """Errors with which a trial ends whose process, node or memory was lost."""
+        from ray import exceptions as lost
+
+        return (
+            lost.WorkerCrashedError,
+            lost.NodeDiedError,
+            lost.OutOfMemoryError,
+            lost.ObjectLostError,
+        )
+
 
 class _RayExecutor(Executor):
     """An executor whose work runs as Ray tasks."""
 
     def __init__(self, ray: Any, cpus: float, gpus: float) -> None:
+        # the sweep counts what is lost, and begins it again
         self._wrap = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)
 
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -514,9 +532,12 @@ class SweepConfig(Task):
             journal.write_bytes(content[: content.rfind(b"\n") + 1])
         study = open_study(self, folder.path)
         trials, running = Trials(self, study), dict[Future[Ended], Any]()
+        lost, again = Counter[int](), list[Any]()
         with self.runner.executor() as pool:
             while True:
-                while len(running) < self.runner.side_by_side and (trial := trials.next()):
+                while len(running) < self.runner.side_by_side and (
+                    trial := again.pop(0) if again else trials.next()
+                ):
                     work = (self, folder.path, trial._trial_id, trial.number, dict(trial.params))
                     running[pool.submit(carry_out_trial, *work)] = trial
                 if not running:
@@ -524,7 +545,20 @@ class SweepConfig(Task):
                 done, _ = wait(running, return_when=FIRST_COMPLETED)
                 # in the order of their numbers, so that nothing hangs on chance
                 for future in sorted(done, key=lambda one: running[one].number):
-                    trials.tell(running.pop(future), future.result())
+                    trial = running.pop(future)
+                    try:
+                        trials.tell(trial, future.result())
+                    except self.runner.losses as error:
+                        lost[trial.number] += 1
+                        if lost[trial.number] < _LOSSES:
+                            say(f"  trial {trial.number}: its process was lost, it goes on anew")
+                            again.append(trial)
+                            continue
+                        fault = (
+                            f"its process was lost {_LOSSES} times ({str(error).splitlines()[0]});"
+                            " the memory may not be enough, so give fewer runner.workers"
+                        )
+                        trials.tell(trial, Ended(None, False, fault, 0.0))
 
 
 def open_study(config: SweepConfig, folder: Path) -> optuna.Study:
