@@ -44,7 +44,9 @@ def made(noise: float = 0.0, count: int = 400, groups: int = 8) -> Samples:
 
 
 def test_exact_coefficients_from_noise_free_samples() -> None:
-    config = RegressorsConfig(terms={axis: tuple(row) for axis, row in TRUTH.items()})  # type: ignore[misc]
+    config = RegressorsConfig.model_validate(
+        {"terms": {axis: [*row] for axis, row in TRUTH.items()}}
+    )
     baseline = config.build(NAMES)
     table = config.fit(baseline, made())
     assert [(entry.axis, entry.term) for entry in table] == [
@@ -80,7 +82,9 @@ def test_an_axis_uses_its_own_terms_only() -> None:
 
 
 def test_standard_errors_cover_the_truth() -> None:
-    config = RegressorsConfig(terms={axis: tuple(row) for axis, row in TRUTH.items()})  # type: ignore[misc]
+    config = RegressorsConfig.model_validate(
+        {"terms": {axis: [*row] for axis, row in TRUTH.items()}}
+    )
     table = config.fit(config.build(NAMES), made(noise=0.05, count=4000, groups=40))
     score = [(entry.value - TRUTH[entry.axis[0]][entry.term]) / entry.error for entry in table]
     assert max(map(abs, score)) < 4

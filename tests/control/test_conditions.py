@@ -16,6 +16,7 @@ from residnet.control.heading.conditions import (
     ConditionedLoop,
     ConditionedRun,
     ConditionsConfig,
+    HeadingChanges,
     gauss_markov,
     quiet,
     wave_motion,
@@ -48,7 +49,9 @@ class Ramp(Policy):
         return s + 0.01 * DEG, s + 0.01 * DEG
 
 
-def drawn(config: ConditionsConfig, rows: int = 4, seed: int = 3, share: float = 1.0):  # type: ignore[no-untyped-def]
+def drawn(
+    config: ConditionsConfig, rows: int = 4, seed: int = 3, share: float = 1.0
+) -> HeadingChanges:
     return config.draw(rows, config.dt, torch.Generator().manual_seed(seed), share)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -37,8 +38,9 @@ def spec(**changes: object) -> ModelSpec:
 
 def test_round_trip(tmp_path: Path) -> None:
     saved, model = spec(), spec().build()
+    theta: Any = model.baseline.theta
     with torch.no_grad():
-        model.baseline.theta.copy_(torch.randn(3, 3, dtype=torch.float64))  # type: ignore[union-attr, operator]
+        theta.copy_(torch.randn(3, 3, dtype=torch.float64))
     save_model(tmp_path / "baseline", saved, model)
     assert sorted(path.name for path in (tmp_path / "baseline").iterdir()) == [
         "model.json",
@@ -46,7 +48,8 @@ def test_round_trip(tmp_path: Path) -> None:
     ]
     loaded, again = load_model(tmp_path / "baseline")
     assert loaded == saved
-    assert torch.equal(again.baseline.theta, model.baseline.theta)  # type: ignore[union-attr, arg-type]
+    found: Any = again.baseline.theta
+    assert torch.equal(found, theta)
     assert (again.dt, again.integrator) == (0.05, "semi_implicit_euler")
     assert loaded.ranges == {
         "u": (-0.1, 0.1),

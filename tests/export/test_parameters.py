@@ -144,8 +144,9 @@ def drawn(seed: int, lift: float) -> tuple[ModelSpec, HybridDynamics]:
     content["baseline"] = {"kind": "regressors", "terms": HULL_TERMS}
     spec = ModelSpec.model_validate(content)
     model = spec.build().double()
+    theta: Any = model.baseline.theta
     with torch.no_grad():
-        model.baseline.theta.copy_(torch.from_numpy(np.linalg.solve(m, rows)))  # type: ignore[union-attr, operator]
+        theta.copy_(torch.from_numpy(np.linalg.solve(m, rows)))
     return spec, model
 
 

@@ -29,7 +29,8 @@ def ready(kind: str, **config: Any) -> ResidualHead:
     torch.manual_seed(3)
     if kind == "genetic":
         pytest.importorskip("deap", reason="genetic programming needs the extra gp")
-    head: ResidualHead = KINDS[kind](**QUICK.get(kind, {}), **config).build(NAMES)  # type: ignore[attr-defined]
+    settings: Any = KINDS[kind](**QUICK.get(kind, {}), **config)
+    head: ResidualHead = settings.build(NAMES)
     head.calibrate(made())
     if isinstance(head, ClosedFormHead):
         head.solve(made())
@@ -163,8 +164,9 @@ def test_a_stored_model_is_the_same_to_the_last_bit(kind: str, tmp_path: Path) -
     model = spec.build()
     model.head = ready(kind)
     model.head.set_step(model.dt)
+    theta: Any = model.baseline.theta
     with torch.no_grad():
-        model.baseline.theta.copy_(torch.randn(3, 5, dtype=torch.float64) * 0.1)  # type: ignore[operator, union-attr]
+        theta.copy_(torch.randn(3, 5, dtype=torch.float64) * 0.1)
     save_model(tmp_path / "mine", spec, model)
     again_spec, again = load_model(tmp_path / "mine")
     assert again_spec == spec

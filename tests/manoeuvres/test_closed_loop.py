@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -239,7 +240,8 @@ def test_four_corner_course_of_the_ferry(vessel: str) -> None:
     began.
     """
     plant = load_vessel(vessel).build()
-    mass, omega = plant.hull.mass.diagonal(), torch.tensor([0.26, 0.26, 0.4], dtype=torch.float64)  # type: ignore[union-attr, operator]
+    hull: Any = plant.hull
+    mass, omega = hull.mass.diagonal(), torch.tensor([0.26, 0.26, 0.4], dtype=torch.float64)
     gains = [
         tuple((part).tolist())
         for part in (mass * omega**2, 0.1 * mass * omega**3, 2 * mass * omega)

@@ -4,7 +4,7 @@ each kind.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -135,9 +135,11 @@ def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
 
 @pytest.mark.parametrize("first", ["starboard", "port"])
 @pytest.mark.parametrize("psi", [0.0, 2.5, -7.0])
-def test_zigzag_switches_at_its_bound(first: str, psi: float, plant: Plant) -> None:
+def test_zigzag_switches_at_its_bound(
+    first: Literal["starboard", "port"], psi: float, plant: Plant
+) -> None:
     bound = float(np.radians(15))
-    zigzag = Zigzag(drive=0.5, steer=0.4, start=4.0, heading=bound, first=first)  # type: ignore[arg-type]
+    zigzag = Zigzag(drive=0.5, steer=0.4, start=4.0, heading=bound, first=first)
     states, commands = fly(plant, [zigzag], seconds=40.0, psi=psi)
     heading = states[0, :-1, 2].numpy() - psi
     side = np.sign((commands[0, :, 0] - commands[0, :, 1]).numpy())

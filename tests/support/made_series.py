@@ -13,7 +13,8 @@ from residnet.judge.goodness import block_interval, independent_interval
 def autoregressive(phi: float, count: int, length: int, seed: int) -> np.ndarray:
     """[count, length], the beginning left out."""
     noise = np.random.default_rng(seed).normal(size=(count, length + 300))
-    return lfilter([1.0], [1.0, -phi], noise, axis=1)[:, 300:] * math.sqrt(1 - phi**2)  # type: ignore[no-any-return]
+    series: np.ndarray = lfilter([1.0], [1.0, -phi], noise, axis=1)
+    return series[:, 300:] * math.sqrt(1 - phi**2)
 
 
 def coverage(phi: float, count: int, length: int, seed: int) -> dict[str, float]:

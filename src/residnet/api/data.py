@@ -317,7 +317,8 @@ def prepare(
     """
     with hearing(progress):
         if like is not None:
-            prepared = _prepared({"external": read_logs(logs)}, like.signals, like.prepare)  # type: ignore[arg-type]
+            external = read_logs(logs)  # type: ignore[arg-type]
+            prepared = _prepared({"external": external}, like.signals, like.prepare)
             return Data(prepared, like.signals, like.prepare, like.evaluation)
         splits, source = _splits(logs)
         given = settings.get("velocities")

@@ -379,7 +379,7 @@ def fit(
         del given["integrator"]
     if not isinstance(data, Data):
         logs = (str, PathLike, Log, list, tuple, Mapping)
-        require(data, logs, "fit: expected logs, or data from residnet.prepare")  # type: ignore[arg-type]
+        require(data, logs, "fit: expected logs, or data from residnet.prepare")
         data = prepare(data)
     sections = {"prepare": data.prepare, "signals": data.signals, "evaluation": data.evaluation}
     config: FitSettings = validate(plain({**sections, **given}), FitSettings, "fit")

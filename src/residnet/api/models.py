@@ -305,7 +305,7 @@ def _objections(name: str, metrics: Sequence[Mapping[str, Any]]) -> list[str]:
     return objections(Evidence(name, split, rows, baseline))
 
 
-def require(given: Any, kind: type[Any], expected: str) -> None:
+def require(given: Any, kind: type[Any] | tuple[type[Any], ...], expected: str) -> None:
     """Stop where an argument is of another kind.
 
     Raises:

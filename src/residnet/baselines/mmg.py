@@ -34,6 +34,7 @@ from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.least_squares import descend
 
 _WAKE_SLOPE = 2.0
+"""C_1 of the wake in drift: that of the KVLCC2 in the source."""
 # keeps the drift angle defined for a ship at rest; (m/s)^2
 _STILL = 1e-6
 

@@ -259,6 +259,7 @@ def living_rows(rows: Sequence[Sequence[str]], names: Sequence[str]) -> list[tup
 
 
 _POINTS = 400
+"""Samples, up to twice as many, that tell slopes; chosen by hand: a median needs few."""
 
 
 def _own_slopes(library: TermLibrary, samples: Samples) -> Tensor:

@@ -45,7 +45,9 @@ from residnet.core.units import si_unit, to_si, units
 T = TypeVar("T")
 
 _LONGEST_FILE = 2_000_000
+"""Bytes; chosen by hand, far above any config."""
 _HUGE = 1e30
+"""Largest size of a number, its inverse the least; no vessel has it, and float32 ends at 3e38."""
 
 
 class Config(BaseModel):

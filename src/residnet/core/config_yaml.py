@@ -19,9 +19,8 @@ from residnet.core.errors import ConfigError
 KeyPath = tuple[str | int, ...]
 """Where a value stands in a config: keys of mappings and indices of lists."""
 
-_MOST_VALUES = 200_000
-_DEEPEST = 60
-_LONGEST_NUMBER = 400
+_MOST_VALUES, _DEEPEST, _LONGEST_NUMBER = 200_000, 60, 400
+"""Values, levels and digits, chosen by hand: no config has so many, and far more take minutes."""
 _PREFIX = "tag:yaml.org,2002:"
 # in the order in which they are tried: a whole number is also a valid float
 _SCALARS: tuple[tuple[str, str, str], ...] = (

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _ROOM = 20_000_000
 """Bytes that must be free before a run."""
 _PROBE = 65_536
+"""Bytes that are written on trial: some blocks of any disk, since quotas count blocks."""
 _DEEPER = 300
 """Bytes that the names of a run's own folders and files add to its path, that of a log included."""
 

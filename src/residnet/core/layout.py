@@ -53,7 +53,7 @@ class StateLayout:
 
     @property
     def pose_columns(self) -> slice:
-        """Columns of the pose."""
+        """The first columns, those of north, east and heading."""
         return slice(0, len(self.pose))
 
     @property

@@ -17,6 +17,7 @@ from residnet.core.names import CHANNEL_UNITS, nearest
 
 SCHEMA = "residnet.log/1"
 _PIECE = 500_000
+"""Rows that are written at a time: 4 MB of each channel."""
 
 
 _WORDS: dict[str, type | tuple[type, ...]] = {

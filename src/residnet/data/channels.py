@@ -20,14 +20,13 @@ STILL = 1e-3
 SPIKE = "spike"
 # a spike leaves the median of its neighbours by so many times the usual change from sample to
 # sample, or the usual distance from that median, and returns within so many samples
-_CHANGES = 12.0
-_DISTANCES = 30.0
-_LONGEST = 2
+_CHANGES, _DISTANCES, _LONGEST = 12.0, 30.0, 2
 # the least of both, in usual changes
 _GLANCE = 3.0
 # or leaves the range of the whole log by so many times that range
 _BEYOND = 0.9
 _FEWEST = 20
+"""Samples below which a channel has no usual change; chosen by hand."""
 _MOVED = ("x", "y", "psi", "phi", "u", "v", "r", "p")
 
 

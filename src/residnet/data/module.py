@@ -213,5 +213,5 @@ class RowsDataModule(EpochDataModule):
 
 
 def epoch_seed(seed: int, epoch: int) -> int:
-    """Return the seed of one epoch of a training."""
+    """Return a seed of torch, below 2^63: resumed trainings shuffle as uninterrupted ones do."""
     return (seed * 7_919 + epoch) % (2**63)

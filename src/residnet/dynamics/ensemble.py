@@ -88,7 +88,8 @@ class MeanHead(ResidualHead):
         return torch.cat(memory, dim=-1)
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
-        low, high = zip(*(member.memory_range() for member in self.members), strict=True)  # type: ignore[operator]
+        ranges = [member.memory_range() for member in self.members]  # type: ignore[operator]
+        low, high = zip(*ranges, strict=True)
         return torch.cat(low), torch.cat(high)
 
     def parameter_count(self) -> list[float]:

@@ -32,6 +32,7 @@ from residnet.physics.signals import FORCE_CHANNELS
 
 Matrix = npt.NDArray[np.float64]
 _SAMPLES = 4000
+"""Velocities that damping is fitted to; chosen by hand, for at most four coefficients an axis."""
 # surge is damped by itself, sway and yaw by both
 _DAMPED_BY = ((0,), (1, 2), (1, 2))
 
@@ -166,7 +167,7 @@ class {title}:
 
 
 def vehicle_python(name: str, found: Coefficients) -> str:
-    """Return a vehicle class for PythonVehicleSimulator."""
+    """Return a Python module whose class steps as those of PythonVehicleSimulator do."""
     title = "".join(part.capitalize() for part in name.split("_"))
     return _VEHICLE.format(
         name=name,
@@ -292,12 +293,11 @@ def _rigid(file: Path) -> dict[str, float]:
     if not file.is_file():
         raise UsageError(f"{ask}; accelerations do not tell how much of a mass is added mass")
     content, _ = parse(file.read_text(), str(file))
-    found = {name: content.get(name) for name in _RIGID} if isinstance(content, dict) else {}
-    wrong = [
-        name
-        for name in _RIGID
-        if not isinstance(found.get(name), int | float) or not 0 < float(found[name]) < math.inf  # type: ignore[arg-type]
-    ]
-    if wrong:
-        raise UsageError(f"{ask}; {wrong[0]} is missing or no positive number")
-    return {name: float(value) for name, value in found.items() if value is not None}
+    content = content if isinstance(content, dict) else {}
+    found: dict[str, float] = {}
+    for name in _RIGID:
+        value = content.get(name)
+        if not isinstance(value, int | float) or not 0 < value < math.inf:
+            raise UsageError(f"{ask}; {name} is missing or no positive number")
+        found[name] = float(value)
+    return found

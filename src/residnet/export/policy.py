@@ -31,8 +31,11 @@ HEADING = {"psi": "rad", "u": "m/s", "r": "rad/s"}
 """What a heading policy sees: heading, speed and yaw rate."""
 COURSE = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
 """What a policy along a course sees: north and east, heading, surge and sway velocity, yaw rate."""
-PARITY_STEPS = 1000
-PARITY_TOLERANCE = 1e-4
+PARITY_STEPS, PARITY_TOLERANCE = 1000, 1e-4
+"""Steps over which exported commands must agree, and to which share of the rudder's limit.
+
+Of a limit of 35 deg it is 0.0035 deg, which no actuator follows, and float32 rounds less.
+"""
 _TURNS = 2000.0 * math.pi
 """Largest heading in rad."""
 _FAR = 1e3

@@ -28,6 +28,7 @@ from residnet.export.torchscript import require_shape, size
 from residnet.heads.base import ResidualHead
 
 PARITY_STEPS = 2000
+"""Steps over which an export must follow the model: long enough for its memory to drift."""
 PAST = 50
 """Steps of measured past that warm the memory up."""
 _TRACKS, _HELD = 16, 20

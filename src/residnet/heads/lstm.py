@@ -236,7 +236,7 @@ class LstmNetwork(nn.Module):
             held.append(near)
         if self.fed:
             # velocities, which the memory does not see, may be anything
-            z = torch.cat((p.new_zeros(p.shape[:-1] + (self.features.dof,)), p), dim=-1)  # noqa: RUF005
+            z = nn.functional.pad(p, (self.features.dof, 0))
             h, s = self.core.along(self.remembered(self.features(z)), s)
             held.append(s)
             return row + self.dropout(h) @ own.T, held

@@ -497,6 +497,7 @@ _LEFT_OPEN = 1.0
 That is one standard error: clean logs have fitted the model too, and look better than others.
 """
 _NOTHING = 1e-12
+"""Keeps quotients of information defined where there is none."""
 _AT_ODDS = 1.345
 """Standard deviations by which a log may differ from the others before it counts for less.
 

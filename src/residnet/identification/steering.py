@@ -13,6 +13,7 @@ from residnet.core.log import Log
 
 _RUDDERS = ("cmd_delta", "delta")
 _SAMPLES = 50
+"""Usable samples below which K and T are not looked for; chosen by hand."""
 _LEAST = 1e-3
 """Least spread of the rudder in rad, rms."""
 

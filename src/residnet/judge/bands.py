@@ -251,11 +251,13 @@ _SMOOTHED = 0.11
 _RIDGE = 0.02
 """Pull of the slopes to zero, against measures of unit variance."""
 _ROUNDS = 2
+"""Turns of shape and slopes, each given the other; chosen by hand."""
 _FOLDS = 5
 """Groups of logs whose errors are scaled by what the others say."""
 _THINNED = 3
 """Of so many horizons one says how liveliness acts."""
 _STEPS = 8
+"""Of Newton's method, at most 1 each."""
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,13 @@ from residnet.core.frames import wrap_array
 from residnet.core.layout import HEADING, POSE, POSITION
 from residnet.core.names import ACCELERATION
 from residnet.data.prepare import Prepared
-from residnet.judge.metrics import tail
+from residnet.judge.metrics import LEVEL, tail
 from residnet.judge.protocol import ProtocolConfig, Window
 
-_COMMAND = 0.05
-_START = 0.25
-_SEARCH = 0.5
+_COMMAND, _START, _SEARCH = 0.05, 0.25, 0.5
+"""How much two runs of a pair differ at most: in commands, share of their range, and at the start,
+in scales. Starts are tried every `_SEARCH` seconds. Chosen by hand: closer ones leave few pairs.
+"""
 
 
 @dataclass(frozen=True)
@@ -194,11 +195,12 @@ def _mean(
     return mean | {"nrmse": float(shares.mean())}
 
 
-_LEVEL = 0.95
 _RESAMPLES = 2_000
+"""Of the blocks: their 2.5 % tail then holds fifty."""
 _MANY = 500
 """From so many blocks on the mean of a resample is normal, and is not drawn."""
 _WIDEST = 1.5
+"""Most that an interval is widened by; chosen by hand: of few blocks the factor is noise itself."""
 _SCREEN = 2.0
 """Standard deviations of a correlation that is no more than noise (Politis and White 2004, section
 3.2: c = 2 for log base 10).
@@ -337,7 +339,7 @@ def independent_interval(values: np.ndarray) -> tuple[float, float]:
     """
     n = len(values)
     half = (
-        float(scipy.stats.t.ppf(0.5 + _LEVEL / 2, n - 1) * values.std(ddof=1)) / math.sqrt(n)
+        float(scipy.stats.t.ppf(0.5 + LEVEL / 2, n - 1) * values.std(ddof=1)) / math.sqrt(n)
         if n > 1
         else math.inf
     )

@@ -21,12 +21,15 @@ from residnet.judge.verdict import FEW_LOGS, diverged_note
 if TYPE_CHECKING:
     import pandas as pd
 
-
-_LEVEL = 0.95
+LEVEL = 0.95
+"""Of all intervals."""
 _RESAMPLES = 10_000
-_LOGS = 5
-_LEAST_BLOCKS = 5
-_WANTED_BLOCKS = 8
+"""Of the blocks: their 2.5 % tail then holds 250."""
+MANY_LOGS, WANTED_BLOCKS, _LEAST_BLOCKS = 5, 8, 5
+"""Logs from which on each is a block; blocks that fewer are cut into, and need at least.
+
+Chosen by hand: to resample fewer blocks tells little, and smaller ones are alike.
+"""
 
 
 @dataclass(frozen=True)
@@ -62,12 +65,12 @@ def blocks(logs: Sequence[int] | np.ndarray) -> Blocks | None:
     """
     numbers = np.asarray(logs, dtype=int)
     names, sizes = np.unique(numbers, return_counts=True)
-    if len(names) >= _LOGS:
+    if len(names) >= MANY_LOGS:
         return Blocks(np.searchsorted(names, numbers), "logs", len(names))
     if len(names) < FEW_LOGS:
         return None
     length = int(sizes.max())
-    while length > 1 and sum(math.ceil(size / length) for size in sizes) < _WANTED_BLOCKS:
+    while length > 1 and sum(math.ceil(size / length) for size in sizes) < WANTED_BLOCKS:
         length -= 1
     labels, count = np.zeros(len(numbers), dtype=int), 0
     for name, size in zip(names, sizes, strict=True):
@@ -120,7 +123,7 @@ def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]
         return [None] * values.shape[1]
     sums = np.stack([np.bincount(places, column, count) for column in values.T], axis=1)
     sizes = np.log(np.maximum(sums / np.bincount(places)[:, None], 1e-12))
-    wide = scipy.stats.t.ppf(0.5 + _LEVEL / 2, count - 1) * math.sqrt(2 / count)
+    wide = scipy.stats.t.ppf(0.5 + LEVEL / 2, count - 1) * math.sqrt(2 / count)
     factor = np.exp(wide * sizes.std(axis=0, ddof=1))
     means = values.mean(0)
     return [[float(mean / f), float(mean * f)] for mean, f in zip(means, factor, strict=True)]
@@ -131,7 +134,7 @@ def tail(count: int) -> float:
 
     It is 0.025 for many blocks and less for few.
     """
-    wide = math.sqrt(count / (count - 1)) * scipy.stats.t.ppf(0.5 + _LEVEL / 2, count - 1)
+    wide = math.sqrt(count / (count - 1)) * scipy.stats.t.ppf(0.5 + LEVEL / 2, count - 1)
     return float(scipy.stats.norm.cdf(-wide))
 
 
@@ -180,9 +183,8 @@ def difference(
 SCHEMA = "residnet.metrics/1"
 LIMITS_SCHEMA = "residnet.limits/1"
 ZERO = "zero"
-_WORST = 3
-_BANDS = 3
-_LEAST = 3
+_WORST, _BANDS, _LEAST = 3, 3, 3
+"""Worst windows that are told, bands of speed, and windows that a band needs; chosen by hand."""
 _WIND = "wind_speed"
 _HORIZONS = (10.0, 30.0, 100.0)
 """Times in s after which errors of the pose are told."""

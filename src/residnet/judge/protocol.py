@@ -16,8 +16,6 @@ from residnet.core.names import nearest
 from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
 
-_OVERLAP = 4
-
 
 @dataclass(frozen=True)
 class Window:
@@ -152,7 +150,7 @@ class Overlapping(Windows):
 
     def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
         """Return the windows of one log, by their start; none where it is too short."""
-        return self.overlapping(log, number, step, self.length / _OVERLAP)
+        return self.overlapping(log, number, step, self.length / 4)
 
 
 def all_windows(

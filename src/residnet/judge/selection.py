@@ -17,13 +17,12 @@ import numpy as np
 from residnet.core.format import number
 from residnet.data.prepare import Prepared
 from residnet.judge.freerun import Errors, FreeRun
+from residnet.judge.metrics import MANY_LOGS, WANTED_BLOCKS
 
 SCHEMA = "residnet.selection/2"
 FAMILIES = ("zero", "baseline", "refitted baseline", "closed-form head", "network", "ensemble")
 """What a model is, the simplest first."""
 
-_LOGS = 5
-_BLOCKS = 8
 _ALIKE = {"logs": 1.0, "stretches": 0.5}
 """Standard errors within which models are alike. Stretches of a few logs resemble each other."""
 _SMALL = 0.1
@@ -233,7 +232,7 @@ def blocks_of(run: FreeRun) -> tuple[Blocks, list[np.ndarray]]:
     lengths = np.array([window.stop - window.start for window in run.windows])
     logs = np.unique(numbers)
     labels: list[np.ndarray] = [np.zeros(length, dtype=int) for length in lengths]
-    pieces = 1 if len(logs) >= _LOGS else math.ceil(_BLOCKS / len(logs))
+    pieces = 1 if len(logs) >= MANY_LOGS else math.ceil(WANTED_BLOCKS / len(logs))
     for place, log in enumerate(logs.tolist()):
         rows = np.flatnonzero(numbers == log)
         count = min(pieces, int(lengths[rows].sum()))

@@ -42,21 +42,25 @@ SCHEMA = "residnet.sanity/1"
 DAMPING, STABILITY, SYMMETRY, BOUNDED = CHECKS = ("damping", "stability", "symmetry", "bounded")
 
 _POINTS = 90
+"""Recorded states that are looked at, besides those of extreme inputs; chosen by hand."""
 _NEGLIGIBLE = 0.05
 """Share of a slope's size elsewhere below which a positive one is no wrong sign."""
 _DOUBLING = 300.0
 """Time in s within which a growing disturbance counts."""
 _ASYMMETRY = 0.1
+"""Uneven part of the acceleration, share of its spread, that no word is said of; chosen by hand."""
 _LONG_RUN = 300.0
+"""Time in s that inputs are held at least: within it a disturbance doubles that counts."""
 _PAUSE, _SETTLED = 10.0, 1e-4
 _FRACTIONS, _CRUISE = (0.0, 0.25, 0.5, 0.67, 1.0, 1.5), 0.67
 """Speeds of straight running, in the largest of the training data."""
 _CORNERS = 64
+"""Corners of the inputs' ranges: all of up to six inputs."""
 _HELD = 0.02
 """Share of an input's range within which it is held."""
 _GROWN, _STAYED, _DECAYED = 20.0, 3.0, 3.0
-_MOST = 20
-_SETTLING = 0.25
+_MOST, _SETTLING = 20, 0.25
+"""Steady runs that are looked at, and the share of each that settles; chosen by hand."""
 _SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 
 

@@ -64,9 +64,9 @@ class Algebra:
     |a|^2 = a^2, |a b| = |a| |b|, cos(-a) = cos a, sin(-a) = -sin a.
     """
 
-    def __init__(self, channels: Sequence[str], limits: Limits = Limits()) -> None:  # noqa: B008 (immutable)
+    def __init__(self, channels: Sequence[str], limits: Limits | None = None) -> None:
         self.channels = tuple(channels)
-        self.limits = limits
+        self.limits = limits or Limits()
         self.atoms: list[Atom] = [Atom(name) for name in channels]
         self._number: dict[Atom, int] = {atom: i for i, atom in enumerate(self.atoms)}
         self._products: dict[tuple[Product, Product], Product] = {}

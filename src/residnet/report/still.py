@@ -13,6 +13,7 @@ from residnet.core.format import powers
 from residnet.report.figure import INK, Case, Figure, Look, parts
 
 DPI = 140
+"""Dots per inch: pictures are 980 dots wide, nearly as wide as the page."""
 WIDTH = 7.0
 """Width of every picture in inches: the text block of an A4 page, so that 9 pt stay 9 pt."""
 _MAP = 4.2

@@ -26,6 +26,7 @@ from residnet.simulators.vehicle import Vehicle
 
 _PACKETS = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
 _GRAVITY = 9.80665
+"""Standard gravity in m/s^2, by which ArduPilot takes its accelerometers."""
 _PULSES = (800, 2200)
 """Pulse widths in us that a servo output can have; 0 means none yet."""
 _RATES = (10, 4000)

@@ -198,7 +198,7 @@ def plan_for(
 def guidance_along(
     config: CourseTaskConfig, planned: PlannedCourse, steering: Steering
 ) -> CourseGuidance:
-    """Return the guidance along the plan."""
+    """Return line of sight with the config's lookahead, drift estimated where it integrates."""
     lookahead = config.course.lookahead
     drift = (
         None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)

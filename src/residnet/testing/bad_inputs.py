@@ -16,6 +16,7 @@ from residnet.testing.checks import require, require_equal, require_finite
 
 _PAST, _STEPS = 6, 8
 _BAD_STEP = 3
+"""Step of bad values: good ones come before it and after it."""
 _FAR = (1e38, -1e38, 1e20, -1e20, 1e9, -1e9, 1e5)
 _WRONG = (float("nan"), float("inf"), float("-inf"), *_FAR)
 """Values that stand in the place of an entry; times of the range's edge are drawn as well."""

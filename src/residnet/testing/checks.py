@@ -50,8 +50,8 @@ from residnet.testing.examples import (
 )
 
 _ROWS, _STEPS = 4, 12
-_STEP = 0.1
-_SHORT = 4
+_STEP, _SHORT = 0.1, 4
+"""Step of flights in s, and rows of one that ended at once."""
 
 
 def require(condition: bool, message: str) -> None:

@@ -205,7 +205,7 @@ class HeadTraining(EpochTraining):
         return int(self.settings.stage(epoch)[0])
 
     def present_epoch(self) -> int:
-        """Return the number of the present epoch."""
+        """Return the epoch by now, for which the loaders ask."""
         return self.epoch
 
     def configure_optimizers(self) -> torch.optim.Optimizer:

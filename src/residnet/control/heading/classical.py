@@ -145,6 +145,7 @@ class BangBangHeading(Policy):
 
 
 _HALVINGS = 40
+"""Of the range of the effort: 2^-40 of it is less than single precision resolves."""
 
 
 @final

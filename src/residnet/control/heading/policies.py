@@ -231,6 +231,7 @@ class HeadingObserver(nn.Module):
 FIXED = ("heading", "yaw_rate", "push", "rudder", "last_command")
 """Memory of every observed policy; pending rudder angles and the network's units stand behind."""
 _FEATURES = 11
+"""Columns that the network sees; `ObservedPolicy.forward` lists them."""
 _DEGREE = math.pi / 180.0
 
 

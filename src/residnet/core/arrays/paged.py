@@ -26,6 +26,7 @@ PIECE = 50_000
 _CHUNK = 1 << 28
 """Bytes of a file that many arrays share: each file holds a descriptor open."""
 _ALIGNED = 64
+"""Arrays begin at multiples of so many bytes, a cache line, as torch's own do."""
 
 _RESIDENT = 1 << 28
 """Bytes of pages of files beyond which those of arrays are given back."""

@@ -28,6 +28,7 @@ from residnet.data.doctor.statistics import (
 )
 
 _SURE = 6.0
+"""Standard errors that call a sign wrong: many, since to turn a right one would ruin a fit."""
 _TURN = "turn it in the channel map (sign: -1)"
 _TURN_AND_CHECK = f"{_TURN}, and check the sign of r and psi"
 
@@ -392,6 +393,7 @@ EARLY = 0.45
 # minima that are looked at closely, and how many times the least counts as good a fit
 _MINIMA, _ALIKE = 4, 1.15
 _SHIFTS = 12
+"""To either side, coarse ones first; chosen by hand: each costs a fit."""
 
 
 @dataclass(frozen=True)

@@ -112,9 +112,11 @@ def start(log: Record, found: Check) -> Iterator[Finding]:
 
 _NAMED = re.compile(r"date|time|stamp|utc|gps|clock|epoch", re.IGNORECASE)
 _ROWS = 50_000
+"""Rows of a table whose dates are read; chosen by hand: more tell no better how fast it goes."""
 # a clock that is off by more than this share misleads
 _LEAST_RATE = 0.005
 _FEWEST_DATES = 20
+"""Dates below which no rate is told; chosen by hand."""
 
 
 def date_findings(log: Log, path: Path) -> list[Finding]:

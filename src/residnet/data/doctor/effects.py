@@ -17,6 +17,7 @@ from residnet.data.doctor.statistics import Blocks, Record, blocks_of, bridged, 
 LEAST_EFFECT = 0.04
 """Change of a fit's predictions, as a share of what they predict, below which none is misled."""
 _RIDGE = 1e-6
+"""Of columns of size 1: solves those that move together, and changes others by a millionth."""
 # the predictions must change by so many times what no fit explains
 _CLEAR = 1.3
 # dead reckoning must change by this share of the way sailed
@@ -24,6 +25,7 @@ _LEAST_PLACE = 0.06
 # a stretch is compared with so many others of its length, because every fit depends on its data
 _OTHERS = 6
 _ROWS_PER_COLUMN = 4
+"""Rows for each coefficient; a fit to fewer follows their noise. Chosen by hand."""
 _CERTAINLY = 20.0
 """Standard errors from which on a size is certain."""
 _LEAST_MOVED = 0.1

@@ -11,6 +11,7 @@ from residnet.data.doctor.findings import Check, Finding, Level, check, share_of
 from residnet.data.doctor.statistics import Record, averaged, bridged
 
 _COLLINEAR = 30.0
+"""Condition number of harmful collinearity: Belsley, Kuh and Welsch, 1980."""
 
 
 @check("excitation", "range", "note")

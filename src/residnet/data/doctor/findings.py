@@ -17,6 +17,7 @@ Level = Literal["note", "will mislead", "fatal"]
 LEVELS = ("note", "will mislead", "fatal")
 SCHEMA = "residnet.inspection/1"
 _MOST_KINDS = 4
+"""Kinds of findings that a summary names, so that it stays one line."""
 
 
 @dataclass(frozen=True)

@@ -168,9 +168,11 @@ def rudder_unit(log: Record, found: Check) -> Iterator[Finding]:
 _DEMAND = re.compile(
     r"^(cmd|ref|command|commanded|set|desired)_|_(cmd|ref|command|commanded|set|desired)(?=_|$)"
 )
-# an actuator that rests so long, s, so far from its demand (share of the demand's range) is stuck
-_STUCK = 5.0
-_FAR_APART = 0.2
+_STUCK, _FAR_APART = 5.0, 0.2
+"""An actuator that rests so long, s, so far from its demand, share of the demand's range, is stuck.
+
+Chosen by hand: longer than actuators lag, and farther than they are inaccurate.
+"""
 
 
 @check("inputs", "stuck", fix="leave this part out", certain=True)

@@ -27,10 +27,10 @@ from residnet.data.doctor.statistics import FEWEST, SECTIONS, WINDOW, Record, br
 LEAST_LAG = 0.2
 """A lag below this matters to no rollout of a vessel, s."""
 _MOST_CAUSES = 4
+"""Causes of one difference; chosen by hand: further ones would explain one another."""
 # a cause must lower the sum of squares by this many variances of the noise, and be this many
 # standard errors from nothing
-_WORTH = 60.0
-_SURE = 3.5
+_WORTH, _SURE = 60.0, 3.5
 _REACH = WINDOW // 2
 
 

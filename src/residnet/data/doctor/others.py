@@ -34,6 +34,7 @@ from residnet.data.doctor.statistics import (
 )
 
 _RIDGE = 1e-6
+"""Of the mean of a diagonal: solves what moves together, and changes the rest by a millionth."""
 _MOST_ROWS = 1500
 """Blocks of a log that are looked at: more of them only overlap more."""
 _OVERLAP = 4.0
@@ -543,6 +544,7 @@ _UNITS = (math.pi / 180.0, 180.0 / math.pi, 60.0, 1.0 / 60.0, 0.5144, 1.944, 3.6
 _OF_MANY = 2.0
 _STEPS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)
 _STILL = 1e-3
+"""Share of an input's usual spread, or of its size, below which it rests; chosen by hand."""
 
 
 def resting(fleet: Fleet, i: int, name: str) -> bool:

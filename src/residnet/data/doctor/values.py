@@ -254,8 +254,7 @@ def _moves(log: Record, names: tuple[str, ...], run: slice) -> bool:
 
 
 # share of the rows from which on repeats are no accident, and their longest run
-_REPEATED = 0.1
-_LONGEST_REPEAT = 5
+_REPEATED, _LONGEST_REPEAT = 0.1, 5
 
 
 @check(

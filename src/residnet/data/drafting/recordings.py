@@ -42,6 +42,7 @@ _SLOW = 0.6
 # rows of a topic of the motion, and of one of inputs
 _FEWEST, _FEW = 50, 20
 _MOST = 12
+"""Positions, and headings, that are tried with each other; chosen by hand: 144 poses take long."""
 _PAIRS = (("x", "y"), ("north", "east"), ("east", "north"))
 
 

@@ -46,7 +46,6 @@ from residnet.data.readers.written import (
 if TYPE_CHECKING:
     import pandas as pd
 
-_ROWS = 20_000
 _FIRST_ROWS = {"parquet": parquet_rows, "json_lines": json_rows}
 _BRACKETS = re.compile(r"[\[(]")
 _QUOTIENT = re.compile(r"(?P<name>.*\S)\s+/\s+(?P<unit>\S.*)")
@@ -343,7 +342,7 @@ class Sheet:
         return self.columns.get(name, name)
 
 
-def peek(path: Path, rows: int = _ROWS) -> Sheet:
+def peek(path: Path, rows: int = 20_000) -> Sheet:
     """Return the first rows of a table, 20,000 where `rows` does not say otherwise.
 
     Raises:

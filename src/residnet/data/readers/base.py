@@ -20,6 +20,8 @@ from residnet.core.progress import report
 
 # recordings below this size are read before anybody waits, bytes
 _LARGE = 50_000_000
+REPORT_EVERY = 5000
+"""Messages or lines between two reports of a reader; chosen by hand: many a second of reading."""
 LARGE = 300_000_000
 """Bytes of a folder above which topics that nobody wants are not read."""
 

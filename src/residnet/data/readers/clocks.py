@@ -8,7 +8,6 @@ from residnet.data.readers.recording import Remark, remark
 
 _BITS = (16, 24, 32, 48)
 """Widths of the counters that microcontrollers stamp with."""
-_HOUR = 3600.0
 _USUAL_STEPS = 3.0
 """Usual steps within which the clock has gone on where its counter began anew."""
 
@@ -33,7 +32,7 @@ def steady_clock(
     if not forward.size:
         return t, []
     usual, remarks = float(np.median(forward)), []
-    lengths = {"an hour, as in autumn": _HOUR} if tick is None else {}
+    lengths = {"an hour, as in autumn": 3600.0} if tick is None else {}
     if tick is not None:
         lengths = {f"2^{bits} of its ticks": 2.0**bits * tick for bits in _BITS}
     added = np.zeros_like(t)

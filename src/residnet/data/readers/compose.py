@@ -61,7 +61,7 @@ from residnet.data.readers.topics import agreement, align_clocks, traffic
 _STATE = ("x", "y", "psi", "u", "v", "r", "p", "phi")
 _MOVING = {*_STATE, "north_rate", "east_rate"}
 _USUAL_GAP = 3.0
-_NS = 1e-9
+"""Usual steps of a topic that are bridged: two rows may get lost; chosen by hand."""
 
 
 class RecordingConfig(Config, ABC):
@@ -502,7 +502,7 @@ def _times(
     first = start
     if recording.epoch is not None:
         # whole multiples of the step in Unix time let logs of one day lie on one grid
-        ahead = recording.epoch % round(clock.step * 1e9) * _NS
+        ahead = recording.epoch % round(clock.step * 1e9) * 1e-9
         first = math.ceil((start + ahead) / clock.step - 1e-6) * clock.step - ahead
     count = math.floor((stop - first) / clock.step + 1e-6) + 1
     return first + clock.step * np.arange(count), clock.step
@@ -635,5 +635,5 @@ def _meta(
         start = recording.epoch + int(np.rint(times[0] * 1e9))
         utc = datetime.fromtimestamp(start // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
         utc = f"{utc}.{start % 10**9:09d}Z"
-        meta |= {"epoch": start * _NS, "epoch_ns": start, "start_utc": utc}
+        meta |= {"epoch": start * 1e-9, "epoch_ns": start, "start_utc": utc}
     return meta

@@ -39,7 +39,9 @@ _LAGS = np.arange(-2.0, 2.025, 0.05)
 # correlation that calls two signals the same quantity
 _SAME = 0.9
 _MOST_ROWS = 4000
+"""Rows, up to twice as many, that tell a lag; chosen by hand: every lag interpolates them."""
 _LEVER = 0.2
+"""Distance of two points of a vessel, m, that is worth telling; chosen by hand."""
 
 
 def align_clocks(

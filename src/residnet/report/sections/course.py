@@ -142,7 +142,8 @@ def _case(run: RunFiles, protocol: str, radii: Sequence[float], flown: Any, plan
         lost = np.zeros(len(flight), dtype=bool)
         for key, known in zip(("east", "north"), seen, strict=True):
             lost |= (values[key] < known.min() - edge) | (values[key] > known.max() + edge)
-        track[name] = tuple(np.where(lost, np.nan, values[key]) for key in ("east", "north"))  # type: ignore[assignment]
+        east_of, north_of = (np.where(lost, np.nan, values[key]) for key in ("east", "north"))
+        track[name] = (east_of, north_of)
         for panel, (quantity, _, factor) in zip(panels[1:], _PANELS, strict=True):
             panel[name] = (values["t"], factor * flight[quantity].to_numpy(float))
     sides = [

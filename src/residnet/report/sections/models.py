@@ -325,9 +325,8 @@ def terms(run: RunFiles) -> Iterator[Figure]:
             "smaller terms": Look("sum of smaller terms", "#7F7F7F", "dotted", 1.0),
             "sum": Look("sum", width=0.8, order=4),
         }
-        raised = str.maketrans({"2": "²", "3": "³", "4": "⁴"})
         for name, look in looks.items():
-            label = re.sub(r"\^([234])", lambda found: found[1].translate(raised), look.label)  # noqa: B023
+            label = re.sub(r"\^([234])", lambda found: "²³⁴"[int(found[1]) - 2], look.label)
             looks[name] = replace(look, label=label)
         yield Figure(
             f"terms_{model}",

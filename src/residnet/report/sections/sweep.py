@@ -30,6 +30,7 @@ from residnet.report.figure import (
 from residnet.report.run_reader import Content, RunFiles
 
 _SHOWN = 15
+"""Trials in the table, the best first; `trials.csv` has all."""
 _LONGEST = 20
 """Most letters of a line beneath an axis."""
 _GROUPS = (

@@ -14,14 +14,20 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 
 from residnet.core.errors import DataError, UsageError
-from residnet.data.readers.base import Advance, missing_package, progress, require_file
+from residnet.data.readers.base import (
+    REPORT_EVERY,
+    Advance,
+    missing_package,
+    progress,
+    require_file,
+)
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.recording import EVERYTHING, Recording, Series, Wanted
 
 _TICKS = {"TimeUS": 1_000, "TimeMS": 1_000_000, "T": 1_000_000}
 """Field of the time since boot -> its unit in ns."""
-_REPORT_EVERY = 5000
 _DATED = 100_000_000.0
+"""Unix time in s, of 1973: a clock below it counts from the start, since it had no GPS."""
 
 
 @final
@@ -90,7 +96,7 @@ def _collect(
         if message is None:
             return
         count += 1
-        if count % _REPORT_EVERY == 0:
+        if count % REPORT_EVERY == 0:
             advance(reader.percent)
         fields = message.get_fieldnames()
         kind, instance = message.get_type(), message.fmt.instance_field

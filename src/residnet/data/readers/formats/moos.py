@@ -11,13 +11,12 @@ from typing import ClassVar, Literal, final
 import numpy as np
 
 from residnet.core.errors import DataError
-from residnet.data.readers.base import progress, require_file
+from residnet.data.readers.base import REPORT_EVERY, progress, require_file
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.recording import EVERYTHING, Recording, Series, Wanted
 
 _LINE = re.compile(rb"^\s*(?P<time>[-+\d.eE]+)\s+(?P<name>\S+)\s+(?P<source>\S+)\s+(?P<value>\S+)")
 _START = re.compile(rb"^%%\s*LOGSTART\s+(?P<start>\d+(?:\.\d+)?)")
-_REPORT_EVERY = 20_000
 
 
 @final
@@ -49,7 +48,7 @@ class MoosConfig(RecordingConfig):
         with path.open("rb") as stream, progress(path.name, size, size) as advance:
             for count, line in enumerate(stream):
                 done += len(line)
-                if count % _REPORT_EVERY == 0:
+                if count % REPORT_EVERY == 0:
                     advance(min(done, size))
                 if begun := _START.match(line):
                     epoch = round(float(begun["start"]) * 1e9)

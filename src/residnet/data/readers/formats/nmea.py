@@ -12,7 +12,7 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.stretches import stretch_bounds
-from residnet.data.readers.base import missing_package, progress, require_file
+from residnet.data.readers.base import REPORT_EVERY, missing_package, progress, require_file
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.recording import EVERYTHING, Recording, Remark, Series, Wanted, remark
 from residnet.data.readers.texts import as_utf8, encoding_of_head
@@ -28,8 +28,8 @@ _STAMP = re.compile(
 )
 _PER_MINUTE = {"rate_of_turn": 1.0 / 60.0}
 _DAY = 86_400 * 10**9
-_REPORT_EVERY = 5000
 _HEAD = 1024
+"""Bytes that tell the encoding: a dozen sentences."""
 
 
 def _holds_sentence(path: Path, head: bytes) -> bool:
@@ -79,7 +79,7 @@ class NmeaConfig(RecordingConfig):
         ):
             for count, line in enumerate(stream):
                 done += len(line)
-                if count % _REPORT_EVERY == 0:
+                if count % REPORT_EVERY == 0:
                     advance(min(done, size))
                 match = _SENTENCE.match(line)
                 if match is None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from residnet.core.errors import DataError, UsageError
 from residnet.data.readers.base import (
+    REPORT_EVERY,
     files_of,
     missing_package,
     progress,
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 # arrays of more elements are pictures, clouds and 6 x 6 covariances, no channels
 _ELEMENTS = 16
-_REPORT_EVERY = 5000
 
 
 @final
@@ -95,7 +95,7 @@ def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
     start, span = reader.start_time, max(1, reader.end_time - reader.start_time)
     with progress(path.name, total_size(files), 1.0) as advance:
         for count, (connection, arrival, raw) in enumerate(reader.messages(connections=chosen)):
-            if count % _REPORT_EVERY == 0:
+            if count % REPORT_EVERY == 0:
                 advance((arrival - start) / span)
             name, kind = connection.topic, connection.msgtype
             if name in failed:

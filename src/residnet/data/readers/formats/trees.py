@@ -28,10 +28,12 @@ _TIMES = (
 # MATLAB's day 719529 is 1 January 1970
 _DATENUM_1970, _DAY = 719_529.0, 86_400.0
 _MOST_COLUMNS = 64
+"""Columns of an array that may be channels; chosen by hand: pictures and clouds have more."""
 _FEWEST = 20
 """Fewest samples of a vector that is timed by another group's time."""
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _ALWAYS_HELD = 200_000_000
+"""Bytes that any dataset may claim; chosen by hand: so many fit into memory."""
 _MOST_COMPRESSED = 1000
 """Bytes of a dataset for each byte of its file at most; a constant channel has some 900."""
 
