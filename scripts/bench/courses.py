@@ -32,8 +32,8 @@ from residnet.control.heading.classical import HeadingPID
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ResidnetError
+from residnet.dynamics.steering_variation import Vessels
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.course import Vessels
 from residnet.tasks.course_run import fly
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from residnet.core.errors import DataError
 from residnet.judge.metrics import blocks, intervals
-from residnet.report.figure import write_figures
+from residnet.report.figure_files import write_figures
 from residnet.report.sections.study import (
     Variant,
     differences,

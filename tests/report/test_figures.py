@@ -31,13 +31,11 @@ from residnet.report.figure import (
     joined,
     names_of,
     parts,
-    read_figures,
     steps,
     thinned,
-    unpacked,
     whiskers,
-    write_figures,
 )
+from residnet.report.figure_files import read_figures, unpacked, write_figures
 from residnet.report.fit import write_fit_figures, write_fit_page
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from residnet.control.heading.turning import Turning
-from residnet.tasks.autopilot import AutopilotConfig, least_time, paced
+from residnet.tasks.autopilot import AutopilotConfig, least_time
 
 CONFIG: dict[str, Any] = {
     "task": "autopilot",
@@ -36,7 +36,7 @@ def test_the_least_time_is_that_of_two_pulses() -> None:
 
 
 def test_times_follow_the_pace_and_delays_do_not() -> None:
-    slow = paced(AutopilotConfig.model_validate(CONFIG | {"pace": 8.0}))
+    slow = AutopilotConfig.model_validate(CONFIG | {"pace": 8.0}).paced()
     assert slow.conditions is not None
     assert (slow.test.duration, slow.test.dt) == (112.0, 0.16)
     for conditions in (slow.conditions.stated, slow.conditions.beyond["late"]):
@@ -44,11 +44,11 @@ def test_times_follow_the_pace_and_delays_do_not() -> None:
         assert conditions.overshoot_weight == 4.0
     assert slow.conditions.stated.delay == (0.0, 0.4)
     assert slow.policies["learned"].training.dt == 0.32
-    assert paced(slow) == slow
+    assert slow.paced() == slow
 
 
 def test_the_pace_of_a_vessel_is_measured() -> None:
-    slow = paced(AutopilotConfig.model_validate(CONFIG | {"pace": "vessel"}))
+    slow = AutopilotConfig.model_validate(CONFIG | {"pace": "vessel"}).paced()
     assert slow.test.duration == pytest.approx(14.0 * 8.7, rel=0.05)
 
 

@@ -18,7 +18,7 @@ from read_page import plain
 from tiny import TINY, call
 
 from residnet.dynamics.store import load_model
-from residnet.report.figure import read_figures
+from residnet.report.figure_files import read_figures
 
 pytestmark = pytest.mark.long
 

@@ -31,8 +31,8 @@ from residnet.report.figure import (
     Look,
     Panel,
     family,
-    write_figure,
 )
+from residnet.report.figure_files import write_figure
 from residnet.report.run_reader import RunFiles, StoredWindow
 
 _PROTOCOL = "record"

@@ -13,7 +13,8 @@ from residnet.core.config import load_config
 from residnet.core.files import read_json
 from residnet.core.format import minus, number
 from residnet.report.blocks import Cell, Column, Section
-from residnet.report.figure import Case, Curve, Figure, Look, Panel, read_figures, write_figure
+from residnet.report.figure import Case, Curve, Figure, Look, Panel
+from residnet.report.figure_files import read_figures, write_figure
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Exports, MainFigure, Outcome, Task
 

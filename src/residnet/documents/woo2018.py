@@ -37,8 +37,8 @@ from residnet.report.figure import (
     bars,
     names_of,
     whiskers,
-    write_figure,
 )
+from residnet.report.figure_files import write_figure
 from residnet.report.run_reader import RunFiles, StoredWindow
 
 PROTOCOL = "manoeuvre"

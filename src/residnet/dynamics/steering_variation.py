@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import final
+from typing import NamedTuple, final
 
 import torch
 from torch import Tensor
@@ -20,6 +20,24 @@ VARIATION = ("effect", "time", "bias")
 """Of each row: rudder force as a multiple, time constants of sway and yaw as a multiple, and an
 angle [rad] that is added to the rudder's.
 """
+
+
+class Vessels(NamedTuple):
+    """The variation of B vessels and the current that each runs in.
+
+    Attributes:
+        variation: of the steering, [B, 3], see `VARIATION`.
+        current: to the north and to the east, [B, 2] in m/s.
+    """
+
+    variation: Tensor
+    current: Tensor
+
+
+NOMINAL = Vessels(
+    torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
+)
+"""The vessel that the course is planned with, in water at rest."""
 
 
 @final

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from residnet.core.format import powers
-from residnet.report.figure import INK, Case, Figure, packed
+from residnet.report.figure import INK, Case, Figure
+from residnet.report.figure_files import packed
 
 if TYPE_CHECKING:
     from bokeh.models import ColumnDataSource

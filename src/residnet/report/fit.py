@@ -8,7 +8,8 @@ from pathlib import Path
 
 from residnet.judge.soundness import read_findings
 from residnet.report.blocks import Section
-from residnet.report.figure import Figure, read_figures, write_figures
+from residnet.report.figure import Figure
+from residnet.report.figure_files import read_figures, write_figures
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import data, free_runs, manoeuvres, models, runs, verdict

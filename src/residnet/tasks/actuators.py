@@ -20,7 +20,7 @@ from residnet.physics.actuators.identify import (
     fit_throttle,
     fit_thrust,
 )
-from residnet.report.figure import write_figures
+from residnet.report.figure_files import write_figures
 from residnet.report.sections.actuators import actuator_tests
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task

@@ -269,7 +269,7 @@ class AutopilotConfig(ComputingTask):
                 own.
         """
         learned = [
-            (school_of(self, name), wanted.training.dt)
+            (self.school_of(name), wanted.training.dt)
             for name, wanted in self.policies.items()
             if wanted.learned is not None
         ]
@@ -278,10 +278,78 @@ class AutopilotConfig(ComputingTask):
             turning = vessel.turning(self.rudder, self.turning_time)
         except FitError as error:
             raise ConfigError(f"vessel '{self.vessel}' cannot be steered: {error}") from error
-        config = paced(self)
+        config = self.paced()
         _check_flights(config, turning, vessel.rate)
         for model, dt in learned:
             model.turning(self.rudder, self.turning_time, dt)
+
+    def school_of(self, name: str) -> SteeredPlant | SteeredModel:
+        """Return what a policy is trained on: the vessel under the conditions, or a learned model.
+
+        Raises:
+            UsageError: where the run or the model is missing.
+            ConfigError: where its inputs are not those of the vessel, or the conditions have
+                weather, which a learned model does not feel.
+        """
+        assert self.conditions is not None
+        wanted = self.policies[name].learned
+        weather = any(conditions.weather for conditions in self.conditions.flown.values())
+        if wanted is None:
+            return SteeredPlant(load_vessel(self.vessel).build(), calm=not weather)
+        if weather:
+            raise ConfigError(
+                f"policies.{name}.learned: a learned model feels no wind or current; leave them out"
+                " of conditions"
+            )
+        spec, model = load_model(wanted.run / "models" / chosen_model(wanted.run, wanted.model))
+        return SteeredModel(model, spec.signals.columns, spec.hold, self.steered)
+
+    def paced(self) -> AutopilotConfig:
+        """Return the config with its times multiplied by its pace, the pace itself being one.
+
+        Delays, which are those of the electronics, stay as they are. What a degree costs grows as
+        the time does.
+
+        Raises:
+            FitError: where the vessel does not turn steadily.
+        """
+        pace = self.pace
+        if pace == "vessel":
+            vessel = self.steered
+            turning = vessel.turning(self.rudder, self.turning_time)
+            slow = least_time(turning, self.rudder, vessel.rate)
+            # two digits are enough, and steps stay numbers that can be read
+            pace = float(f"{slow / least_time(*REFERENCE, None):.2g}")
+            say(f"  pace {pace:g}: a change of 30 deg takes {slow:.3g} s at least")
+        if pace == 1.0 or self.conditions is None:
+            return self
+
+        def longer(part: Any, *names: str) -> Any:
+            given = {name: getattr(part, name) for name in names}
+            return part.model_copy(
+                update={name: pace * value for name, value in given.items() if value is not None}
+            )
+
+        def slower(conditions: ConditionsConfig) -> ConditionsConfig:
+            times = ("hold", "duration", "push_time", "dt", "overshoot_weight", "travel_weight")
+            changed: ConditionsConfig = longer(conditions, *times)
+            return changed
+
+        flown = {name: slower(one) for name, one in self.conditions.flown.items()}
+        conditions = {"stated": flown.pop("stated"), "beyond": flown}
+        policies = {
+            name: one.model_copy(
+                update={"training": longer(one.training, "dt", "hold", "duration")}
+            )
+            for name, one in self.policies.items()
+        }
+        changed = {
+            "pace": 1.0,
+            "test": longer(self.test, "dt", "duration", "bias_time"),
+            "conditions": self.conditions.model_copy(update=conditions),
+            "policies": policies,
+        }
+        return self.model_copy(update=changed)
 
     def carry_out(self, folder: RunFolder) -> Outcome:
         """Train, tune and compare.
@@ -297,28 +365,6 @@ class AutopilotConfig(ComputingTask):
         from residnet.tasks.autopilot_run import export_policy
 
         return export_policy(self, asked)
-
-
-def school_of(config: AutopilotConfig, name: str) -> SteeredPlant | SteeredModel:
-    """Return what a policy is trained on: the vessel under the conditions, or a learned model.
-
-    Raises:
-        UsageError: where the run or the model is missing.
-        ConfigError: where its inputs are not those of the vessel, or the conditions have weather,
-            which a learned model does not feel.
-    """
-    assert config.conditions is not None
-    wanted = config.policies[name].learned
-    weather = any(conditions.weather for conditions in config.conditions.flown.values())
-    if wanted is None:
-        return SteeredPlant(load_vessel(config.vessel).build(), calm=not weather)
-    if weather:
-        raise ConfigError(
-            f"policies.{name}.learned: a learned model feels no wind or current; leave them out of"
-            " conditions"
-        )
-    spec, model = load_model(wanted.run / "models" / chosen_model(wanted.run, wanted.model))
-    return SteeredModel(model, spec.signals.columns, spec.hold, config.steered)
 
 
 _PUSHED = 2.0
@@ -377,49 +423,3 @@ def least_time(turning: Turning, limit: float, rate: float | None, change: float
         middle = 0.5 * (low + high)
         low, high = (low, middle) if turned(middle)[0] > change else (middle, high)
     return turned(high)[1] + (0.0 if rate is None else 2.0 * limit / rate)
-
-
-def paced(config: AutopilotConfig) -> AutopilotConfig:
-    """Return the config with its times multiplied by its pace, the pace itself being one.
-
-    Delays, which are those of the electronics, stay as they are. What a degree costs grows as the
-    time does.
-
-    Raises:
-        FitError: where the vessel does not turn steadily.
-    """
-    pace = config.pace
-    if pace == "vessel":
-        vessel = config.steered
-        turning = vessel.turning(config.rudder, config.turning_time)
-        slow = least_time(turning, config.rudder, vessel.rate)
-        # two digits are enough, and steps stay numbers that can be read
-        pace = float(f"{slow / least_time(*REFERENCE, None):.2g}")
-        say(f"  pace {pace:g}: a change of 30 deg takes {slow:.3g} s at least")
-    if pace == 1.0 or config.conditions is None:
-        return config
-
-    def longer(part: Any, *names: str) -> Any:
-        given = {name: getattr(part, name) for name in names}
-        return part.model_copy(
-            update={name: pace * value for name, value in given.items() if value is not None}
-        )
-
-    def slower(conditions: ConditionsConfig) -> ConditionsConfig:
-        times = ("hold", "duration", "push_time", "dt", "overshoot_weight", "travel_weight")
-        changed: ConditionsConfig = longer(conditions, *times)
-        return changed
-
-    flown = {name: slower(one) for name, one in config.conditions.flown.items()}
-    conditions = {"stated": flown.pop("stated"), "beyond": flown}
-    policies = {
-        name: one.model_copy(update={"training": longer(one.training, "dt", "hold", "duration")})
-        for name, one in config.policies.items()
-    }
-    changed = {
-        "pace": 1.0,
-        "test": longer(config.test, "dt", "duration", "bias_time"),
-        "conditions": config.conditions.model_copy(update=conditions),
-        "policies": policies,
-    }
-    return config.model_copy(update=changed)

@@ -6,7 +6,7 @@ import math
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import torch
@@ -65,14 +65,10 @@ from residnet.report.sections.autopilot import (
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import ExportRequest, MainFigure, Outcome
-from residnet.tasks.autopilot import (
-    AnyController,
-    AutopilotConfig,
-    JudgedConditions,
-    paced,
-    school_of,
-)
 from residnet.training.policies.fit import train_policy
+
+if TYPE_CHECKING:
+    from residnet.tasks.autopilot import AnyController, AutopilotConfig, JudgedConditions
 
 Controllers = dict[str, tuple[str, Policy]]
 """Kind (policy, classical, floor and others) and controller by name."""
@@ -80,7 +76,7 @@ Controllers = dict[str, tuple[str, Policy]]
 
 def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
     """Tune, train and compare."""
-    config = paced(config)
+    config = config.paced()
     vessel = config.steered
     turning = vessel.turning(config.rudder, config.turning_time)
     say(
@@ -188,7 +184,7 @@ def _policy(
     """
     wanted, stated = config.policies[name], config.conditions
     assert stated is not None
-    school, turning = school_of(config, name), steering.turning
+    school, turning = config.school_of(name), steering.turning
     if wanted.learned is not None:
         turning = school.turning(config.rudder, config.turning_time, wanted.training.dt)
         say(
@@ -360,7 +356,7 @@ def export_policy(config: AutopilotConfig, asked: ExportRequest) -> Path:
         ExportError: where the file does not reproduce the policy.
     """
     name, rows = asked.named(config.policies), asked.run.read_metrics()["rows"]
-    flown = paced(config)
+    flown = config.paced()
     about = {"vessel": config.vessel, "conditions": _stated(flown).model_dump(mode="json")}
     learned = config.policies[name].learned
     about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}

@@ -13,7 +13,8 @@ from residnet.core.errors import UsageError
 from residnet.core.format import DEG, number
 from residnet.judge.metrics import blocks, difference
 from residnet.report.blocks import Block, Cell, Section, Table, table_of
-from residnet.report.figure import GLANCE, Case, Figure, Panel, family, write_figure
+from residnet.report.figure import GLANCE, Case, Figure, Panel, family
+from residnet.report.figure_files import write_figure
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder

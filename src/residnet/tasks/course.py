@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import ClassVar, Literal, NamedTuple, Self, final
+from typing import ClassVar, Literal, Self, final
 
 import numpy as np
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor
 
 from residnet.control.courses.config import BuoyCourseConfig, plan_course, smallest_turn
 from residnet.control.courses.course_check import Protocol
@@ -25,27 +24,10 @@ from residnet.core.config import (
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.dynamics.simulated import check_steps
+from residnet.dynamics.steering_variation import Vessels
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, ExportRequest, Outcome, PartName
 from residnet.tasks.autopilot import AnyController, AutopilotConfig
-
-
-class Vessels(NamedTuple):
-    """The variation of B vessels and the current that each runs in.
-
-    Attributes:
-        variation: of the steering, [B, 3] (`dynamics.steering_variation.VARIATION`).
-        current: to the north and to the east, [B, 2] in m/s.
-    """
-
-    variation: Tensor
-    current: Tensor
-
-
-NOMINAL = Vessels(
-    torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
-)
-"""The vessel that the course is planned with, in water at rest."""
 
 
 class CourseSpreadConfig(Config):

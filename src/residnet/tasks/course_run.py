@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -34,6 +34,7 @@ from residnet.core.progress import say
 from residnet.documents.gouletas2020.autopilot import load_predictive
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import InAmbientCurrent
+from residnet.dynamics.steering_variation import NOMINAL, Vessels
 from residnet.export.policy import ExportedCoursePolicy
 from residnet.judge.courses import CourseFlight, row, spread_row
 from residnet.judge.metrics import SCHEMA
@@ -42,7 +43,9 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import ExportRequest, MainFigure, Outcome
 from residnet.tasks.autopilot import AnyController, AutopilotConfig
 from residnet.tasks.autopilot_run import stored_policy
-from residnet.tasks.course import NOMINAL, CourseTaskConfig, Vessels
+
+if TYPE_CHECKING:
+    from residnet.tasks.course import CourseTaskConfig
 
 _UNITS = {
     "course_time": "s",

@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -52,7 +53,9 @@ from residnet.runs.model_store import FolderStore
 from residnet.runs.provenance import Provenance
 from residnet.runs.task import ExportRequest, Exports, Finished, MainFigure, Outcome
 from residnet.tasks.booklet import write_booklet
-from residnet.tasks.fit import FitConfig
+
+if TYPE_CHECKING:
+    from residnet.tasks.fit import FitConfig
 
 _CHOSEN = ("predictor", "selected")
 """What stands for a model's name: the one reported first, and the single one chosen."""

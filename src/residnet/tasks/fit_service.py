@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -36,25 +36,18 @@ from residnet.identification.prepared import prepare_logs, require_window, throu
 from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
 from residnet.judge.metrics import find
 from residnet.report.blocks import Section, Table, bad_where, table_of
-from residnet.report.figure import (
-    DASHED,
-    GLANCE,
-    SOLID,
-    ZERO,
-    Case,
-    Figure,
-    Panel,
-    family,
-    write_figure,
-)
+from residnet.report.figure import DASHED, GLANCE, SOLID, ZERO, Case, Figure, Panel, family
+from residnet.report.figure_files import write_figure
 from residnet.report.page import write_page
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.provenance import Provenance
 from residnet.runs.task import Outcome
-from residnet.tasks.fit import FitConfig
 from residnet.tasks.fit_run import SPLIT, external_logs, fit_outcome, limit_of, write_judged
 from residnet.training.left_out import left_open
+
+if TYPE_CHECKING:
+    from residnet.tasks.fit import FitConfig
 
 _NAMED = 3
 """Causes that are named."""

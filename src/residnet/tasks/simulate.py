@@ -40,7 +40,7 @@ from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.replay import Replay
 from residnet.physics.vessel import load_vessel
-from residnet.report.figure import write_figures
+from residnet.report.figure_files import write_figures
 from residnet.report.sections.manoeuvres import flight_figures, indices_text
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome

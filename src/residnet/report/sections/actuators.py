@@ -11,17 +11,8 @@ import numpy as np
 from residnet.core.format import DASH, interval, number
 from residnet.physics.actuators.identify import StepAnswer, ThrottleMap, ThrustFit, follow_command
 from residnet.report.blocks import Block, Code, Section, Table, Text, table_of
-from residnet.report.figure import (
-    GREEN,
-    SOLID,
-    Case,
-    Curve,
-    Figure,
-    Look,
-    Panel,
-    joined,
-    read_figures,
-)
+from residnet.report.figure import GREEN, SOLID, Case, Curve, Figure, Look, Panel, joined
+from residnet.report.figure_files import read_figures
 from residnet.report.run_reader import Content, RunFiles
 
 _TITLES = {

@@ -15,20 +15,8 @@ from residnet.control.heading.conditions import quiet_after
 from residnet.core.format import DEG, signed
 from residnet.judge.autopilots import not_for
 from residnet.report.blocks import Block, Code, Column, Section, Table, Text, bad_where, table_of
-from residnet.report.figure import (
-    ZERO,
-    Case,
-    Curve,
-    Figure,
-    Look,
-    Panel,
-    band,
-    family,
-    figures_section,
-    read_figures,
-    steps,
-    write_figures,
-)
+from residnet.report.figure import ZERO, Case, Curve, Figure, Look, Panel, band, family, steps
+from residnet.report.figure_files import figures_section, read_figures, write_figures
 from residnet.report.run_reader import Content, RunFiles
 
 FLIGHTS = "flights.parquet"

@@ -11,20 +11,8 @@ import numpy as np
 
 from residnet.core.format import DEG, number
 from residnet.report.blocks import Block, Cell, Column, Section, Table, Text, bad_where, table_of
-from residnet.report.figure import (
-    COLORS,
-    ZERO,
-    Case,
-    Curve,
-    Figure,
-    Look,
-    Panel,
-    figures_section,
-    joined,
-    names_of,
-    read_figures,
-    write_figures,
-)
+from residnet.report.figure import COLORS, ZERO, Case, Curve, Figure, Look, Panel, joined, names_of
+from residnet.report.figure_files import figures_section, read_figures, write_figures
 from residnet.report.run_reader import Content, RunFiles
 
 TRACKS = "tracks.parquet"

@@ -20,16 +20,8 @@ from residnet.report.blocks import (
     bad_where,
     table_of,
 )
-from residnet.report.figure import (
-    GLANCE,
-    SOLID,
-    START,
-    Case,
-    Curve,
-    Figure,
-    Panel,
-    write_figure,
-)
+from residnet.report.figure import GLANCE, SOLID, START, Case, Curve, Figure, Panel
+from residnet.report.figure_files import write_figure
 from residnet.report.run_reader import RunFiles
 
 _NOTE = "note"

@@ -39,11 +39,10 @@ from residnet.report.figure import (
     Look,
     Panel,
     band,
-    figures_section,
     joined,
-    read_figures,
     steps,
 )
+from residnet.report.figure_files import figures_section, read_figures
 from residnet.report.run_reader import Content, RunFiles
 
 _EACH = 12

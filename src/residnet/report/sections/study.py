@@ -13,18 +13,8 @@ from residnet.core.errors import DataError
 from residnet.core.format import plural, signed
 from residnet.judge.metrics import blocks, intervals
 from residnet.report.blocks import Cell, Column, Section, Table, Text, nested, table_of
-from residnet.report.figure import (
-    BLUE,
-    Case,
-    Figure,
-    Look,
-    Panel,
-    joined,
-    names_of,
-    read_figures,
-    whiskers,
-    write_figures,
-)
+from residnet.report.figure import BLUE, Case, Figure, Look, Panel, joined, names_of, whiskers
+from residnet.report.figure_files import read_figures, write_figures
 from residnet.report.run_reader import Content, RunFiles
 
 

@@ -23,10 +23,9 @@ from residnet.report.figure import (
     bars,
     joined,
     names_of,
-    read_figures,
     steps,
-    write_figures,
 )
+from residnet.report.figure_files import read_figures, write_figures
 from residnet.report.run_reader import Content, RunFiles
 
 _SHOWN = 15

@@ -1,0 +1,181 @@
+"""The figures of a run as files: a picture for each case, and beside it all that a page draws."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from residnet.core.files import file_stem, whole
+from residnet.core.progress import begin
+from residnet.report.blocks import Section
+from residnet.report.figure import Case, Curve, Figure, Look, Panel, Surface, joined, parts, thinned
+from residnet.report.still import save, still
+
+
+def packed(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return columns as 16-bit numbers with offset and step; equal columns are stored once."""
+    out: dict[str, Any] = {}
+    stored: dict[bytes, str] = {}
+    for name, values in columns.items():
+        before = stored.setdefault(values.tobytes(), name)
+        if before != name:
+            out[name] = before
+            continue
+        finite = np.isfinite(values)
+        known = values[finite]
+        low, span = (float(known.min()), float(np.ptp(known))) if known.size else (0.0, 0.0)
+        # finer than any screen; the largest number is a gap
+        step = span / 65_000 if span > 0 else 1.0
+        levels = np.full(len(values), 65_535, dtype="<u2")
+        levels[finite] = np.round((known - low) / step)
+        out[name] = [low, step, base64.b64encode(levels.tobytes()).decode("ascii")]
+    return out
+
+
+def unpacked(columns: Mapping[str, Any], name: str) -> np.ndarray:
+    """Return one of the columns that `packed` gave, as numbers [T]."""
+    stored = columns[name]
+    low, step, text = columns[stored] if isinstance(stored, str) else stored
+    levels = np.frombuffer(base64.b64decode(text), dtype="<u2")
+    values: np.ndarray = np.where(levels == 65_535, np.nan, low + step * levels)
+    return values
+
+
+def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
+    """Write a figure of a run: a PNG for each case that has one, and the figure itself beside them.
+
+    Args:
+        folder: for the files.
+        figure: what they show.
+        name: of the files, that of the figure where empty.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    name = file_stem(name or figure.name)
+    # the sections of a surface belong to the screen, its cases stand side by side
+    groups = [figure.cases] if figure.surface else [[case] for case in figure.cases if case.still]
+    stills = []
+    for number, cases in enumerate(groups, start=1):
+        path = folder / (f"{name}.png" if len(groups) == 1 else f"{name}_{number}.png")
+        title = figure.title + (f": {cases[0].title}" if len(groups) > 1 else "")
+        save(still(figure, cases), path, title, figure.caption)
+        stills.append(path)
+    content = {name: getattr(figure, name) for name in _PLAIN} | {
+        "looks": {name: asdict(look) for name, look in figure.looks.items()},
+        "panels": [asdict(panel) for panel in figure.panels],
+        "surface": figure.surface and asdict(figure.surface),
+        "stills": [path.name for path in stills],
+        "cases": [_stored(figure, case) for case in figure.cases],
+    }
+    with whole(folder / f"{name}.json") as file:
+        file.write_text(json.dumps(content, separators=(",", ":")), encoding="utf-8")
+    return replace(figure, stills=stills)
+
+
+_PLAIN = ("name", "title", "caption", "chooser", "columns")
+
+
+def _stored(figure: Figure, case: Case) -> dict[str, Any]:
+    panels = []
+    for of_panel in case.curves:
+        # every cell of a surface has its height
+        light = {
+            name: curve if figure.looks[name].kind == "cells" else _light(*curve)
+            for name, curve in of_panel.items()
+        }
+        # packed curves of NaN alone are gaps
+        panels.append(
+            packed(
+                {
+                    f"{axis}{name}": np.asarray(values, dtype=float)
+                    for name, curve in light.items()
+                    for axis, values in zip("xy", curve, strict=True)
+                }
+            )
+        )
+    heights = np.log10(case.heights) if figure.surface and figure.surface.log else case.heights
+    return {
+        "title": case.title,
+        "note": case.note,
+        "still": case.still,
+        "chosen": list(map(float, case.chosen)),
+        "heights": packed({"heights": heights}),
+        "curves": panels,
+    }
+
+
+def _light(x: np.ndarray, y: np.ndarray) -> Curve:
+    """Return a curve with no more samples than a screen shows."""
+    pieces = parts(x, y)
+    most = max(20, min(600, 6_000 // max(len(pieces), 1)))
+    rows = [thinned(len(a), most) for a, _ in pieces]
+    return joined([(a[kept], b[kept]) for (a, b), kept in zip(pieces, rows, strict=True)])
+
+
+def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
+    """Write figures in the order in which a page shows them; those of an earlier call are replaced.
+
+    Other pictures of the folder stay.
+    """
+    for path in folder.glob("*.json"):
+        before = _read(path)
+        for file in (path, *before.stills) if before else ():
+            file.unlink(missing_ok=True)
+    begin("drawing figures")
+    # the number keeps the order for whoever lists the folder
+    return [
+        write_figure(folder, one, f"{i:02d}_{one.name}") for i, one in enumerate(figures, start=1)
+    ]
+
+
+def read_figures(folder: Path, names: str = ".*") -> list[Figure]:
+    """Return the figures of a folder in the order of their files; damaged ones are left out.
+
+    Args:
+        folder: as `write_figures` left it.
+        names: regular expression of the names of those that are wanted.
+    """
+    found = (_read(path) for path in sorted(folder.glob("*.json")))
+    return [figure for figure in found if figure and re.fullmatch(names, figure.name)]
+
+
+def figures_section(folder: Path, names: str = ".*") -> list[Section]:
+    """Return a section with the figures of a folder, none where there are none."""
+    figures = read_figures(folder, names)
+    return [Section("Figures", figures)] if figures else []
+
+
+def _read(path: Path) -> Figure | None:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        surface = content["surface"] and Surface(**content["surface"])
+        cases = []
+        for case in content.pop("cases"):
+            heights = unpacked(case.pop("heights"), "heights")
+            case["heights"] = 10.0**heights if surface and surface.log else heights
+            case["curves"] = [
+                {
+                    name[1:]: (unpacked(of, name), unpacked(of, f"y{name[1:]}"))
+                    for name in of
+                    if name[0] == "x"
+                }
+                for of in case["curves"]
+            ]
+            cases.append(Case(**case))
+        return Figure(
+            **{name: content[name] for name in _PLAIN},
+            looks={name: Look(**look) for name, look in content["looks"].items()},
+            panels=[Panel(**panel) for panel in content["panels"]],
+            cases=cases,
+            surface=surface,
+            stills=[path.parent / name for name in content["stills"]],
+        )
+    except (OSError, ValueError, TypeError, KeyError):
+        # damaged: it is drawn again, or is not one of residnet
+        return None
