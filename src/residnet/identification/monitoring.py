@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import copy
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import final
 
 import numpy as np
 import scipy
@@ -27,195 +26,12 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
 from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE, Live
 from residnet.data.prepare import Prepared
-from residnet.dynamics.base import Dynamics
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
-from residnet.physics.signals import SignalsConfig
+from residnet.identification.changes import Change, ChangedDynamics, causes, shown, surroundings
 from residnet.physics.symmetry import live_of
-
-_AXES = ("surge", "sway", "yaw")
-_TAKEN = (0.1, 1.0, 1.0)
-"""Share of the velocity of surge, sway and yaw whose absence shows what damps it."""
-
-
-@dataclass(frozen=True)
-class Change:
-    """A small change of a vessel, of its commands, of its surroundings or of a sensor.
-
-    Attributes:
-        name: short, for tables.
-        words: what it is, completing "the logs look as if ...".
-        unit: of its size.
-        size: that its effect is computed with.
-        heavier: added to the inertia of all axes, as a share.
-        damping: axis (0 surge, 1 sway, 2 yaw) whose damping changes; None for none.
-        damped: added to the damping of that axis, as a share of what the model has.
-        push: acceleration to north and east, m/s^2.
-        gain: added to the gain of inputs, by their number.
-        offset: added to inputs, by their number.
-        sensor: what a sensor adds: `gyro_scale`, `gyro_offset`, `speed_scale`, `lag`, or
-            `current_north`, `current_east` for water that moves; empty for none.
-    """
-
-    name: str
-    words: str
-    unit: str
-    size: float
-    heavier: float = 0.0
-    damping: int | None = None
-    damped: float = 0.0
-    push: tuple[float, float] = (0.0, 0.0)
-    gain: Mapping[int, float] = field(default_factory=dict)
-    offset: Mapping[int, float] = field(default_factory=dict)
-    sensor: str = ""
-
-    def of_size(self, size: float) -> Change:
-        """Return the same change of another size, in its unit."""
-        k = size / self.size
-        return replace(
-            self,
-            size=size,
-            heavier=k * self.heavier,
-            damped=k * self.damped,
-            push=(k * self.push[0], k * self.push[1]),
-            gain={place: k * value for place, value in self.gain.items()},
-            offset={place: k * value for place, value in self.offset.items()},
-        )
-
-
-def causes(signals: SignalsConfig) -> list[Change]:
-    """Return the changes that a monitor looks for, given the inputs of a model."""
-    units = signals.units()
-    out = [Change("mass", "the vessel has become heavier", "share", 0.02, heavier=0.02)]
-    live = signals.live
-    for axis, name in ((axis, _AXES[axis]) for axis in live.axes):
-        words = f"the damping in {name} has grown"
-        out.append(Change(f"damping {name}", words, "share", 0.02, damping=axis, damped=0.02))
-    for place, name in enumerate(signals.inputs):
-        words = f"{name} has grown stronger than it was"
-        out.append(Change(f"gain {name}", words, "share", 0.02, gain={place: 0.02}))
-        if units.get(name) == "rad":
-            words = f"{name} has an offset"
-            out.append(Change(f"offset {name}", words, "rad", 0.01, offset={place: 0.01}))
-    gyro = [
-        Change("gyro scale", "the gyro shows too much", "share", 0.02, sensor="gyro_scale"),
-        Change("gyro offset", "the gyro has an offset", "rad/s", 0.001, sensor="gyro_offset"),
-    ]
-    speed = Change(
-        "speed scale", "u and v are shown too large", "share", 0.02, sensor="speed_scale"
-    )
-    lag = Change("lag", "u, v and r come late", "s", 0.1, sensor="lag")
-    return [*out, *gyro * live.turns, *[speed] * live.moves, lag]
-
-
-def surroundings() -> list[Change]:
-    """Return what wind and current do, which is no change of the vessel."""
-    return [
-        Change("current north", "", "m/s", 0.05, sensor="current_north"),
-        Change("current east", "", "m/s", 0.05, sensor="current_east"),
-        Change("push north", "", "m/s^2", 0.005, push=(0.005, 0.0)),
-        Change("push east", "", "m/s^2", 0.005, push=(0.0, 0.005)),
-    ]
-
-
-def shown(sensor: str, x: Tensor, rate: Tensor, size: float) -> Tensor:
-    """Return what a sensor adds to states [..., 6] whose velocities change by `rate` [..., 3]."""
-    out = torch.zeros_like(x)
-    if sensor == "gyro_scale":
-        out[..., YAW_RATE] = size * x[..., YAW_RATE]
-    elif sensor == "gyro_offset":
-        out[..., YAW_RATE] = size
-    elif sensor == "speed_scale":
-        out[..., SURGE : SWAY + 1] = size * x[..., SURGE : SWAY + 1]
-    elif sensor == "lag":
-        out[..., VELOCITIES] = -size * rate
-    elif sensor in ("current_north", "current_east"):
-        cos, sin = torch.cos(x[..., HEADING]), torch.sin(x[..., HEADING])
-        north = sensor == "current_north"
-        out[..., SURGE] = size * (cos if north else sin)
-        out[..., SWAY] = size * (-sin if north else cos)
-    return out
-
-
-@final
-class ChangedDynamics(Dynamics):
-    """A model with a change of its own for every block of rows.
-
-    Args:
-        model: as it was fitted.
-        changes: C of them; rows [C * B] are blocks of B.
-        rows: B.
-        inputs: number of the model's inputs.
-    """
-
-    def __init__(
-        self, model: HybridDynamics, changes: Sequence[Change], rows: int, inputs: int
-    ) -> None:
-        super().__init__(model.dt, model.integrator)
-        self.model = model
-        self.n_state = model.n_state
-
-        def each(values: Sequence[Sequence[float]]) -> Tensor:
-            table = torch.tensor(values, dtype=torch.float64)
-            return table.repeat_interleave(rows, dim=0)
-
-        span = range(inputs)
-        self.inertia = each([[1.0 + change.heavier] for change in changes])
-        damped = [k for k, change in enumerate(changes) if change.damping is not None]
-        self.damps = len(damped) > 0
-        self.damped_rows = torch.tensor(damped).repeat_interleave(rows) * rows + torch.arange(
-            rows
-        ).repeat(len(damped))
-        self.damping = torch.tensor(
-            [changes[k].damping or 0 for k in damped], dtype=torch.long
-        ).repeat_interleave(rows)
-        self.damped = torch.tensor(
-            [changes[k].damped for k in damped], dtype=torch.float64
-        ).repeat_interleave(rows)
-        self.push = each([change.push for change in changes])
-        self.gain = each([[1.0 + change.gain.get(i, 0.0) for i in span] for change in changes])
-        self.offset = each([[change.offset.get(i, 0.0) for i in span] for change in changes])
-
-    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return state and memory one step later, with the changed acceleration."""
-        w = w * self.gain + self.offset
-        after, memory = self.model.step(x, w, s)
-        nu = x[:, VELOCITIES]
-        gained = after[:, VELOCITIES] - nu
-        if self.damps:
-            gained = gained - self._slowed(x, w, s, gained)
-        cos, sin = torch.cos(x[:, HEADING]), torch.sin(x[:, HEADING])
-        north, east = self.push[:, 0], self.push[:, 1]
-        push = torch.stack(
-            (cos * north + sin * east, cos * east - sin * north, torch.zeros_like(north)), dim=1
-        )
-        moved = nu + gained / self.inertia + self.dt * push
-        changed = after.clone()
-        changed[:, VELOCITIES] = moved
-        # the heading follows what the yaw rate has gained over the step
-        changed[:, HEADING] = after[:, HEADING] + 0.5 * self.dt * (moved[:, 2] - after[:, YAW_RATE])
-        return changed, memory
-
-    def _slowed(self, x: Tensor, w: Tensor, s: Tensor, gained: Tensor) -> Tensor:
-        """Return what changed damping takes from the velocities gained over a step [B, 3].
-
-        What damps a velocity is what the step lacks without it; of surge only a part is taken away,
-        for models that hold near a service speed alone.
-        """
-        rows, axis = self.damped_rows, self.damping
-        taken = torch.tensor(_TAKEN, dtype=x.dtype)[axis]
-        share = torch.ones(len(rows), 3, dtype=x.dtype)
-        share[torch.arange(len(rows)), axis] = 1.0 - taken
-        still = x[rows].clone()
-        still[:, VELOCITIES] = still[:, VELOCITIES] * share
-        alone = self.model.step(still, w[rows], s[rows])[0][:, VELOCITIES] - still[:, VELOCITIES]
-        place = torch.arange(len(rows))
-        out = torch.zeros_like(gained)
-        out[rows, axis] = self.damped * (alone[place, axis] - gained[rows, axis]) / taken
-        return out
-
 
 SEEN = {"u": SURGE, "v": SWAY, "r": YAW_RATE, "heading": HEADING}
 """What innovations are taken of, and its columns in states."""

@@ -23,11 +23,10 @@ from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import UsageError
 from residnet.core.layout import VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.identification.changes import Change, ChangedDynamics
 from residnet.identification.models import FittedModel
 from residnet.identification.monitoring import (
     BELIEVED,
-    Change,
-    ChangedDynamics,
     Piece,
     Verdict,
     Watch,

@@ -12,9 +12,8 @@ from residnet.core.errors import DataError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
+from residnet.identification.changes import Change, ChangedDynamics
 from residnet.identification.monitoring import (
-    Change,
-    ChangedDynamics,
     MonitorConfig,
     Piece,
     Verdict,
