@@ -25,7 +25,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 import made_run
 from browser import browser
 
-from residnet.report.fit import write_fit_report
+from residnet.report.fit import write_fit_figures, write_fit_page
+from residnet.report.run_reader import RunFiles
 
 _TOLD = """<script>(function wait() {
   const parts = [...document.querySelectorAll(".live .opening .explorer")];
@@ -99,7 +100,9 @@ def main() -> None:
     logs = [f"{kinds[i % len(kinds)]}_{i:02d}" for i in range(given.logs)]
     made_run.KINDS = {name: name.rpartition("_")[0] for name in logs}
     with tempfile.TemporaryDirectory() as folder:
-        page = write_fit_report(made_run.made_run(Path(folder) / "run"))
+        run = RunFiles(made_run.made_run(Path(folder) / "run"))
+        write_fit_figures(run)
+        page = write_fit_page(run)
         size = page.stat().st_size
         times = sorted(opened(program, page) for _ in range(given.times))
     print(

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from exact_steps import NomotoDynamics
 from kinds import of_kind
 from torch import Tensor
 
@@ -20,7 +21,7 @@ from residnet.control import (
 from residnet.core.errors import ConfigError
 from residnet.documents.gouletas2020.law import DocumentAutopilot, Predictor, SimulatedPredictor
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import NomotoDynamics, PlantDynamics
+from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.nomoto import SteeringVessel
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel

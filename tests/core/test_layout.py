@@ -17,7 +17,6 @@ def test_columns_are_those_of_the_names() -> None:
     assert STATE[layout.VELOCITIES] == VELOCITY
     assert STATE[layout.POSITION] == ("x", "y")
     assert STATE[layout.LATERAL] == ("v", "r")
-    assert STATE[layout.HEADING_AND_VELOCITIES] == ("psi", "u", "v", "r")
     places = (layout.HEADING, layout.SURGE, layout.SWAY, layout.YAW_RATE)
     assert tuple(STATE[place] for place in places) == ("psi", "u", "v", "r")
 

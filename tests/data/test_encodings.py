@@ -13,8 +13,9 @@ from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.detect import format_of, recording_for
+from residnet.data.readers.detect import AutoConfig, format_of
 from residnet.data.readers.formats.topic_folder import TopicFolderConfig
+from residnet.data.readers.recording import EVERYTHING
 from residnet.data.readers.texts import encoding_of
 
 T = np.arange(0.0, 30.0, 0.1)
@@ -95,7 +96,7 @@ def test_sentences_that_a_shell_of_windows_wrote(tmp_path: Path) -> None:
     found = format_of(path)
     assert found is not None
     assert found.name == "NMEA 0183"
-    latitude = recording_for(path).series["RMC"].fields["latitude"]
+    latitude = AutoConfig().load(path, EVERYTHING).series["RMC"].fields["latitude"]
     np.testing.assert_allclose(latitude, [59 + (54.320 + 0.001 * i) / 60 for i in range(5)])
 
 

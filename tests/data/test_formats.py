@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import written_logs
-from written_logs import COMMANDS, EPOCH, outcome, trial
+from written_logs import COMMANDS, EPOCH, outcome, reader_for, recording_for, trial
 
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.detect import format_of, reader_for, recording_for
+from residnet.data.readers.detect import format_of
 
 Writer = Callable[[Log, Path], Path]
 TABLES: list[Writer] = [written_logs.csv, written_logs.parquet]
@@ -222,7 +222,7 @@ def test_formats_by_content(tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text("a,b\n1,2\n")
     assert format_of(tmp_path / "table.csv") is None
     with pytest.raises(UsageError, match="give a channel map"):
-        reader_for(tmp_path / "table.csv")
+        reader_for(tmp_path / "table.csv").read(tmp_path / "table.csv")
 
 
 def test_everything_that_a_bag_holds(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import written_recorders
-from written_logs import EPOCH, outcome, trial
+from written_logs import EPOCH, outcome, reader_for, trial
 from written_recorders import ORIGIN
 
 import residnet
@@ -19,7 +19,7 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.detect import format_of, reader_for
+from residnet.data.readers.detect import format_of
 
 
 def read(path: Path, **config: Any) -> Log:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.core.layout import HEADING_AND_VELOCITIES, POSITION
+from residnet.core.layout import HEADING, MOTION, POSITION
 from residnet.core.samples import Samples
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
@@ -47,9 +47,9 @@ def test_heading_and_velocities_do_not_hang_on_positions(
     for model.positions in (True, False):
         held = w.clone().requires_grad_(True)
         x, _, _ = Rollout(model)(x0, held, model.initial_state(5).double())
-        slopes.append(torch.autograd.grad(x[:, -1, HEADING_AND_VELOCITIES].square().sum(), held)[0])
+        slopes.append(torch.autograd.grad(x[:, -1, HEADING : MOTION.stop].square().sum(), held)[0])
         states.append(x.detach())
-    whole, alone = (x[..., HEADING_AND_VELOCITIES] for x in states)
+    whole, alone = (x[..., HEADING : MOTION.stop] for x in states)
     assert float(whole.diff(dim=1).abs().max()) > 0.01
     torch.testing.assert_close(alone, whole, rtol=0, atol=1e-13)
     torch.testing.assert_close(*slopes, rtol=0, atol=1e-13)
@@ -90,9 +90,9 @@ def test_gradients_are_those_of_single_steps(head: FeatureConfig, terms: str) ->
     for model.positions in (True, False):
         model.zero_grad()
         states, _, memory = free(x0, w, s)
-        (states[..., HEADING_AND_VELOCITIES].square().sum() + memory.square().sum()).backward()
+        (states[..., HEADING : MOTION.stop].square().sum() + memory.square().sum()).backward()
         slopes = [p.grad for p in model.head.parameters() if p.grad is not None]
-        found.append([states[..., HEADING_AND_VELOCITIES].detach(), memory.detach(), *slopes])
+        found.append([states[..., HEADING : MOTION.stop].detach(), memory.detach(), *slopes])
     assert len(found[0]) == len(found[1]) > 4
     for alone, ahead in zip(*found, strict=True):
         torch.testing.assert_close(ahead, alone, rtol=1e-8, atol=1e-10)

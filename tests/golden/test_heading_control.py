@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from exact_steps import NomotoDynamics
 from golden_tables import over_its_length, table
 from torch import Tensor
 
@@ -33,7 +34,7 @@ from residnet.control import (
 from residnet.documents.gouletas2020.law import DocumentAutopilot, SimulatedPredictor
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import NomotoDynamics, TracedPlantDynamics
+from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.hull import PatrolConfig

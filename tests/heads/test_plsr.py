@@ -134,7 +134,7 @@ def test_named_terms_and_features() -> None:
     np.testing.assert_allclose(
         head.basis(samples.z), torch.stack((u * u.abs(), u * r, r * r.abs()), dim=1), rtol=1e-12
     )
-    assert list(head.coefficient_table()) == ["u|u|", "u r", "r|r|"]
+    assert list(head.library.terms) == ["u|u|", "u r", "r|r|"]
 
 
 def test_free_runs_are_offered_every_order_and_none() -> None:

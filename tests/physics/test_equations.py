@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from exact_steps import NomotoDynamics
 from scipy.integrate import solve_ivp
 from scipy.signal import TransferFunction, lsim
 from torch import Tensor
 
 from residnet.core.config import load_config
-from residnet.core.errors import ConfigError
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import NomotoDynamics, PlantDynamics, TracedPlantDynamics
+from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.actuators import AzimuthThrusters
 from residnet.physics.actuators.rudders import WaterJets
@@ -786,14 +786,12 @@ def test_an_unstable_ship_has_both_signs_negative() -> None:
     assert states[-1, 5] == pytest.approx(0.1 * (np.exp(10.0 / 20) - 1), rel=1e-12)
 
 
-def test_an_exact_step_needs_a_rudder_that_is_held() -> None:
+def test_a_rudder_that_lags_follows_its_time_constant() -> None:
     plant = load_config(
         vessel_files()["nomoto_oceanos"],
         ["rudder.response={kind: first_order, time: 1 s}"],
         VesselConfig,
     ).build()
-    with pytest.raises(ConfigError, match="an exact step holds the rudder"):
-        NomotoDynamics(plant, 0.1)
     assert flown(PlantDynamics(plant, 0.1), np.full(30, 0.1))[-1, -1] == pytest.approx(
         0.1 * (1 - np.exp(-3.0)), rel=1e-5
     )

@@ -17,7 +17,7 @@ from read_page import Page, plain
 from residnet.core.errors import DataError, UsageError
 from residnet.core.format import change, number
 from residnet.judge.soundness import CHECKS, Finding, sanity_content
-from residnet.report.fit import write_fit_page, write_fit_report
+from residnet.report.fit import write_fit_figures, write_fit_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.models import term_unit
 
@@ -283,7 +283,8 @@ def test_standard_errors_of_a_refitted_baseline_are_named(run: Path) -> None:
 @pytest.mark.long
 def test_the_file_stands_alone_and_loads_nothing(run: Path) -> None:
     residuals().to_parquet(run / "residuals.parquet")
-    path = write_fit_report(run)
+    write_fit_figures(RunFiles(run))
+    path = write_fit_page(RunFiles(run))
     assert path == run / "report.html"
     text = path.read_text()
     scripts = re.findall(r"<script([^>]*)>", text)

@@ -18,7 +18,11 @@ from scipy.io import savemat
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.data.readers.detect import reader_for
+from residnet.data.readers.base import LogReader
+from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.readers.detect import AutoConfig
+from residnet.data.readers.recording import EVERYTHING, Recording
+from residnet.data.readers.topics import align_clocks
 
 EPOCH = 1_744_362_945
 COMMANDS = ("cmd_port", "cmd_stbd")
@@ -257,6 +261,16 @@ def _quaternion(log: Log) -> tuple[np.ndarray, ...]:
     """Of the heading, counter-clockwise from east; its sign flips wherever the wrapped yaw does."""
     yaw = np.remainder(np.pi / 2 - log["psi"] + np.pi, 2 * np.pi) - np.pi
     return 0.0 * yaw, 0.0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)
+
+
+def reader_for(path: Path) -> LogReader:
+    """The reader of a file or folder that describes itself."""
+    return (CanonicalConfig() if Log.recognises(path) else AutoConfig()).build()
+
+
+def recording_for(path: Path) -> Recording:
+    """All that a file or folder holds, its clocks settled, before it becomes a log."""
+    return align_clocks(AutoConfig().load(path, EVERYTHING), {}, None)
 
 
 def outcome(path: Path) -> str | None:

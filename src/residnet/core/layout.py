@@ -271,8 +271,6 @@ SWAY = PLANAR.names.index("v")
 YAW_RATE = PLANAR.names.index("r")
 LATERAL = slice(SWAY, YAW_RATE + 1)
 """Columns of sway and yaw, whose motion is that of steering."""
-HEADING_AND_VELOCITIES = slice(HEADING, len(PLANAR.names))
-"""Columns of all that forces may depend on."""
 
 RANGE_VELOCITIES = slice(0, PLANAR.dof)
 """Of ranges, channels and accelerations: velocities stand first."""

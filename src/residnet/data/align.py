@@ -148,7 +148,7 @@ class _Reach:
     """
 
     def __init__(self, t: np.ndarray, grid: np.ndarray, half: np.ndarray, gap: np.ndarray) -> None:
-        self._t, self._half, self._gap = t, half, gap
+        self._t, self._gap = t, gap
         self._low, self._w_low = self._place(grid - half)
         self._high, self._w_high = self._place(grid + half)
         # first and last sample that carry weight

@@ -457,7 +457,7 @@ def compiled_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
         ExportError: where there is no compiler, or it fails.
     """
     tool = compiler()
-    flags = _flags(quick)
+    flags = ("-O0", *_FLAGS[1:]) if quick else _FLAGS
     file = _kept(tool, source, flags)
     try:
         if not file.is_file():
@@ -474,10 +474,6 @@ def compiled_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
             out = Path(folder) / "compiled.so"
             _compile(tool, source, flags, out)
             return ctypes.CDLL(str(out))
-
-
-def _flags(quick: bool) -> tuple[str, ...]:
-    return ("-O0", *_FLAGS[1:]) if quick else _FLAGS
 
 
 def _kept(tool: str, source: str, flags: Sequence[str]) -> Path:

@@ -96,7 +96,6 @@ def lowered(
     arguments: Sequence[tuple[str, int]],
     results: Sequence[str],
     what: str,
-    examples: Sequence[Tensor] | None = None,
 ) -> ca.Function:
     """Return the CasADi function of a step for one row in float64.
 
@@ -105,13 +104,11 @@ def lowered(
         arguments: names and sizes.
         results: names.
         what: is lowered, for messages.
-        examples: arguments to record with; zeros where not given.
 
     Raises:
         ExportError: where an operation is not known, by its name, or Python decides by values.
     """
-    if examples is None:
-        examples = [torch.zeros(1, size, dtype=torch.float64) for _, size in arguments]
+    examples = [torch.zeros(1, size, dtype=torch.float64) for _, size in arguments]
     columns = [ca.MX.sym(name, size) for name, size in arguments]
     graph = recorded(step, examples, what)
     values = dict(zip(_placeholders(graph), map(_Value, examples, columns), strict=True))

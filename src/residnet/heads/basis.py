@@ -144,10 +144,3 @@ class BasisHead(ClosedFormHead):
             names=self.library.terms,
             outputs=self.outputs,
         )
-
-    def coefficient_table(self) -> dict[str, list[float]]:
-        """Return the coefficients (of each axis) by basis function, for the report.
-
-        Features are in units of their standard deviation.
-        """
-        return dict(zip(self.library.terms, self.coefficients.tolist(), strict=True))

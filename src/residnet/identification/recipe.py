@@ -58,9 +58,9 @@ class Facts:
     rolling: float = math.inf
 
     @classmethod
-    def supposed(cls, names: tuple[str, ...], step: float = 0.1) -> Facts:
+    def supposed(cls, names: tuple[str, ...]) -> Facts:
         """Return facts before any log is read: every channel moves, ahead only."""
-        return cls(names, _acting(names), (), step, _USUAL, 0.1 * _USUAL, math.inf, 10_000)
+        return cls(names, _acting(names), (), 0.1, _USUAL, 0.1 * _USUAL, math.inf, 10_000)
 
     @classmethod
     def of(

@@ -84,13 +84,12 @@ class Refit:
     ended: str
 
 
-def recursive_refit(watch: Watch, logs: Sequence[Sequence[Piece]], most: int = _MOST) -> Refit:
+def recursive_refit(watch: Watch, logs: Sequence[Sequence[Piece]]) -> Refit:
     """Put the changes that a monitor names into a copy of its model, until it names none.
 
     Args:
         watch: over the model, which stays as it is.
         logs: windows of the new logs, in the order of time.
-        most: changes that are put into the model at most.
 
     Raises:
         UsageError: where the model's baseline has no parameters that could move.
@@ -106,7 +105,7 @@ def recursive_refit(watch: Watch, logs: Sequence[Sequence[Piece]], most: int = _
     model, moved = watch.model, list[Moved]()
     while True:
         first = verdict.suspects[0].change
-        ended = _ended(verdict, [one.change for one in moved], most)
+        ended = _ended(verdict, [one.change for one in moved])
         if not ended:
             _, share = _direction(watch.model, first, groups)
             if share < _EXPRESSED:
@@ -151,7 +150,7 @@ def _judged(watch: Watch, groups: Sequence[tuple[int, Sequence[Piece]]]) -> Verd
     return watch.judge([log for log, _ in groups], sums)
 
 
-def _ended(verdict: Verdict, taken: Sequence[Change], most: int) -> str:
+def _ended(verdict: Verdict, taken: Sequence[Change]) -> str:
     """Return why no further change is taken, empty where one is."""
     first = verdict.suspects[0]
     if not verdict.alarm:
@@ -166,8 +165,8 @@ def _ended(verdict: Verdict, taken: Sequence[Change], most: int) -> str:
         )
     if first.change in taken:
         return f"'{first.change.name}' is named again, so that its size does not explain the logs"
-    if len(taken) >= most:
-        return f"{most} changes are in the model; fit it anew from the new logs"
+    if len(taken) >= _MOST:
+        return f"{_MOST} changes are in the model; fit it anew from the new logs"
     return ""
 
 

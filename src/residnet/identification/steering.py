@@ -37,15 +37,13 @@ class IdentifiedSteering(NamedTuple):
     rudder: float
 
 
-def identify_steering(
-    logs: Sequence[Log], rudder: str | None = None, longest_delay: float = 2.0
-) -> IdentifiedSteering:
+def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> IdentifiedSteering:
     """Return K, T and delay of the vessel that logs are of.
 
     Args:
-        logs: with yaw rate `r` or heading `psi`, and the rudder; turns to both sides tell most.
-        rudder: channel of the rudder angle; by default the command where a log has it, since the
-            delay of the steering gear counts, otherwise the measured angle.
+        logs: with yaw rate `r` or heading `psi`, and the rudder; turns to both sides tell most. The
+            rudder is the command where a log has it, since the delay of the steering gear counts,
+            otherwise the measured angle.
         longest_delay: that is searched for, in s.
 
     Raises:
@@ -54,7 +52,7 @@ def identify_steering(
     """
     if not logs:
         raise DataError("steering: no logs given")
-    found = [_record(log, rudder) for log in logs]
+    found = [_record(log) for log in logs]
     records, names = [record for record, _ in found], {name for _, name in found}
     spread = max(float(np.std(record.rudder)) for record in records)
     if spread < _LEAST:
@@ -84,15 +82,14 @@ def _noise(logs: Sequence[Log], name: str) -> float:
     return float(np.median(finite) / (0.6745 * np.sqrt(6.0))) if len(finite) else float("nan")
 
 
-def _record(log: Log, rudder: str | None) -> tuple[Record, str]:
+def _record(log: Log) -> tuple[Record, str]:
     """Return a log on a uniform grid at its median step, and the rudder's channel."""
-    names = _RUDDERS if rudder is None else (rudder,)
-    name = next((name for name in names if name in log.channels), None)
+    name = next((name for name in _RUDDERS if name in log.channels), None)
     source = next((name for name in ("r", "psi") if name in log.channels), None)
     if name is None or source is None:
         raise DataError(
-            f"log {log.name}: K and T need the rudder ({' or '.join(names)}) and the yaw rate r or"
-            f" the heading psi; it has {', '.join(log.channels)}"
+            f"log {log.name}: K and T need the rudder ({' or '.join(_RUDDERS)}) and the yaw rate r"
+            f" or the heading psi; it has {', '.join(log.channels)}"
         )
     usable = log.usable & np.isfinite(log[source]) & np.isfinite(log[name])
     if int(usable.sum()) < _SAMPLES:

@@ -281,7 +281,7 @@ def memory(pieces: Pieces) -> Memory:
     return Memory(block, variance, min(n * float(covariance[0]) / variance, float(n)))
 
 
-def block_interval(pieces: Pieces, seed: int = 0) -> Interval:
+def block_interval(pieces: Pieces) -> Interval:
     """Return the mean of all samples with its 95 % interval by a moving-block bootstrap.
 
     The block length is that of `memory`.
@@ -309,7 +309,7 @@ def block_interval(pieces: Pieces, seed: int = 0) -> Interval:
         low = error * float(scipy.stats.norm.ppf(level))
         high = -low
     else:
-        draws = np.random.default_rng(seed).integers(0, len(sums), size=(_RESAMPLES, drawn))
+        draws = np.random.default_rng(0).integers(0, len(sums), size=(_RESAMPLES, drawn))
         means = sums[draws].sum(axis=1) / sizes[draws].sum(axis=1)
         apart = means - means.mean()
         error = float(apart.std())

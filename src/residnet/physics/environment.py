@@ -329,10 +329,6 @@ class Waves(nn.Module):
         )
         return self.omega * t - self.number * along + self.phase
 
-    def elevation(self, north: Tensor, east: Tensor, t: float) -> Tensor:
-        """Return the elevation of the surface [B] in m, upwards."""
-        return (self.amplitude * torch.cos(self.phases(north, east, t))).sum(-1)
-
     def response(self, psi: Tensor) -> tuple[Tensor, Tensor]:
         """Return the force per wave amplitude in quadrature [B, K, 3] and in phase [B, K].
 

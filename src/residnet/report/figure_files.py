@@ -145,9 +145,9 @@ def read_figures(folder: Path, names: str = ".*") -> list[Figure]:
     return [figure for figure in found if figure and re.fullmatch(names, figure.name)]
 
 
-def figures_section(folder: Path, names: str = ".*") -> list[Section]:
+def figures_section(folder: Path) -> list[Section]:
     """Return a section with the figures of a folder, none where there are none."""
-    figures = read_figures(folder, names)
+    figures = read_figures(folder)
     return [Section("Figures", figures)] if figures else []
 
 

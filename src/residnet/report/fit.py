@@ -68,18 +68,6 @@ def write_fit_figures(run: RunFiles) -> list[Figure]:
     return write_figures(run.path / "figures", (one for one in _figures(run) if one is not None))
 
 
-def write_fit_report(path: Path) -> Path:
-    """Write figures and `report.html` of a fit or an evaluation from its folder alone.
-
-    Raises:
-        UsageError: where the folder holds no metrics.json.
-        DataError: where a file in it cannot be read.
-    """
-    run = RunFiles(path)
-    write_fit_figures(run)
-    return write_fit_page(run)
-
-
 def write_fit_page(run: RunFiles) -> Path:
     """Write `report.html` of a fit or an evaluation with the figures that stand in its folder.
 

@@ -405,14 +405,12 @@ class Delay:
         error: standard error of that, s.
         better: what a fit leaves without the shift, over what it leaves with it (sums of squares).
         late: what the best shift leaves that is no early answer, over the least that any leaves.
-        sharp: `better` where the shift is wrong by the least lag that matters to either side.
     """
 
     seconds: float
     error: float
     better: float
     late: float
-    sharp: float
 
 
 def delays(log: Record) -> dict[tuple[str, str], tuple[tuple[str, ...], Delay]]:
@@ -505,10 +503,8 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     scatter = SIGMA_OF_MAD * float(np.median(np.abs(np.array(each) - np.median(each))))
     error = max(1.5 * scatter / np.sqrt(len(sections)), 0.25 * step)
     rest = max(float(sums[best][good].sum()), 1e-300)
-    apart = max(round(EARLY * 1.5 / step), 2)
     late = min(value for shift, value in total.items() if -shift * step <= EARLY) / floor
-    beside = min(float(left(best + side)[good].sum()) for side in (-apart, apart))
-    return Delay(best * step, error, float(sums[0][good].sum()) / rest, late, beside / rest)
+    return Delay(best * step, error, float(sums[0][good].sum()) / rest, late)
 
 
 @check(

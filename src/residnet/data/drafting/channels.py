@@ -270,7 +270,11 @@ class Channels:
 
         Names such as vx and vy do not say which; position and heading do, without them.
         """
-        called = [n for n in ("u", "v") if n in self._names and self._along_axis(n)]
+        called = [
+            name
+            for name in ("u", "v")
+            if name in self._names and axis_velocity(words_of(self._names[name])) is not None
+        ]
         if not called:
             return
         if self._over_ground(called):
@@ -281,9 +285,6 @@ class Channels:
         for name in called:
             text = "taken along the vessel's own axes, which position and heading do not contradict"
             self._marks.guess((*CHANNELS, name), text)
-
-    def _along_axis(self, name: str) -> bool:
-        return axis_velocity(words_of(self._names[name])) is not None
 
     def _over_ground(self, called: Sequence[str]) -> bool:
         """Return whether velocities along x and y fit those along north and east better."""

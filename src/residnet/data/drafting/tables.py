@@ -101,7 +101,11 @@ def draft_tables(
         marks.guess((*READER, "time"), clock.guess)
     held = {name for sheet in sheets for name in sheet.numbers}
     numeric = [name for name in shared if name in held and name not in clock.columns]
-    minutes = [n for n in numeric if state_channel(words_of(n)) in _LARGEST and _in_minutes(n)]
+    minutes = [
+        name
+        for name in numeric
+        if state_channel(words_of(name)) in _LARGEST and written_unit(name, "s") == "min"
+    ]
     if minutes:
         raise DataError(
             f"{first.path}: '{minutes[0]}' holds minutes whose degrees stand in another column;"
@@ -135,10 +139,6 @@ def draft_tables(
     content |= mark_folders(files, marks)
     _unused(first, names, clock, marks)
     return {**content, "channels": channels}, left_out
-
-
-def _in_minutes(column: str) -> bool:
-    return written_unit(column, "s") == "min"
 
 
 def _wider(sheet: Sheet, clock: Clock, numeric: Sequence[str]) -> str:

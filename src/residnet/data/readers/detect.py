@@ -8,8 +8,7 @@ from typing import Literal, final
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.data.readers.base import LogReader, require_file
-from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.readers.base import require_file
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.formats.ardupilot import ArduPilotConfig
 from residnet.data.readers.formats.moos import MoosConfig
@@ -18,10 +17,9 @@ from residnet.data.readers.formats.rosbag import RosbagConfig
 from residnet.data.readers.formats.topic_folder import TopicFolderConfig
 from residnet.data.readers.formats.trees import Hdf5Config, MatConfig
 from residnet.data.readers.formats.ulog import UlogConfig
-from residnet.data.readers.recording import EVERYTHING, Recording, Wanted
+from residnet.data.readers.recording import Recording, Wanted
 from residnet.data.readers.tables import TABLES
 from residnet.data.readers.texts import first_rows
-from residnet.data.readers.topics import align_clocks
 
 # in the order in which they are asked: content that cannot be mistaken first, endings last
 _RECORDINGS: tuple[type[RecordingConfig], ...] = (
@@ -126,25 +124,6 @@ def kind_of(path: Path) -> str:
     if recording is None and ending not in TABLES and not is_text_table(path):
         raise UsageError(f"{path}: is of no format that residnet knows; {to_table(ending)}")
     return "table" if recording is None else recording.name
-
-
-def reader_for(path: Path) -> LogReader:
-    """Return a reader for a file or folder that describes itself.
-
-    Raises:
-        UsageError: where there is nothing at `path`, or it needs a channel map.
-    """
-    return CanonicalConfig().build() if Log.recognises(path) else _config_for(path).build()
-
-
-def recording_for(path: Path) -> Recording:
-    """Return all that a file or folder holds, its clocks settled, before it becomes a log.
-
-    Raises:
-        UsageError: where there is nothing at `path`, or its format describes no channels.
-        DataError: where it cannot be read.
-    """
-    return align_clocks(_config_for(path).load(path, EVERYTHING), {}, None)
 
 
 def _config_for(path: Path) -> RecordingConfig:
