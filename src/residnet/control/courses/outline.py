@@ -272,7 +272,7 @@ class Outlines:
             target = self._poses(number)
             before = [groups[-1]]
             if self.centres.size:
-                for other in self._between(groups[-1], number):
+                for other in self._between(number):
                     for side in (1, -1):
                         via = self._around(self.kept[other], side, None, ())
                         self._reach(before, via, number == 0)
@@ -308,7 +308,7 @@ class Outlines:
         poses = _Poses(circle.place + spots, headings, number)
         return poses.with_arc(side, circle.table, ring)
 
-    def _between(self, before: _Poses, number: int) -> list[int]:
+    def _between(self, number: int) -> list[int]:
         """Return the circles that lie in the way to a buoy, the nearest first."""
         begin = self.start if number == 0 else self.circles[number - 1].place
         end = self.circles[number].place

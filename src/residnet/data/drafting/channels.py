@@ -378,7 +378,6 @@ class Channels:
         unit = self._unit("wind_dir", mark=False)
         shares = [
             explained_turn(
-                raw,
                 raw.columns["wind_dir"] * to_si(unit, "rad"),
                 heading_of(raw, self._psi_unit, self._frame),
             )

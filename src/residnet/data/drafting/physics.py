@@ -232,11 +232,10 @@ def turns_to(
     return float(solution[0]), spread
 
 
-def explained_turn(log: Raw, direction: np.ndarray, psi: np.ndarray) -> float:
+def explained_turn(direction: np.ndarray, psi: np.ndarray) -> float:
     """Return how far a wind's direction turns against the heading, from 0 (not) to 1 (all).
 
     Args:
-        log: of both.
         direction: [T] in rad.
         psi: [T] in rad.
     """
