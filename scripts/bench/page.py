@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 import made_run
 from browser import browser
 
-from residnet.report.fit import write_fit_figures, write_fit_page
+from residnet.report.fit import write_fit_figures
 from residnet.report.run_reader import RunFiles
 
 _TOLD = """<script>(function wait() {
@@ -102,7 +102,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = RunFiles(made_run.made_run(Path(folder) / "run"))
         write_fit_figures(run)
-        page = write_fit_page(run)
+        page = made_run.write_fit_page(run)
         size = page.stat().st_size
         times = sorted(opened(program, page) for _ in range(given.times))
     print(

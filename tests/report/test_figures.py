@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import browser, layout
-from made_run import LEVEL, made_run, metrics, residuals, write_json
+from made_run import LEVEL, made_run, metrics, residuals, write_fit_page, write_json
 from PIL import Image
 
 from residnet.core.errors import UsageError
@@ -36,7 +36,7 @@ from residnet.report.figure import (
     whiskers,
 )
 from residnet.report.figure_files import read_figures, unpacked, write_figures
-from residnet.report.fit import write_fit_figures, write_fit_page
+from residnet.report.fit import write_fit_figures
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import runs

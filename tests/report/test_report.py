@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_json
+from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_fit_page, write_json
 from read_page import Page, plain
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.format import change, number
 from residnet.judge.soundness import CHECKS, Finding, sanity_content
-from residnet.report.fit import write_fit_figures, write_fit_page
+from residnet.report.fit import write_fit_figures
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.models import term_unit
 

@@ -6,12 +6,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-from made_run import made_run
+from made_run import made_run, write_fit_page
 from read_page import plain
 
 from residnet.core.log import Log
 from residnet.data.doctor import inspect, inspect_together, inspection
-from residnet.report.fit import write_fit_page
 from residnet.report.run_reader import RunFiles
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from made_run import DEG, made_run, write_json
+from made_run import DEG, made_run, write_fit_page, write_json
 from made_series import autoregressive
 
 from residnet.core.format import number
 from residnet.judge.goodness import OneStep, content, table
 from residnet.report.blocks import Section, Table, Text
-from residnet.report.fit import write_fit_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.models import goodness
 

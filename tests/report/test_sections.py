@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from browser import browser, layout
-from made_run import made_run
+from made_run import made_run, write_fit_page
 from made_task_runs import (
     made_actuators,
     made_autopilot,
@@ -23,7 +23,7 @@ from read_page import Page, plain
 
 from residnet.judge.verdict import LEVELS
 from residnet.report.blocks import Section
-from residnet.report.fit import fit_sections, write_fit_figures, write_fit_page
+from residnet.report.fit import fit_sections, write_fit_figures
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import actuators, autopilot, course, import_logs, manoeuvres, study

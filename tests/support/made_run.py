@@ -10,6 +10,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from residnet.report.fit import fit_sections
+from residnet.report.page import write_page
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections import verdict
+
 DEG = 180.0 / math.pi
 MODELS = {"zero": "zero", "baseline": "baseline", "mlp": "head", "plsr": "head", "truth": "truth"}
 # error of each model: rmse of u [m/s], v [m/s], r [rad/s]
@@ -217,3 +222,16 @@ def made_run(run: Path, *, split: str = "test") -> Path:
         {"parameters": 1347, "epochs": 4, "seconds": 23.0, "validation": 0.14, "curve": curve()},
     )
     return run
+
+
+def write_fit_page(run: RunFiles) -> Path:
+    """Write `report.html` of a fit or an evaluation with the figures that stand in its folder."""
+    title = str(run.metrics.get("run") or run.path.name)
+    return write_page(
+        run.path,
+        title,
+        run.description,
+        verdict.verdict(run),
+        fit_sections(run),
+        level=verdict.level(run),
+    )

@@ -10,7 +10,6 @@ from residnet.judge.soundness import read_findings
 from residnet.report.blocks import Section
 from residnet.report.figure import Figure
 from residnet.report.figure_files import read_figures, write_figures
-from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import data, free_runs, manoeuvres, models, runs, verdict
 
@@ -66,24 +65,6 @@ def write_fit_figures(run: RunFiles) -> list[Figure]:
         UsageError: where the folder holds no metrics.json.
     """
     return write_figures(run.path / "figures", (one for one in _figures(run) if one is not None))
-
-
-def write_fit_page(run: RunFiles) -> Path:
-    """Write `report.html` of a fit or an evaluation with the figures that stand in its folder.
-
-    Raises:
-        UsageError: where the folder holds no metrics.json.
-        DataError: where a file in it cannot be read.
-    """
-    title = str(run.metrics.get("run") or run.path.name)
-    return write_page(
-        run.path,
-        title,
-        run.description,
-        verdict.verdict(run),
-        fit_sections(run),
-        level=verdict.level(run),
-    )
 
 
 def fit_sections(run: RunFiles) -> list[Section]:
