@@ -220,7 +220,7 @@ def series(name: str, flights: Flights, variations: Tensor) -> pd.DataFrame:
 
 
 QUIET_FLIGHTS = 100
-"""Flights in still air and water, which differ in their changes of heading only."""
+"""Flights without noise, waves and push; chosen by hand: fewer tell, and each takes longer."""
 
 
 def drawn(conditions: ConditionsConfig, flights: int, seed: int) -> HeadingChanges:

@@ -257,7 +257,7 @@ _FOLDS = 5
 _THINNED = 3
 """Of so many horizons one says how liveliness acts."""
 _STEPS = 8
-"""Of Newton's method, at most 1 each."""
+"""Of Newton's method; chosen by hand: near the end each doubles the digits."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ _NEGLIGIBLE = 0.05
 _DOUBLING = 300.0
 """Time in s within which a growing disturbance counts."""
 _ASYMMETRY = 0.1
-"""Uneven part of the acceleration, share of its spread, that no word is said of; chosen by hand."""
+"""Uneven part of the acceleration, share of its spread, beyond which sides differ; by choice."""
 _LONG_RUN = 300.0
 """Time in s that inputs are held at least: within it a disturbance doubles that counts."""
 _PAUSE, _SETTLED = 10.0, 1e-4

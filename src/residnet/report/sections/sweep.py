@@ -29,7 +29,7 @@ from residnet.report.figure_files import read_figures, write_figures
 from residnet.report.run_reader import Content, RunFiles
 
 _SHOWN = 15
-"""Trials in the table, the best first; `trials.csv` has all."""
+"""Trials in the first table, the best ones, which fit on a screen; the last section has all."""
 _LONGEST = 20
 """Most letters of a line beneath an axis."""
 _GROUPS = (
