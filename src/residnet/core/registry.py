@@ -31,17 +31,6 @@ import residnet
 from residnet.core.errors import UsageError
 from residnet.core.files import config_folder
 
-GROUPS = (
-    "residnet.heads",
-    "residnet.baselines",
-    "residnet.readers",
-    "residnet.manoeuvres",
-    "residnet.vessels",
-    "residnet.tasks",
-    "residnet.exporters",
-)
-"""Groups of entry points that residnet reads."""
-
 
 @dataclass(frozen=True)
 class ThirdParty:
@@ -81,7 +70,7 @@ def third_party(group: str) -> tuple[ThirdParty, ...]:
     """Return the entry points of one group, loaded once, sorted by name.
 
     Args:
-        group: one of `GROUPS`.
+        group: of entry points, such as `residnet.heads`.
 
     Raises:
         UsageError: where a part is needed while it is itself being imported.

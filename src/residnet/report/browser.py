@@ -25,8 +25,6 @@ HEIGHT = "height of a cell"
 """Name of the column of a surface's heights; of their logarithms on a page where they are so."""
 _DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
 _MARKERS = {"o": "circle", "s": "square", "x": "x", "^": "triangle"}
-_TOLD = ("line", "points", "cells")
-"""Kinds of marks whose values stand beside the pointer."""
 
 
 @dataclass(frozen=True)

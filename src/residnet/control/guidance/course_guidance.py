@@ -20,13 +20,10 @@ _LEAST = 0.3
 point no longer known.
 """
 
-FOLLOWED = ("heading", "yaw_rate", "rudder")
-"""Reference of a course at every step: heading, yaw rate and rudder in rad, rad/s, rad."""
-
 
 @final
 class CourseGuidance(Reference):
-    """Reference [B, 3] of `FOLLOWED` for a planned course.
+    """Reference [B, 3] for a planned course: heading, yaw rate and rudder in rad, rad/s, rad.
 
     Line of sight on a curved path: heading_d = heading of the course - atan(e / look-ahead), e the
     cross-track error, positive to starboard, where the vessel makes way along the course's own
@@ -138,8 +135,8 @@ class TrackKeeping(Policy):
     that a law for steps of the heading corrects them and lags behind nothing. A law with an
     observer gets the rudder angle less delta_d.
 
-    Reference [B, 3]: `FOLLOWED`. Memory [B, 1 + n_state of the law]: the rudder angle [rad] as the
-    steering gear follows, then the law's.
+    Reference [B, 3] as of `CourseGuidance`. Memory [B, 1 + n_state of the law]: the rudder angle
+    [rad] as the steering gear follows, then the law's.
 
     Args:
         law: heading controller.
@@ -174,7 +171,7 @@ class TrackKeeping(Policy):
 
         Args:
             x: state [B, nx].
-            reference: reference [B, 3], `FOLLOWED`.
+            reference: reference [B, 3] as of `CourseGuidance`.
             s: memory [B, 1 + n_state of the law].
         """
         needed = reference[:, 2:3]

@@ -22,8 +22,6 @@ from residnet.dynamics.steering_variation import PushedSteering
 from residnet.physics.environment import JonswapSpectrum
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
-_EXTRA = ("push", "reference", "noise_psi", "noise_r", "delay")
-"""Columns that stand behind the vessel's own inputs while flights are flown."""
 _SINES = 12
 """That a motion with the waves is made of."""
 

@@ -161,9 +161,8 @@ def absurd(log: Record, found: Check) -> Iterator[Finding]:
 _LEAST_RUN = 5
 # after a receiver's freeze its filter needs so long to recover, s
 _RECOVERY = 2.0
-# a compass may rest for so long, s, and turn by so little, rad, while a heading is steady
+# a compass may rest for so long, s, while a heading is steady
 _STEADY = 3.0
-_NEGLIGIBLE_ANGLE = math.radians(0.1)
 
 
 @check("values", "frozen", certain=True, spoils=True)
