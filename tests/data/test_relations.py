@@ -189,3 +189,24 @@ def test_the_order_of_logs_says_nothing(vessel: tuple[str, int]) -> None:
     for first, other in ((one.z, two.z), (one.target, two.target), (fitted(one), fitted(two))):
         again = np.concatenate(np.split(np.asarray(other), ends)[::-1])
         np.testing.assert_allclose(again, np.asarray(first), rtol=EXACT, atol=EXACT)
+
+
+def test_a_long_log_tells_by_stretches_what_it_tells_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    from residnet.data.doctor import kinematics
+    from residnet.data.doctor.statistics import Record
+
+    random, t = np.random.default_rng(3), 0.1 * np.arange(120_000)
+    r = 0.1 * np.sin(0.2 * t) + 0.05 * np.sin(0.53 * t)
+    psi = np.append(0.0, np.cumsum(0.05 * (r[1:] + r[:-1])))
+    noise = random.normal(0.0, 1e-3, (2, t.size))
+    log = Log("long", t, {"psi": psi + noise[0], "r": 1.1 * r + noise[1]})
+    part = kinematics.evenly_spread(Record(log))
+    assert len(part) == 100_000
+    assert np.flatnonzero(np.isnan(part["r"])).tolist() == list(range(0, 100_000, 10_000))
+    found = kinematics.yaw_causes(Record(log))
+    monkeypatch.setattr(kinematics, "_LONG", 1_000_000)
+    whole = kinematics.yaw_causes(Record(log))
+    assert list(found) == list(whole) == ["gain"]
+    assert found["gain"].values == pytest.approx(whole["gain"].values, abs=1e-3)
+    # the share of r that psi does not follow
+    assert found["gain"].values == pytest.approx([1.0 - 1.0 / 1.1], abs=1e-3)

@@ -57,6 +57,23 @@ class Cause:
 _TURNED = 3.0
 
 
+_LONG, _STRETCHES = 100_000, 10
+"""Samples of a log beyond which as many are looked at, and in how many evenly spread stretches."""
+
+
+def evenly_spread(log: Record) -> Record:
+    """Return stretches of a long log, each without its first motion; a short log whole.
+
+    No increment then leads from one to the next.
+    """
+    if len(log) <= _LONG:
+        return log
+    size = _LONG // _STRETCHES
+    first = np.linspace(0, len(log) - size, _STRETCHES).astype(int)
+    part = log.log.rows((first[:, None] + np.arange(size)).ravel())
+    return Record(part, log.inputs).without(np.arange(len(part)) % size == 0)
+
+
 def yaw_causes(log: Record) -> dict[str, Cause]:
     """Return what makes the increments of psi differ from the integral of r.
 
@@ -64,6 +81,7 @@ def yaw_causes(log: Record) -> dict[str, Cause]:
     negative of what psi gains over it) and `ramp` (its growth over the log, rad/s from start to
     end).
     """
+    log = log.of(evenly_spread)
     psi, r, t = log["psi"], log["r"], log.t
     dt = np.diff(t)
     smooth = _around(r)
@@ -85,6 +103,7 @@ def position_causes(log: Record) -> dict[str, Cause]:
     starboard, m), `current` (u, v are through water that moves north, east, m/s), `bias` (of u, v,
     m/s).
     """
+    log = log.of(evenly_spread)
     dt, psi = np.diff(log.t), log["psi"]
     turn, mid = np.exp(1j * psi), np.exp(0.5j * (psi[1:] + psi[:-1]))
     u, v = _around(log["u"]), _around(log["v"])
