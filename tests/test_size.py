@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (865, 126),
     "control": (3255, 351),
     "core": (1481, 232),
-    "data": (9118, 821),
+    "data": (9128, 822),
     "documents": (2500, 229),
     "dynamics": (2046, 258),
     "export": (1483, 169),
