@@ -155,13 +155,15 @@ class Product:
     Attributes:
         rows: times that each row is multiplied with the matrix, with other numbers each time.
         taken, given: numbers of a row, and of the result; the matrix is [taken, given].
-        place: number of the matrix among `Parts.prepared`.
+        place: number of what holds the matrix among the results of `Parts.prepare`.
+        member: number of the matrix in there, where several lie side by side.
     """
 
     rows: int
     taken: int
     given: int
     place: int
+    member: int = 0
 
 
 @dataclass(frozen=True)
@@ -268,13 +270,14 @@ def in_parts(
         if (shared_matrix := matrix(node)) is not None:
             bias, a, b = (None, *args) if len(args) == 2 else args
             example = a.example @ b.example
-            (times, taken), given = a.example.shape, b.example.shape[1]
-            made = Product(times, taken, given, edge.index(shared_matrix))
-            symbol = ca.MX.sym(f"product_{len(products)}", example.numel())
-            products.append(made)
-            symbols.append(symbol)
-            factors.append(a.column)
-            found = _Value(example, symbol)
+            (times, taken), given = a.example.shape[-2:], b.example.shape[-1]
+            first, count = len(products), b.example.numel() // (taken * given)
+            for member in range(count):
+                made = Product(times, taken, given, edge.index(shared_matrix), member)
+                symbols.append(ca.MX.sym(f"product_{len(products)}", times * given))
+                factors.append(a.column[member * times * taken : (member + 1) * times * taken])
+                products.append(made)
+            found = _Value(example, ca.vertcat(*symbols[first:]))
             return found if bias is None else _each("add", example + bias.example, found, bias)
         if node.target is torch.ops.aten.detach.default and not args[0].constant:
             symbol = ca.MX.sym(f"detached_{len(apart)}", args[0].column.numel())
@@ -307,7 +310,7 @@ def in_parts(
     )
 
 
-_PRODUCTS: Final = (torch.ops.aten.mm.default, torch.ops.aten.addmm.default)
+_PRODUCTS: Final = tuple(getattr(torch.ops.aten, name).default for name in ("mm", "addmm", "bmm"))
 
 
 def _name(target: Any) -> str:
