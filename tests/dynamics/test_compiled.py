@@ -88,6 +88,34 @@ def test_what_is_no_number_stays_so_and_subnormal_numbers_stay_numbers() -> None
     assert float(torch.tensor(1e-310, dtype=torch.float64) * 0.5) == 5e-311
 
 
+def test_functions_of_many_numbers_at_once_are_right_to_the_last_digit() -> None:
+    source = compiled._prelude(torch.float32) + "".join(
+        f"void each_{name}(const REAL *a, REAL *o, long n)"
+        f" {{ for (long i = 0; i < n; i += LANES) *(U *)(o + i) = v_{name}(*(U *)(a + i)); }}\n"
+        for name in compiled._AT_ONCE
+    )
+    library = c_code.compiled_library(source)
+    given = torch.cat(
+        (
+            torch.linspace(-87.0, 88.5, 200_000),
+            torch.linspace(-2.0, 2.0, 200_000),
+            torch.logspace(-30.0, 0.0, 31_984),
+            torch.tensor([-torch.inf, -120.0, -90.0, 0.0, 89.0, torch.inf, torch.nan, -0.0]).repeat(
+                2
+            ),
+        )
+    )
+    for name in compiled._AT_ONCE:
+        found, wanted = torch.empty_like(given), getattr(torch, name)(given.double())
+        room = ctypes.c_void_p(given.data_ptr()), ctypes.c_void_p(found.data_ptr())
+        library[f"each_{name}"](*room, ctypes.c_long(len(given)))
+        # numbers near the ends of the range are rounded to zero or to infinity, as torch does
+        assert torch.equal(found.isnan(), wanted.isnan())
+        torch.testing.assert_close(
+            found, wanted.float(), rtol=4e-7, atol=1e-37, equal_nan=True, msg=name
+        )
+
+
 def test_the_number_of_threads_changes_nothing() -> None:
     rollout, given = loop()
     alone = CompiledRollout(rollout, *given)
