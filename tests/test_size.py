@@ -22,7 +22,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "core": (1481, 232),
     "data": (9128, 822),
     "documents": (2500, 229),
-    "dynamics": (2046, 258),
+    "dynamics": (2055, 260),
     "export": (1483, 169),
     "heads": (1283, 189),
     "identification": (2195, 224),
