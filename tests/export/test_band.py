@@ -13,7 +13,8 @@ from residnet.dynamics.store import BandTable
 from residnet.export import exporter, vessel
 from residnet.export.c_code import compile_shared
 from residnet.export.vessel import ExportedModel, ExportedVessel
-from residnet.testing.examples import example_model, example_spec
+from residnet.physics.signals import SignalsConfig
+from residnet.testing.examples import ROLLING, SIGNALS, example_model, example_spec
 
 TABLE = BandTable(
     level=0.9,
@@ -26,18 +27,27 @@ TABLE = BandTable(
     logs=12,
     cautions=("It is a test.",),
 )
+ROLLS = TABLE.model_copy(update={"p": (0.01, 0.03, 0.03), "phi": (0.001, 0.02, 0.05)})
+CASES = pytest.mark.parametrize(
+    ("table", "signals"),
+    [(TABLE, SIGNALS), (None, SIGNALS), (ROLLS, ROLLING), (None, ROLLING)],
+    ids=["band", "none", "roll", "none of roll"],
+)
 
 
-@pytest.mark.parametrize("table", [TABLE, None], ids=["band", "none"])
+@CASES
 def test_half_widths_are_those_of_the_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: BandTable | None
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    table: BandTable | None,
+    signals: SignalsConfig,
 ) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 5)
-    spec = example_spec(None).model_copy(update={"band": table})
+    spec = example_spec(None, signals).model_copy(update={"band": table})
     exported = ExportedVessel(spec, example_model(spec))
     card = exporter("torchscript").export(exported, tmp_path / "model.pt")
     loaded = torch.jit.load(str(tmp_path / "model.pt"))
-    assert loaded.band(0).tolist() == [0.0] * 5
+    assert loaded.band(0).tolist() == [0.0] * len(signals.live.layout.banded)
     if table is None:
         assert card["band"] is None
         assert torch.isinf(loaded.band(7)).all()
@@ -50,20 +60,24 @@ def test_half_widths_are_those_of_the_table(
     torch.testing.assert_close(loaded.band(60), 2.0 * wanted[2])
     assert card["band"]["horizon"] == pytest.approx(30 * spec.dt)
     assert card["band"]["cautions"] == ["It is a test."]
+    assert ("phi" in card["band"]) == signals.live.rolls
 
 
-@pytest.mark.parametrize("table", [TABLE, None], ids=["band", "none"])
+@CASES
 def test_c_has_the_same_half_widths(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: BandTable | None
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    table: BandTable | None,
+    signals: SignalsConfig,
 ) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 5)
-    spec = example_spec(None).model_copy(update={"band": table})
+    spec = example_spec(None, signals).model_copy(update={"band": table})
     model = example_model(spec)
     exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
     library = ctypes.CDLL(
         str(compile_shared([tmp_path / "boat.c"], tmp_path / "boat.so", ["-DEXAMPLE_DOUBLE"]))
     )
-    half = np.zeros(5)
+    half = np.zeros(len(signals.live.layout.banded))
 
     def band(k: int) -> list[float]:
         library.example_band(k, half.ctypes.data_as(ctypes.c_void_p))

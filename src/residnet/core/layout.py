@@ -47,6 +47,12 @@ class StateLayout:
         return (*self.pose, *self.moving)
 
     @property
+    def banded(self) -> tuple[str, ...]:
+        """What free runs have bands of: u, v, r, heading, position, then what else moves."""
+        planar, beside = self.moving[: len(names.VELOCITY)], self.moving[len(names.VELOCITY) :]
+        return (*planar, "heading", "position", *beside)
+
+    @property
     def dof(self) -> int:
         """Number of degrees of freedom."""
         return len(self.velocities)
@@ -264,6 +270,10 @@ MOTION = PLANAR.motion_columns
 ACCELERATIONS = slice(MOTION.stop, MOTION.stop + PLANAR.dof)
 """Of a motion with accelerations, which stand behind pose and velocities."""
 ACTUATORS = PLANAR.actuator_columns
+MOVING = slice(POSE.stop, None)
+"""Of a free run: what moves."""
+BESIDE = slice(MOTION.stop, None)
+"""Of a free run: what moves beside u, v and r."""
 POSITION = slice(0, PLANAR.pose.index("psi"))
 HEADING = PLANAR.names.index("psi")
 SURGE = PLANAR.names.index("u")

@@ -20,6 +20,7 @@ from residnet.baselines import BaselineConfig
 from residnet.core.config import Config, validate
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.files import read_json, whole
+from residnet.core.layout import PLANAR, ROLL
 from residnet.core.names import nearest
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
@@ -41,6 +42,8 @@ class BandTable(Config):
         r: half widths in rad/s.
         heading: half widths in rad.
         position: radius about the predicted position in m.
+        p: half widths in rad/s, where the model rolls.
+        phi: half widths in rad, where it does.
         logs: number of logs that calibrated them.
         cautions: whole sentences about what they do not promise.
     """
@@ -52,19 +55,26 @@ class BandTable(Config):
     r: tuple[float, ...]
     heading: tuple[float, ...]
     position: tuple[float, ...]
+    p: tuple[float, ...] | None = None
+    phi: tuple[float, ...] | None = None
     logs: int = Field(ge=1)
     cautions: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _one_length(self) -> BandTable:
         if any(len(column) != len(self.steps) for column in self.columns):
-            raise ValueError("u, v, r, heading and position need one half width for each of steps")
+            raise ValueError(f"{', '.join(self.channels)} need one half width for each of steps")
         return self
 
     @property
+    def channels(self) -> tuple[str, ...]:
+        """What has half widths."""
+        return PLANAR.banded if self.p is None and self.phi is None else ROLL.banded
+
+    @property
     def columns(self) -> tuple[tuple[float, ...], ...]:
-        """The half widths of u, v, r, heading and position."""
-        return self.u, self.v, self.r, self.heading, self.position
+        """The half widths of each of `channels`."""
+        return tuple(getattr(self, name) or () for name in self.channels)
 
 
 _DESCRIPTION, _WEIGHTS = "model.json", "model.safetensors"

@@ -12,8 +12,9 @@ A stepped vessel keeps this contract, with batches of rows B in all tensors:
 - `step(x, w, s) -> (x, s, outside)`: state [B, nx], memory and flag [B] one step of `dt` later.
 - `rollout(x0, w, s) -> (x, s, outside)`: states [B, T+1, nx] from x0 on under inputs w [B, T, m],
   the memory after the last step, and the flag of each step [B, T].
-- `band(k) -> half widths [5]` of u, v, r, heading and position k steps after a measured state,
-  where a format has methods; the table that it reads stands in every card as `band`.
+- `band(k) -> half widths` of u, v, r, heading and position, then of p and phi where the vessel
+  rolls, k steps after a measured state, where a format has methods; the table that it reads stands
+  in every card as `band`.
 
 A controller has `initial_state(y) -> s` at the first measurement y, and `step`, which gives the
 command, the memory and the flag `fault`. A format without methods starts it with a memory that is

@@ -40,11 +40,11 @@ _WARMUP = """    {p}_real after[{P}_STATES];
     }}
 """
 _BAND = """    static const int steps[{count}] = {{{steps}}};
-    static const REAL widths[{count}][5] = {{{widths}}};
+    static const REAL widths[{count}][{channels}] = {{{widths}}};
     int i, after = 0;
     REAL from, share;
     while (after < {count} && steps[after] <= k) after++;
-    for (i = 0; i < 5; i++) {{
+    for (i = 0; i < {channels}; i++) {{
         if (k <= 0) half[i] = ZERO;
         else if (after == {count})
             half[i] = widths[{last}][i] * ((REAL)k / (REAL)steps[{last}]);
@@ -146,11 +146,13 @@ def _vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, 
     unread = "    (void)x;\n    (void)w;\n    (void)count;\n    (void)s;\n"
     table: BandTable | None = exported.spec.band
     steps = (1,) if table is None else table.steps
-    rows = [(math.inf,) * 5] if table is None else list(zip(*table.columns, strict=True))
+    banded = exported.spec.signals.live.layout.banded
+    rows = [(math.inf,) * len(banded)] if table is None else list(zip(*table.columns, strict=True))
     widths = ["{" + ", ".join(map(literal, row)) + "}" for row in rows]
     band = _BAND.format(
         count=len(steps),
         last=len(steps) - 1,
+        channels=len(banded),
         steps=", ".join(map(str, steps)),
         widths=",\n        ".join(widths),
     )
@@ -166,7 +168,7 @@ def _vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, 
             _WARMUP.format(p=prefix, P=upper) if memory else unread,
         ),
         (
-            "half widths of u, v, r, heading and position k steps after a measured state: between"
+            f"half widths of {', '.join(banded)} k steps after a measured state: between"
             "\n * steps of the table interpolated, beyond the last in proportion to time, infinite"
             "\n * without a table",
             f"void {prefix}_band(int k, {real} *half)",

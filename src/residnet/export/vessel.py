@@ -68,16 +68,19 @@ class ExportedModel(nn.Module):
         self.register_buffer("band_steps", torch.tensor([1.0] if known is None else known.steps))
         self.register_buffer(
             "band_widths",
-            torch.full((1, 5), torch.inf) if known is None else torch.tensor(known.columns).T,
+            torch.full((1, len(spec.signals.live.layout.banded)), torch.inf)
+            if known is None
+            else torch.tensor(known.columns).T,
         )
         self.band_steps: Tensor
         self.band_widths: Tensor
 
     @torch.jit.export
     def band(self, k: int) -> Tensor:
-        """Return the half widths [5] of u, v, r, heading and position k steps after a measurement.
+        """Return the half widths [c] k steps after a measurement.
 
-        They are zero at k = 0, grow in proportion to time beyond the calibrated horizon, and are
+        They are of u, v, r, heading and position, then of p and phi where the vessel rolls. They
+        are zero at k = 0, grow in proportion to time beyond the calibrated horizon, and are
         infinite where the model has no band.
         """
         steps, widths = self.band_steps.float(), self.band_widths.float()
@@ -226,7 +229,8 @@ class ExportedVessel(Exported):
         table: dict[str, Any] | None = None
         if band is not None:
             horizon = band.steps[-1] * spec.dt
-            table = {"about": _BAND, "horizon": horizon, **band.model_dump(mode="json")}
+            known = band.model_dump(mode="json", exclude_none=True)
+            table = {"about": _BAND, "horizon": horizon, **known}
         return {
             "schema": "residnet.card/1",
             "model": spec.name,

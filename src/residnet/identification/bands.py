@@ -23,15 +23,7 @@ from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.fitter import residual_samples
 from residnet.identification.identified import Identified, members_of
 from residnet.identification.models import FittedModel, references
-from residnet.judge.band import (
-    CHANNELS,
-    Band,
-    BandsConfig,
-    corrected,
-    independent,
-    quantile,
-    run_weights,
-)
+from residnet.judge.band import Band, BandsConfig, corrected, independent, quantile, run_weights
 from residnet.judge.bands import RunErrors, calibrate, few, run_errors, usual_spread
 from residnet.judge.freerun import Candidate, free_run
 from residnet.judge.protocol import Window
@@ -354,7 +346,7 @@ class _Calibration:
 
 
 def _level(runs: Sequence[RunErrors], band: Band, level: float) -> np.ndarray:
-    """Return the quantile [5] of errors over the half widths of a band."""
+    """Return the quantile [c] of errors over the half widths of a band."""
     names = [run.log for run in runs]
     weight = run_weights(names)
     ratios = [run.error / run.within(band) for run in runs]
@@ -362,7 +354,7 @@ def _level(runs: Sequence[RunErrors], band: Band, level: float) -> np.ndarray:
     raised = corrected(level, independent(inside, weight, names, level))
     joined = np.concatenate(ratios)
     share = np.repeat(weight, [len(ratio) for ratio in ratios])
-    return np.array([quantile(joined[:, i], share, raised) for i in range(len(CHANNELS))])
+    return np.array([quantile(joined[:, i], share, raised) for i in range(joined.shape[1])])
 
 
 def _scaled(reference: str, logs: int) -> tuple[str, ...]:

@@ -10,11 +10,14 @@ import numpy as np
 from pydantic import Field
 
 from residnet.core.config import Config, Seconds
-from residnet.core.layout import VELOCITIES
+from residnet.core.layout import BESIDE, HEADING, MOVING, PLANAR, VELOCITIES
 from residnet.dynamics.store import BandTable
 
-CHANNELS = ("u", "v", "r", "heading", "position")
-"""What has a band; the position's is the radius about the predicted one."""
+
+def by_channel(states: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return what has bands [L, 2 + n] of states [L, 3 + n], with the radius [L] of position."""
+    moving, heading = states[:, VELOCITIES], states[:, HEADING]
+    return np.column_stack((moving, heading, position, states[:, BESIDE]))
 
 
 class BandsConfig(Config):
@@ -38,8 +41,6 @@ class BandsConfig(Config):
     seed: int = Field(default=0, ge=0)
 
 
-MEASURES = ("u", "v", "r", "u_dot", "v_dot", "r_dot")
-"""Predicted velocities and accelerations whose root mean square so far tells how lively it is."""
 _FLOOR = 0.02
 """Share of the usual mean square below which a measure says nothing more."""
 _FURTHEST = 2.5
@@ -47,13 +48,15 @@ _FURTHEST = 2.5
 
 
 def mean_squares(states: np.ndarray, step: float) -> np.ndarray:
-    """Return the mean squares so far of predicted velocities and accelerations, [L, 6].
+    """Return the mean squares so far of what moves, then of its rates [L, 2 n].
+
+    They tell how lively a run is.
 
     Args:
-        states: predicted [L + 1, 6], from the initial state on.
+        states: predicted [L + 1, 3 + n], from the initial state on.
         step: in s.
     """
-    nu = states[:, VELOCITIES]
+    nu = states[:, MOVING]
     seen = np.concatenate((nu[1:], np.diff(nu, axis=0) / step), axis=1)
     return np.asarray(np.cumsum(seen**2, axis=0) / np.arange(1, len(seen) + 1)[:, None])
 
@@ -63,9 +66,9 @@ class Activity:
     """Standardised logarithms of the mean squares of a predicted run.
 
     Attributes:
-        floor: added to each mean square [6], squares of SI units.
-        centre: mean of the logarithms over the runs that calibrated [6].
-        spread: their standard deviation [6].
+        floor: added to each mean square [2 n], squares of SI units.
+        centre: mean of the logarithms over the runs that calibrated [2 n].
+        spread: their standard deviation [2 n].
     """
 
     floor: np.ndarray
@@ -77,7 +80,7 @@ class Activity:
         """Return what standardises the runs of a calibration.
 
         Args:
-            squares: `mean_squares` of each of W runs, [L, 6].
+            squares: `mean_squares` of each of W runs, [L, 2 n].
             weight: of each run [W].
         """
         share = np.concatenate(
@@ -91,11 +94,11 @@ class Activity:
         return cls(floor, centre, np.maximum(spread, 1e-6))
 
     def of_run(self, states: np.ndarray, step: float) -> np.ndarray:
-        """Return the measures [L, 6] of a run with predicted states [L + 1, 6]."""
+        """Return the measures [L, 2 n] of a run with predicted states [L + 1, 3 + n]."""
         return self.standard(mean_squares(states, step))
 
     def standard(self, squares: np.ndarray) -> np.ndarray:
-        """Return mean squares [..., 6] standardised."""
+        """Return mean squares [..., 2 n] standardised."""
         z = (np.log(squares + self.floor) - self.centre) / self.spread
         return np.asarray(np.clip(z, -_FURTHEST, _FURTHEST))
 
@@ -175,7 +178,7 @@ _MOST = 2.0
 
 @dataclass(frozen=True)
 class Band:
-    """Half widths of the errors of a model's free runs.
+    """Half widths of the errors of a model's free runs, by channel [c].
 
     A half width at horizon k is `width[k]` times a factor by how lively the run has been so far.
 
@@ -183,18 +186,19 @@ class Band:
         level: share of the samples that it is to hold.
         step: in s.
         steps: horizons of the tables, numbers of steps [G], ascending.
-        width: half widths of a run of usual liveliness [G, 5], SI and rad.
-        plain: half widths that take every run for the same [G, 5].
-        whole: factors [5] by which a band grows that is to hold a whole run.
-        constant: half widths [5] that are the same at all horizons, for comparison.
-        unit: root mean square errors of `zero` [5], which scores are given in.
+        width: half widths of a run of usual liveliness [G, c], SI and rad.
+        plain: half widths that take every run for the same [G, c].
+        whole: factors [c] by which a band grows that is to hold a whole run.
+        constant: half widths [c] that are the same at all horizons, for comparison.
+        unit: root mean square errors of `zero` [c], which scores are given in.
         activity: measures of liveliness; None where the band knows none.
-        slope: logarithm of the factor by each measure [6, 5].
+        slope: logarithm of the factor by each measure [2 n, c].
         logs: number of logs that calibrated it.
         number: of independent scores among them.
         cautions: whole sentences about what the band does not promise.
-        usual: root mean square [G, 5] over the runs that calibrated it of how far the members of a
+        usual: root mean square [G, c] over the runs that calibrated it of how far the members of a
             mean lie apart; None for a single model.
+        channels: their names.
     """
 
     level: float
@@ -211,23 +215,24 @@ class Band:
     number: float
     cautions: tuple[str, ...] = ()
     usual: np.ndarray | None = None
+    channels: tuple[str, ...] = PLANAR.banded
 
     def half_widths(self, states: np.ndarray, spread: np.ndarray | None = None) -> np.ndarray:
-        """Return half widths [L, 5] along a run with predicted states [L + 1, 6].
+        """Return half widths [L, c] along a run with predicted states [L + 1, 3 + n].
 
         Beyond the longest calibrated horizon they grow in proportion to time. Where the members of
         a mean lie farther apart than they usually do, they grow in proportion to that.
 
         Args:
             states: predicted.
-            spread: standard deviation between the members [L, 5]; None for a single model.
+            spread: standard deviation between the members [L, c]; None for a single model.
         """
         z = self.activity.of_run(states, self.step)
         out = self.tabled(self.width, len(z)) * factor(z, self.slope)
         return np.asarray(out if spread is None else out * self.wider(spread))
 
     def wider(self, spread: np.ndarray) -> np.ndarray:
-        """Return the factors [L, 1], 1 or more, by which a spread [L, 5] widens the band.
+        """Return the factors [L, 1], 1 or more, by which a spread [L, c] widens the band.
 
         A few members tell each channel's spread badly: its root mean square over all is taken.
         """
@@ -239,7 +244,7 @@ class Band:
         return np.asarray(np.maximum(np.sqrt(np.mean(ratio**2, axis=1, keepdims=True)), 1.0))
 
     def tabled(self, table: np.ndarray, count: int) -> np.ndarray:
-        """Return a table [G, 5] at steps 1 to `count`, [count, 5]."""
+        """Return a table [G, c] at steps 1 to `count`, [count, c]."""
         k = np.arange(1, count + 1)
         found = np.stack([np.interp(k, self.steps, column) for column in table.T], axis=1)
         return np.asarray(found * np.maximum(k / self.steps[-1], 1.0)[:, None])
@@ -257,7 +262,7 @@ class Band:
                 "steps": self.steps.tolist(),
                 **{
                     name: column.tolist()
-                    for name, column in zip(CHANNELS, self.plain.T, strict=True)
+                    for name, column in zip(self.channels, self.plain.T, strict=True)
                 },
                 "logs": self.logs,
                 "cautions": self.cautions,
@@ -268,11 +273,12 @@ class Band:
         """Return the band as JSON takes it."""
 
         def named(rows: np.ndarray) -> dict[str, list[float]]:
-            return {name: rows[:, i].tolist() for i, name in enumerate(CHANNELS)}
+            return {name: rows[:, i].tolist() for i, name in enumerate(self.channels)}
 
         def single(values: np.ndarray) -> dict[str, float]:
-            return dict(zip(CHANNELS, map(float, values), strict=True))
+            return dict(zip(self.channels, map(float, values), strict=True))
 
+        moving = [name for name in self.channels if name not in ("heading", "position")]
         return {
             "level": self.level,
             "step": self.step,
@@ -287,7 +293,7 @@ class Band:
             "constant_half_width": single(self.constant),
             "score_unit": single(self.unit),
             "activity": {
-                "measures": list(MEASURES),
+                "measures": [*moving, *(f"{name}_dot" for name in moving)],
                 "floor": self.activity.floor.tolist(),
                 "centre": self.activity.centre.tolist(),
                 "spread": self.activity.spread.tolist(),
@@ -300,11 +306,13 @@ class Band:
     def read(cls, content: Mapping[str, Any]) -> Band:
         """Return the band from what `content` gave."""
 
+        channels = tuple(content["half_width"])
+
         def table(name: str) -> np.ndarray:
-            return np.array([content[name][channel] for channel in CHANNELS]).T
+            return np.array([content[name][channel] for channel in channels]).T
 
         def single(name: str) -> np.ndarray:
-            return np.array([content[name][channel] for channel in CHANNELS])
+            return np.array([content[name][channel] for channel in channels])
 
         activity = content["activity"]
         return cls(
@@ -317,17 +325,18 @@ class Band:
             single("constant_half_width"),
             single("score_unit"),
             Activity(*(np.array(activity[key]) for key in ("floor", "centre", "spread"))),
-            np.array([activity["slope"][channel] for channel in CHANNELS]).T,
+            np.array([activity["slope"][channel] for channel in channels]).T,
             int(content["logs"]),
             float(content["independent_scores"]),
             tuple(content["cautions"]),
             # files of earlier versions hold none
             table("usual_spread") if content.get("usual_spread") else None,
+            channels,
         )
 
 
 def factor(z: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the factors [..., 5] of half widths at measures of liveliness [..., 6]."""
+    """Return the factors [..., c] of half widths at measures of liveliness [..., 2 n]."""
     return np.asarray(np.exp(np.clip(z @ slope, -_MOST, _MOST)))
 
 
@@ -336,12 +345,12 @@ Bands = Mapping[str, Mapping[str, Band]]
 
 
 def covered(error: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Return 1 where an error [..., 5] is within its half width, 0 beyond, NaN where unscored."""
+    """Return 1 where an error [..., c] is within its half width, 0 beyond, NaN where unscored."""
     return np.asarray(np.where(np.isfinite(error), error <= width, np.nan))
 
 
 def interval_score(error: np.ndarray, width: np.ndarray, level: float) -> np.ndarray:
-    """Return the interval score [..., 5] of half widths, NaN where nothing is scored.
+    """Return the interval score [..., c] of half widths, NaN where nothing is scored.
 
     Source: Gneiting and Raftery (2007), eq. (43): the width, and what lies outside by 2 / (1 -
     level).
@@ -350,8 +359,8 @@ def interval_score(error: np.ndarray, width: np.ndarray, level: float) -> np.nda
 
 
 def worst(errors: Sequence[np.ndarray], widths: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the largest error of each run in its half widths [W, 5]; NaN where unscored."""
-    out = np.full((len(errors), len(CHANNELS)), np.nan)
+    """Return the largest error of each run in its half widths [W, c]; NaN where unscored."""
+    out = np.full((len(errors), errors[0].shape[1]), np.nan)
     for i, (error, width) in enumerate(zip(errors, widths, strict=True)):
         seen = np.isfinite(error)
         ratio = np.where(seen, error / width, -np.inf).max(axis=0)

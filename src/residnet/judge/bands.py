@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.layout import HEADING, POSITION, VELOCITIES
+from residnet.core.layout import ALIVE, BESIDE, HEADING, PLANAR, POSITION, VELOCITIES, Live
 from residnet.data.prepare import Prepared
 from residnet.judge.band import (
-    CHANNELS,
-    MEASURES,
     Activity,
     Band,
+    by_channel,
     corrected,
     covered,
     factor,
@@ -29,7 +28,7 @@ from residnet.judge.band import (
 from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction, spread_of
 from residnet.judge.protocol import Window
 
-_MASKED = tuple(CHANNELS.index(name) for name in ("u", "v", "position"))
+_MASKED = tuple(PLANAR.banded.index(name) for name in ("u", "v", "position"))
 """Channels that are scored over usable samples alone."""
 
 
@@ -40,9 +39,10 @@ class RunErrors:
     Attributes:
         log: name of the log.
         manoeuvre: its kind.
-        error: absolute errors [L, 5] by channel, NaN where they are not scored.
+        error: absolute errors [L, c] by channel, NaN where they are not scored.
         states: predicted [L + 1, 3 + n], from the initial state on.
-        spread: standard deviation between the members of a mean [L, 5]; None for a single model.
+        spread: standard deviation between the members of a mean [L, c]; None for a single model.
+        live: what moves, by which channels are.
     """
 
     log: str
@@ -50,9 +50,10 @@ class RunErrors:
     error: np.ndarray
     states: np.ndarray
     spread: np.ndarray | None = None
+    live: Live = ALIVE
 
     def within(self, band: Band) -> np.ndarray:
-        """Return the half widths [L, 5] that a band gives the run."""
+        """Return the half widths [L, c] that a band gives the run."""
         return band.half_widths(self.states, self.spread)
 
     def __len__(self) -> int:
@@ -67,20 +68,21 @@ def run_errors(
 ) -> list[RunErrors]:
     """Return the errors of one model's free runs over W windows, their first samples left out."""
     found = Errors.of(windows, predictions, logs) if found is None else found
-    channels = np.column_stack(
-        (
-            np.abs(found.error[:, VELOCITIES]),
-            np.abs(found.error[:, HEADING]),
-            np.hypot(*found.error[:, POSITION].T),
-        )
-    )
+    channels = by_channel(np.abs(found.error), np.hypot(*found.error[:, POSITION].T))
     channels[np.ix_(~found.usable, np.array(_MASKED))] = np.nan
     live = found.live
-    moved = {*live.velocities, *["heading"] * live.turns, *["position"] * live.moves}
-    channels[:, [name not in moved for name in CHANNELS]] = np.nan
+    moved = {*live.channels, *["heading"] * live.turns, *["position"] * live.moves}
+    channels[:, [name not in moved for name in live.layout.banded]] = np.nan
     parts = np.split(channels, found.begins[1:])
     return [
-        RunErrors(log.log.name, log.log.manoeuvre, error[1:], prediction.states, prediction.spread)
+        RunErrors(
+            log.log.name,
+            log.log.manoeuvre,
+            error[1:],
+            prediction.states,
+            prediction.spread,
+            live,
+        )
         for log, error, prediction in zip(
             (logs[window.log] for window in windows), parts, predictions, strict=True
         )
@@ -93,9 +95,10 @@ _FITTED = ("baseline", "head")
 
 @dataclass(frozen=True)
 class BandCounts:
-    """Sums over the scored samples of each of W windows, by channel [W, 5].
+    """Sums over the scored samples of each of W windows, by channel [W, c].
 
     Attributes:
+        channels: names.
         scored: number of samples.
         inside: how many of them the band holds.
         whole: 1 where the band of whole runs holds the window, NaN where nothing is scored.
@@ -104,6 +107,7 @@ class BandCounts:
         spread: the same of the spread of the run's models; None where there are too few.
     """
 
+    channels: tuple[str, ...]
     scored: np.ndarray
     inside: np.ndarray
     whole: np.ndarray
@@ -120,7 +124,7 @@ class BandCounts:
             return np.asarray(sums[chosen].sum(axis=0)[seen] / count[seen])
 
         inside = mean(self.inside)
-        names = [name for name, known in zip(CHANNELS, seen, strict=True) if known]
+        names = [name for name, known in zip(self.channels, seen, strict=True) if known]
         return {
             "band_coverage": {
                 **dict(zip(names, map(float, inside), strict=True)),
@@ -178,9 +182,10 @@ def _counted(
     spread = None
     if spreads is not None:
         normal, radial = _reach(band.level)
-        reach = np.array([normal] * 4 + [radial])
+        reach = np.where([name == "position" for name in band.channels], radial, normal)
         spread = scores([reach * own for own in spreads])
     return BandCounts(
+        band.channels,
         np.stack([np.isfinite(error).sum(axis=0) for error in errors]),
         np.stack(
             [(error <= width).sum(axis=0) for error, width in zip(errors, widths, strict=True)]
@@ -198,7 +203,7 @@ def _reach(level: float) -> tuple[float, float]:
 
 
 def _spreads(run: FreeRun, models: Sequence[str]) -> list[np.ndarray]:
-    """Return the standard deviation [L, 5] between models along each window."""
+    """Return the standard deviation [L, c] between models along each window."""
     return [
         spread_of([run.predictions[model][i].states for model in models])
         for i in range(len(run.windows))
@@ -206,7 +211,7 @@ def _spreads(run: FreeRun, models: Sequence[str]) -> list[np.ndarray]:
 
 
 def usual_spread(runs: Sequence[RunErrors], steps: np.ndarray) -> np.ndarray | None:
-    """Return the root mean square [G, 5] over runs of how far members lie apart.
+    """Return the root mean square [G, c] over runs of how far members lie apart.
 
     None where they are the runs of a single model.
 
@@ -214,7 +219,7 @@ def usual_spread(runs: Sequence[RunErrors], steps: np.ndarray) -> np.ndarray | N
         runs: that calibrate a band.
         steps: its horizons [G].
     """
-    squares = np.full((len(runs), len(steps), len(CHANNELS)), np.nan)
+    squares = np.full((len(runs), len(steps), runs[0].error.shape[1] if runs else 0), np.nan)
     for i, run in enumerate(runs):
         if run.spread is None:
             return None
@@ -229,16 +234,17 @@ def limits(states: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Return the lower and upper limits [L + 1, 3 + n] of predicted states.
 
     The initial state is given, and has no width. Limits of x and y are those of the box about the
-    circle that holds the position. A roll has no band.
+    circle that holds the position.
 
     Args:
         states: predicted [L + 1, 3 + n], from the initial state on.
-        width: half widths [L, 5] after it.
+        width: half widths [L, c] after it.
     """
     reach = np.zeros_like(states)
     reach[1:, VELOCITIES] = width[:, :3]
     reach[1:, HEADING] = width[:, 3]
     reach[1:, POSITION] = width[:, 4:5]
+    reach[1:, BESIDE] = width[:, 5:]
     return states - reach, states + reach
 
 
@@ -262,7 +268,7 @@ _STEPS = 8
 
 @dataclass(frozen=True)
 class _Runs:
-    """Errors [W, G, 5] of W runs at G horizons, and measures [W, G, 6] of how lively they are."""
+    """Errors [W, G, c] of W runs at G horizons, and measures [W, G, 2 n] of how lively they are."""
 
     names: Sequence[str]
     weight: np.ndarray
@@ -291,7 +297,7 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
         runs: over logs that the model was not fitted on, under one protocol; at least one.
         level: wanted.
         step: of the runs in s.
-        unit: that scores are given in, [5].
+        unit: that scores are given in, [c].
     """
     given = _at_horizons(runs, step)
     names, weight = given.names, given.weight
@@ -306,20 +312,22 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
     same = _shape(given, np.zeros_like(slope))
     plain = same * _quantiles(given, np.broadcast_to(same, given.error.shape), raised)
     plain = np.nan_to_num(plain)
-    flat = given.error.reshape(-1, len(CHANNELS))
+    channels = runs[0].live.layout.banded
+    flat = given.error.reshape(-1, len(channels))
     band = Band(
         level,
         step,
         given.steps,
         width,
         plain,
-        np.ones(len(CHANNELS)),
+        np.ones(len(channels)),
         np.nan_to_num(quantile(flat, np.repeat(weight, given.error.shape[1]), raised)),
         unit,
         given.activity,
         slope,
         len(set(names)),
         number,
+        channels=channels,
     )
     largest = worst([run.error for run in runs], [band.half_widths(run.states) for run in runs])
     # as far as the runs of other logs know the scale
@@ -330,20 +338,20 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
 
 
 def _largest(error: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Return the largest error in half widths of each run [W, 5], over horizons."""
+    """Return the largest error in half widths of each run [W, c], over horizons."""
     return np.asarray(np.nanmax(np.where(np.isfinite(error), error / width, 1e-12), axis=1))
 
 
 def _scale(given: _Runs) -> tuple[np.ndarray, np.ndarray]:
-    """Return shape [G, 5] and slopes [6, 5] of the errors of runs."""
-    slope = np.zeros((len(MEASURES), len(CHANNELS)))
+    """Return shape [G, c] and slopes [2 n, c] of the errors of runs."""
+    slope = np.zeros((given.measures.shape[2], given.error.shape[2]))
     for _ in range(_ROUNDS):
         slope = _slopes(given, _shape(given, slope), slope)
     return _shape(given, slope), slope
 
 
 def _scales_of_others(given: _Runs) -> np.ndarray:
-    """Return the scale [W, G, 5] of every run's errors as the runs of other logs have it.
+    """Return the scale [W, G, c] of every run's errors as the runs of other logs have it.
 
     A scale that has seen a run would take its errors for smaller than those of runs to come.
     """
@@ -377,8 +385,8 @@ def _at_horizons(runs: Sequence[RunErrors], step: float) -> _Runs:
     weight = run_weights(names)
     squares = [mean_squares(run.states, step) for run in runs]
     activity = Activity.of(squares, weight)
-    error = np.full((len(runs), len(steps), len(CHANNELS)), np.nan)
-    measures = np.zeros((len(runs), len(steps), len(MEASURES)))
+    error = np.full((len(runs), len(steps), runs[0].error.shape[1]), np.nan)
+    measures = np.zeros((len(runs), len(steps), squares[0].shape[1]))
     for i, run in enumerate(runs):
         reached = steps[steps <= len(run)] - 1
         error[i, : len(reached)] = run.error[reached]
@@ -387,7 +395,7 @@ def _at_horizons(runs: Sequence[RunErrors], step: float) -> _Runs:
 
 
 def _shape(given: _Runs, slope: np.ndarray) -> np.ndarray:
-    """Return the root mean square [G, 5] of errors over what liveliness explains, smoothed."""
+    """Return the root mean square [G, c] of errors over what liveliness explains, smoothed."""
     scaled = (given.error / factor(given.measures, slope)) ** 2
     weight = np.where(np.isfinite(scaled), given.weight[:, None, None], 0.0)
     total = weight.sum(axis=0)
@@ -397,12 +405,12 @@ def _shape(given: _Runs, slope: np.ndarray) -> np.ndarray:
 
 
 def _quantiles(given: _Runs, scale: np.ndarray, level: float) -> np.ndarray:
-    """Return the quantile [G, 5] of errors over a scale [W, G, 5], smoothed over horizons."""
+    """Return the quantile [G, c] of errors over a scale [W, G, c], smoothed over horizons."""
     return _smooth(quantile(given.error / scale, given.weight, level), given.steps)
 
 
 def _smooth(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return moving means [G, 5] over neighbouring horizons; gaps are filled from beside them."""
+    """Return moving means [G, c] over neighbouring horizons; gaps are filled from beside them."""
     reach = 0.5 * _SMOOTHED * steps[-1]
     # the first steps, where errors begin, are smoothed over what lies as near as the start itself
     near = np.minimum(reach, steps - 1 + 0.5)
@@ -420,7 +428,7 @@ def _smooth(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _slopes(given: _Runs, shape: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return by how much liveliness raises the logarithm of the errors [6, 5].
+    """Return by how much liveliness raises the logarithm of the errors [2 n, c].
 
     Errors over the shape are taken for gamma distributed with a logarithmic link; Newton's method.
     """
@@ -429,7 +437,7 @@ def _slopes(given: _Runs, shape: np.ndarray, slope: np.ndarray) -> np.ndarray:
     error, z, shape = given.error[:, rows], given.measures[:, rows], shape[rows]
     weight = given.weight[:, None] / error.shape[1]
     pull = _RIDGE * np.eye(z.shape[2])
-    for channel in range(len(CHANNELS)):
+    for channel in range(error.shape[2]):
         ratio = error[:, :, channel] / shape[:, channel]
         seen = np.isfinite(ratio)
         y, w = np.where(seen, ratio, 0.0), np.where(seen, weight, 0.0)

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from residnet.core.frames import wrap_array
-from residnet.core.layout import ALIVE, HEADING, POSE, POSITION, VELOCITIES, Live, levelled
+from residnet.core.layout import ALIVE, HEADING, POSE, POSITION, Live, levelled
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.judge.band import Band
+from residnet.judge.band import Band, by_channel
 from residnet.judge.protocol import Window
 
 _LONGER = 4
@@ -65,9 +65,8 @@ class Prediction:
     """A prediction of one model for one window.
 
     States [L, 3 + n] hold what moves in the model and the pose integrated from it; `diverged`
-    says whether the free run ran away. `spread` [L - 1, 5] is the standard deviation of u, v, r,
-    heading and position between the members of a mean, from the first step on; None for a single
-    model.
+    says whether the free run ran away. `spread` [L - 1, c] is the standard deviation between the
+    members of a mean by channel of a band, from the first step on; None for a single model.
     """
 
     states: np.ndarray
@@ -217,13 +216,12 @@ def free_run(
 
 
 def spread_of(states: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the standard deviation [L, 5] between models' states [L + 1, 3 + n] after the first.
+    """Return the standard deviation [L, c] between models' states [L + 1, 3 + n] after the first.
 
-    Its columns are u, v, r, heading and position; that of the position is per axis, mean over both.
+    Its columns are the channels of a band; that of the position is per axis, mean over both.
     """
     spread = np.stack([one[1:] for one in states]).std(axis=0, ddof=1)
-    position = np.sqrt(0.5 * (spread[:, POSITION] ** 2).sum(axis=1))
-    return np.column_stack((spread[:, VELOCITIES], spread[:, HEADING], position))
+    return by_channel(spread, np.sqrt(0.5 * (spread[:, POSITION] ** 2).sum(axis=1)))
 
 
 def _run(

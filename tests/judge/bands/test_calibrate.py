@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from residnet.core.layout import ROLL, Live
 from residnet.judge.band import Band, corrected, covered, independent, quantile, run_weights, worst
-from residnet.judge.bands import RunErrors, calibrate, usual_spread
+from residnet.judge.bands import RunErrors, calibrate, limits, usual_spread
 
 STEP = 0.5
 LENGTH = 60
@@ -95,6 +96,34 @@ def test_a_band_comes_back_from_json(band: Band) -> None:
     again, run = Band.read(band.content()), runs(1, 1, 5)[0]
     np.testing.assert_allclose(again.half_widths(run.states), band.half_widths(run.states))
     np.testing.assert_allclose(again.whole, band.whole)
+
+
+def test_a_roll_has_bands_of_its_own(band: Band) -> None:
+    live, random = Live(ROLL.velocities), np.random.default_rng(6)
+
+    def rolling(given: list[RunErrors]) -> list[RunErrors]:
+        out = []
+        for run in given:
+            # rate and angle, which move alike in every run
+            more = 0.1 * np.sin(0.5 * np.arange(LENGTH + 1.0))[:, None] * [0.5, 1.0]
+            error = np.abs(random.normal(size=(LENGTH, 2)) * [0.02, 0.1])
+            states = np.column_stack((run.states, more))
+            out.append(replace(run, error=np.c_[run.error, error], states=states, live=live))
+        return out
+
+    found = calibrate(rolling(runs(40, 12, 0)), 0.9, STEP, np.ones(7))
+    assert found.channels == ("u", "v", "r", "heading", "position", "p", "phi")
+    assert tuple(found.table().columns[-1]) == tuple(found.plain[:, -1])
+    # of normal errors nine tenths lie within 1.645 deviations
+    np.testing.assert_allclose(found.plain[5:, 5:] / [0.02, 0.1], 1.645, rtol=0.15)
+    # what has no roll is held as without
+    np.testing.assert_allclose(found.plain[:, :5], band.plain, rtol=0.05)
+    run = rolling(runs(1, 1, 5))[0]
+    again = Band.read(found.content())
+    np.testing.assert_allclose(again.half_widths(run.states), found.half_widths(run.states))
+    low, high = limits(run.states, run.within(found))
+    assert ((high - low)[1:] > 0.0).all()
+    np.testing.assert_allclose(0.5 * (high - low)[1:, 6:], run.within(found)[:, 5:])
 
 
 def test_runs_of_a_log_count_as_one_where_they_agree() -> None:

@@ -32,8 +32,6 @@ from residnet.report.blocks import (
 from residnet.report.figure import Figure
 from residnet.report.run_reader import Content, RunFiles
 
-_BANDS = ("u", "v", "r", "heading", "position")
-
 
 def distinct(run: RunFiles, split: str, protocol: str) -> list[str]:
     """Return kinds and groups of manoeuvres without those that hold the same runs as one before.
@@ -456,7 +454,7 @@ def _coverage(
         note = percent(100 * (value / own - 1)) if value is not None and own > 0 else ""
         return Cell(number(value), note)
 
-    shown = [name for name in _BANDS if name in rows[0]["band_coverage"]]
+    shown = [name for name in rows[0]["band_coverage"] if name not in ("mean", "whole")]
 
     return table_of(
         rows,

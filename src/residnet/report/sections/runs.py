@@ -54,8 +54,6 @@ _MOTION = {
     "p": "roll rate\np",
     "phi": "roll angle\nphi",
 }
-_BANDED = ("u", "v", "r", "psi")
-"""What has a band, of the motion."""
 _ERRORS = {
     "u": "u", "v": "v", "r": "r", "x": "position", "psi": "heading", "p": "p", "phi": "phi",
 }  # fmt: skip
@@ -292,7 +290,7 @@ def _curves(window: StoredWindow, lead: str, units: Units) -> list[dict[str, Cur
             panel["masked"] = masked
         for model, states in window.predicted.items():
             panel[model] = (time, factor * (states - origin)[:, column])
-        if lead in window.low and name in _BANDED:
+        if lead in window.low:
             low, high = (limit[lead] - origin for limit in (window.low, window.high))
             panel["band"] = band(time, factor * low[:, column], factor * high[:, column])
         out.append(panel)
@@ -518,35 +516,37 @@ def bands(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     model = run.lead
     known = (run.json("bands.json").get("models") or {}).get(model) or {}
     cases, level, units = [], 0.0, units_of(run)
-    banded = {"x", *_BANDED}
-    shown = {name: place for name, place in _errors_of(run).items() if name in banded}
-    factors = [units[name][2] for name in _ERRORS if name in banded]
+    shown = _errors_of(run)
     for protocol, found in known.items():
         members = [one for one in windows if one.protocol == protocol and model in one.low]
         if not members:
             continue
         level = float(found["level"])
         longest = max(window.t.size for window in members)
-        error, width = np.full((2, len(members), longest, 5), np.nan)
+        # u, v, r, heading, position, then what else moves
+        wide = members[0].measured.shape[1] - 1
+        error, width = np.full((2, len(members), longest, wide), np.nan)
         for i, window in enumerate(members):
             apart = np.abs(window.predicted[model] - window.measured)
-            errors = np.column_stack((apart[:, :4], np.hypot(apart[:, 4], apart[:, 5])))
+            radius = np.hypot(apart[:, 4], apart[:, 5])
+            errors = np.column_stack((apart[:, :4], radius, apart[:, 6:]))
             errors[:, [0, 1, 4]] = np.where(window.usable[:, None], errors[:, [0, 1, 4]], np.nan)
             error[i, : len(errors)] = errors
-            width[i, : len(errors)] = 0.5 * (window.high[model] - window.low[model])[:, :5]
+            reach = 0.5 * (window.high[model] - window.low[model])
+            width[i, : len(errors)] = np.delete(reach, 5, axis=1)
         time = np.arange(longest) * float(np.median(np.diff(members[0].t)))
-        held = np.full((longest, 5), np.nan)
-        for column in range(5):
+        held = np.full((longest, wide), np.nan)
+        for column in range(wide):
             seen = np.isfinite(error[:, :, column]).any(axis=0)
             held[seen, column] = np.nanquantile(error[:, seen, column], level, axis=0)
         mean = np.nanmean(width, axis=0)
         few = slice(1, None, max(longest // 200, 1))
-        # u, v, r, position, heading
-        panels = [
-            {"width": (time[few], f * mean[few, k]), "errors": (time[few], f * held[few, k])}
-            for k, f in zip((0, 1, 2, 4, 3), factors, strict=True)
-        ]
-        panels = [panels[place] for place in shown.values()]
+        panels: list[dict[str, Curve]] = []
+        for name, k in shown.items():
+            # heading before position there, behind it here
+            k, f = {3: 4, 4: 3}.get(k, k), units[name][2]
+            curves = {"width": mean, "errors": held}
+            panels.append({key: (time[few], f * of[few, k]) for key, of in curves.items()})
         cases.append(Case(protocol, panels))
     if not cases:
         return None
