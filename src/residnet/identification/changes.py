@@ -9,14 +9,15 @@ from typing import final
 import torch
 from torch import Tensor
 
-from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE
+from residnet.core.layout import HEADING, MOVING, SURGE, SWAY, YAW_RATE, turning
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.signals import SignalsConfig
+from residnet.physics.symmetry import live_of
 
-_AXES = ("surge", "sway", "yaw")
-_TAKEN = (0.1, 1.0, 1.0)
-"""Share of the velocity of surge, sway and yaw whose absence shows what damps it."""
+_AXES = {"u": "surge", "v": "sway", "r": "yaw", "p": "roll"}
+_TAKEN = {"u": 0.1}
+"""Share of a velocity whose absence shows what damps it; all of others."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,9 @@ class Change:
         unit: of its size.
         size: that its effect is computed with.
         heavier: added to the inertia of all axes, as a share.
-        damping: axis (0 surge, 1 sway, 2 yaw) whose damping changes; None for none.
-        damped: added to the damping of that axis, as a share of what the model has.
+        damping: velocity whose damping changes; empty for none.
+        by: what damps it: itself where empty, or an angle that holds it back.
+        damped: added to that, as a share of what the model has.
         push: acceleration to north and east, m/s^2.
         gain: added to the gain of inputs, by their number.
         offset: added to inputs, by their number.
@@ -43,7 +45,8 @@ class Change:
     unit: str
     size: float
     heavier: float = 0.0
-    damping: int | None = None
+    damping: str = ""
+    by: str = ""
     damped: float = 0.0
     push: tuple[float, float] = (0.0, 0.0)
     gain: Mapping[int, float] = field(default_factory=dict)
@@ -69,9 +72,14 @@ def causes(signals: SignalsConfig) -> list[Change]:
     units = signals.units()
     out = [Change("mass", "the vessel has become heavier", "share", 0.02, heavier=0.02)]
     live = signals.live
-    for axis, name in ((axis, _AXES[axis]) for axis in live.axes):
-        words = f"the damping in {name} has grown"
-        out.append(Change(f"damping {name}", words, "share", 0.02, damping=axis, damped=0.02))
+    for axis in live.velocities:
+        words = f"the damping in {_AXES[axis]} has grown"
+        out.append(
+            Change(f"damping {_AXES[axis]}", words, "share", 0.02, damping=axis, damped=0.02)
+        )
+    if live.rolls:
+        stiff = Change("restoring", "the vessel has become stiffer in roll", "share", 0.02)
+        out.append(replace(stiff, damping="p", by="phi", damped=0.02))
     for place, name in enumerate(signals.inputs):
         words = f"{name} has grown stronger than it was"
         out.append(Change(f"gain {name}", words, "share", 0.02, gain={place: 0.02}))
@@ -85,7 +93,7 @@ def causes(signals: SignalsConfig) -> list[Change]:
     speed = Change(
         "speed scale", "u and v are shown too large", "share", 0.02, sensor="speed_scale"
     )
-    lag = Change("lag", "u, v and r come late", "s", 0.1, sensor="lag")
+    lag = Change("lag", "velocities come late", "s", 0.1, sensor="lag")
     return [*out, *gyro * live.turns, *[speed] * live.moves, lag]
 
 
@@ -100,7 +108,7 @@ def surroundings() -> list[Change]:
 
 
 def shown(sensor: str, x: Tensor, rate: Tensor, size: float) -> Tensor:
-    """Return what a sensor adds to states [..., 6] whose velocities change by `rate` [..., 3]."""
+    """Return what a sensor adds to states [..., 3 + n] where what moves has the rates [..., n]."""
     out = torch.zeros_like(x)
     if sensor == "gyro_scale":
         out[..., YAW_RATE] = size * x[..., YAW_RATE]
@@ -109,7 +117,7 @@ def shown(sensor: str, x: Tensor, rate: Tensor, size: float) -> Tensor:
     elif sensor == "speed_scale":
         out[..., SURGE : SWAY + 1] = size * x[..., SURGE : SWAY + 1]
     elif sensor == "lag":
-        out[..., VELOCITIES] = -size * rate
+        out[..., MOVING] = -size * rate
     elif sensor in ("current_north", "current_east"):
         cos, sin = torch.cos(x[..., HEADING]), torch.sin(x[..., HEADING])
         north = sensor == "current_north"
@@ -134,7 +142,8 @@ class ChangedDynamics(Dynamics):
     ) -> None:
         super().__init__(model.dt, model.integrator)
         self.model = model
-        self.n_state = model.n_state
+        self.n_state, self.dof, self.rolls = model.n_state, model.dof, model.rolls
+        moving = live_of(model.signals.names).moving
 
         def each(values: Sequence[Sequence[float]]) -> Tensor:
             table = torch.tensor(values, dtype=torch.float64)
@@ -142,17 +151,20 @@ class ChangedDynamics(Dynamics):
 
         span = range(inputs)
         self.inertia = each([[1.0 + change.heavier] for change in changes])
-        damped = [k for k, change in enumerate(changes) if change.damping is not None]
+        damped = [k for k, change in enumerate(changes) if change.damping]
         self.damps = len(damped) > 0
         self.damped_rows = torch.tensor(damped).repeat_interleave(rows) * rows + torch.arange(
             rows
         ).repeat(len(damped))
-        self.damping = torch.tensor(
-            [changes[k].damping or 0 for k in damped], dtype=torch.long
-        ).repeat_interleave(rows)
-        self.damped = torch.tensor(
-            [changes[k].damped for k in damped], dtype=torch.float64
-        ).repeat_interleave(rows)
+
+        def of_damped(values: Sequence[float], dtype: torch.dtype = torch.float64) -> Tensor:
+            return torch.tensor(values, dtype=dtype).repeat_interleave(rows)
+
+        by = [changes[k].by or changes[k].damping for k in damped]
+        self.damping = of_damped([moving.index(changes[k].damping) for k in damped], torch.long)
+        self.by = of_damped([moving.index(name) for name in by], torch.long)
+        self.taken = of_damped([_TAKEN.get(name, 1.0) for name in by])
+        self.damped = of_damped([changes[k].damped for k in damped])
         self.push = each([change.push for change in changes])
         self.gain = each([[1.0 + change.gain.get(i, 0.0) for i in span] for change in changes])
         self.offset = each([[change.offset.get(i, 0.0) for i in span] for change in changes])
@@ -161,36 +173,37 @@ class ChangedDynamics(Dynamics):
         """Return state and memory one step later, with the changed acceleration."""
         w = w * self.gain + self.offset
         after, memory = self.model.step(x, w, s)
-        nu = x[:, VELOCITIES]
-        gained = after[:, VELOCITIES] - nu
+        nu = x[:, MOVING]
+        gained = after[:, MOVING] - nu
         if self.damps:
             gained = gained - self._slowed(x, w, s, gained)
         cos, sin = torch.cos(x[:, HEADING]), torch.sin(x[:, HEADING])
         north, east = self.push[:, 0], self.push[:, 1]
-        push = torch.stack(
-            (cos * north + sin * east, cos * east - sin * north, torch.zeros_like(north)), dim=1
-        )
+        push = torch.stack((cos * north + sin * east, cos * east - sin * north), dim=1)
+        push = torch.cat((push, torch.zeros_like(nu[:, 2:])), dim=1)
         moved = nu + gained / self.inertia + self.dt * push
         changed = after.clone()
-        changed[:, VELOCITIES] = moved
-        # the heading follows what the yaw rate has gained over the step
-        changed[:, HEADING] = after[:, HEADING] + 0.5 * self.dt * (moved[:, 2] - after[:, YAW_RATE])
+        # angles follow what their rates have gained over the step
+        known = (moved - after[:, MOVING]) @ self.model.known_rates
+        angles = after[:, MOVING] + 0.5 * self.dt * known
+        changed[:, MOVING] = torch.where(self.model.live > 0.0, moved, angles)
+        turned = turning(changed[:, MOVING], self.dof) - turning(after[:, MOVING], self.dof)
+        changed[:, HEADING] = after[:, HEADING] + 0.5 * self.dt * turned[:, 0]
         return changed, memory
 
     def _slowed(self, x: Tensor, w: Tensor, s: Tensor, gained: Tensor) -> Tensor:
-        """Return what changed damping takes from the velocities gained over a step [B, 3].
+        """Return what changed damping takes from the velocities gained over a step [B, n].
 
         What damps a velocity is what the step lacks without it; of surge only a part is taken away,
         for models that hold near a service speed alone.
         """
-        rows, axis = self.damped_rows, self.damping
-        taken = torch.tensor(_TAKEN, dtype=x.dtype)[axis]
-        share = torch.ones(len(rows), 3, dtype=x.dtype)
-        share[torch.arange(len(rows)), axis] = 1.0 - taken
-        still = x[rows].clone()
-        still[:, VELOCITIES] = still[:, VELOCITIES] * share
-        alone = self.model.step(still, w[rows], s[rows])[0][:, VELOCITIES] - still[:, VELOCITIES]
+        rows, axis, taken = self.damped_rows, self.damping, self.taken.to(x.dtype)
         place = torch.arange(len(rows))
+        share = torch.ones(len(rows), self.dof, dtype=x.dtype)
+        share[place, self.by] = 1.0 - taken
+        still = x[rows].clone()
+        still[:, MOVING] = still[:, MOVING] * share
+        alone = self.model.step(still, w[rows], s[rows])[0][:, MOVING] - still[:, MOVING]
         out = torch.zeros_like(gained)
         out[rows, axis] = self.damped * (alone[place, axis] - gained[rows, axis]) / taken
         return out

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE, Live
+from residnet.core.layout import HEADING, MOVING, Live
 from residnet.data.prepare import Prepared
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
@@ -33,14 +33,11 @@ from residnet.dynamics.store import ModelSpec
 from residnet.identification.changes import Change, ChangedDynamics, causes, shown, surroundings
 from residnet.physics.symmetry import live_of
 
-SEEN = {"u": SURGE, "v": SWAY, "r": YAW_RATE, "heading": HEADING}
-"""What innovations are taken of, and its columns in states."""
-
 
 def seen_of(live: Live) -> dict[str, int]:
-    """Return what innovations are taken of where only some velocities live."""
-    moved = {*live.velocities, *["heading"] * live.turns}
-    return {name: column for name, column in SEEN.items() if name in moved}
+    """Return what innovations are taken of, and its columns in states."""
+    seen = {name: live.states.index(name) for name in live.channels}
+    return seen | ({"heading": HEADING} if live.turns else {})
 
 
 _PAST = 5.0
@@ -54,9 +51,9 @@ class Piece:
     """A measured window of K steps.
 
     Attributes:
-        y: states [K + 1, 6].
+        y: states [K + 1, 3 + n].
         w: inputs held over each step [K, m].
-        past_y: states before it that warm a memory up [P, 6].
+        past_y: states before it that warm a memory up [P, 3 + n].
         past_w: inputs before it [P, m].
     """
 
@@ -69,7 +66,7 @@ class Piece:
 def innovations(
     model: HybridDynamics, pieces: Sequence[Piece], changes: Sequence[Change]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return innovations [B, n] and what a unit of each change adds to them [B, C, n].
+    """Return innovations [B, k] and what a unit of each change adds to them [B, C, k].
 
     Args:
         model: float64, in evaluation mode.
@@ -91,7 +88,7 @@ def innovations(
             torch.from_numpy(np.stack([piece.past_y for piece in pieces])),
             torch.from_numpy(np.stack([piece.past_w for piece in pieces])),
         )
-        begin = (y[:, 1] - y[:, 0])[:, VELOCITIES] / model.dt
+        begin = (y[:, 1] - y[:, 0])[:, MOVING] / model.dt
         x0 = torch.cat(
             [y[:, 0] + shown(one.sensor, y[:, 0], begin, one.size) for one in all_changes]
         )
@@ -101,7 +98,7 @@ def innovations(
         )
     path = path.reshape(count, rows, steps + 1, -1)
     # what a sensor shows is taken of the prediction: noise of the measurement is in the error too
-    rate = mean @ path[0].diff(dim=1)[..., VELOCITIES] / model.dt
+    rate = mean @ path[0].diff(dim=1)[..., MOVING] / model.dt
     path = mean @ path[:, :, 1:]
     columns = [*seen_of(live_of(model.signals.names)).values()]
     error = _seen(mean @ y[:, 1:] - path[0], columns)
@@ -137,7 +134,7 @@ def parted(piece: Piece, parts: int) -> list[Piece]:
 
 
 def _seen(states: Tensor, columns: Sequence[int]) -> Tensor:
-    """Return differences of states [B, k, 6] as innovations [B, 4 k], or of fewer columns."""
+    """Return columns [c] of differences of states [B, k, 3 + n] as innovations [B, k c]."""
     return states[..., list(columns)].flatten(1)
 
 
@@ -596,7 +593,6 @@ class Watch:
         clean: Sequence[Sequence[Piece]],
         config: MonitorConfig,
     ) -> None:
-        spec.signals.live.require_no_roll("a monitor")
         self.model = model.to(torch.float64).eval()
         self.config = config
         self.dt = spec.dt
@@ -613,11 +609,9 @@ class Watch:
                 f"the clean logs hold {len(groups)} stretches of {config.group:g} s; a monitor"
                 f" needs at least {_FEWEST} to know how innovations scatter"
             )
-        fastest = np.max(
-            [np.abs(p.y[:, VELOCITIES]).max(axis=0) for log in clean for p in log], axis=0
-        )
-        most = dict(zip(SEEN, np.append(fastest, _TURN), strict=True))
-        self.limit = _FAR * np.array([most[name] for name in self.seen])
+        most = np.max([np.abs(p.y).max(axis=0) for log in clean for p in log], axis=0)
+        most[HEADING] = _TURN
+        self.limit = _FAR * most[[*self.seen.values()]]
         self.parts = [1, _PARTS] if round(config.window / spec.dt) >= _LEAST_PART * _PARTS else [1]
         found = [[self.innovations(group, parts) for parts in self.parts] for group in groups]
         lost = np.concatenate([(group[0][0] == 0.0).all(axis=1) for group in found])
@@ -790,7 +784,7 @@ class Watcher:
         self.w: list[np.ndarray] = []
 
     def step(self, y: np.ndarray, w: np.ndarray) -> Verdict | None:
-        """Take one sample: measured state [6], and the inputs [m] held over the step after it.
+        """Take one sample: measured state [3 + n], and the inputs [m] held over the step after it.
 
         Returns:
             The verdict where a window is complete, else None. A sample that is no measurement ends

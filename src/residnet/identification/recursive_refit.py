@@ -21,7 +21,7 @@ from torch import Tensor
 
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import UsageError
-from residnet.core.layout import VELOCITIES
+from residnet.core.layout import MOVING
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.identification.changes import Change, ChangedDynamics
 from residnet.identification.models import FittedModel
@@ -191,10 +191,10 @@ def _direction(
     with torch.no_grad():
         changed = ChangedDynamics(brief, [change], len(x), w.shape[1])
         gained = changed.step(x, w, memory)[0] - brief.step(x, w, memory)[0]
-        wanted = gained[:, VELOCITIES].flatten() / (brief.dt * change.size)
+        wanted = gained[:, MOVING].flatten() / (brief.dt * change.size)
         slopes = baseline.sensitivity(model.channels(x, w)).flatten(0, 1)
         # axes count alike, though an acceleration in yaw is no acceleration in surge
-        weight = gained[:, VELOCITIES].square().mean(0)
+        weight = gained[:, MOVING].square().mean(0)
         weight = (weight + 1e-4 * weight.max()).rsqrt().repeat(len(x))
         slopes, wanted = slopes * weight[:, None], wanted * weight
         gram = slopes.T @ slopes

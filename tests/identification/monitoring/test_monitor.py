@@ -75,7 +75,7 @@ def watch(known: tuple[ModelSpec, HybridDynamics]) -> Watch:
     [
         Change("mass", "", "", 0.15, heavier=0.15),
         Change("gain n_stbd", "", "", 0.1, gain={1: -0.1}),
-        Change("damping yaw", "", "", 0.1, damping=2, damped=-0.2),
+        Change("damping yaw", "", "", 0.1, damping="r", damped=-0.2),
         Change("gyro scale", "", "", 0.05, sensor="gyro_scale"),
     ],
     ids=lambda change: change.name,
