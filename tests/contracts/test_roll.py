@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import struct
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -10,20 +13,36 @@ import torch
 
 from residnet.baselines import BaselineConfig
 from residnet.baselines.regressors import RegressorsConfig
+from residnet.control.heading.vessels import SteeredModel, SteeredPlant
 from residnet.core.config import validate
-from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.errors import ResidnetError
 from residnet.core.layout import ROLL, Live, levelled
 from residnet.core.log import Log
 from residnet.core.registry import kinds
 from residnet.data.doctor import inspect
+from residnet.data.sea import Disturbance, SensorNoise
+from residnet.data.simulated import Craft, Sea, fly
+from residnet.dynamics.actuated import ActuatedDynamics, PlantActuators
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.rollout import Rollout, scripted
-from residnet.dynamics.store import ModelSpec
+from residnet.dynamics.store import ModelSpec, save_model
 from residnet.heads import HeadConfig
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
-from residnet.identification.monitoring import MonitorConfig, Watch
+from residnet.identification.monitoring import (
+    Change,
+    ChangedDynamics,
+    MonitorConfig,
+    Piece,
+    Watch,
+    Watcher,
+)
 from residnet.judge.freerun import integrate
+from residnet.manoeuvres.base import Helm
+from residnet.manoeuvres.open_loop import ConstantInput
+from residnet.physics.vessel import load_vessel
+from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
+from residnet.simulators.vehicle import vehicle
 from residnet.testing import check_baseline, check_head, example_samples
 from residnet.testing.examples import ROLLING, example_model, example_spec
 
@@ -138,10 +157,83 @@ def test_what_logs_tell() -> None:
     assert Live.shared([Live(("u",)), Live(("r",))]).planar
 
 
-def test_what_knows_no_roll_says_so() -> None:
+def test_a_monitor_tells_stiffness_from_damping_in_roll() -> None:
+    spec = example_spec(None, ROLLING)
+    model = example_model(spec).double()
+    noise = np.array([0.0, 0.0, 0.002, 0.02, 0.02, 0.003, 0.003, 0.003])
+    low, high = np.array(spec.low[5:]), np.array(spec.high[5:])
+
+    def logs(change: Change, count: int, seed: int) -> list[list[Piece]]:
+        random = np.random.default_rng(seed)
+        w = random.uniform(low, high, size=(count, 6, 2)).repeat(50, axis=1)
+        x = torch.zeros(count, 8).double()
+        x[:, 3] = 0.7 * spec.high[0]
+        changed = ChangedDynamics(model, [change], count, 2)
+        with torch.no_grad():
+            states = Rollout(changed)(x, torch.from_numpy(w), x[:, :0])[0].numpy()
+        y = states + noise * random.normal(size=states.shape)
+        return [
+            [Piece(a[k : k + 101], b[k : k + 100], a[:0], b[:0]) for k in (0, 100, 200)]
+            for a, b in zip(y, w, strict=True)
+        ]
+
+    watch = Watch(spec, model, logs(Change("none", "", "", 1.0), 16, 0), MonitorConfig())
+    assert list(watch.seen) == ["u", "v", "r", "p", "phi", "heading"]
+    for cause in ("restoring", "damping roll"):
+        watcher = Watcher(watch, 0)
+        (known,) = (one for one in watch.causes if one.name == cause)
+        for log in logs(known.of_size(-0.3), 5, 1):
+            watcher.restart()
+            for sums in watch.sums(log):
+                verdict = watcher.take(sums)
+        first = verdict.suspects[0]
+        assert verdict.alarm
+        assert first.change.name == cause
+        assert first.size == pytest.approx(-0.3, rel=0.3)
+
+
+def test_a_model_that_rolls_flies_behind_the_gear_of_its_vessel() -> None:
+    spec, plant = example_spec(RidgeConfig(), ROLLING), load_vessel("patrol_p06_linear").build()
+    model, columns = example_model(spec).double(), spec.signals.columns
+    gear = PlantActuators(plant, spec.dt)
+    flown = ActuatedDynamics(model, columns, "start", gear)
+    helm = Helm(gear.demand, flown.state, gear.inputs)
+    craft = Craft("own", flown, helm, gear.commands, flown.approach(1))
+    turn = ConstantInput(drive=0.8, steer=0.5, duration=12.0)
+    log = fly(craft, [turn], Sea(None, Disturbance(), SensorNoise(), 0), 12.0, spec.dt)[0].motion
+    x, w = flown.approach(1)[:, : len(ROLL.names)], torch.from_numpy(log.stack(columns))[None]
+    with torch.no_grad():
+        alone = Rollout(model)(x, w[:, :-1], model.initial_state(1).double())[0][0].numpy()
+    np.testing.assert_allclose(log.stack(ROLL.names), alone, atol=1e-9)
+    assert np.ptp(log["phi"]) > 0.01
+    # a heading controller sees the same steps
+    steered = SteeredModel(model, columns, "start", SteeredPlant(plant))
+    straight, held = steered.start(torch.ones(1).double())
+    memory = steered.memory(torch.tensor([[1.0, 1.0, 0.0]]).double())
+    with torch.no_grad():
+        moved = steered.model(spec.dt).step(straight, held, memory)[0]
+        wanted = model.step(straight[:, :8], held[:, :2], model.initial_state(1).double())[0]
+    assert steered.state[:8] == ROLL.names
+    torch.testing.assert_close(moved[:, :8], wanted)
+
+
+def test_a_simulator_shows_the_roll(tmp_path: Path) -> None:
     spec = example_spec(RidgeConfig(), ROLLING)
-    with pytest.raises(UsageError, match=r"a monitor knows no roll.*\[u, v, r\]"):
-        Watch(spec, example_model(spec), [], MonitorConfig())
+    save_model(tmp_path / "models" / "example", spec, example_model(spec))
+    known = vehicle(tmp_path, model="example")
+    assert known.states == ROLL.names
+    assert known.low.tolist() == pytest.approx(spec.low[5:])
+    back = ArduPilotBackEnd(known, servos(known), port=0)
+    try:
+        pulses = [1900, 1500, 1900, *[0] * 13]
+        for frame in range(1, 200):
+            said = json.loads(back.answer(struct.pack("<HHI16H", 18458, 50, frame, *pulses)) or b"")
+    finally:
+        back.close()
+    phi, p = (float(back.after[0, place]) for place in (PHI, P))
+    assert abs(phi) > 0.01
+    assert said["attitude"][0] == pytest.approx(phi, abs=0.1 * abs(p) + 1e-6)
+    assert said["imu"]["gyro"][0] == pytest.approx(p, abs=0.05)
 
 
 @pytest.mark.parametrize("gain", [1.0, -1.0, 57.3])

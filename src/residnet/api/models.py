@@ -357,7 +357,7 @@ class Monitor:
         """Take one sample, and return the verdict where a window is complete, else None.
 
         Args:
-            y: measured x, y, psi, u, v, r, psi without jumps.
+            y: measured x, y, psi, u, v, r, then p and phi of a model that rolls; psi without jumps.
             w: inputs held over the step after it, in the model's order.
         """
         found = self._watcher.step(np.asarray(y, dtype=float), np.asarray(w, dtype=float))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal, final
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from residnet.core import layout
 from residnet.core.config import Config, Quantity
 from residnet.core.errors import ConfigError
-from residnet.core.names import CHANNEL_UNITS, STATE, nearest
+from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import TracedPlantDynamics
@@ -44,8 +44,13 @@ class Actuators(nn.Module, ABC):
         """Return the states [B, k] one step later under inputs w [B, m]."""
 
     @abstractmethod
-    def approach(self, rows: int) -> Tensor:
-        """Return the state [rows, 6 + k] of hull and actuators that trials start from, float64."""
+    def approach(self, rows: int, hull: Sequence[str]) -> Tensor:
+        """Return the state [rows, h + k] that trials start from, float64: hull, then actuators.
+
+        Args:
+            rows: number of trials.
+            hull: names of the hull's h states; what the actuators do not know of it is zero.
+        """
 
 
 @final
@@ -77,9 +82,10 @@ class PlantActuators(Actuators):
         x[:, self.columns] = a
         return self.dynamics.step(x, w, x[:, :0])[0][:, self.columns]
 
-    def approach(self, rows: int) -> Tensor:
-        x = self.plant.approach(rows)
-        return x[:, [*map(self.plant.state.index, STATE), *self.columns]]
+    def approach(self, rows: int, hull: Sequence[str]) -> Tensor:
+        known = dict(zip(self.plant.state, self.plant.approach(rows).unbind(1), strict=True))
+        still = torch.zeros(rows, dtype=torch.float64)
+        return torch.stack([known.get(name, still) for name in (*hull, *self.state)], dim=1)
 
 
 class InputShare(Config):
@@ -163,10 +169,10 @@ class GivenActuators(Actuators):
         step = self.rate[self.limited].to(a.dtype) * self.dt
         return a + torch.minimum(torch.maximum(w[:, self.limited] - a, -step), step)
 
-    def approach(self, rows: int) -> Tensor:
+    def approach(self, rows: int, hull: Sequence[str]) -> Tensor:
         """Return the state at rest, the inputs without demand."""
-        hull = torch.zeros(rows, len(STATE), dtype=torch.float64)
-        return torch.cat((hull, self.centre[self.limited].expand(rows, -1)), dim=-1)
+        still = torch.zeros(rows, len(hull), dtype=torch.float64)
+        return torch.cat((still, self.centre[self.limited].expand(rows, -1)), dim=-1)
 
 
 def commanded(name: str) -> str:
@@ -176,9 +182,9 @@ def commanded(name: str) -> str:
 
 @final
 class ActuatedDynamics(Dynamics):
-    """A learned model behind actuators, with states x [B, 6 + k] and their inputs w [B, m].
+    """A learned model behind actuators, with states x [B, 3 + n + k] and their inputs w [B, m].
 
-    The state is x, y, psi, u, v, r, then the states of the actuators.
+    The state is that of the model, then the states of the actuators.
 
     Each input of the model is a state of the actuators where they have one of that name, else one
     of their inputs, else the command of that name (`cmd_delta` for `delta`: a rudder that stands at
@@ -193,7 +199,6 @@ class ActuatedDynamics(Dynamics):
 
     Raises:
         ConfigError: where the actuators have nothing for an input of the model.
-        UsageError: where the model rolls.
     """
 
     def __init__(
@@ -204,10 +209,10 @@ class ActuatedDynamics(Dynamics):
         actuators: Actuators,
     ) -> None:
         super().__init__(model.dt, model.integrator)
-        live_of(model.signals.names).require_no_roll("a simulation by a learned model")
         self.model, self.actuators = model, actuators
-        self.n_state = model.n_state
-        self.state = (*STATE, *actuators.state)
+        self.n_state, self.dof, self.rolls = model.n_state, model.dof, model.rolls
+        self.hull = live_of(model.signals.names).states
+        self.state = (*self.hull, *actuators.state)
         self.mean = hold == "mean"
         names = [*actuators.state, *actuators.inputs]
         self.take: list[int] = []
@@ -223,11 +228,15 @@ class ActuatedDynamics(Dynamics):
     def initial_state(self, batch: int) -> Tensor:
         return self.model.initial_state(batch)
 
+    def approach(self, rows: int) -> Tensor:
+        """Return the state [rows, 3 + n + k] that trials start from, float64."""
+        return self.actuators.approach(rows, self.hull)
+
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        a = layout.actuators(x)
+        a = layout.actuators(x, self.dof)
         moved = self.actuators.move(a, w)
         given = torch.cat((a, w), dim=-1)[:, self.take]
         if self.mean:
             given = 0.5 * (given + torch.cat((moved, w), dim=-1)[:, self.take])
-        y, s = self.model.step(layout.motion(x), given, s)
+        y, s = self.model.step(layout.motion(x, self.dof), given, s)
         return torch.cat((y, moved), dim=-1), s

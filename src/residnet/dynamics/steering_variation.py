@@ -122,9 +122,9 @@ class VariedPlant(Dynamics):
 class VariedModel(Dynamics):
     """A learned hull behind a rudder with a rate, each row with its own variation.
 
-    State x [B, 6 or 7]: x, y, psi, u, v, r, and the rudder angle where it has a rate. Memory s [B,
-    3 + k]: the variation, then the head's. `effect` multiplies the rudder angle that the model is
-    given, `time` divides what a step changes in sway and yaw.
+    State x [B, 3 + n or one more]: that of the model, and the rudder angle where it has a rate.
+    Memory s [B, 3 + k]: the variation, then the head's. `effect` multiplies the rudder angle that
+    the model is given, `time` divides what a step changes in sway and yaw.
 
     Args:
         model: of the hull.
@@ -154,6 +154,7 @@ class VariedModel(Dynamics):
         for model_at_precision in self.models:
             model_at_precision.dt = dt
         self.n_state = len(VARIATION) + model.n_state
+        self.dof, self.rolls = model.dof, model.rolls
         self.take, self.mean = list(take), mean
         self.travel = None if rate is None else rate * dt
 
@@ -164,7 +165,7 @@ class VariedModel(Dynamics):
         return self.models[1 if x.dtype == torch.float64 else 0]
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        command, angle = w[:, :1], actuators(x)
+        command, angle = w[:, :1], actuators(x, self.dof)
         if self.travel is None:
             angle_before = angle_after = command
         else:
@@ -174,10 +175,10 @@ class VariedModel(Dynamics):
         effect, time_share, bias = s[:, : len(VARIATION)].split(1, dim=1)
         effective = effect * held + bias
         given = torch.cat((effective, w[:, 1:]), dim=1)[:, self.take]
-        moved, memory = self._of(x).step(motion(x), given, s[:, len(VARIATION) :])
+        moved, memory = self._of(x).step(motion(x, self.dof), given, s[:, len(VARIATION) :])
         slowed = x[:, LATERAL] + (moved[:, LATERAL] - x[:, LATERAL]) / time_share
-        straight = moved[:, :SWAY]
-        parts = (straight, slowed) if self.travel is None else (straight, slowed, angle_after)
+        parts = [moved[:, :SWAY], slowed, moved[:, LATERAL.stop :]]
+        parts += [] if self.travel is None else [angle_after]
         return torch.cat(parts, dim=1), torch.cat((s[:, : len(VARIATION)], memory), dim=1)
 
 

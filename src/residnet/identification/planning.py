@@ -15,8 +15,7 @@ from torch import Tensor
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.config import Config, Metres, MetresPerSecond, Seconds
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import POSITION, SURGE, SWAY
-from residnet.core.names import STATE
+from residnet.core.layout import MOVING, POSITION, SURGE, SWAY
 from residnet.data.sea import Disturbance, SensorNoise
 from residnet.data.simulated import Craft, Flight, Sea, fly
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, commanded
@@ -26,6 +25,7 @@ from residnet.identification.models import FittedModel
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
 from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne
+from residnet.physics.signals import SignalsConfig
 from residnet.training.left_out import LeftOpen
 from residnet.training.refit import RefitConfig, step_sensitivities
 
@@ -34,16 +34,16 @@ from residnet.training.refit import RefitConfig, step_sensitivities
 def moments(
     model: HybridDynamics, runs: Sequence[tuple[Tensor, Tensor]], horizon: int, scales: Tensor
 ) -> Tensor:
-    """Return the sums over each run's samples of squared sensitivities of u, v, r, [R, P, P].
+    """Return the sums over each run's samples of squared sensitivities of what moves, [R, P, P].
 
     They are in scales. Each run is cut into free runs of `horizon` steps, each from its own
     measured state, as a refit takes it; what is left at the end does not count.
 
     Args:
         model: a baseline without a head.
-        runs: states [T + 1, 6] and inputs held over each step [T, m] of R runs.
+        runs: states [T + 1, 3 + n] and inputs held over each step [T, m] of R runs.
         horizon: steps of the free runs of a refit.
-        scales: of the velocities [3].
+        scales: of what moves [n].
     """
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
@@ -57,7 +57,7 @@ def moments(
     number = torch.tensor([run for run, _ in places])
     x = torch.stack([runs[run][0][start : start + horizon] for run, start in places])
     w = torch.stack([runs[run][1][start : start + horizon] for run, start in places])
-    s = torch.zeros(len(places), 4, size, dtype=scales.dtype)
+    s = torch.zeros(len(places), 1 + model.dof, size, dtype=scales.dtype)
     for k in range(horizon):
         s = step_sensitivities(model, baseline, x[:, k], model.signals.prepare(w[:, k]), s)
         seen = s[:, 1:] / scales[:, None]
@@ -257,9 +257,9 @@ def plan(
         fitted: a refitted baseline.
         open_: what its refit has left open.
         refit: settings of the refit.
-        scales: of u, v, r [3].
+        scales: of what moves [n].
         shares: of the inputs in drive and steer.
-        limit: of |u, v, r| [3] beyond which a flight has diverged.
+        limit: of what moves [n] beyond which a flight has diverged.
         limits: of the trials.
         aim: what is to be predicted; None for all candidates alike.
 
@@ -267,11 +267,10 @@ def plan(
         DataError: where no candidate stays within the limits, or nothing is open.
     """
     spec, model = fitted.spec, fitted.model.double()
-    spec.signals.live.require_no_roll("a plan of trials")
     horizon = round(refit.horizon / spec.dt)
     divisor = torch.from_numpy(scales)
     flown = [
-        (flight, _path(flight, spec.signals.columns))
+        (flight, _path(flight, spec.signals))
         for flight in _flights(
             fitted,
             shares,
@@ -290,7 +289,7 @@ def plan(
     each = spec.dt / refit.correlation / max(open_.square, 1e-12)
     goal = told.sum(dim=0)
     if aim is not None:
-        paths = [_path(one, spec.signals.columns) for one in _flights(fitted, shares, aim)]
+        paths = [_path(one, spec.signals) for one in _flights(fitted, shares, aim)]
         goal = moments(model, paths, horizon, divisor).sum(dim=0)
     before = spread(open_.covariance, goal)
     if not (np.isfinite(before) and before > 0.0):
@@ -339,7 +338,7 @@ def _flights(fitted: FittedModel, shares: Mapping[str, InputShare], aim: Aim) ->
     spec, model = fitted.spec, fitted.model.double()
     gear = GivenActuators(shares, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.columns, spec.hold, gear)
-    start = gear.approach(1)
+    start = actuated.approach(1)
     # trials begin at a speed in the middle of what the model knows
     start[:, SURGE] = 0.5 * (max(spec.low[0], 0.0) + spec.high[0])
     for name, value in aim.initial.items():
@@ -351,14 +350,14 @@ def _flights(fitted: FittedModel, shares: Mapping[str, InputShare], aim: Aim) ->
     return fly(craft, list(aim.manoeuvres), sea, aim.duration, spec.dt)
 
 
-def _path(flight: Flight, columns: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """Return states [T + 1, 6] and inputs [T, m] of a flight."""
+def _path(flight: Flight, signals: SignalsConfig) -> tuple[Tensor, Tensor]:
+    """Return states [T + 1, 3 + n] and inputs [T, m] of a flight."""
     motion = flight.motion
     known: dict[str, Any] = motion.channels
     still = np.zeros(len(motion))
     # what nobody commands, such as the wind, is left at rest
-    w = [known.get(name, known.get(commanded(name), still)) for name in columns]
-    states = torch.from_numpy(motion.stack(STATE))
+    w = [known.get(name, known.get(commanded(name), still)) for name in signals.columns]
+    states = torch.from_numpy(motion.stack(signals.live.states))
     return states, torch.from_numpy(np.stack(w, axis=1))[:-1]
 
 
@@ -368,7 +367,7 @@ def _reach(states: Tensor) -> float:
 
 def _allowed(states: Tensor, limit: np.ndarray, limits: TrialLimits) -> bool:
     """Whether a flight stays sound and within the limits."""
-    fastest = states[:, 3:6].abs().amax(0).numpy()
+    fastest = states[:, MOVING].abs().amax(0).numpy()
     speed = float(torch.hypot(states[:, SURGE], states[:, SWAY]).max())
     return bool(
         (fastest <= limit).all()

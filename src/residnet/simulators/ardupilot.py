@@ -203,17 +203,23 @@ class ArduPilotBackEnd:
         state: Tensor = self.before[0] + share * (self.after[0] - self.before[0])
         change = ((self.after[0] - self.before[0]) / self._dt).tolist()
         north, east, psi, u, v, r = state[:6].tolist()
-        cos, sin = math.cos(psi), math.sin(psi)
+        roll = dict(zip(self.vehicle.states, state.tolist(), strict=True))
+        phi, p = roll.get("phi", 0.0), roll.get("p", 0.0)
+        cos, sin, level = math.cos(psi), math.sin(psi), v * math.cos(phi)
         wrapped = math.remainder(psi, 2 * math.pi)
         reply = {
             "timestamp": self.time,
             "imu": {
-                "gyro": [0.0, 0.0, r],
+                "gyro": [p, 0.0, r],
                 # what an accelerometer feels: the motion of a turning frame, and not to fall
-                "accel_body": [change[3] - r * v, change[4] + r * u, -_GRAVITY],
+                "accel_body": [
+                    change[3] - r * v,
+                    change[4] + r * u - _GRAVITY * math.sin(phi),
+                    p * v - _GRAVITY * math.cos(phi),
+                ],
             },
             "position": [north, east, 0.0],
-            "attitude": [0.0, 0.0, wrapped],
-            "velocity": [u * cos - v * sin, u * sin + v * cos, 0.0],
+            "attitude": [phi, 0.0, wrapped],
+            "velocity": [u * cos - level * sin, u * sin + level * cos, 0.0],
         }
         return b"\n" + json.dumps(reply, separators=(",", ":")).encode() + b"\n"

@@ -79,24 +79,24 @@ def learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
     Its commands are its inputs within their training ranges; it feels no wind.
 
     Raises:
-        UsageError: where the run has no such model, or it rolls.
+        UsageError: where the run has no such model.
     """
     spec, model = load_model(run / "models" / chosen_model(run, name))
-    spec.signals.live.require_no_roll("a simulator of a learned model")
+    live = spec.signals.live
     guarded = _Guarded(GuardedDynamics(model.float(), spec).float().eval().requires_grad_(False))
-    commands = len(spec.signals.inputs)
+    driven = slice(live.size, live.size + len(spec.signals.inputs))
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)
     return _settled(
         Vehicle(
             spec.name,
             guarded,
-            STATE,
+            live.states,
             spec.signals.columns,
-            commands,
-            low[3 : 3 + commands],
-            high[3 : 3 + commands],
+            len(spec.signals.inputs),
+            low[driven],
+            high[driven],
             torch.zeros(len(spec.signals.exogenous)),
-            torch.zeros(len(STATE)),
+            torch.zeros(len(live.states)),
             float(max(abs(low[0]), abs(high[0]))),
         )
     )

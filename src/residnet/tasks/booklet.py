@@ -10,8 +10,9 @@ import torch
 
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import ConfigError, DataError
+from residnet.core.layout import ROLL
 from residnet.core.log import Log
-from residnet.core.names import STATE, VELOCITY, nearest
+from residnet.core.names import STATE, nearest
 from residnet.data.prepare import Prepared
 from residnet.data.sea import Disturbance, SensorNoise
 from residnet.data.simulated import Craft, Flight, Sea, fly, source_of
@@ -41,7 +42,7 @@ def write_booklet(
         config: what to fly.
         fitted: the refitted baseline.
         logs: of the run by split.
-        limit: [3] of |u, v, r| beyond which a free run has diverged.
+        limit: [n] of what moves beyond which a free run has diverged.
 
     Raises:
         ResidnetError: where the model cannot fly the manoeuvres, or no interval can be had.
@@ -109,7 +110,7 @@ def _craft(config: BookletConfig, fitted: FittedModel, inputs: Mapping[str, Inpu
     spec, model = fitted.spec, fitted.model.double()
     gear = GivenActuators(inputs, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.columns, spec.hold, gear)
-    start = gear.approach(1)
+    start = actuated.approach(1)
     for name, value in config.initial.items():
         if name not in actuated.state:
             raise ConfigError(
@@ -202,10 +203,11 @@ def _zigzags(
 
 
 def sound(flight: Flight, limit: np.ndarray) -> bool:
-    """Whether a flight ended as it should, with |u, v, r| within the limit [3] beyond which a free
+    """Whether a flight ended as it should, with what moves within the limit [n] beyond which a free
     run has diverged.
     """
-    return flight.fault is None and bool((np.abs(flight.motion.stack(VELOCITY)) <= limit).all())
+    moving = np.abs(flight.motion.stack(ROLL.moving[: len(limit)]))
+    return flight.fault is None and bool((moving <= limit).all())
 
 
 def _page(

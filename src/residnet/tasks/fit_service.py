@@ -17,6 +17,7 @@ from residnet.core.config import dump_config, validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import whole
 from residnet.core.format import fixed, number, plural
+from residnet.core.layout import ROLL
 from residnet.core.names import nearest
 from residnet.core.progress import say
 from residnet.data.prepare import Prepared, samples
@@ -447,10 +448,11 @@ class PlannedTrials:
         trials, tracks = folder / "next_trials.yaml", folder / "next_tracks.csv"
         flights = [trial.flight for trial in self.plan.chosen]
         chosen = [flight.manoeuvre.model_dump(mode="json") for flight in flights]
-        lines = ["manoeuvre,t,x,y,psi,u,v,r"]
+        states = [name for name in ROLL.names if name in flights[0].motion.channels]
+        lines = [",".join(("manoeuvre", "t", *states))]
         for motion in (flight.motion for flight in flights):
             every = max(round(1.0 / float(motion.t[1] - motion.t[0])), 1)
-            rows = np.column_stack((motion.t, motion.stack(("x", "y", "psi", "u", "v", "r"))))
+            rows = np.column_stack((motion.t, motion.stack(states)))
             lines += [
                 ",".join([motion.name, *(f"{value:.6g}" for value in row)]) for row in rows[::every]
             ]

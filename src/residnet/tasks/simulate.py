@@ -248,7 +248,7 @@ class Programme(Config):
                 f"disturbance.wind: model '{name}' and its actuators have no input '{missing[0]}'"
             )
         helm = Helm(gear.demand, actuated.state, gear.inputs, forces)
-        start = self._started(gear.approach(1), actuated.state, name)
+        start = self._started(actuated.approach(1), actuated.state, name)
         sea = Sea(plant, calm, self.noise, self.seed)
         return Craft(name, actuated, helm, gear.commands, start), sea
 

@@ -15,7 +15,7 @@ from residnet.control.base import ClosedLoop, GivenReference, Policy
 from residnet.control.heading.turning import Steered, Turning, measure_turning
 from residnet.core.errors import ConfigError
 from residnet.core.frames import wrap
-from residnet.core.names import STATE, nearest
+from residnet.core.names import nearest
 from residnet.dynamics.actuated import commanded
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
@@ -285,9 +285,9 @@ class SteeredModel(SteeredVessel):
     def __init__(
         self, model: HybridDynamics, columns: tuple[str, ...], hold: str, vessel: SteeredPlant
     ) -> None:
-        live_of(model.signals.names).require_no_roll("heading control by a learned model")
+        states = live_of(model.signals.names).states
         self.hull, self.vessel, self.mean = model, vessel, hold == "mean"
-        self.state = STATE if vessel.rate is None else (*STATE, "delta")
+        self.state = states if vessel.rate is None else (*states, "delta")
         self.inputs, self.rate = vessel.inputs, vessel.rate
         if not {"delta", "cmd_delta"} & set(columns):
             raise ConfigError(
@@ -318,4 +318,7 @@ class SteeredModel(SteeredVessel):
 
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
         x, w = self.vessel.start(speed)
-        return x[:, [self.vessel.column(name) for name in self.state]], w
+        known = dict(zip(self.vessel.state, x.unbind(1), strict=True))
+        # what the vessel does not have, such as roll, is at rest
+        still = torch.zeros_like(speed)
+        return torch.stack([known.get(name, still) for name in self.state], dim=1), w
