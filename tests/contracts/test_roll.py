@@ -177,7 +177,7 @@ def test_a_monitor_tells_stiffness_from_damping_in_roll() -> None:
             for a, b in zip(y, w, strict=True)
         ]
 
-    watch = Watch(spec, model, logs(Change("none", "", "", 1.0), 16, 0), MonitorConfig())
+    watch = Watch(spec, model, logs(Change("none", "", "", 1.0), 30, 0), MonitorConfig())
     assert list(watch.seen) == ["u", "v", "r", "p", "phi", "heading"]
     for cause in ("restoring", "damping roll"):
         watcher = Watcher(watch, 0)
