@@ -29,14 +29,8 @@ from residnet.dynamics.store import ModelSpec, save_model
 from residnet.heads import HeadConfig
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
-from residnet.identification.monitoring import (
-    Change,
-    ChangedDynamics,
-    MonitorConfig,
-    Piece,
-    Watch,
-    Watcher,
-)
+from residnet.identification.changes import Change, ChangedDynamics
+from residnet.identification.monitoring import MonitorConfig, Piece, Watch, Watcher
 from residnet.judge.freerun import integrate
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.open_loop import ConstantInput
