@@ -550,6 +550,43 @@ def minutes_apart(folder: Path, k: int, s: pd.DataFrame) -> None:
     pd.DataFrame({**columns, **renamed(s, ACTS)})[:100].to_csv(folder / f"run{k}.csv", index=False)
 
 
+def on_change(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """Commands in rows of their own, when they change."""
+    rows, last = list[dict[str, object]](), None
+    for row in s.itertuples():
+        rows.append({"t_s": row.t, "kind": "NAV", "x_m": row.x, "y_m": row.y, "hdg": row.heading})
+        if last != (row.rudder, row.rpm):
+            rows.append({"t_s": row.t + 0.03, "kind": "CMD", "rudder": row.rudder, "rpm": row.rpm})
+        last = (row.rudder, row.rpm)
+    pd.DataFrame(rows).to_csv(folder / f"run{k}.csv", index=False)
+
+
+def packed_clock(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """Hours, minutes and seconds in one number; beside a compass, the one that is true."""
+    at = START + pd.to_timedelta(s.t, "s")
+    columns = {"utc": at.dt.strftime("%H%M%S.%f").str[:-4], "easting": s.y, "northing": s.x}
+    columns |= {"magnetic heading (deg)": (s.heading - 4.5) % 360.0}
+    columns |= {"true heading of the gyro (deg)": s.heading, "rudder_fb": s.rudder}
+    csv(folder, k, {**columns, "shaft_rpm": s.rpm})
+
+
+def side_by_side(folder: Path, k: int, s: pd.DataFrame) -> None:
+    """Two boats in one table, each row twice."""
+    names = {"x": "x [m]", "y": "y [m]", "heading": "heading [deg]", "rudder": "rudder [deg]"}
+    columns: dict[str, object] = {"time [s]": s.t}
+    for boat, part in (("boat1", s), ("boat2", seen(3 - k))):
+        columns |= {f"{boat}_{new}": part[old] for old, new in {**names, "rpm": "rpm"}.items()}
+    table = pd.DataFrame(columns)
+    table.loc[table.index.repeat(2)].to_csv(folder / f"race{k}.csv", index=False)
+
+
+def korean(folder: Path, k: int, s: pd.DataFrame) -> None:
+    names = {"t": "시간(s)", "x": "북쪽(m)", "y": "동쪽(m)", "heading": "선수각(deg)"}
+    names |= {"rate": "선회율(deg/s)", "rudder": "타각(deg)", "rpm": "프로펠러 회전수(rpm)"}
+    table = pd.DataFrame(renamed(s, names))
+    table.to_csv(folder / f"run{k}.csv", index=False, encoding="cp949")
+
+
 LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
     layout.__name__: layout
     for layout in (
@@ -570,6 +607,7 @@ LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
         *(yaw_alone, speed_and_heading),
         *(portuguese, polish, chinese, russian, signal_k, topic_echo, newest_first, three_files),
         *(lever, frames_in_names, to_port, parts_of_time, totals, minutes_apart),
+        *(on_change, packed_clock, side_by_side, korean),
     )
 }
 

@@ -269,7 +269,7 @@ _TOGETHER = (("x", "y"), ("u", "v"), ("psi",), ("r",))
 """Channels that come from one sensor: either may rest at a new measurement, both hardly ever do."""
 _FEWEST_INTERVALS = 20
 """Intervals between measurements that are needed to tell their rule."""
-_ALIKE, _REGULAR = 0.25, 0.9
+ALIKE, REGULAR = 0.25, 0.9
 """So large a share of the intervals is the usual one, within this share of it."""
 
 
@@ -280,7 +280,7 @@ def usual_interval(values: np.ndarray) -> float:
     if every.size < _FEWEST_INTERVALS:
         return 1.0
     usual = float(np.median(every))
-    regular = float((np.abs(every - usual) <= _ALIKE * usual).mean()) >= _REGULAR
+    regular = float((np.abs(every - usual) <= ALIKE * usual).mean()) >= REGULAR
     return usual if usual >= 2.0 and regular else 1.0
 
 

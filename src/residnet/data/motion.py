@@ -230,6 +230,12 @@ def _integrated(log: Log, missing: Sequence[str]) -> Log:
     )
 
 
+def without_pauses(t: np.ndarray) -> np.ndarray:
+    """Return times [T] in s from zero on, pauses of the recorder cut to what is bridged."""
+    step = np.diff(t)
+    return np.append(0.0, np.cumsum(np.minimum(step, BRIDGED * np.median(step))))
+
+
 def fill_sparse(log: Log, names: tuple[str, ...], held: tuple[str, ...]) -> Log:
     """Return the log with values at every sample of channels that lack some, or come more rarely.
 

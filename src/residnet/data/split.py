@@ -20,6 +20,7 @@ from residnet.core.config import Config, ConfigPath, Seconds, load_mapping, vali
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE, nearest
+from residnet.data.motion import without_pauses
 from residnet.data.readers.base import files_of
 from residnet.data.readers.detect import LOG_ENDINGS, format_of, is_text_table
 
@@ -282,11 +283,13 @@ def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
             out[{2: "validation", 4: "test"}.get(place % 5, "train")].append(log)
         return out
     for log in kept:
-        first, length = float(log.t[0]), float(log.t[-1] - log.t[0])
+        gone, length = without_pauses(log.t), float(log.t[-1] - log.t[0])
         # whole numbers read better, where the log is long enough for them
         digits = max(0, 2 - int(np.log10(max(length, 1e-9))))
         for split, *shares in _SHARES:
-            low, high = (round(first + share * length, digits) for share in shares)
+            low, high = (
+                round(float(np.interp(share * gone[-1], gone, log.t)), digits) for share in shares
+            )
             start, stop = low if shares[0] else -np.inf, high if shares[1] < 1.0 else np.inf
             out[split].append(stretch_of(log, start, stop))
     return out

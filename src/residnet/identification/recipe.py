@@ -15,6 +15,7 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
+from residnet.data.motion import without_pauses
 from residnet.data.prepare import Prepared
 from residnet.judge.protocol import EvaluationConfig, Windows
 from residnet.physics.environment import WIND_INPUTS
@@ -497,7 +498,8 @@ def _memory(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float:
         return float("nan")
     t, x = log.t[known], values[known] - values[known].mean()
     step = float(np.median(np.diff(t)))
-    even = np.interp(np.arange(t[0], t[-1], step), t, x)[:20_000]
+    gone = without_pauses(t)
+    even = np.interp(np.arange(0.0, gone[-1], step), gone, x)[:20_000]
     power = np.abs(np.fft.rfft(even, 2 * even.size)) ** 2
     correlation = np.fft.irfft(power)[: even.size]
     below = np.flatnonzero(correlation < correlation[0] / np.e)

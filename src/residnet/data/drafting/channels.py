@@ -36,7 +36,7 @@ _SURE = 0.9
 """Correlation from which a measured factor overrules a header."""
 STATE_NAMES = ("x", "y", "psi", "u", "v", "r", "phi", "p", "wind_speed", "wind_dir")
 _FIXES = {"x": "latitude", "y": "longitude"}
-_MAGNETIC = re.compile(r"magn|compass|kompass|\bhdm\b|\(m\)|\bmag(?![a-z])|_mag(?![a-z])", re.I)
+MAGNETIC = re.compile(r"magn|compass|kompass|\bhdm\b|\(m\)|\bmag(?![a-z])|_mag(?![a-z])", re.I)
 _QUATERNION = re.compile(
     r"(?P<stem>(?:.*[\W_])?(?:q|quat|quaternions?|orient|orientation|att|attitude|rot|rotation))"
     r"[\W_]*(?P<part>[xyzwijk0-3])\W*",
@@ -403,7 +403,7 @@ class Channels:
         if self._fixes and name in ("x", "y"):
             return entry | {"unit": "deg"} | ({"scale": self._fixes} if self._fixes < 1.0 else {})
         if name == "psi":
-            if _MAGNETIC.search(column):
+            if MAGNETIC.search(column):
                 text = f"'{column}' is magnetic by its name, and is taken as true: give `offset`,"
                 self._marks.guess((*CHANNELS, name), f"{text} minus the declination at that place")
             entry["unit"] = self._psi_unit

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from residnet.core.units import si_unit, to_si, units
+from residnet.data.motion import without_pauses
 
 _WINDOW = 1.0
 """Shortest time in s over which positions are differentiated."""
@@ -209,7 +210,7 @@ def turns_to(
         known = np.isfinite(values) & np.isfinite(r) & np.isfinite(raw.t)
         if known.sum() < 50:
             continue
-        t, v, w = raw.t[known], values[known], r[known]
+        t, v, w = without_pauses(raw.t[known]), values[known], r[known]
         span = max(2.0, 3.0 * float(np.median(np.diff(t))))
         grid = np.arange(t[0], t[-1] - span, span / 4)
         if grid.size < 10:

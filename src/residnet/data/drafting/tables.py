@@ -14,9 +14,10 @@ import numpy as np
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.names import CHANNEL_UNITS, shown
 from residnet.core.units import known_unit, to_si
-from residnet.data.channels import without_fills
+from residnet.data.channels import ALIKE, REGULAR, without_fills
 from residnet.data.drafting.channels import (
     CHANNELS,
+    MAGNETIC,
     READER,
     STATE_NAMES,
     drafted_channels,
@@ -28,7 +29,8 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.units import other_dimension, written_unit
 from residnet.data.drafting.words import input_channel, plain, state_channel, words_of
 from residnet.data.readers.base import require_file
-from residnet.data.readers.clocks import steady_clock
+from residnet.data.readers.clocks import first_of_copies, steady_clock
+from residnet.data.readers.quantities import QUATERNION
 from residnet.data.readers.tables import TABLES, excel_sheet, json_rows, parquet_rows, sheet_names
 from residnet.data.readers.texts import first_rows
 from residnet.data.readers.written import (
@@ -57,6 +59,8 @@ _PARTS_OF_TIME = (
     *("stunde", "minute", "minutes", "min", "second", "seconds", "sekunde", "ss"),
 )
 _DAY = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
+_POINTS = r"^\d\d?\.\d\d\.\d\d[.,]"
+"""How a time of day begins that has points between its parts."""
 _FORMS: tuple[Form, ...] = ("number", "ddmm")
 _LARGEST = {"latitude": 90.0, "longitude": 180.0}
 _SIDES = {"latitude": {"N", "S"}, "longitude": {"E", "W", "O"}}
@@ -113,7 +117,7 @@ def draft_tables(
         )
     attitudes = quaternions(numeric)
     parts = {column for attitude in attitudes for column in attitude.values()}
-    names = named([name for name in numeric if name not in parts], marks)
+    names = _of_one_vessel([name for name in numeric if name not in parts], marks)
     names = _pulsed(names, sheets)
     # a vessel without roll is modelled too, so that no log is lost for it
     rolls = [name for name in ("phi", "p") if name in names]
@@ -130,7 +134,11 @@ def draft_tables(
     logs = _raw(sheets, names, left_out)
     cells = [str(text) for texts in first.texts.values() for text in texts.unique()[:20]]
     channels = drafted_channels(names, logs, marks, [*first.header, *cells])
-    for entry in channels.values():
+    for name, entry in channels.items():
+        if _on_change(name, logs):
+            entry["hold"] = True
+            text = "recorded when it changes: the last value holds until the next"
+            marks.guess((*CHANNELS, name), text)
         settings = written.get(entry["column"], {})
         entry |= {"column": first.column(entry["column"]), **settings}
     about = {key: value for key, value in first.about.items() if key != "kind"}
@@ -197,6 +205,31 @@ def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, ResidnetErro
     return [sheets[best], *sheets[:best], *sheets[best + 1 :]], left_out
 
 
+def _of_one_vessel(columns: Sequence[str], marks: Marks) -> dict[str, str]:
+    """Return channel -> column; of vessels side by side, `boat1_x` and `boat2_x`, the first.
+
+    What moves and what drives it stand behind the same words of each.
+    """
+    vessels: dict[str, dict[str, str]] = {}
+    for column in columns:
+        word, _, rest = re.sub(r"[\W_]+", "\0", column, count=1).partition("\0")
+        vessels.setdefault(word, {})[rest] = column
+    for word, own in vessels.items():
+        alike = [
+            other for other, its in vessels.items() if len(own) > 2 and its.keys() == own.keys()
+        ]
+        found = named([*own], Marks()) if len(alike) > 1 else {}
+        if found.keys() & set(STATE_NAMES) and found.keys() - {*STATE_NAMES, *_LARGEST}:
+            text = (
+                f"the columns of {', '.join(alike)} are taken as those of a vessel each, of which"
+            )
+            marks.guess(
+                CHANNELS, f"{text} {word} is read; write the others into tables of their own"
+            )
+            return {channel: own[rest] for channel, rest in named([*own], marks).items()}
+    return named(columns, marks)
+
+
 def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
     """Return channel -> column, by what the columns are called.
 
@@ -217,8 +250,13 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
     speeds: list[str] = []
     about = {column: words_of(column) for column in columns}
     copied = re.compile(r"\.\d+$")
-    # shorter names first: `heading` before `heading of the second compass`
-    for column in sorted(columns, key=lambda name: len(about[name].about)):
+
+    def order(column: str) -> tuple[bool, int]:
+        magnetic = MAGNETIC.search(column) and state_channel(about[column]) == "psi"
+        return bool(magnetic), len(about[column].about)
+
+    # true headings first, then shorter names: `heading` before `heading of the second compass`
+    for column in sorted(columns, key=order):
         channel = state_channel(about[column]) or input_channel(about[column])
         si = CHANNEL_UNITS.get(channel or "")
         other = other_dimension(column, si) if si else None
@@ -255,15 +293,15 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
     if "u" not in names and speeds and ("v" in names or not placed):
         names["u"] = speeds[0]
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
-    order = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
-    return {name: names[name] for name in order if name in names}
+    listed = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
+    return {name: names[name] for name in listed if name in names}
 
 
 def _pulsed(names: Mapping[str, str], sheets: Sequence[Sheet]) -> dict[str, str]:
     """Return channel -> column, where pulses to a motor are no revolutions but its throttle.
 
-    Pulses are whole microseconds between 900 and 2,100; revolutions say in their name what they
-    are, or are zero at rest.
+    Pulses are whole microseconds between 900 and 2,100, and a share of a motor's all is one at
+    most; revolutions say in their name what they are, or are zero at rest.
     """
     out = {}
     for channel, column in names.items():
@@ -271,7 +309,10 @@ def _pulsed(names: Mapping[str, str], sheets: Sequence[Sheet]) -> dict[str, str]
         values = values[np.isfinite(values)]
         if re.match(r"(cmd_)?n(_|$)", channel) and values.size and not _TURNS.search(column):
             whole = bool((values == np.round(values)).all())
-            if whole and values.min() >= _PULSES[0] and values.max() <= _PULSES[1]:
+            pulses = whole and values.min() >= _PULSES[0] and values.max() <= _PULSES[1]
+            motor = words_of(column)
+            share = motor.has("engine") and motor.lacks("revolutions", "propeller", "speed")
+            if pulses or (share and not whole and np.abs(values).max() <= 1.0):
                 channel = re.sub(r"^(cmd_)?n", "throttle", channel)
         out[channel] = column
     return out
@@ -295,8 +336,27 @@ def _raw(
         # the newest first
         way = -1 if (np.diff(clock.seconds[np.isfinite(clock.seconds)]) < 0.0).all() else 1
         columns = {channel: values[::way] for channel, values in columns.items()}
-        logs.append(Raw(clock.seconds[::way], columns))
+        t = clock.seconds[::way]
+        first = first_of_copies(t, np.stack([*columns.values()], axis=1)) if columns else t == t
+        logs.append(Raw(t[first], {name: values[first] for name, values in columns.items()}))
     return logs
+
+
+def _on_change(channel: str, logs: Sequence[Raw]) -> bool:
+    """Return whether a channel that drives the vessel has values at fewer than half of the samples,
+    and no interval between them that is usual.
+    """
+    if channel in (*STATE_NAMES, *QUATERNION, *_LARGEST):
+        return False
+    known = [
+        np.flatnonzero(np.isfinite(raw.columns[channel])) for raw in logs if channel in raw.columns
+    ]
+    samples = sum(raw.t.size for raw in logs if channel in raw.columns)
+    every = np.concatenate([np.diff(at) for at in known]) if known else np.zeros(0)
+    if not every.size or 2 * sum(at.size for at in known) >= samples:
+        return False
+    usual = np.abs(every - np.median(every)) <= ALIKE * np.median(every)
+    return bool(usual.mean() < REGULAR)
 
 
 def _unused(sheet: Sheet, names: Mapping[str, str], clock: Clock, marks: Marks) -> None:
@@ -304,8 +364,13 @@ def _unused(sheet: Sheet, names: Mapping[str, str], clock: Clock, marks: Marks) 
     idle = [name for name in sheet.numbers if name not in used]
     if idle:
         marks.note(CHANNELS, f"columns that no channel takes: {', '.join(idle[:20])}")
-    if sheet.texts.keys() - used:
-        marks.note(CHANNELS, f"columns of text: {', '.join(list(sheet.texts.keys() - used)[:12])}")
+    texts = [
+        f"{name} ('{shown(str(cells.dropna().iloc[0]), 20)}')"
+        for name, cells in sheet.texts.items()
+        if name not in used
+    ]
+    if texts:
+        marks.note(CHANNELS, f"columns of text: {', '.join(texts[:12])}")
     if sheet.empty:
         marks.note(CHANNELS, f"empty columns: {', '.join(sheet.empty[:12])}")
     if sheet.others:
@@ -509,11 +574,11 @@ def _dated(sheet: Sheet, dated: dict[str, pd.Series]) -> Clock:
     def hold(name: str, pattern: str) -> bool:
         return bool(dated[name].dropna().astype("string").str.contains(pattern).all())
 
-    clocks = [name for name in dated if hold(name, ":|時")]
+    clocks = [name for name in dated if hold(name, rf":|時|\s\d\d?\.\d\d\.\d\d|{_POINTS}")]
     days = [name for name in dated if name not in clocks]
     if not clocks:
         raise DataError(f"{sheet.path}: column '{days[0]}' holds dates without a time of day")
-    whole = [name for name in clocks if hold(name, _DAY)]
+    whole = [name for name in clocks if hold(name, _DAY) and not hold(name, _POINTS)]
     column = (whole or clocks)[0]
     settings: dict[str, Any] = {"column": column, "unit": "date"}
     texts, guess = dated[column], ""

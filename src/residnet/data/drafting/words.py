@@ -14,51 +14,58 @@ from residnet.core.names import ACCELERATION, CHANNEL_UNITS
 
 # what a name may be about -> parts of words, and whole words behind a bar
 _ABOUT: dict[str, str] = {
-    "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻"
-    " 時間 日時 micros millis czas время 时间 aika | t time stamp tid sec secs seconds elapsed"
-    " hora heure uhrzeit datum date datetime fecha utc dato tempo",
-    "north": "north nord norte noord hochwert 北 север polnoc pohjoinen | n northing",
+    "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻 時間"
+    " 日時 micros millis czas время 时间 aika 시간 시각 | t time stamp tid sec secs seconds"
+    " elapsed hora heure uhrzeit datum date datetime fecha utc dato tempo ora orario zaman"
+    " sure",
+    "north": "north nord norte noord hochwert 北 север polnoc pohjoinen kuzey 북쪽 북방 | n"
+    " northing",
     "east": "east ost oste este oost rechtswert ostwert ostkoord ostricht 東 восток 东 ostlig"
-    " wschod itainen | e easting est leste",
+    " wschod itainen 동쪽 동방 | e easting est leste dogu",
     "position": "posit posic posisj coordin koordinat coorden coordonn 位置 posiz pozyc полож |"
-    " pos local utm pose ned enu",
-    "x": "| x",
-    "y": "| y",
-    "latitude": "latit breitengrad breedte bredde breddegrad 緯度 纬度 широт szerokosc | lat"
-    " breite",
-    "longitude": "longitude longitud longitudine langengrad lengte lengde 経度 经度 долгот"
-    " dlugosc | lon lng long laenge lange",
+    " pos local utm pose ned enu xpos ypos posx posy px py konum 위치",
+    "x": "| x xpos posx px",
+    "y": "| y ypos posy py",
+    "latitude": "latit breitengrad breedte bredde breddegrad 緯度 纬度 широт szerokosc 위도 enlem"
+    " | lat breite",
+    "longitude": "longitude longitud longitudine langengrad lengte lengde 経度 经度 долгот dlugosc"
+    " 경도 boylam | lon lng long laenge lange",
     "heading": "heading steuerkurs gierwinkel rumbo voorliggende heng kurswinkel 船首方位 方位"
     " 回頭角 船首角 方位角 針路 lacet guinada giringsvinkel girvinkel gierhoek kompaskoers"
-    " kompasskurs курс 艏向 航向 | kompas psi yaw hdg cap koers kurs kompass compass koersen"
-    " kompassi peiling hdt proa prua rotta stavriktning rumo",
+    " kompasskurs курс 艏向 航向 선수각 선수방위 침로 | kompas psi yaw hdg cap koers kurs"
+    " kompass compass koersen kompassi peiling hdt proa prua rotta stavriktning rumo pruva"
+    " rota",
     "ground": "ground grund fond grond grunn 対地 | cog sog smg cmg",
     "course": "course | cog cmg",
     "rate": "rate taux geschwind vitesse velocidad velocita snelheid hastighet 速度 角速度 回頭率"
-    " taxa скорост predkosc | speed velo velocity rot",
+    " taxa скорост predkosc 속도 hizi | speed velo velocity rot",
     "turn": "turn dreh gier wende drei giring 回頭 旋回 virage girat giro guin accostat sving"
-    " svang guinada 转艏 поворот | rot angvelo yaw lacet girhastighet",
+    " svang guinada 转艏 поворот donus 선회 | rot angvelo yaw lacet girhastighet",
     "turn_rate": "turnrate drehrate gierrate wenderate drehgeschwind giergeschwind wendegeschwind"
     " angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet drejehastighed"
-    " bochtaanwijzer girhastighet 回頭角速度 回頭率 旋回角速度 转艏角速度 | rot yawrate wz gyroz"
-    " omega gz",
-    "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 углов katowa | gyro gyrz",
+    " bochtaanwijzer girhastighet 回頭角速度 回頭率 旋回角速度 转艏角速度 선회율 선회각속도"
+    " 회두각속도 | rot yawrate wz gyroz omega gz",
+    "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 углов katowa 각속도 |"
+    " gyro gyrz acisal",
     "speed": "speed velo 風速 geschwind vitesse velocidad velocita snelheid hastighet 速度 船速"
-    " fahrt vaart 速力 скорост predkosc | velo sog stw fart vel spd log tws",
+    " fahrt vaart 速力 скорост predkosc 속도 속력 | velo sog stw fart vel spd log tws hiz hizi"
+    " surat",
     "surge": "surge langsgeschw laengsgeschw longitudinal avance avante voraus vooruit voorwaart"
     " fremover forover fremad 前後 langs avanzamento avanco 纵向 framat продольн | u forward"
     " ahead corredera",
     "sway": "sway quergeschw seitlich lateral dwars tverr sideveis sidelaens 左右 derive deriva"
     " transvers verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards"
     " sideways 横向 sidled попереч | v vm quer",
-    "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre руль |"
-    " delta rudder rud ror rsa steering helm pala leme ster",
-    "propeller": "propel schraube helice schroef 推進 プロペラ propulseur 螺旋桨 винт srub | prop"
-    " screw shaft welle eje arbre aksel 軸 elica",
-    "engine": "engine motor maschine maquina moteur hovedmaskin 主機 двигат silnik | main",
+    "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre руль 타각"
+    " dumen | delta rudder rud ror rsa steering helm pala leme ster tiller rorkult barra pinne"
+    " ruderpinne",
+    "propeller": "propel schraube helice schroef 推進 プロペラ propulseur 螺旋桨 винт srub pervane"
+    " 프로펠러 | prop screw shaft welle eje arbre aksel 軸 elica",
+    "engine": "engine motor maschine maquina moteur hovedmaskin 主機 двигат silnik makine 엔진"
+    " 모터 | main motoru",
     "revolutions": "drehzahl revolution umdreh tours toerental omdreining turtall varvtal regime"
-    " giri 回転 revoluc 转速 оборот obrot rotac | rpm erpm rps rev revs n",
-    "thrust": "thrust schub poussee empuje stuwkracht skyv 推力 тяг spinta empuxo",
+    " giri 回転 revoluc 转速 оборот obrot rotac 회전수 devir devri | rpm erpm rps rev revs n",
+    "thrust": "thrust schub poussee empuje stuwkracht skyv 推力 тяг spinta empuxo 추력 itki",
     "torque": "torque drehmoment couple koppel dreiemoment トルク",
     "power": "power leistung puissance potencia vermogen effekt 出力",
     "throttle": "throttle actuator gashebel gashendel gasspak gasreglage acelerador accelerateur"
@@ -66,24 +73,24 @@ _ABOUT: dict[str, str] = {
     "azimuth": "azimu schottel pod | azi nozzle alpha",
     "servo": "servo rcou",
     "force": "force kraft fuerza kracht 力 tau",
-    "wind": "wind vind vent viento 風 风 ветер wiatr | tws twd vento",
+    "wind": "wind vind vent viento 風 风 ветер wiatr 풍속 풍향 ruzgar | tws twd vento",
     "true": "true wahr vrai verdadero real reel ware sann 真 | tws twd",
     "relative": "relativ apparent scheinb aparente schijnb tilsyn 相対 gemessen measured",
     "direction": "direction direzion richtung riktning direccion richting retning angle winkel"
     " 方向 風向 | dir twd from angulo hoek vinkel",
     "angle": "angle winkel angulo hoek vinkel lage 角 | ang angolo",
-    "roll": "roll roulis balanceo krenging 横揺 kranken slagside 横摇 横倾 крен przechyl | phi"
-    " heel",
+    "roll": "roll roulis balanceo krenging 横揺 kranken slagside 横摇 横倾 крен przechyl 횡동요 |"
+    " phi heel yalpa",
     "pitch": "pitch tangage cabeceo stampf | theta trim",
     "acceleration": "accel beschleun versnell akselerasjon 加速 | udot vdot rdot dot acc",
     "command": "command soll setpoint consigne befehl gevraagd onsket 指令 demand reference"
-    " desired задан | cmd set ref des order ordre ordered comando",
-    "port": "backbord babord babor bakboord 左舷 portside bombordo sinistra лев | port bb ps left"
-    " links izquierda izquierdo gauche venstre",
+    " desired задан 명령 komut | cmd set ref des order ordre ordered comando",
+    "port": "backbord babord babor bakboord 左舷 portside bombordo sinistra лев 좌현 iskele | port"
+    " bb ps left links izquierda izquierdo gauche venstre",
     "starboard": "starboard steuerbord tribord estribor stuurboord styrbord 右舷 estibordo dritta"
-    " прав | stbd sb stb right rechts derecha derecho droite hoyre",
+    " прав 우현 sancak | stbd sb stb right rechts derecha derecho droite hoyre",
     "current": "current stromung courant corriente stroming 潮流",
-    "depth": "depth tiefe profond profund diepte dybde 水深",
+    "depth": "depth tiefe profond profund diepte dybde 水深 수심 derinlik",
     "voltage": "volt spannung tension battery batterie bateria batteri | amp ampere current_a",
     "bow": "| bow bug proue proa boeg baug",
     "stern": "| stern heck poupe popa hek akter aft",
@@ -127,12 +134,16 @@ class Words(NamedTuple):
 
 
 _IN_BRACKETS = re.compile(r"[\[({][^\])}]*[\])}]")
-_LETTERS = str.maketrans({"ß": "ss", "ø": "o", "Ø": "O", "æ": "ae", "ł": "l"})
+_LETTERS = str.maketrans({"ß": "ss", "ø": "o", "Ø": "O", "æ": "ae", "ł": "l", "ı": "i"})
+_SYMBOLS = {"ψ̇": "r", "ψ": "psi", "δ": "delta", "φ": "phi", "ϕ": "phi", "θ": "theta", "τ": "tau"}
+"""Greek letters that stand alone."""
 
 
 def plain(name: str) -> str:
     """Return a name in lower case and plain letters, its words apart, its units left out."""
     text = _IN_BRACKETS.sub(" ", name)
+    for sign, word in _SYMBOLS.items():
+        text = re.sub(rf"(?<![^\W_]){sign}(?![^\W_\d])", word, text)
     text = re.sub(r"([a-z])([A-Z])", r"\1 \2", text)
     text = text.translate(_LETTERS)
     decomposed = unicodedata.normalize("NFKD", text)
@@ -213,9 +224,6 @@ def state_channel(words: Words) -> str | None:
     if w.has("turn_rate") or (w.has("heading") and w.has("rate")) or w.text in ("r", "r mid"):
         return "r"
     if (w.has("turn") and w.has("rate")) or (w.has("angular") and _YAWING.search(w.text)):
-        return "r"
-    if w.has("angular", "rate") and w.lacks("x", "y", "pitch"):
-        # of an axis that is not told: what turns is the vessel
         return "r"
     if w.has("angular", "rate") and w.lacks("x", "y", "pitch"):
         # of an axis that is not told: what turns is the vessel

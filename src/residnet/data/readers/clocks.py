@@ -1,4 +1,6 @@
-"""Clocks that go on though their numbers do not: counters that wrap, stamps of whole seconds."""
+"""Clocks that go on though their numbers do not: counters that wrap, stamps of whole seconds,
+hours, minutes and seconds in one number.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +10,43 @@ from residnet.data.readers.recording import Remark, remark
 
 _BITS = (16, 24, 32, 48)
 """Widths of the counters that microcontrollers stamp with."""
+_DAY = 86_400.0
+"""s"""
 _USUAL_STEPS = 3.0
 """Usual steps within which the clock has gone on where its counter began anew."""
+
+
+def first_of_copies(t: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return [T] bool: rows that do not repeat the one before them, time and all.
+
+    True everywhere where times repeat without that, for then the clock is coarser than the rows.
+
+    Args:
+        t: times [T] in s, as recorded.
+        rows: what was recorded [T, k].
+    """
+    same = (rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1]))
+    first = np.append(True, (np.diff(t) != 0.0) | ~same.all(axis=1))
+    return first if (np.diff(t[first]) != 0.0).all() else np.ones_like(first)
+
+
+def _unpacked(t: np.ndarray) -> np.ndarray | None:
+    """Return seconds [T] from numbers such as 83059.8 for 8:30:59.8; None where they are others.
+
+    They tell themselves where a minute ends: the number goes on by 40 more than the clock.
+    """
+    whole = np.floor(t)
+    hours, minutes, seconds = whole // 10_000, whole // 100 % 100, t - whole // 100 * 100
+    if t.min() < 0.0 or hours.max() >= 24 or max(minutes.max(), seconds.max()) >= 60.0:
+        return None
+    out = (60.0 * hours + minutes) * 60.0 + seconds
+    out += _DAY * np.cumsum(np.diff(out, prepend=out[0]) < -0.5 * _DAY)
+    step = np.diff(out)
+    jumps = np.diff(t) - step > 1.0
+    usual = _USUAL_STEPS * float(np.median(step))
+    return (
+        out if jumps.any() and bool(((step[jumps] > 0.0) & (step[jumps] <= usual)).all()) else None
+    )
 
 
 def steady_clock(
@@ -19,8 +56,10 @@ def steady_clock(
 
     A counter that passes its largest number begins anew at zero: where a step back is one of its
     lengths but for a few usual steps, that length is added from there on; so is the hour that a
-    clock on the wall is set back in autumn. Stamps that several rows share are those of a clock
-    coarser than the rows: these are spread over the time to the next stamp, unless they are copies.
+    clock on the wall is set back in autumn, and taken off that of spring. Stamps that several rows
+    share are those of a clock coarser than the rows: these are spread over the time to the next
+    stamp, unless they are copies. Numbers that hold hours, minutes and seconds in one (83059.8 for
+    8:30:59.8) are read as such.
 
     Args:
         t: as recorded; all finite.
@@ -31,7 +70,11 @@ def steady_clock(
     forward = step[step > 0.0]
     if not forward.size:
         return t, []
-    usual, remarks = float(np.median(forward)), []
+    usual, remarks = float(np.median(forward)), list[Remark]()
+    if tick == 1.0 and (packed := _unpacked(t)) is not None:
+        text = "times are hours, minutes and seconds in one number (83059.8 for 8:30:59.8)"
+        t, remarks = packed, [remark("note", "clock_packed", text)]
+        step = np.diff(t)
     lengths = {"an hour, as in autumn": 3600.0} if tick is None else {}
     if tick is not None:
         lengths = {f"2^{bits} of its ticks": 2.0**bits * tick for bits in _BITS}
@@ -44,6 +87,12 @@ def steady_clock(
             first = float(t[:-1][began][0])
             text = f"the clock fell back after {first:.6g} s by {what}; it is read as going on"
             remarks.append(remark("note", "clock_wraps", text, count=float(began.sum())))
+        ahead = (step > length) & (step - length < _USUAL_STEPS * usual)
+        if tick is None and ahead.any():
+            added[1:] -= length * np.cumsum(ahead)
+            first = float(t[:-1][ahead][0])
+            text = f"the clock leapt an hour after {first:.6g} s, as in spring; it is taken off"
+            remarks.append(remark("note", "clock_leaps", text, count=float(ahead.sum())))
     t = t + added
     stamps, begins, counts = np.unique(t, return_index=True, return_counts=True)
     each = int(np.median(counts))

@@ -179,12 +179,15 @@ class ChannelMap(Conversion):
             where there is none.
         letter_o: what the letter O means in longitudes, `east` (Ost, Oost) or `west` (Oeste, Ouest,
             Ovest); null refuses it.
+        hold: the last value holds until the next, as of commands that are recorded when they
+            change; rows that hold nothing else are left out.
     """
 
     column: str
     form: Form = "number"
     hemisphere: str | None = None
     letter_o: LetterO | None = None
+    hold: bool = False
 
     @property
     def is_angle(self) -> bool:

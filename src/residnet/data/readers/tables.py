@@ -36,7 +36,7 @@ from residnet.data.readers.base import (
     require_values,
     unwrap,
 )
-from residnet.data.readers.clocks import steady_clock
+from residnet.data.readers.clocks import first_of_copies, steady_clock
 from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
 from residnet.data.readers.quantities import QUATERNION, ChannelMap, factor, told_headings
 from residnet.data.readers.recording import Remark, remark
@@ -301,8 +301,20 @@ class TableReader(LogReader):
             kept = kept[::-1]
             text = "the rows stand with the newest first, and are read from the last one on"
             findings.append(remark("note", "newest_first", text))
-        tick = None if config.time.unit == DATE else to_si(config.time.unit)
         recorded = np.stack([values[kept] for values in raw.values()], axis=1)
+        first = first_of_copies(t[kept], recorded)
+        if not first.all():
+            text = f"{int((~first).sum())} rows repeat the one before them and are left out"
+            findings.append(remark("note", "copied_rows", text, rows=float((~first).sum())))
+            kept, recorded = kept[first], recorded[first]
+        for name, values in raw.items():
+            if maps[name].hold:
+                raw[name] = values[_last_known(values)]
+        # a row of commands alone belongs to the next sample of the motion
+        moving = [values for name, values in raw.items() if not maps[name].hold] or [*raw.values()]
+        there = np.isfinite(np.stack([values[kept] for values in moving])).any(axis=0)
+        kept, recorded = kept[there], recorded[there]
+        tick = None if config.time.unit == DATE else to_si(config.time.unit)
         t[kept], said = steady_clock(t[kept], recorded, tick)
         findings += said
         require_increasing(path, t[kept], lambda i: self._row(int(kept[i]) + above))
@@ -416,6 +428,13 @@ class TableReader(LogReader):
                 f" ({bad.size} such cells); correct or empty them, or correct the unit"
             )
         return values, findings
+
+
+def _last_known(values: np.ndarray) -> np.ndarray:
+    """Return for each sample [T] that of the last number at or before it; its own for none."""
+    at = np.arange(values.size)
+    last = np.maximum.accumulate(np.where(np.isfinite(values), at, -1))
+    return np.where(last < 0, at, last)
 
 
 def _placed(path: Path, channels: dict[str, np.ndarray], units: dict[str, str]) -> list[Remark]:

@@ -50,6 +50,10 @@ _MARKS = {
 # Chinese looks like narrow kana in a Japanese encoding
 _JAPANESE = re.compile(r"\A[^\uff61-\uff9f]*[\u3040-\u30ff\u4e00-\u9fff]")
 _CHINESE = re.compile(r"[\u4e00-\u9fa5]{2}")
+# its bytes make Chinese signs as well; those of Chinese words make more than Hangul
+_KOREAN = re.compile(
+    r"\A[\x00-\x7f°±²³µ·]*(?:[\uac00-\ud7a3]{2}[\x00-\x7f°±²³µ·\uac00-\ud7a3]*)+\Z"
+)
 _CYRILLIC, _RUN = re.compile(rb"[\xc0-\xff\xa8\xb0\xb8\xb9]+"), re.compile(rb"[\xc0-\xff]{4}")
 _POLISH = re.compile(r"[a-z][³¹¿¼¾][a-z]")
 _LATIN = re.compile(r"[\x00-\x7fÀ-ÿ°º²³µ·±´×–’]*")
@@ -563,7 +567,7 @@ def encoding_of(path: Path) -> str:
     """Return the encoding of a text file: by its byte order mark, else by what its bytes can be.
 
     Text without a mark is UTF-8 where all of it can be, else UTF-16, Russian (cp1251), Polish
-    (cp1250), Western European (cp1252), Japanese (cp932) or Chinese (gb18030).
+    (cp1250), Western European (cp1252), Japanese (cp932), Korean (cp949) or Chinese (gb18030).
     """
     with path.open("rb") as stream:
         told = _told(stream.read(_HEAD))
@@ -667,7 +671,12 @@ def _of_bytes(block: bytes) -> str:
     # a Latin letter and the next one may look like one Japanese sign, but not the other way
     if _LATIN.fullmatch(western):
         return "cp1252"
-    for name, likely in (("cp932", _JAPANESE), ("gb18030", _CHINESE), ("cp1252", re.compile(""))):
+    for name, likely in (
+        ("cp932", _JAPANESE),
+        ("cp949", _KOREAN),
+        ("gb18030", _CHINESE),
+        ("cp1252", re.compile("")),
+    ):
         with suppress(UnicodeDecodeError):
             if likely.search(block.decode(name)):
                 return name

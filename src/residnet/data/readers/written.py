@@ -51,8 +51,9 @@ _PARTS = (
 )
 _DATE = r"(?P<date>\d{1,4}\s*[-./年]\s*(?:\d{1,2}|[^\W\d_]{3,9}\.?)\s*[-./月]\s*\d{1,4}日?|\d{8})"
 _CLOCK = (
-    r"(?P<hour>\d{1,2})\s*[:h時]\s*(?P<minute>\d{1,2})\s*"
-    r"(?:[:分']\s*(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d+))?秒?)?\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+    # Italians and Finns write 08.30.00
+    r"(?P<hour>\d{1,2})\s*(?:[:h時]|\.(?=\d\d\.\d\d))\s*(?P<minute>\d{1,2})\s*"
+    r"(?:(?:[:分']|(?<=\.\d\d)\.)\s*(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d+))?秒?)?\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
 )
 _FORM = (
     rf"^\s*(?:{_DATE}(?:[T ,_;]+|$))?(?:{_CLOCK})?\s*(?P<zone>Z|UTC|GMT|[+-]\d{{2}}:?\d{{2}})?\s*$"
@@ -62,6 +63,8 @@ _SECOND = (
     r"^(?P<before>(?:.*[\d日][T ,_;]+)?\d\d?:\d\d?):(?P<second>\d\d?)(?:[.,:](?P<fraction>\d+))?"
     r"(?P<after>\s*(?:[^\s\d.,:分秒'].*)?)$"
 )
+# minutes and seconds alone, as Excel exports a time
+_MINUTES = re.compile(r"^\s*(\d{1,2}:\d\d[.,]\d+)\s*$")
 _NUMBER = r"^\s*(?P<whole>[-+]?\d+)(?:\.(?P<fraction>\d+))?\s*$"
 Form = Literal["number", "ddmm"]
 """How a number stands for an angle: as degrees, or as degrees and minutes in one."""
@@ -162,6 +165,8 @@ def _parts(cells: pd.Series) -> pd.DataFrame:
     import pyarrow as pa
     from pyarrow import compute
 
+    if _MINUTES.fullmatch(str(next(iter(cells), ""))):
+        cells = cells.str.replace(_MINUTES, r"0:\1", regex=True)
     form, texts = re.compile(_FORM), pa.array(cells.tolist(), pa.string())
     before, *seconds, after = compute.extract_regex(texts, _SECOND).flatten()
     rest = compute.coalesce(compute.binary_join_element_wise(before, after, ""), texts)

@@ -19,8 +19,8 @@ from residnet.data.readers.texts import as_utf8, encoding_of_head
 from residnet.data.readers.written import Stamps, parse_texts, whole_second
 
 _SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2,4},[\x20-\x7e]*)")
-# a sentence with its checksum at the start of a line, or behind a time
-_WHOLE = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\*[0-9A-Fa-f]{2}\s*$")
+# a sentence, to its checksum where it has one, at the start of a line or behind a time
+_WHOLE = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\s*$")
 # a date with a time, a time of day or Unix time, among what else a recorder writes
 _STAMP = re.compile(
     r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[T ,_]+\d{1,2}:\d\d[\d:.,]*(?:Z|[-+]\d\d:?\d\d)?"
