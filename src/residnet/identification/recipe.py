@@ -15,7 +15,7 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
-from residnet.data.motion import without_pauses
+from residnet.data.motion import BRIDGED, without_pauses
 from residnet.data.prepare import Prepared
 from residnet.judge.protocol import EvaluationConfig, Windows
 from residnet.physics.environment import WIND_INPUTS
@@ -513,10 +513,18 @@ def window_length(logs: Sequence[Log], memory: float) -> float:
         logs: to be judged on; none ask for half a second.
         memory: how long the vessel remembers, s.
     """
-    lengths = sorted(float(log.t[-1] - log.t[0]) for log in logs) or [1.0]
+    lengths = sorted(_longest(log.t) for log in logs) or [1.0]
     usual = lengths[int(0.25 * (len(lengths) - 1))]
     room = [length for length in _WINDOWS if 1.15 * length <= usual] or [0.5 * usual]
     return next((length for length in room if length <= 15.0 * memory), room[-1])
+
+
+def _longest(t: np.ndarray) -> float:
+    """Return the longest time in s without a pause of the recorder; no free run goes across one."""
+    step = np.diff(t)
+    pauses = np.flatnonzero(step > BRIDGED * np.median(step) * (1.0 + 1e-6))
+    first, last = np.append(0, pauses + 1), np.append(pauses, t.size - 1)
+    return float((t[last] - t[first]).max())
 
 
 def protocols(length: float) -> dict[str, Any]:
