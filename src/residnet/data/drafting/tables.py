@@ -134,11 +134,11 @@ def draft_tables(
     logs = _raw(sheets, names, left_out)
     cells = [str(text) for texts in first.texts.values() for text in texts.unique()[:20]]
     channels = drafted_channels(names, logs, marks, [*first.header, *cells])
-    for name, entry in channels.items():
-        if _on_change(name, logs):
+    for channel, entry in channels.items():
+        if _on_change(channel, logs):
             entry["hold"] = True
             text = "recorded when it changes: the last value holds until the next"
-            marks.guess((*CHANNELS, name), text)
+            marks.guess((*CHANNELS, channel), text)
         settings = written.get(entry["column"], {})
         entry |= {"column": first.column(entry["column"]), **settings}
     about = {key: value for key, value in first.about.items() if key != "kind"}

@@ -302,11 +302,11 @@ class TableReader(LogReader):
             text = "the rows stand with the newest first, and are read from the last one on"
             findings.append(remark("note", "newest_first", text))
         recorded = np.stack([values[kept] for values in raw.values()], axis=1)
-        first = first_of_copies(t[kept], recorded)
-        if not first.all():
-            text = f"{int((~first).sum())} rows repeat the one before them and are left out"
-            findings.append(remark("note", "copied_rows", text, rows=float((~first).sum())))
-            kept, recorded = kept[first], recorded[first]
+        fresh = first_of_copies(t[kept], recorded)
+        if not fresh.all():
+            text = f"{int((~fresh).sum())} rows repeat the one before them and are left out"
+            findings.append(remark("note", "copied_rows", text, rows=float((~fresh).sum())))
+            kept, recorded = kept[fresh], recorded[fresh]
         for name, values in raw.items():
             if maps[name].hold:
                 raw[name] = values[_last_known(values)]
