@@ -75,31 +75,52 @@ def _horner(x: str, *parts: float) -> str:
     return f"(ALL({first!r}) + {x} * {_horner(x, *rest)})" if rest else f"ALL({first!r})"
 
 
+def _at_once(terms: int, bits: int, bias: int, least: int, most: int) -> dict[str, str]:
+    """Return functions of many numbers at once, right but for the last digits, by name.
+
+    They are those that networks call most. With C's library a step of a recurrent network takes six
+    times as long.
+
+    Args:
+        terms: of the exponential's series for what is at most a half.
+        bits: of a number behind its exponent.
+        bias: of the exponent.
+        least, most: beyond which the exponential is zero and infinite.
+    """
+    series = [2.0 / math.factorial(k) for k in range(terms + 1)]
+    return {
+        # 2^n e^r, whose rest r is at most half of log 2. Twice e^r, and half of 2^n from two
+        # powers, since 2^n alone may lie outside of what there is. The two parts of log 2 must stay
+        # apart: the first has so few digits that its multiples are exact
+        "exp": (
+            '__attribute__((noinline, optimize("no-associative-math"))) static V v_exp(V a) {\n'
+            f"    a = pick(a < ALL({least}), ALL({least}), a);\n"
+            f"    a = pick(a > ALL({most}), ALL({most}), a);\n"
+            f"    V k = a * ALL({1.0 / math.log(2.0)!r});\n"
+            "    V half = pick(k < ZERO, ALL(-.5), ALL(.5));\n"
+            "    I n = __builtin_convertvector(k + half, I), one = (n - 1) >> 1;\n"
+            f"    I other = n - 1 - one + {bias};\n"
+            "    V whole = __builtin_convertvector(n, V), r = a - whole * ALL(0.693359375);\n"
+            "    r = r - whole * ALL(-2.12194440054690583e-4);\n"
+            f"    return {_horner('r', *series)}"
+            f" * (V)((one + {bias}) << {bits}) * (V)(other << {bits});\n}}\n"
+        ),
+        # by e^2a - 1, which the series gives where the exponential would leave few digits
+        "tanh": (
+            "static __attribute__((noinline)) V v_tanh(V a) {\n"
+            "    V x = ALL(2) * pick(a < ZERO, -a, a);\n"
+            f"    V low = x * ALL(.5) * {_horner('x', *series[1:])};\n"
+            "    V e = pick(x < ALL(.5), low, v_exp(x) - ONE), t = ONE - ALL(2) / (e + ALL(2));\n"
+            "    t = pick(x < ALL(.5), e / (e + ALL(2)), t);\n"
+            "    return pick(a < ZERO, -t, t);\n}\n"
+        ),
+    }
+
+
 _AT_ONCE = {
-    # 2^n e^r, whose rest r is at most half of log 2. Twice e^r, and half of 2^n from two powers,
-    # since 2^n alone may lie outside of what there is. The two parts of log 2 must stay apart
-    "exp": (
-        '__attribute__((noinline, optimize("no-associative-math"))) static V v_exp(V a) {\n'
-        "    a = pick(a < ALL(-104), ALL(-104), a); a = pick(a > ALL(89), ALL(89), a);\n"
-        f"    V k = a * ALL({1.0 / math.log(2.0)!r}), half = pick(k < ZERO, ALL(-.5), ALL(.5));\n"
-        "    I n = __builtin_convertvector(k + half, I), one = (n - 1) >> 1, other = n - 1 - one;\n"
-        "    V whole = __builtin_convertvector(n, V), r = a - whole * ALL(0.693359375);\n"
-        f"    r = r - whole * ALL({math.log(2.0) - 0.693359375!r});\n"
-        f"    return {_horner('r', *(2.0 / math.factorial(k) for k in range(8)))}"
-        " * (V)((one + 127) << 23) * (V)((other + 127) << 23);\n}\n"
-    ),
-    # by the exponential, and by the series where that would leave few digits
-    "tanh": (
-        "static __attribute__((noinline)) V v_tanh(V a) {\n"
-        "    V s = a * a, e = v_exp(ALL(2) * pick(a < ZERO, -a, a));\n"
-        "    V t = ONE - ALL(2) / (e + ONE);\n"
-        f"    V low = a * {_horner('s', 1.0, -1 / 3, 2 / 15, -17 / 315, 62 / 2835)};\n"
-        "    return pick(s < ALL(.09), low, pick(a < ZERO, -t, t));\n}\n"
-    ),
+    torch.float32: _at_once(8, 23, 127, -104, 89),
+    torch.float64: _at_once(14, 52, 1023, -746, 710),
 }
-"""Functions of many numbers at once in single precision, right but for its last digit: those that
-networks call most. With C's library a step of a recurrent network takes six times as long.
-"""
 _SIDE_BY_SIDE = 8
 """Sums of a product that are in registers at once, each an entry of its result."""
 
@@ -139,7 +160,7 @@ def _prelude(dtype: torch.dtype) -> str:
         "R(name)": "name##f" if single else "name",
     }
     defined = [f"#define {name} {text}\n" for name, text in words.items()]
-    functions = _ONE_BY_ONE | (_AT_ONCE if single else {})
+    functions = _ONE_BY_ONE | _AT_ONCE[dtype]
     return "".join((*defined, _PRELUDE, *functions.values(), _PRODUCT))
 
 
