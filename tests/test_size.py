@@ -22,7 +22,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "core": (1486, 233),
     "data": (9218, 829),
     "documents": (2500, 229),
-    "dynamics": (2064, 262),
+    "dynamics": (2067, 263),
     "export": (1485, 169),
     "heads": (1283, 189),
     "identification": (2213, 226),
