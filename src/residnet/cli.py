@@ -61,6 +61,14 @@ Overrides = Annotated[
         help="Override a key of the config, or take one away with ~KEY; may be repeated.",
     ),
 ]
+Given = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="[PATH]...", help="Logs in the order of time: files or folders."),
+]
+Logs = Annotated[
+    list[Path] | None,
+    typer.Option("--logs", metavar="PATH", help="The same, one at a time; may be repeated."),
+]
 _CONFIG = "YAML file of one run, or the name of a config that comes with residnet."
 
 
@@ -222,23 +230,30 @@ def inspect(
         raise typer.Exit(1)
 
 
+def _named(run: Path, *parts: list[Path] | None) -> list[Path]:
+    """Return the logs that a command line names.
+
+    Raises:
+        UsageError: where there is none.
+    """
+    from residnet.core.errors import UsageError
+
+    logs = [path for part in parts for path in part or ()]
+    if not logs:
+        raise UsageError(f"{run}: which logs? Name files or folders of logs behind the run")
+    return logs
+
+
 @app.command()
 def evaluate(
     folder: RunPath,
-    logs: Annotated[
-        list[Path],
-        typer.Option(
-            "--logs", metavar="PATH", help="Logs to predict: files or folders; may be repeated."
-        ),
-    ],
+    given: Given = None,
+    logs: Logs = None,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out", metavar="DIR", help="Where results go; RUN/external-<time> where not given."
         ),
-    ] = None,
-    more: Annotated[
-        list[Path] | None, typer.Argument(metavar="[PATH]...", help="Further logs.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -249,19 +264,15 @@ def evaluate(
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "evaluate")
         require_room(out or folder)
-        finished = task.evaluate_on(run, [*logs, *(more or [])], out)
+        finished = task.evaluate_on(run, _named(folder, given, logs), out)
     show(finished)
 
 
 @app.command()
 def monitor(
     folder: RunPath,
-    logs: Annotated[
-        list[Path],
-        typer.Option(
-            "--logs", metavar="PATH", help="New logs in the order of time; may be repeated."
-        ),
-    ],
+    given: Given = None,
+    logs: Logs = None,
     model: Annotated[str, typer.Option(help="Name of the model.")] = "selected",
     window: Annotated[str, typer.Option(help="Length of the short free runs.")] = "10 s",
     stretch: Annotated[str, typer.Option(help="Time that is looked back over.")] = "300 s",
@@ -297,7 +308,8 @@ def monitor(
     settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "monitor")
-        found, refitted = task.monitor(run, logs, model, settings, refit)
+        named = _named(folder, given, logs)
+        found, refitted = task.monitor(run, named, model, settings, refit)
     for log in found:
         print("\n".join(log.text()))
     content: list[dict[str, Any]] = [log.content() for log in found]

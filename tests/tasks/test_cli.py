@@ -84,7 +84,8 @@ def test_measured_csv_end_to_end(
     assert len(json.loads((out / "provenance.json").read_text())["inputs"]) == 6
     for split, logs in (("train", range(4)), ("test", (5,))):
         shutil.rmtree(external, ignore_errors=True)
-        words = [word for i in logs for word in ("--logs", tmp_path / "logs" / f"log_{i}.csv")]
+        first, *others = [tmp_path / "logs" / f"log_{i}.csv" for i in logs]
+        words = [first, *(word for log in others for word in ("--logs", log))]
         assert call(monkeypatch, "evaluate", out, *words, "--out", external) == 0
         rows = json.loads((external / "metrics.json").read_text())["rows"]
         own = [row for row in content["rows"] if row["split"] == split]
@@ -102,6 +103,9 @@ def test_measured_csv_end_to_end(
     assert call(monkeypatch, "export", out, "--model", "rigde") == 2
     assert "did you mean 'ridge'" in one_line(capsys)
     assert call(monkeypatch, "evaluate", out, "--logs", tmp_path / "nothing") == 2
+    capsys.readouterr()
+    assert call(monkeypatch, "evaluate", out) == 2
+    assert "Name files or folders of logs behind the run" in one_line(capsys)
     assert call(monkeypatch, "report", tmp_path) == 2
 
 
