@@ -109,9 +109,9 @@ def _at_once(terms: int, bits: int, bias: int, least: int, most: int) -> dict[st
         "tanh": (
             "static __attribute__((noinline)) V v_tanh(V a) {\n"
             "    V x = ALL(2) * pick(a < ZERO, -a, a);\n"
+            "    x = pick(x > ALL(50), ALL(50), x);\n"
             f"    V low = x * ALL(.5) * {_horner('x', *series[1:])};\n"
-            "    V e = pick(x < ALL(.5), low, v_exp(x) - ONE), t = ONE - ALL(2) / (e + ALL(2));\n"
-            "    t = pick(x < ALL(.5), e / (e + ALL(2)), t);\n"
+            "    V e = pick(x < ALL(.5), low, v_exp(x) - ONE), t = e / (e + ALL(2));\n"
             "    return pick(a < ZERO, -t, t);\n}\n"
         ),
     }
