@@ -85,6 +85,12 @@ def test_rows_without_measurements_go_at_the_ends_only(tmp_path: Path) -> None:
     assert (log.meta["rows_read"], log.meta["rows_dropped"]) == (7, 3)
 
 
+def test_rows_written_twice_are_read_once(tmp_path: Path) -> None:
+    log = read(tmp_path, "t,u,v\n0,1,2\n1,1,2\n1,1,2\n1,1,2\n2,1,\n2,1,\n")
+    np.testing.assert_array_equal(log.t, [0.0, 1.0, 2.0])
+    assert [one["code"] for one in log.meta["findings"]] == ["copied_rows"]
+
+
 def test_delimiter_decimal_comma_byte_order_mark_and_spaces(tmp_path: Path) -> None:
     log = read(tmp_path, "\ufefft; u ;v\n0,5; 1,25;2\n1,0;1,5;3\n", delimiter=";", decimal=",")
     np.testing.assert_array_equal(log.t, [0.5, 1.0])
@@ -114,7 +120,7 @@ ROWS = "t,u,v\n0,1,2\n1,1,2\n"
         ("t,u,v\n0,1,2\n1,inf,2\n", DataError, ["line 3, column 'u'", "finite"]),
         ("t,u,v\n0,,2\n1,,2\n", DataError, ["column 'u' (channel u) holds no number"]),
         (
-            "t,u,v\n0,1,2\n\n1,1,2\n1,1,2\n1,1,2\n",
+            "t,u,v\n0,1,2\n\n1,1,2\n1,1,2\n1,1,3\n",
             DataError,
             ["repeats from line 4 (1 s) to line 5", "2 such steps"],
         ),

@@ -307,13 +307,14 @@ class TableReader(LogReader):
             text = f"{int((~fresh).sum())} rows repeat the one before them and are left out"
             findings.append(remark("note", "copied_rows", text, rows=float((~fresh).sum())))
             kept, recorded = kept[fresh], recorded[fresh]
-        for name, values in raw.items():
-            if maps[name].hold:
-                raw[name] = values[_last_known(values)]
-        # a row of commands alone belongs to the next sample of the motion
-        moving = [values for name, values in raw.items() if not maps[name].hold] or [*raw.values()]
-        there = np.isfinite(np.stack([values[kept] for values in moving])).any(axis=0)
-        kept, recorded = kept[there], recorded[there]
+        held = [name for name in raw if maps[name].hold]
+        for name in held:
+            raw[name] = raw[name][_last_known(raw[name])]
+        moving = [values[kept] for name, values in raw.items() if name not in held]
+        if held and moving:
+            # a row of commands alone belongs to the next sample of the motion
+            there = np.isfinite(np.stack(moving)).any(axis=0)
+            kept, recorded = kept[there], recorded[there]
         tick = None if config.time.unit == DATE else to_si(config.time.unit)
         t[kept], said = steady_clock(t[kept], recorded, tick)
         findings += said
