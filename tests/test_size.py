@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (865, 126),
     "control": (3257, 351),
     "core": (1486, 233),
-    "data": (9218, 829),
+    "data": (9219, 829),
     "documents": (2500, 229),
     "dynamics": (2067, 263),
     "export": (1485, 169),
