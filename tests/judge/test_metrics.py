@@ -12,7 +12,7 @@ from residnet.baselines.given import StillConfig
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.zero import ZeroHead
 from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction
-from residnet.judge.metrics import Judged, find
+from residnet.judge.metrics import Judged, find, new_trials
 from residnet.judge.protocol import Window
 from residnet.physics.signals import SignalsConfig
 
@@ -187,3 +187,30 @@ def test_find_wants_exactly_one() -> None:
         find(table, model="c")
     with pytest.raises(KeyError, match="2 rows"):
         find(table, split="test")
+
+
+def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest() -> None:
+    random, held, logs, windows = np.random.default_rng(3), [], 4, 3
+    numbers = np.repeat(np.arange(logs), windows)
+    for _ in range(400):
+        # a log has its size in common, half of it for all columns
+        sizes = 0.4 * random.normal(size=(2, logs, 1)) + 0.4 * random.normal(size=(2, logs, 6))
+        seen, new = np.exp(sizes.repeat(windows, axis=1) + 0.1 * random.normal(size=(2, 12, 6)))
+        spans = np.array(new_trials(seen, numbers))
+        own = np.log(seen.reshape(logs, windows, 6).mean(1)).std(0)
+        surest = int(own.argmin())
+        low, high = spans[surest]
+        held.append(low <= new.mean(0)[surest] <= high)
+        np.testing.assert_allclose(np.sqrt(spans.prod(1)), seen.mean(0))
+    assert 0.92 <= np.mean(held) <= 0.99
+
+
+def test_what_ran_away_or_is_exact_leaves_the_intervals_of_others() -> None:
+    values = np.exp(np.random.default_rng(4).normal(size=(12, 4)))
+    numbers = np.repeat(np.arange(4), 3)
+    plain = new_trials(values[:, :2], numbers)
+    values[:, 2], values[5, 3] = 0.0, np.inf
+    spans = new_trials(values, numbers)
+    assert spans[:2] == plain
+    assert spans[2] == [0.0, 0.0]
+    assert new_trials(values[:6], numbers[:6]) == [None] * 4

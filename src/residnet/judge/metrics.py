@@ -103,15 +103,22 @@ def intervals(values: np.ndarray, blocks: Blocks | None) -> list[list[float] | N
     ]
 
 
+def _sizes(error: np.ndarray) -> np.ndarray:
+    """Return position and heading errors [W, 2] of errors of the pose [W, 3]."""
+    return np.column_stack((np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])))
+
+
 def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]:
     """Return 95 % intervals of the means of columns [W, C] over as many new logs, [low, high].
 
     The windows of a log have its manoeuvre, weather and speed in common, so that the means of logs
     are what scatters. Errors are positive and their size is drawn: Student's t holds for the
-    logarithms of these means, twice over, for the logs seen and the new ones.
+    logarithms of these means, twice over, for the logs seen and the new ones. By how much logs
+    differ is estimated from all columns, since the few logs of one alone tell too little by chance,
+    and what looks best has too narrow an interval then. Columns hang together: they count as two.
 
     Args:
-        values: errors of windows, none negative.
+        values: errors of windows, none negative; a column is a model's error of one kind.
         logs: number [W] of the log that each window is of.
 
     Returns:
@@ -123,10 +130,12 @@ def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]
         return [None] * values.shape[1]
     sums = np.stack([np.bincount(places, column, count) for column in values.T], axis=1)
     sizes = np.log(np.maximum(sums / np.bincount(places)[:, None], 1e-12))
-    wide = scipy.stats.t.ppf(0.5 + LEVEL / 2, count - 1) * math.sqrt(2 / count)
-    factor = np.exp(wide * sizes.std(axis=0, ddof=1))
-    means = values.mean(0)
-    return [[float(mean / f), float(mean * f)] for mean, f in zip(means, factor, strict=True)]
+    told = sizes[:, sums.any(axis=0) & np.isfinite(sizes).all(axis=0)]
+    scatter = math.sqrt(told.var(axis=0, ddof=1).mean()) if told.size else 0.0
+    freedom = min(values.shape[1], 2) * (count - 1)
+    wide = scipy.stats.t.ppf(0.5 + LEVEL / 2, freedom) * math.sqrt(2 / count)
+    factor = math.exp(wide * scatter)
+    return [[float(mean / factor), float(mean * factor)] for mean in values.mean(0)]
 
 
 def tail(count: int) -> float:
@@ -344,18 +353,27 @@ class Judged:
                 continue
             numbers = self.numbers[there]
 
-            def off(error: np.ndarray, numbers: np.ndarray = numbers) -> dict[str, Any]:
-                """Return means and intervals of errors of the pose [W, 3]."""
-                values = np.column_stack((np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])))
-                means, new = values.mean(0), new_trials(values, numbers)
-                if new[1] is not None:
-                    # a heading is off by half a turn at most
-                    new[1][1] = min(new[1][1], math.pi)
-                names = [(column - self.live.size - 1, name) for column, name in self._ends]
-                return {
-                    **{name: float(means[k]) for k, name in names},
-                    "intervals": {name: new[k] for k, name in names},
-                }
+            names = [(column - self.live.size - 1, name) for column, name in self._ends]
+
+            def off(
+                errors: Mapping[str, np.ndarray],
+                numbers: np.ndarray = numbers,
+                names: Sequence[tuple[int, str]] = names,
+            ) -> dict[str, dict[str, Any]]:
+                """Return means and intervals of errors of the pose [W, 3], by name."""
+                values = np.hstack(
+                    [_sizes(error)[:, [k for k, _ in names]] for error in errors.values()]
+                )
+                means = iter(values.mean(0).tolist())
+                told = iter(new_trials(values, numbers))
+                out: dict[str, dict[str, Any]] = {}
+                for model in errors:
+                    ends = {name: next(told) for _, name in names}
+                    if (heading := ends.get("heading")) is not None:
+                        # it is off by half a turn at most
+                        heading[1] = min(heading[1], math.pi)
+                    out[model] = {name: next(means) for _, name in names} | {"intervals": ends}
+                return out
 
             measured = [
                 log.y[part.start : part.start + k + 1]
@@ -377,11 +395,13 @@ class Judged:
                     "slowest": float(speeds[there].min()),
                     "fastest": float(speeds[there].max()),
                     "sailed": float(np.mean(sailed)),
-                    "floor": off(floor),
-                    "models": {
-                        name: off(found.error[(found.begins + k)[there]][:, POSE])
-                        for name, found in self.found.items()
-                    },
+                    "floor": off({"floor": floor})["floor"],
+                    "models": off(
+                        {
+                            name: found.error[(found.begins + k)[there]][:, POSE]
+                            for name, found in self.found.items()
+                        }
+                    ),
                 }
             )
         return out
