@@ -26,7 +26,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "export": (1485, 169),
     "heads": (1283, 189),
     "identification": (2213, 226),
-    "judge": (2036, 224),
+    "judge": (2045, 225),
     "manoeuvres": (897, 136),
     "physics": (2025, 252),
     "regression": (1814, 204),
