@@ -737,9 +737,8 @@ def _models(config: ForceResidualConfig, results: Results, group: Mapping[str, R
 
 
 def _recommended(rows: Sequence[Any]) -> str:
-    """Return the best of the models surely better than no regression; where none is, one of these."""
-    fits = [row for row in rows if "minus_reference" in row]
-    sure = [row for row in fits if row["minus_reference"]["ci95"][3][1] < 0]
-    others = [row for row in rows if "minus_reference" not in row]
-    best = min(sure or others or rows, key=lambda row: sum(row["of_zero"]))
+    """Return the best of the models surely better than no regression, else of these."""
+    sure = [row for row in rows if row["model"] not in _NULLS and better(row, "reference")[3]]
+    nulls = [row for row in rows if row["model"] in _NULLS]
+    best = min(sure or nulls or rows, key=lambda row: sum(row["of_zero"]))
     return str(best["model"])
