@@ -21,7 +21,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "control": (3257, 351),
     "core": (1486, 233),
     "data": (9219, 829),
-    "documents": (2500, 229),
+    "documents": (2505, 230),
     "dynamics": (2067, 263),
     "export": (1485, 169),
     "heads": (1283, 189),
