@@ -150,7 +150,7 @@ SHORT: dict[str, Short] = {
             "runner.workers=1",
         )
     ),
-    "simulate_wam_v": Short(("~programme.families", "programme.step=0.1 s")),
+    "simulate_wam_v": Short(("~programme.families",)),
     "rudder_boat_trials": Short(_TRIALS),
     "patrol_identified": Short(_trained("mlp")),
     "patrol_roll": Short((*_TRIALS, "refit={}", "bands=null", *_trained("network"))),
