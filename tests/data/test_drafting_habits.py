@@ -255,3 +255,25 @@ def test_n_beside_e_is_north(log: Log, tmp_path: Path) -> None:
 )
 def test_german_compounds_of_north_and_east(column: str, channel: str) -> None:
     assert state_channel(words_of(column)) == channel
+
+
+def test_records_beside_each_other_are_told_from_vessels(log: Log, tmp_path: Path) -> None:
+    heading, rudder, rpm = np.degrees(log["psi"]), np.degrees(log["delta"]), 60.0 * log["n"]
+
+    def frame(**changes: dict[str, np.ndarray]) -> pd.DataFrame:
+        one = {"u": log["u"], "x": log["x"], "y": log["y"], "psi_deg": heading}
+        one |= {"delta_deg": rudder, "n_rpm": rpm}
+        columns = {"time_s": log.t}
+        for word, change in changes.items():
+            columns |= {f"{word}_{name}": part for name, part in (one | change).items()}
+        return pd.DataFrame(columns)
+
+    still = {name: np.zeros(len(log)) for name in ("u", "x", "y", "psi_deg", "delta_deg", "n_rpm")}
+    for words, told in (
+        ({"cmd": {"u": 1.0 + 0.0 * log.t}, "meas": {}}, False),
+        ({"alpha": still, "bravo": {}}, True),
+    ):
+        read, marks = _drafted(frame(**words), tmp_path / "table.csv")
+        np.testing.assert_allclose(read["u"], log["u"])
+        np.testing.assert_allclose(read["delta"], log["delta"])
+        assert any("hold a position each" in text for _, text in marks.guesses) == told

@@ -392,7 +392,7 @@ class RayConfig(Config):
             yield _RayExecutor(ray, self.cpus, self.gpus)
         except ray.exceptions.RayError as error:
             raise FitError(
-                f"runner: Ray has ended a trial ({str(error).splitlines()[0]}); continue with"
+                f"runner: Ray has ended a trial ({str(error).partition(chr(10))[0]}); continue with"
                 " --resume"
             ) from error
         finally:
@@ -554,8 +554,9 @@ class SweepConfig(Task):
                             say(f"  trial {trial.number}: its process was lost, it goes on anew")
                             again.append(trial)
                             continue
+                        said = str(error).partition("\n")[0]
                         fault = (
-                            f"its process was lost {_LOSSES} times ({str(error).splitlines()[0]});"
+                            f"its process was lost {_LOSSES} times ({said});"
                             " the memory may not be enough, so give fewer runner.workers"
                         )
                         trials.tell(trial, Ended(None, False, fault, 0.0))

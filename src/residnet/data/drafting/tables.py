@@ -117,7 +117,7 @@ def draft_tables(
         )
     attitudes = quaternions(numeric)
     parts = {column for attitude in attitudes for column in attitude.values()}
-    names = _of_one_vessel([name for name in numeric if name not in parts], marks)
+    names = _of_one_vessel([name for name in numeric if name not in parts], first.numbers, marks)
     names = _pulsed(names, sheets)
     # a vessel without roll is modelled too, so that no log is lost for it
     rolls = [name for name in ("phi", "p") if name in names]
@@ -205,28 +205,34 @@ def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, ResidnetErro
     return [sheets[best], *sheets[:best], *sheets[best + 1 :]], left_out
 
 
-def _of_one_vessel(columns: Sequence[str], marks: Marks) -> dict[str, str]:
-    """Return channel -> column; of vessels side by side, `boat1_x` and `boat2_x`, the first.
+def _of_one_vessel(
+    columns: Sequence[str], numbers: Mapping[str, np.ndarray], marks: Marks
+) -> dict[str, str]:
+    """Return channel -> column; of `boat1_x` and `boat2_x`, side by side, those of the first.
 
-    What moves and what drives it stand behind the same words of each.
+    The same words stand behind the word of each vessel or sensor, a place and an input among them.
+    What rests or is commanded is not taken for a vessel.
     """
-    vessels: dict[str, dict[str, str]] = {}
+    words: dict[str, dict[str, str]] = {}
     for column in columns:
         word, _, rest = re.sub(r"[\W_]+", "\0", column, count=1).partition("\0")
-        vessels.setdefault(word, {})[rest] = column
-    for word, own in vessels.items():
-        alike = [
-            other for other, its in vessels.items() if len(own) > 2 and its.keys() == own.keys()
-        ]
-        found = named([*own], Marks()) if len(alike) > 1 else {}
-        if found.keys() & set(STATE_NAMES) and found.keys() - {*STATE_NAMES, *_LARGEST}:
-            text = (
-                f"the columns of {', '.join(alike)} are taken as those of a vessel each, of which"
-            )
-            marks.guess(
-                CHANNELS, f"{text} {word} is read; write the others into tables of their own"
-            )
-            return {channel: own[rest] for channel, rest in named([*own], marks).items()}
+        words.setdefault(word, {})[rest] = column
+    for own in words.values():
+        alike = {word: its for word, its in words.items() if its.keys() == own.keys()}
+        if len(alike) < 2 or any(words_of(word).has("command") for word in alike):
+            continue
+        found = named([*own], Marks())
+        place = next((pair for pair in (("x", "y"), (*_LARGEST,)) if {*pair} <= found.keys()), ())
+        if not place or not found.keys() - {*STATE_NAMES, *_LARGEST}:
+            continue
+        for word, its in alike.items():
+            if any(np.nanstd(numbers[its[found[name]]]) > 0.0 for name in place):
+                text = (
+                    f"the columns of {', '.join(alike)} hold a position each; of these vessels or"
+                    f" sensors {word} is read; write the others into tables of their own"
+                )
+                marks.guess(CHANNELS, text)
+                return {channel: its[rest] for channel, rest in named([*its], marks).items()}
     return named(columns, marks)
 
 
