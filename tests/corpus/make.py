@@ -9,6 +9,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -74,7 +75,7 @@ def seen(number: int, every: int = EVERY) -> pd.DataFrame:
     )
 
 
-def csv(folder: Path, number: int, columns: dict[str, object], word: str = "run") -> None:
+def csv(folder: Path, number: int, columns: dict[str, Any], word: str = "run") -> None:
     """Write one table."""
     pd.DataFrame(columns).to_csv(folder / f"{word}{number}.csv", index=False)
 
@@ -172,7 +173,11 @@ def rostopic(folder: Path, k: int, s: pd.DataFrame) -> None:
     yaw = np.pi / 2 - np.radians(s.heading)
     topic, zero = "field.pose.pose.", np.zeros(len(s))
     stamps = START.value + (1e9 * s.t).round().astype("int64")
-    columns = {"%time": stamps, "field.header.seq": s.index, "field.header.stamp": stamps}
+    columns: dict[str, Any] = {
+        "%time": stamps,
+        "field.header.seq": s.index,
+        "field.header.stamp": stamps,
+    }
     columns |= {"field.header.frame_id": ["odom"] * len(s)}
     columns |= {"field.child_frame_id": ["base_link"] * len(s)}
     columns |= {f"{topic}position.x": s.y, f"{topic}position.y": s.x, f"{topic}position.z": zero}
@@ -187,6 +192,7 @@ def rostopic(folder: Path, k: int, s: pd.DataFrame) -> None:
 
 def moos_alog(folder: Path, k: int, s: pd.DataFrame) -> None:
     lines = [f"%% LOG FILE:   ./boat_{k}.alog", f"%% LOGSTART {START.timestamp():.2f}", ""]
+    row: Any
     for row in s.itertuples():
         told = {"NAV_X": row.y, "NAV_Y": row.x, "NAV_HEADING": row.heading, "NAV_SPEED": row.u}
         lines += [f"{row.t:<10.3f} {name:<12} uNav   {value:.3f}" for name, value in told.items()]

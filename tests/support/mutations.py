@@ -178,7 +178,7 @@ def _edited_table(path: Path, rng: random.Random) -> str:
     import pandas as pd
 
     table = pd.read_parquet(path)
-    column, how = rng.choice(list(table)), rng.randrange(5)
+    column, how = str(rng.choice(list(table))), rng.randrange(5)
     changes: list[Callable[[], pd.DataFrame]] = [
         lambda: table.drop(columns=[column]),
         lambda: table.iloc[:0],
