@@ -138,11 +138,18 @@ def limited(**limits: int) -> Callable[[], None]:
 
 
 def closed(*streams: int) -> Callable[[], None]:
-    return lambda: [os.close(stream) for stream in streams] and None
+    def apply() -> None:
+        for stream in streams:
+            os.close(stream)
+
+    return apply
 
 
 def full(stream: int) -> Callable[[], None]:
-    return lambda: os.dup2(os.open("/dev/full", os.O_WRONLY), stream) and None
+    def apply() -> None:
+        os.dup2(os.open("/dev/full", os.O_WRONLY), stream)
+
+    return apply
 
 
 ENVIRONMENTS: dict[str, tuple[dict[str, str | None], Callable[[], None] | None]] = {

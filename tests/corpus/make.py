@@ -90,70 +90,70 @@ def renamed(s: pd.DataFrame, *names: dict[str, str]) -> dict[str, object]:
     return {new: s[old] for part in names for old, new in part.items()}
 
 
-def plain(folder: Path, k: int, s: pd.DataFrame) -> None:
+def plain(folder: Path, k: int, s: Any) -> None:
     csv(folder, k, {"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)})
 
 
-def pandas_index(folder: Path, k: int, s: pd.DataFrame) -> None:
+def pandas_index(folder: Path, k: int, s: Any) -> None:
     columns = {"tvec": s.t, **renamed(s, {n: n for n in ("x", "y", "u", "v", "rudder", "rpm")})}
     columns |= {"psi": s.heading, "r": s.rate}
     pd.DataFrame(columns).to_csv(folder / f"run{k}.csv")
 
 
-def heading_interpolated(folder: Path, k: int, s: pd.DataFrame) -> None:
+def heading_interpolated(folder: Path, k: int, s: Any) -> None:
     between = np.interp(s.t, s.t[::4], s.heading[::4])
     csv(folder, k, {"time [s]": s.t, **renamed(s.assign(heading=between), POSE, ACTS)})
 
 
-def dead_gyro(folder: Path, k: int, s: pd.DataFrame) -> None:
+def dead_gyro(folder: Path, k: int, s: Any) -> None:
     dead = s.assign(rate=2e-5)
     csv(folder, k, {"time [s]": s.t, **renamed(dead, POSE, SPEEDS, ACTS)})
 
 
-def no_pose(folder: Path, k: int, s: pd.DataFrame) -> None:
+def no_pose(folder: Path, k: int, s: Any) -> None:
     csv(folder, k, {"time [s]": s.t, **renamed(s, SPEEDS, ACTS)})
 
 
-def surge_alone(folder: Path, k: int, s: pd.DataFrame) -> None:
+def surge_alone(folder: Path, k: int, s: Any) -> None:
     csv(folder, k, {"time [s]": s.t, "speed [m/s]": s.u, "motor [us]": (1100 + s.rpm / 2).round()})
 
 
-def yaw_alone(folder: Path, k: int, s: pd.DataFrame) -> None:
+def yaw_alone(folder: Path, k: int, s: Any) -> None:
     csv(folder, k, {"time [s]": s.t, "heading [deg]": s.heading, "rudder [deg]": s.rudder})
 
 
-def speed_and_heading(folder: Path, k: int, s: pd.DataFrame) -> None:
+def speed_and_heading(folder: Path, k: int, s: Any) -> None:
     columns = {"time [s]": s.t, "speed [m/s]": s.u, "heading [deg]": s.heading}
     csv(folder, k, {**columns, **renamed(s, ACTS)})
 
 
-def with_roll(folder: Path, k: int, s: pd.DataFrame) -> None:
+def with_roll(folder: Path, k: int, s: Any) -> None:
     roll = {"roll": "roll [deg]", "roll rate": "roll rate [deg/s]"}
     csv(folder, k, {"time [s]": s.t, **renamed(s, POSE, SPEEDS, roll, ACTS)})
 
 
-def micros_wrap(folder: Path, k: int, s: pd.DataFrame) -> None:
+def micros_wrap(folder: Path, k: int, s: Any) -> None:
     micros = (2**32 - 40_000_000 * k + (1e6 * s.t).round().astype("int64")) % 2**32
     csv(folder, k, {"micros": micros, **renamed(s, POSE, SPEEDS, ACTS)})
 
 
-def whole_seconds(folder: Path, k: int, s: pd.DataFrame) -> None:
+def whole_seconds(folder: Path, k: int, s: Any) -> None:
     stamps = (START + pd.to_timedelta(np.floor(s.t), "s")).dt.strftime("%Y-%m-%d %H:%M:%S")
     csv(folder, k, {"time": stamps, **renamed(s, POSE, SPEEDS, ACTS)})
 
 
-def summer_hour(folder: Path, k: int, s: pd.DataFrame) -> None:
+def summer_hour(folder: Path, k: int, s: Any) -> None:
     moments = pd.Timestamp("2024-10-27 00:59:20", tz="UTC") + pd.to_timedelta(s.t, "s")
     local = moments.dt.tz_convert("Europe/Berlin").dt.strftime("%d.%m.%Y %H:%M:%S.%f").str[:-4]
     csv(folder, k, {"Zeit": local, **renamed(s, POSE, SPEEDS, ACTS)})
 
 
-def magnetic(folder: Path, k: int, s: pd.DataFrame) -> None:
+def magnetic(folder: Path, k: int, s: Any) -> None:
     pose = {**POSE, "heading": "compass heading [deg]"}
     csv(folder, k, {"time [s]": s.t, **renamed(s, pose, ACTS)})
 
 
-def bridge(folder: Path, k: int, s: pd.DataFrame) -> None:
+def bridge(folder: Path, k: int, s: Any) -> None:
     north, east = np.gradient(s.x, s.t), np.gradient(s.y, s.t)
     columns = {
         "UTC": (START + pd.to_timedelta(s.t, "s")).dt.strftime("%Y-%m-%dT%H:%M:%S.%f").str[:-3],
@@ -169,7 +169,7 @@ def bridge(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, columns)
 
 
-def rostopic(folder: Path, k: int, s: pd.DataFrame) -> None:
+def rostopic(folder: Path, k: int, s: Any) -> None:
     yaw = np.pi / 2 - np.radians(s.heading)
     topic, zero = "field.pose.pose.", np.zeros(len(s))
     stamps = START.value + (1e9 * s.t).round().astype("int64")
@@ -190,7 +190,7 @@ def rostopic(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, columns, "odom")
 
 
-def moos_alog(folder: Path, k: int, s: pd.DataFrame) -> None:
+def moos_alog(folder: Path, k: int, s: Any) -> None:
     lines = [f"%% LOG FILE:   ./boat_{k}.alog", f"%% LOGSTART {START.timestamp():.2f}", ""]
     row: Any
     for row in s.itertuples():
@@ -201,13 +201,13 @@ def moos_alog(folder: Path, k: int, s: pd.DataFrame) -> None:
     (folder / f"boat_{k}.alog").write_text("\n".join(lines) + "\n")
 
 
-def cut(folder: Path, k: int, s: pd.DataFrame) -> None:
+def cut(folder: Path, k: int, s: Any) -> None:
     """One recording in two files."""
     part = seen(1)[(k - 1) * 250 : k * 250]
     csv(folder, k, {"time [s]": part.t, **renamed(part, POSE, SPEEDS, ACTS)}, "part_")
 
 
-def two_files(folder: Path, k: int, s: pd.DataFrame) -> None:
+def two_files(folder: Path, k: int, s: Any) -> None:
     fix = {"utc_s": START.timestamp() + 3600 * k + s.t, **renamed(s, POSE)}
     csv(folder, k, fix, "gnss_")
     fast = seen(k, 2)
@@ -216,7 +216,7 @@ def two_files(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {"millis": millis, **{n: v.round() for n, v in pulses.items()}}, "motors_")
 
 
-def several_rates(folder: Path, k: int, s: pd.DataFrame) -> None:
+def several_rates(folder: Path, k: int, s: Any) -> None:
     fast, columns = seen(k, 5), {"time [s]": seen(k, 5).t.round(3)}
     for name, column in {**POSE, **SPEEDS, **ACTS}.items():
         rows = {"x": 10, "y": 10, "heading": 2, "rpm": 4}.get(name, 1)
@@ -224,12 +224,12 @@ def several_rates(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, columns)
 
 
-def excel(folder: Path, k: int, s: pd.DataFrame) -> None:
+def excel(folder: Path, k: int, s: Any) -> None:
     table = pd.DataFrame({"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)})
     table.to_excel(folder / f"run{k}.xlsx", index=False)
 
 
-def json_lines(folder: Path, k: int, s: pd.DataFrame) -> None:
+def json_lines(folder: Path, k: int, s: Any) -> None:
     rows = [
         {"stamp": row.t, "nav": {"north": row.x, "east": row.y, "heading_deg": row.heading}}
         | {"act": {"rudder_deg": row.rudder, "shaft_rpm": row.rpm}}
@@ -238,7 +238,7 @@ def json_lines(folder: Path, k: int, s: pd.DataFrame) -> None:
     (folder / f"run{k}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
-def mat_arrays(folder: Path, k: int, s: pd.DataFrame) -> None:
+def mat_arrays(folder: Path, k: int, s: Any) -> None:
     import scipy.io
 
     names = {"t": "t", "x": "north", "y": "east", "heading": "heading_deg", "rudder": "rudder_deg"}
@@ -247,11 +247,11 @@ def mat_arrays(folder: Path, k: int, s: pd.DataFrame) -> None:
     scipy.io.savemat(folder / f"run{k}.mat", arrays, do_compression=True)
 
 
-def rows_npy(folder: Path, k: int, s: pd.DataFrame) -> None:
+def rows_npy(folder: Path, k: int, s: Any) -> None:
     np.save(folder / f"run{k}.npy", s.to_numpy()[:100])
 
 
-def bag_topics(folder: Path, k: int, s: pd.DataFrame) -> None:
+def bag_topics(folder: Path, k: int, s: Any) -> None:
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -279,7 +279,7 @@ def bag_topics(folder: Path, k: int, s: pd.DataFrame) -> None:
                 bag.write(topics[name], stamp, raw)
 
 
-def course_alone(folder: Path, k: int, s: pd.DataFrame) -> None:
+def course_alone(folder: Path, k: int, s: Any) -> None:
     north, east = np.gradient(s.x, s.t), np.gradient(s.y, s.t)
     columns = {"time [s]": s.t, "north [m]": s.x, "east [m]": s.y}
     columns |= {"course over ground [deg]": (np.degrees(np.arctan2(east, north)) % 360).round(1)}
@@ -287,14 +287,14 @@ def course_alone(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {**columns, **renamed(s, ACTS)})
 
 
-def nothing_known(folder: Path, k: int, s: pd.DataFrame) -> None:
+def nothing_known(folder: Path, k: int, s: Any) -> None:
     import scipy.io
 
     arrays = {"tank": s.u.to_numpy(), "volts": s.v.to_numpy(), "note": "harbour"}
     scipy.io.savemat(folder / f"run{k}.mat", arrays)
 
 
-def two_boats(folder: Path, k: int, s: pd.DataFrame) -> None:
+def two_boats(folder: Path, k: int, s: Any) -> None:
     """The same quantities of two boats that sailed together."""
     csv(folder, k, {"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)}, "alpha_")
     other = seen(3 - k)
@@ -302,13 +302,13 @@ def two_boats(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {"t (s)": other.t, **renamed(other, calls, SPEEDS, ACTS)}, "bravo_")
 
 
-def savetxt(folder: Path, k: int, s: pd.DataFrame) -> None:
+def savetxt(folder: Path, k: int, s: Any) -> None:
     names = "t[s] north[m] east[m] psi[deg] u[m/s] v[m/s] r[deg/s] rudder[deg] shaft[rpm]"
     rows = s[["t", "x", "y", "heading", "u", "v", "rate", "rudder", "rpm"]].to_numpy()
     np.savetxt(folder / f"run{k}.txt", rows, fmt="%.3f", header=names)
 
 
-def quotients(folder: Path, k: int, s: pd.DataFrame) -> None:
+def quotients(folder: Path, k: int, s: Any) -> None:
     """A quantity by its unit, and signs between thousands."""
     columns = {"t / ms": (1e3 * s.t + 3_600_000).map("{:,.0f}".format)}
     columns |= {"N / m": (s.x + 5_990_000).map("{:,.3f}".format), "E / m": s.y}
@@ -316,9 +316,9 @@ def quotients(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {**columns, "RSA / deg": s.rudder, "RPM / 1/min": s.rpm.map("{:,.0f}".format)})
 
 
-def marks_for_nothing(folder: Path, k: int, s: pd.DataFrame) -> None:
+def marks_for_nothing(folder: Path, k: int, s: Any) -> None:
     table = pd.DataFrame({"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)}).astype(object)
-    marks = {
+    marks: dict[str, tuple[Any, int]] = {
         "north [m]": (-9999.0, 37),
         "surge [m/s]": ("---", 41),
         "yaw rate [deg/s]": ("n/a", 23),
@@ -328,14 +328,14 @@ def marks_for_nothing(folder: Path, k: int, s: pd.DataFrame) -> None:
     table.to_csv(folder / f"run{k}.csv", index=False)
 
 
-def begun_anew(folder: Path, k: int, s: pd.DataFrame) -> None:
+def begun_anew(folder: Path, k: int, s: Any) -> None:
     """The names again where the recorder was switched on again, and remarks at the end."""
     table = pd.DataFrame({"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)})
     text = table[:220].to_csv(index=False) + "\n" + table[260:].to_csv(index=False)
     (folder / f"run{k}.csv").write_text(f"{text}\n# battery empty\n")
 
 
-def plotjuggler(folder: Path, k: int, s: pd.DataFrame) -> None:
+def plotjuggler(folder: Path, k: int, s: Any) -> None:
     yaw = np.pi / 2 - np.radians(s.heading)
     columns = {"__time": START.timestamp() + s.t}
     columns |= {"/odom/pose/pose/position/x": s.y, "/odom/pose/pose/position/y": s.x}
@@ -349,7 +349,7 @@ def degrees_and_minutes(degrees: float, width: int) -> str:
     return f"{int(degrees):0{width}d}{60.0 * (degrees % 1.0):09.6f}"
 
 
-def chart_plotter(folder: Path, k: int, s: pd.DataFrame) -> None:
+def chart_plotter(folder: Path, k: int, s: Any) -> None:
     at = START + pd.to_timedelta(s.t, "s")
     columns = {"DATE": at.dt.strftime("%d/%m/%Y"), "UTC": at.dt.strftime("%H:%M:%S.%f").str[:-5]}
     columns |= {"LAT(DDMM.MMMM)": [degrees_and_minutes(54.3 + x / 111_315.0, 2) for x in s.x]}
@@ -359,7 +359,7 @@ def chart_plotter(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, columns)
 
 
-def voyage_recorder(folder: Path, k: int, s: pd.DataFrame) -> None:
+def voyage_recorder(folder: Path, k: int, s: Any) -> None:
     """Sentences behind a time and the address that they came from."""
     lines = []
     for row in s.itertuples():
@@ -381,7 +381,7 @@ def voyage_recorder(folder: Path, k: int, s: pd.DataFrame) -> None:
     (folder / f"vdr_{k}.txt").write_text("\n".join(lines) + "\n")
 
 
-def labview(folder: Path, k: int, s: pd.DataFrame) -> None:
+def labview(folder: Path, k: int, s: Any) -> None:
     """A table about the columns above theirs, as LabVIEW writes it, and an ending of its own."""
     names = ("North", "East", "Heading", "Surge", "Sway", "Yaw rate", "Rudder", "Shaft")
     units = ("m", "m", "deg", "m/s", "m/s", "deg/s", "deg", "rpm")
@@ -395,13 +395,13 @@ def labview(folder: Path, k: int, s: pd.DataFrame) -> None:
     (folder / f"trial_{k}.lvm").write_text("\n".join(lines) + "\n")
 
 
-def parquet_index(folder: Path, k: int, s: pd.DataFrame) -> None:
+def parquet_index(folder: Path, k: int, s: Any) -> None:
     at = pd.DatetimeIndex(START + pd.to_timedelta(s.t, "s")).tz_localize("UTC")
     table = pd.DataFrame(renamed(s, POSE, SPEEDS, ACTS)).set_index(at)
     table.to_parquet(folder / f"run{k}.parquet")
 
 
-def ulog_csv(folder: Path, k: int, s: pd.DataFrame) -> None:
+def ulog_csv(folder: Path, k: int, s: Any) -> None:
     """A folder a recording and a file a topic, in microseconds, as ulog2csv writes them."""
     psi, stamp = np.radians(s.heading), (1e6 * s.t).round().astype("int64") + 12_345_678
     place = {"x": s.x, "y": s.y, "heading": ((psi + np.pi) % (2 * np.pi) - np.pi).round(4)}
@@ -415,20 +415,20 @@ def ulog_csv(folder: Path, k: int, s: pd.DataFrame) -> None:
         table.to_csv(folder / f"log_{k}" / f"log_{k}_{name}.csv", index=False)
 
 
-def long_rows(folder: Path, k: int, s: pd.DataFrame) -> None:
+def long_rows(folder: Path, k: int, s: Any) -> None:
     names = {"x": "north_m", "y": "east_m", "heading": "heading_deg", "rudder": "rudder_deg"}
     long = s.rename(columns=names).melt(["t"], [*names.values()], "signal").sort_values("t")
     long.to_csv(folder / f"run{k}.csv", index=False)
 
 
-def file_a_channel(folder: Path, k: int, s: pd.DataFrame) -> None:
+def file_a_channel(folder: Path, k: int, s: Any) -> None:
     (folder / f"trial_{k}").mkdir(exist_ok=True)
     for column in ("x", "y", "heading", "rudder"):
         table = pd.DataFrame({"t": s.t, "value": s[column]})
         table.to_csv(folder / f"trial_{k}" / f"{column}.csv", index=False)
 
 
-def hdf5_trials(folder: Path, k: int, s: pd.DataFrame) -> None:
+def hdf5_trials(folder: Path, k: int, s: Any) -> None:
     """Both trips in one file, a group each."""
     import h5py
 
@@ -439,7 +439,7 @@ def hdf5_trials(folder: Path, k: int, s: pd.DataFrame) -> None:
                 file.create_dataset(f"trial_{number}/{new}", data=seen(number)[old])
 
 
-def portuguese(folder: Path, k: int, s: pd.DataFrame) -> None:
+def portuguese(folder: Path, k: int, s: Any) -> None:
     names = {"x": "posição norte (m)", "y": "posição leste (m)", "heading": "rumo (graus)"}
     names |= {"u": "avanço (m/s)", "v": "deriva (m/s)", "rate": "taxa de guinada (graus/s)"}
     names |= {"rudder": "leme (graus)", "rpm": "rotação do hélice (rpm)"}
@@ -447,17 +447,17 @@ def portuguese(folder: Path, k: int, s: pd.DataFrame) -> None:
     table.to_csv(folder / f"ensaio{k}.csv", index=False, sep="\t", decimal=",")
 
 
-def polish(folder: Path, k: int, s: pd.DataFrame) -> None:
+def polish(folder: Path, k: int, s: Any) -> None:
     """An older Windows of its own, whose letters are other ones in Western Europe."""
     north, east = (54.3 + s.x / 111_315.0).round(7), (10.15 + s.y / 65_079.0).round(7)
     columns = {"czas [s]": s.t, "szerokość [°]": north, "długość [°]": east, "kurs [°]": s.heading}
     columns |= {"prędkość kątowa [°/s]": s.rate, "ster [°]": s.rudder}
     table = pd.DataFrame({**columns, "obroty śruby [obr/min]": s.rpm})
-    form = {"sep": ";", "decimal": ",", "encoding": "cp1250"}
+    form: dict[str, Any] = {"sep": ";", "decimal": ",", "encoding": "cp1250"}
     table.to_csv(folder / f"proba{k}.csv", index=False, **form)
 
 
-def chinese(folder: Path, k: int, s: pd.DataFrame) -> None:
+def chinese(folder: Path, k: int, s: Any) -> None:
     names = {"t": "时间(s)", "x": "北向位置(m)", "y": "东向位置(m)", "heading": "艏向角(°)"}
     names |= {"u": "纵向速度(m/s)", "v": "横向速度(m/s)", "rate": "转艏角速度(°/s)"}
     names |= {"rudder": "舵角(°)", "rpm": "螺旋桨转速(rpm)"}
@@ -465,15 +465,15 @@ def chinese(folder: Path, k: int, s: pd.DataFrame) -> None:
     table.to_csv(folder / f"trip{k}.csv", index=False, encoding="gb18030")
 
 
-def russian(folder: Path, k: int, s: pd.DataFrame) -> None:
+def russian(folder: Path, k: int, s: Any) -> None:
     names = {"t": "время, с", "x": "север, м", "y": "восток, м", "heading": "курс, град"}
     names |= {"rate": "угловая скорость, град/с", "rudder": "руль, град"}
     table = pd.DataFrame(renamed(s, {**names, "rpm": "обороты винта, об/мин"}))
-    form = {"sep": ";", "decimal": ",", "encoding": "cp1251"}
+    form: dict[str, Any] = {"sep": ";", "decimal": ",", "encoding": "cp1251"}
     table.to_csv(folder / f"opyt{k}.csv", index=False, **form)
 
 
-def signal_k(folder: Path, k: int, s: pd.DataFrame) -> None:
+def signal_k(folder: Path, k: int, s: Any) -> None:
     lines = []
     for row in s.itertuples():
         at = (START + pd.Timedelta(seconds=row.t)).isoformat(timespec="milliseconds") + "Z"
@@ -488,7 +488,7 @@ def signal_k(folder: Path, k: int, s: pd.DataFrame) -> None:
     (folder / f"boat{k}.jsonl").write_text("\n".join(lines) + "\n")
 
 
-def topic_echo(folder: Path, k: int, s: pd.DataFrame) -> None:
+def topic_echo(folder: Path, k: int, s: Any) -> None:
     """Messages as `ros2 topic echo` prints them."""
     lines = [
         f"header:\n  stamp:\n    sec: {int(row.t)}\n    nanosec: 0\npose:\n  x: {row.y}\n---"
@@ -497,11 +497,11 @@ def topic_echo(folder: Path, k: int, s: pd.DataFrame) -> None:
     (folder / f"pose{k}.txt").write_text("\n".join(lines) + "\n")
 
 
-def newest_first(folder: Path, k: int, s: pd.DataFrame) -> None:
+def newest_first(folder: Path, k: int, s: Any) -> None:
     csv(folder, k, {"time [s]": s.t[::-1], **renamed(s[::-1], POSE, ACTS)})
 
 
-def three_files(folder: Path, k: int, s: pd.DataFrame) -> None:
+def three_files(folder: Path, k: int, s: Any) -> None:
     """Three recorders with Unix time and rates of their own; the trip stands first in the names."""
     for word, every, columns in (
         ("gps", 10, {"x": "north [m]", "y": "east [m]"}),
@@ -513,14 +513,14 @@ def three_files(folder: Path, k: int, s: pd.DataFrame) -> None:
         pd.DataFrame(table).to_csv(folder / f"trip{k}_{word}.csv", index=False)
 
 
-def lever(folder: Path, k: int, s: pd.DataFrame) -> None:
+def lever(folder: Path, k: int, s: Any) -> None:
     """Commands as counts of a lever, 1000 all the way."""
     columns = {"time [s]": s.t, **renamed(s, POSE)}
     columns |= {"steering": (s.rudder / 0.035).round(), "throttle": (s.rpm / 1.5).round()}
     csv(folder, k, columns)
 
 
-def frames_in_names(folder: Path, k: int, s: pd.DataFrame) -> None:
+def frames_in_names(folder: Path, k: int, s: Any) -> None:
     columns = {"Time_us": (1e6 * s.t).round().astype("int64"), "NED.N": s.x, "NED.E": s.y}
     columns |= {"NED.D": 0.1 + 0.0 * s.t, "Euler.theta": 0.0 * s.t}
     columns |= {"Euler.psi": np.radians(s.heading).round(4), "Body.u": s.u, "Body.v": s.v}
@@ -528,7 +528,7 @@ def frames_in_names(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {**columns, "Act.delta": np.radians(s.rudder).round(4), "Act.n": s.rpm / 60.0})
 
 
-def to_port(folder: Path, k: int, s: pd.DataFrame) -> None:
+def to_port(folder: Path, k: int, s: Any) -> None:
     """What counts to port, told in words alone; headings in gon."""
     columns = {"t [s]": s.t, "x [m]": s.x, "y [m]": s.y, "heading [gon]": s.heading / 0.9}
     columns |= {"surge [m/s]": s.u, "sway to port [m/s]": -s.v}
@@ -536,27 +536,27 @@ def to_port(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {**columns, "shaft [rpm]": s.rpm})
 
 
-def parts_of_time(folder: Path, k: int, s: pd.DataFrame) -> None:
+def parts_of_time(folder: Path, k: int, s: Any) -> None:
     at = (START + pd.to_timedelta(s.t, "s")).dt
     columns = {"YYYY": at.year, "MM": at.month, "DD": at.day, "hh": at.hour, "mm": at.minute}
     csv(folder, k, {**columns, "ss": s.t % 60.0, **renamed(s, POSE, ACTS)})
 
 
-def totals(folder: Path, k: int, s: pd.DataFrame) -> None:
+def totals(folder: Path, k: int, s: Any) -> None:
     """Largest and least values below the rows."""
     table = pd.DataFrame({"time [s]": s.t, **renamed(s, POSE, ACTS)})
     text = table[:100].to_csv(index=False) + f"max,{s.x.max()},,,,\nmin,{s.x.min()},,,,\n"
     (folder / f"run{k}.csv").write_text(text)
 
 
-def minutes_apart(folder: Path, k: int, s: pd.DataFrame) -> None:
+def minutes_apart(folder: Path, k: int, s: Any) -> None:
     columns: dict[str, object] = {"time [s]": s.t}
     for name, degrees in (("lat", 54.3 + s.x / 111_315.0), ("lon", 10.15 + s.y / 65_079.0)):
         columns |= {f"{name}_deg": degrees // 1, f"{name}_min": (60.0 * (degrees % 1)).round(6)}
     pd.DataFrame({**columns, **renamed(s, ACTS)})[:100].to_csv(folder / f"run{k}.csv", index=False)
 
 
-def on_change(folder: Path, k: int, s: pd.DataFrame) -> None:
+def on_change(folder: Path, k: int, s: Any) -> None:
     """Commands in rows of their own, when they change."""
     rows, last = list[dict[str, object]](), None
     for row in s.itertuples():
@@ -567,7 +567,7 @@ def on_change(folder: Path, k: int, s: pd.DataFrame) -> None:
     pd.DataFrame(rows).to_csv(folder / f"run{k}.csv", index=False)
 
 
-def packed_clock(folder: Path, k: int, s: pd.DataFrame) -> None:
+def packed_clock(folder: Path, k: int, s: Any) -> None:
     """Hours, minutes and seconds in one number; beside a compass, the one that is true."""
     at = START + pd.to_timedelta(s.t, "s")
     columns = {"utc": at.dt.strftime("%H%M%S.%f").str[:-4], "easting": s.y, "northing": s.x}
@@ -576,7 +576,7 @@ def packed_clock(folder: Path, k: int, s: pd.DataFrame) -> None:
     csv(folder, k, {**columns, "shaft_rpm": s.rpm})
 
 
-def side_by_side(folder: Path, k: int, s: pd.DataFrame) -> None:
+def side_by_side(folder: Path, k: int, s: Any) -> None:
     """Two boats in one table, each row twice."""
     names = {"x": "x [m]", "y": "y [m]", "heading": "heading [deg]", "rudder": "rudder [deg]"}
     columns: dict[str, object] = {"time [s]": s.t}
@@ -586,7 +586,7 @@ def side_by_side(folder: Path, k: int, s: pd.DataFrame) -> None:
     table.loc[table.index.repeat(2)].to_csv(folder / f"race{k}.csv", index=False)
 
 
-def korean(folder: Path, k: int, s: pd.DataFrame) -> None:
+def korean(folder: Path, k: int, s: Any) -> None:
     names = {"t": "시간(s)", "x": "북쪽(m)", "y": "동쪽(m)", "heading": "선수각(deg)"}
     names |= {"rate": "선회율(deg/s)", "rudder": "타각(deg)", "rpm": "프로펠러 회전수(rpm)"}
     table = pd.DataFrame(renamed(s, names))

@@ -24,7 +24,7 @@ def gridded(
 
 def test_a_log_on_the_grid_keeps_its_times_and_samples_exactly() -> None:
     rng = np.random.default_rng(0)
-    t = 1176.1 + 0.1 * np.arange(500) + rng.uniform(-4e-5, 4e-5, 500)
+    t: np.ndarray = 1176.1 + 0.1 * np.arange(500) + rng.uniform(-4e-5, 4e-5, 500)
     log = Log("a", t, {"u": rng.normal(size=500)}, masks={"frozen": rng.random(500) < 0.1})
     out = align(log, GridConfig(step=0.1))
     assert (out.t is log.t, out["u"] is log["u"], out.masks == log.masks) == (True, True, True)

@@ -37,7 +37,7 @@ PSI, T = LOG["psi"], LOG.t
 RANDOM = np.random.default_rng(0)
 
 
-def changed(log: Log = LOG, **channels: np.ndarray) -> Log:
+def changed(log: Log = LOG, /, **channels: np.ndarray) -> Log:
     return log.replace(channels={**log.channels, **channels})
 
 

@@ -94,7 +94,8 @@ def test_what_is_no_trip_or_cannot_be_joined_is_told(ship_logs: list[Log], tmp_p
     assert logs == {"gnss"}
     assert moved(told[0]) == ("note: motors", pytest.approx(1.75e9 - 7.0, abs=0.2))
     # motors of another trip, and none that moves: what cannot be sure is a warning
-    for name, wrong in (("strange", strange), ("rest", acts.assign(**dict.fromkeys(acts, 1.0)))):
+    resting = acts.assign(**dict.fromkeys(map(str, acts), 1.0))
+    for name, wrong in (("strange", strange), ("rest", resting)):
         wrong["board [s]"] = acts["board [s]"]
         _, told, _ = found(tmp_path / name, gnss=fixes, motors=wrong)
         assert told[0].startswith("will mislead: "), name

@@ -89,11 +89,11 @@ def test_nine_measured_quantities_become_one_motion() -> None:
     noise = np.array([0.05, 0.05, 0.01, 0.03, 0.03, 0.005, 0.05, 0.05, 0.01])
     seen = truth + noise * np.random.default_rng(0).standard_normal(truth.shape)
     for known in (noise, np.where(np.arange(9) > 5, np.inf, noise)):
-        off = (smooth_motion(seen, known, 0.1) - truth)[100:-100]
+        off = (smooth_motion(seen, known.tolist(), 0.1) - truth)[100:-100]
         assert (np.sqrt(np.mean(off**2, axis=0)) < 0.25 * noise).all()
     seen[3, 4] = np.nan
     with pytest.raises(DataError, match="column 4 is not finite at sample 3"):
-        smooth_motion(seen, noise, 0.1)
+        smooth_motion(seen, noise.tolist(), 0.1)
 
 
 @pytest.mark.parametrize("every", [2, 10])

@@ -114,7 +114,7 @@ def test_a_mirrored_vessel_turns_to_the_other_side(vessel: tuple[str, int]) -> N
     turning = [name for name in ("y", "psi", "v", "r", "delta") if name in logs[0].channels]
     mirrored = []
     for log in logs:
-        other = {name: -log[name] for name in turning}
+        other: dict[str, np.ndarray] = {name: -log[name] for name in turning}
         if "n_port" in log.channels:
             other |= {"n_port": log["n_stbd"], "n_stbd": log["n_port"]}
         mirrored.append(changed(log, **other))

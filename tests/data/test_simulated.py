@@ -253,7 +253,7 @@ def runaway(start: float = 0.0) -> Craft:
 
 def test_logs_end_where_the_manoeuvre_does() -> None:
     craft, sea = ship(Disturbance())
-    turn = {"drive": 0.6, "steer": 0.6, "start": 3, "until": math.pi / 2}
+    turn: dict[str, Any] = {"drive": 0.6, "steer": 0.6, "start": 3, "until": math.pi / 2}
     manoeuvres: list[Manoeuvre] = [
         TurningCircle(**turn),
         ConstantInput(drive=0.5, steer=0.1, duration=7),

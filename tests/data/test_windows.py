@@ -4,6 +4,8 @@ derivatives.
 
 from __future__ import annotations
 
+from typing import Any
+
 import lightning as L
 import numpy as np
 import pytest
@@ -166,7 +168,9 @@ class Counting(L.LightningModule):
 
 def fitted(data: L.LightningDataModule, epochs: int) -> Counting:
     module = Counting()
-    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar"), False)
+    quiet: dict[str, Any] = dict.fromkeys(
+        ("logger", "enable_checkpointing", "enable_progress_bar"), False
+    )
     L.Trainer(
         max_epochs=epochs, accelerator="cpu", enable_model_summary=False, **quiet
     ).fit(module, data)  # fmt: skip

@@ -287,7 +287,7 @@ def short_runs() -> dict[str, tuple[str, ...]]:
     return {
         **short,
         "my_boat": SMALL,
-        **dict.fromkeys(("my_autopilot", "from_run", "from_k_and_t"), own),
+        **dict.fromkeys(("my_autopilot", "from_run", "from_k_and_t"), tuple(own)),
     }
 
 

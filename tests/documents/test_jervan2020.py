@@ -133,7 +133,10 @@ def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
 
 
 def test_lag_and_no_residual_are_tried_with_every_order(short: Flown) -> None:
-    believed, wanted = ForceModel(hull("milliampere")), FerryModelConfig(fit={"kind": "plsr"})
+    believed, wanted = (
+        ForceModel(hull("milliampere")),
+        FerryModelConfig.model_validate({"fit": {"kind": "plsr"}}),
+    )
     late = identify(wanted, short.record, believed)
     assert late.lag is not None
     assert late.fit.notes["left_out"] < 0.1

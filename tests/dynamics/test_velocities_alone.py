@@ -72,7 +72,8 @@ def test_gradients_are_those_of_single_steps(head: FeatureConfig, terms: str) ->
     signals = SignalsConfig(inputs=("a", "b")).build()
     baseline = RegressorBaseline([TERMS[terms]] * 3, signals.names, bounded=terms != "linear")
     z = torch.randn(60, len(signals.names), dtype=torch.float64)
-    known = Samples(z, z[:, :3].flip(1), *torch.zeros(2, 60).long(), ("a",), signals.names)
+    log, start = torch.zeros(2, 60).long()
+    known = Samples(z, z[:, :3].flip(1), log, start, ("a",), signals.names)
     if baseline.bound is not None:
         baseline.bound.calibrate(known)
     baseline.theta.data.copy_(0.2 * torch.randn(3, 5) - 0.6 * torch.eye(3, 5))

@@ -333,7 +333,7 @@ def test_a_changed_weight_and_a_wrong_rollout_are_found() -> None:
 
     class NotFinite(ScriptedModel):
         def rollout(self, *given: Any) -> Any:
-            out = super().rollout(*given)
+            out: Any = super().rollout(*given)
             out[-1, 5] = np.nan
             return out
 

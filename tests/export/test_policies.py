@@ -144,7 +144,8 @@ def flown(loaded: Loaded) -> np.ndarray:
     """Return the track [T, 4] of a vessel in a current, whose commands come late, with noise."""
     random, late = np.random.default_rng(3), 10
     x, y, psi, r = FAR, FAR + 2.0, 0.05, 0.0
-    waiting, track, s = [0.0] * late, [], None
+    waiting, track = [0.0] * late, []
+    s: Any = None
     for _ in range(400):
         noise = random.normal(size=4) * [0.1, 0.1, 0.1 * DEG, 0.1 * DEG]
         seen = np.array([x + noise[0], y + noise[1], psi + noise[2], SPEED, 0.0, r + noise[3]])

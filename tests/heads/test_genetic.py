@@ -17,10 +17,12 @@ from made_odin import FORCE_TRUTH, MSD_TRUTH, force_logs, msd_log
 from made_samples import NAMES, made
 
 from residnet.baselines.given import StillConfig
+from residnet.core.config import validate
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
+from residnet.heads import HeadConfig
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.terms import TermLibrary
@@ -114,7 +116,7 @@ def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:
         role="head",
         signals=signals,
         baseline=StillConfig(),
-        head=config,
+        head=validate(config.model_dump(), HeadConfig, "test"),
         dt=0.1,
         integrator="rk4",
         low=(0,) * 5,

@@ -41,7 +41,9 @@ def test_a_fit_is_of_what_the_logs_tell(
     models = residnet.fit(data, "regressors", ["ridge"] if len(velocities) > 1 else ())
     table = residnet.metrics(models, split="test")
     live = Live(velocities)
-    assert {name for name in table if name.startswith("rmse_")} == {f"rmse_{v}" for v in velocities}
+    assert {name for name in map(str, table) if name.startswith("rmse_")} == {
+        f"rmse_{v}" for v in velocities
+    }
     assert ("position_error_end" in table) == live.moves
     assert ("heading_error_end" in table) == live.turns
     error = table.groupby("model")["nrmse_mean"].mean()

@@ -5,6 +5,7 @@ that the documents and their corrections print.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from residnet.physics.vessel import VesselConfig, load_vessel
 from residnet.physics.vessel_file import vessel_files
 
 
-def plant_of(name: str, *overrides: str) -> Plant:
+def plant_of(name: str, *overrides: str) -> Any:
     return load_config(vessel_files()[name], list(overrides), VesselConfig).build()
 
 

@@ -52,7 +52,7 @@ def drawn(kind: str, seed: int, count: int, fewest: int = 8, most: int = 20) -> 
             for i in np.flatnonzero(sizes > k):
                 rows = int(random.integers(350, 900))
                 part = {name: values[:rows] for name, values in flight.items()}
-                members[i].append(log_of(of, kind, part, step, i, k, random))
+                members[i].append(log_of(of, kind, part, step, int(i), k, random))
     inputs = ("n_port", "n_stbd") if kind == "twin" else ("n", "delta")
     return [
         Fleet(f"{kind} {i}", logs, sisters, inputs, inputs[1])

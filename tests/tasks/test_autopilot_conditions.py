@@ -139,7 +139,7 @@ def test_a_network_without_a_law_is_exported_and_read_back(run: Path) -> None:
 
 def test_the_verdict_begins_with_the_cheapest_policy() -> None:
     costs = {"a": ("network", 6.3), "b": ("policy", 6.1), "law": ("classical", 6.4)}
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"protocol": "conditions", "model": name, "kind": kind, "cost": {"mean": cost}}
         for name, (kind, cost) in costs.items()
     ]

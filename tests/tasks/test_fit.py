@@ -118,7 +118,7 @@ def test_killed_and_resumed(
 ) -> None:
     out = tmp_path / "killed"
     command = [sys.executable, "-m", "residnet.cli", "run", str(tiny_config), "--out", str(out)]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     process = subprocess.Popen(command, **quiet, env={**os.environ, "OMP_NUM_THREADS": "1"})
     checkpoint = out / "checkpoints" / "lstm" / "last.ckpt"
     for _ in range(1200):

@@ -211,7 +211,7 @@ def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(
     for log, name in zip(simulate(drawn, data), data.splits(drawn), strict=True):
         split.setdefault(name, []).append(f"{name}/{log.name}.parquet")
     measured = {"kind": "measured", "reader": {"kind": "canonical"}, "split": split}
-    light = {"heads": {"ridge": {"kind": "ridge"}}, "ensembles": {}, "training": {}}
+    light: dict[str, Any] = {"heads": {"ridge": {"kind": "ridge"}}, "ensembles": {}, "training": {}}
     light |= {"export": {"models": []}, "data": measured, "name": "files"}
     (tmp_path / "files.yaml").write_text(yaml.safe_dump(TINY | light, sort_keys=False))
     assert call(monkeypatch, "run", tmp_path / "files.yaml", "--out", tmp_path / "files") == 0

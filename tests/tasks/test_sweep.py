@@ -98,7 +98,7 @@ def test_values_of_a_random_search_hang_on_its_seed_alone(sweep: Path, tmp_path:
         search = f"search={{kind: random, trials: 30, seed: {seed}}}"
         config = load_config(sweep, [space, search], SweepConfig)
         (folder := tmp_path / str(number)).mkdir()
-        drawn = []
+        drawn: list[Any] = []
         # what a resumed sweep draws goes on as the undisturbed one does
         for _ in range(3):
             trials = Trials(config, open_study(config, folder))
@@ -130,7 +130,7 @@ def test_a_poor_trial_is_ended_early(sweep: Path, tmp_path: Path) -> None:
     for level in (1.0, 2.0, 3.0):
         trial = trials.next()
         assert trial is not None
-        heard = watch(config, tmp_path, trial._trial_id)
+        heard: Any = watch(config, tmp_path, trial._trial_id)
         for epoch in (1, 2):
             heard(Progress("training ridge", epoch, 2, score=level / epoch))
         study.tell(trial.number, level)
