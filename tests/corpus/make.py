@@ -593,6 +593,30 @@ def korean(folder: Path, k: int, s: Any) -> None:
     table.to_csv(folder / f"run{k}.csv", index=False, encoding="cp949")
 
 
+def units_in_cells(folder: Path, k: int, s: Any) -> None:
+    """Each number with its unit behind it, decimals with a comma; two motors alike by `speed`."""
+    cells = {
+        "Zeit": [f"{t:.2f} s".replace(".", ",") for t in s.t],
+        "Nord": [f"{x:.3f} m".replace(".", ",") for x in s.x],
+        "Ost": [f"{y:.3f} m".replace(".", ",") for y in s.y],
+        "Kurs": [f"{psi:.2f}°".replace(".", ",") for psi in s.heading],
+        "Fahrt voraus": [f"{u * 3600.0 / 1852.0:.3f} kn".replace(".", ",") for u in s.u],
+        "Ruder": [f"{delta:.1f} °".replace(".", ",") for delta in s.rudder],
+        "port_speed": [f"{n:.0f} rpm" for n in s.rpm],
+        "stbd_speed": [f"{n:.0f} rpm" for n in s.rpm],
+    }
+    pd.DataFrame(cells).to_csv(folder / f"run{k}.csv", index=False, sep=";")
+
+
+def json_document(folder: Path, k: int, s: Any) -> None:
+    """One document: lists by name within an object, beside what the trip is called."""
+    names = {"t": "time_s", "x": "north_m", "y": "east_m", "heading": "heading_deg"}
+    names |= {"rudder": "rudder_deg", "rpm": "shaft_rpm"}
+    table = {new: s[old].round(3).tolist() for old, new in names.items()}
+    document = {"vessel": "Alma", "crew": ["Ada", "Bo"], "log": {"version": 2, "data": table}}
+    (folder / f"run{k}.json").write_text(json.dumps(document))
+
+
 LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
     layout.__name__: layout
     for layout in (
@@ -613,7 +637,7 @@ LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
         *(yaw_alone, speed_and_heading),
         *(portuguese, polish, chinese, russian, signal_k, topic_echo, newest_first, three_files),
         *(lever, frames_in_names, to_port, parts_of_time, totals, minutes_apart),
-        *(on_change, packed_clock, side_by_side, korean),
+        *(on_change, packed_clock, side_by_side, korean, units_in_cells, json_document),
     )
 }
 

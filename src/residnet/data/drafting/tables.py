@@ -256,6 +256,15 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
     speeds: list[str] = []
     about = {column: words_of(column) for column in columns}
     copied = re.compile(r"\.\d+$")
+    # of one vessel only what drives it has a speed to either side
+    sides = {"port": "n_port", "starboard": "n_stbd"}
+    sided = {
+        column: n
+        for column, words in about.items()
+        for side, n in sides.items()
+        if state_channel(words) == "v" and words.has("speed", side) and words.lacks("sway")
+    }
+    sided = sided if len({*sided.values()}) == 2 else {}
 
     def order(column: str) -> tuple[bool, int]:
         magnetic = MAGNETIC.search(column) and state_channel(about[column]) == "psi"
@@ -263,7 +272,7 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
 
     # true headings first, then shorter names: `heading` before `heading of the second compass`
     for column in sorted(columns, key=order):
-        channel = state_channel(about[column]) or input_channel(about[column])
+        channel = sided.get(column) or state_channel(about[column]) or input_channel(about[column])
         si = CHANNEL_UNITS.get(channel or "")
         other = other_dimension(column, si) if si else None
         if channel == "n" and other == "m":
@@ -453,11 +462,13 @@ def peek(path: Path, rows: int = 20_000) -> Sheet:
 
 
 def _described(table: pd.DataFrame) -> dict[str, str]:
-    """Return the names of columns with the units that stand beneath them -> their names alone."""
+    """Return the names of columns with the units beneath them or in cells -> their names alone."""
+    held = table.attrs.get("units", {})
     names = [str(name).strip() for name in table.columns]
     rows = [[_unit_in(cell) for cell in row] for row in table.attrs.get("between", [])]
     units = max(rows, key=lambda row: sum(map(bool, row)), default=[])
     units = units if 2 * sum(map(bool, units)) >= len([name for name in names if name]) else []
+    units = [held.get(name, "") for name in table.columns] if held else units
     out = {}
     for name, below in zip(names, [*units, *[""] * len(names)], strict=False):
         # physicists write a quantity by its unit, `u / m/s`

@@ -32,12 +32,14 @@ _RECORDINGS: tuple[type[RecordingConfig], ...] = (
     MatConfig,
     Hdf5Config,
 )
-LOG_ENDINGS = (*TABLES, *(ending for config in _RECORDINGS for ending in config.endings))
-"""Endings of files that may be logs."""
+LOG_ENDINGS = (
+    *(ending for ending in TABLES if ending != ".json"),
+    *(ending for config in _RECORDINGS for ending in config.endings),
+)
+"""Endings of files that may be logs; a .json beside them rather tells of them."""
 _TABLE_OF = {
     **dict.fromkeys((".gz", ".zip", ".bz2", ".xz"), "pandas.read_csv(file)"),
     **dict.fromkeys((".xls", ".ods"), "pandas.read_excel(file)"),
-    ".json": "pandas.read_json(file)",
     ".pkl": "pandas.read_pickle(file)",
     ".feather": "pandas.read_feather(file)",
     **dict.fromkeys(
@@ -68,7 +70,9 @@ def to_table(ending: str) -> str:
 
 
 def is_text_table(path: Path) -> bool:
-    """Return whether a file of any ending holds lines of names and numbers."""
+    """Return whether a file of any ending holds lines of names and numbers, or is a JSON document."""
+    if path.suffix.lower() == ".json":
+        return True
     try:
         table, _ = first_rows(path, 20)
     except DataError:

@@ -52,7 +52,7 @@ TABLES = {
     **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), "csv"),
     ".xlsx": "excel",
     ".parquet": "parquet",
-    **dict.fromkeys((".jsonl", ".ndjson"), "json_lines"),
+    **dict.fromkeys((".jsonl", ".ndjson", ".json"), "json_lines"),
 }
 """Ending of a table -> its kind of reader; a table does not say what its columns are."""
 FIX = ("latitude", "longitude")
@@ -229,9 +229,11 @@ class ParquetConfig(TableConfig):
 
 @final
 class JsonLinesConfig(TableConfig):
-    """Files with a JSON object a line (.jsonl, .ndjson); a column is a key, `nav.lat` one within.
+    """Files with a JSON object a line (.jsonl, .ndjson), or one document (.json) that holds a table.
 
-    Entries of lists are counted from zero: `imu.q[0]`.
+    A column is a key, `nav.lat` one within; entries of lists are counted from zero: `imu.q[0]`. The
+    table of a document is its longest list of objects, or the lists of one length beside each
+    other.
     """
 
     kind: Literal["json_lines"] = "json_lines"
@@ -281,6 +283,7 @@ class TableReader(LogReader):
             table = config.load(path, [*columns, *sides], advance)
         above = table.attrs.get("above", 0)
         cells = {name: table.iloc[:, i] for i, name in enumerate([*columns, *sides])}
+        self._require_units(path, table.attrs.get("units", ()))
         t, start, findings = self._times(path, cells, above)
         raw = {name: self._values(path, name, cells, above) for name in maps}
         measured = np.logical_or.reduce([np.isfinite(values) for values in raw.values()])
@@ -340,6 +343,19 @@ class TableReader(LogReader):
         kind = config.manoeuvre
         kind = path.resolve().parent.name if kind == "folder" else kind
         return Log(path.stem, t[kept], channels, units, kind or "unknown", meta=meta)
+
+    def _require_units(self, path: Path, written: Sequence[str]) -> None:
+        """Stop where cells name another unit than the channel map; `written` are those of cells."""
+        time, maps = self._config.time, self._config.channels.values()
+        clock = [(name, time.unit) for name in time.columns]
+        # with a scale, the map says what its numbers mean
+        mapped = [(one.column, "" if one.scale != 1.0 else one.unit) for one in maps]
+        for (column, unit), told in zip([*clock, *mapped], written, strict=False):
+            if told and unit and told != known_unit(unit):
+                raise DataError(
+                    f"{path}: the cells of column '{column}' are in {told}, not in {unit}; set"
+                    f" unit: {told}"
+                )
 
     def _row(self, i: int) -> str:
         return self._config.row.format(i + 1, i + 2)
@@ -620,6 +636,9 @@ class _JsonLines:
     def __iter__(self) -> Iterator[dict[str, Any]]:
         number = 0
         with as_utf8(self._path) as file, file.open("rb") as stream:
+            if (table := _table_in(self._path, file)) is not None:
+                yield from map(_flat, table)
+                return
             for line_number, line in enumerate(stream, start=1):
                 text = line.decode("utf-8-sig", errors="replace").strip()
                 try:
@@ -635,6 +654,45 @@ class _JsonLines:
                         f"{self._path}: line {line_number}, '{shown(text, 60)}', is no JSON object;"
                         " give files with one object a line"
                     ) from error
+
+
+def _table_in(path: Path, file: Path) -> Sequence[Mapping[str, Any]] | None:
+    """Return the objects of the table that one JSON document holds; None for an object a line.
+
+    Raises:
+        DataError: where a document holds no table.
+    """
+    if path.suffix.lower() != ".json":
+        return None
+    try:
+        document = json.loads(file.read_text("utf-8-sig", errors="replace"))
+    except (ValueError, RecursionError):
+        return None
+    tables = list(_tables(document))
+    if not tables:
+        raise DataError(
+            f"{path}: holds no table; a list of objects, or lists of one length by name, were"
+            " expected"
+        )
+    return max(tables, key=len)
+
+
+def _tables(value: Any) -> Iterator[Sequence[Mapping[str, Any]]]:
+    """Yield the tables in a value and the values within: lists of objects, and lists by name."""
+    if isinstance(value, list):
+        if value and all(isinstance(row, dict) for row in value):
+            yield value
+        return
+    if not isinstance(value, dict):
+        return
+    columns = {name: cells for name, cells in value.items() if isinstance(cells, list)}
+    plain = {n: c for n, c in columns.items() if not any(isinstance(cell, dict) for cell in c)}
+    longest = max(map(len, plain.values()), default=0)
+    plain = {name: cells for name, cells in plain.items() if len(cells) == longest}
+    if len(plain) > 1:
+        yield [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
+    for inner in value.values():
+        yield from _tables(inner)
 
 
 def _object(text: str) -> dict[str, Any]:

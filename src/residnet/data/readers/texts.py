@@ -17,6 +17,7 @@ import numpy as np
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, shown
+from residnet.core.units import known_unit
 from residnet.data.readers.base import Advance
 
 if TYPE_CHECKING:
@@ -37,7 +38,12 @@ _NUMBER = re.compile(
     r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)", re.IGNORECASE
 )
 _TIME = re.compile(r"\d{1,4}\s*[-./:年時h]\s*\d")
-_FRACTION = r"\s*-?\d+{}\d+(?:[eE][-+]?\d+)?\s*"
+_UNIT = r"(?:[^\W\d_]|[°%µ])\S*"
+_FRACTION = rf"\s*-?\d+{{}}\d+(?:[eE][-+]?\d+)?\s*(?:{_UNIT})?"
+_WITH_UNIT = re.compile(rf"(?P<number>[-+]?[\d.,'’ \u00a0\u202f]*\d)\s*(?P<unit>{_UNIT})")
+"""A number with its unit behind it, as in `1450 rpm`."""
+_SIDES = frozenset("NSEW")
+"""Behind a number they rather tell the side of the globe than newtons or seconds."""
 _BEYOND = "beyond the last column"
 # the longer marks first: one of UTF-32 begins as one of UTF-16 does
 _MARKS = {
@@ -111,8 +117,9 @@ def read_csv(
 ) -> pd.DataFrame:
     """Return the wanted columns of a text table, in order.
 
-    Its `attrs` hold `above`, the number of lines above the values less one, and `cut`, whether the
-    last line was left out because the file ends within it.
+    Its `attrs` hold `above`, the number of lines above the values less one, `cut`, whether the last
+    line was left out because the file ends within it, and `units`, those in the cells of each
+    column.
 
     Args:
         path: the file.
@@ -159,8 +166,10 @@ def read_csv(
             ) from error
     pieces = pieces or [pd.DataFrame({place: [] for place in where})]
     table = pieces[0] if len(pieces) == 1 else pd.concat(pieces)
-    table = _plain(table, decimal)[where].iloc[: -1 if cut else None]
-    table.attrs |= {"above": header.above - 1, "cut": cut}
+    table = _plain(table, decimal)
+    units = [table.attrs["units"].get(place, "") for place in where]
+    table = table[where].iloc[: -1 if cut else None]
+    table.attrs |= {"above": header.above - 1, "cut": cut, "units": units}
     return table
 
 
@@ -189,8 +198,9 @@ def _form(
 def _plain(table: pd.DataFrame, decimal: str) -> pd.DataFrame:
     """Return a table whose numbers have no signs between thousands, and no marks for none (---).
 
-    A column that then still holds a word stays as it is, and so does one in which every cell could
-    as well have three decimals.
+    Where each cell of a column names the same unit (`1450 rpm`), it stands in the `units` of the
+    table's `attrs` instead. A column that then still holds a word stays as it is, and so does one
+    in which every cell could as well have three decimals.
     """
     import pandas as pd
 
@@ -204,15 +214,44 @@ def _plain(table: pd.DataFrame, decimal: str) -> pd.DataFrame:
             cell = re.sub(between, "", cell)
         return cell.replace(decimal, ".") if re.search(r"\w", cell) else np.nan
 
-    table = table.copy(deep=False)
+    table, units = table.copy(deep=False), {}
     for name, cells in table.items():
         if not pd.api.types.is_numeric_dtype(cells.dtype):
+            unit, cells = _without_unit(cells)
             signs = {len(re.findall(r"[^\d+-]", str(cell).strip())) for cell in cells.dropna()}
             bare = cells.map(number)
             values = pd.to_numeric(bare, errors="coerce")
-            if signs != {1} and values.isna().sum() == bare.isna().sum():
+            if (unit or signs != {1}) and values.isna().sum() == bare.isna().sum():
                 table[name] = values
+                units |= {name: unit} if unit else {}
+    table.attrs["units"] = units
     return table
+
+
+def _without_unit(cells: pd.Series) -> tuple[str, pd.Series]:
+    """Return the unit that stands behind each number of a column, and the cells without it.
+
+    The unit is empty, and the cells are as they were, where any cell is no number with that unit.
+    """
+    written = cells.dropna()
+    told = _unit_behind(str(written.iloc[0]).strip()) if len(written) else ""
+    bare = written.astype("string").str.strip()
+    if not told or not bare.str.endswith(told).all():
+        return "", cells
+    numbers = bare.str.removesuffix(told).str.strip().astype(object)
+    return known_unit(told), numbers.reindex(cells.index)
+
+
+def _unit_behind(cell: str) -> str:
+    """Return the unit behind a number, as it is written; empty for none."""
+    found = _WITH_UNIT.fullmatch(cell)
+    if found is None or found["unit"] in _SIDES:
+        return ""
+    try:
+        known_unit(found["unit"])
+    except UsageError:
+        return ""
+    return found["unit"]
 
 
 def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -315,8 +354,8 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _measures(cell: str) -> bool:
-    """Return whether a cell holds a number, a date or a time of day."""
-    return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell))
+    """Return whether a cell holds a number, with or without its unit, a date or a time of day."""
+    return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell) or _unit_behind(cell))
 
 
 def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str]) -> Header:
