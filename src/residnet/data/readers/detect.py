@@ -70,7 +70,7 @@ def to_table(ending: str) -> str:
 
 
 def is_text_table(path: Path) -> bool:
-    """Return whether a file of any ending holds lines of names and numbers, or is a JSON document."""
+    """Return whether a file of any ending holds lines of names and numbers, or is JSON."""
     if path.suffix.lower() == ".json":
         return True
     try:

@@ -229,7 +229,7 @@ class ParquetConfig(TableConfig):
 
 @final
 class JsonLinesConfig(TableConfig):
-    """Files with a JSON object a line (.jsonl, .ndjson), or one document (.json) that holds a table.
+    """Files with a JSON object a line (.jsonl, .ndjson), or a document (.json) that holds a table.
 
     A column is a key, `nav.lat` one within; entries of lists are counted from zero: `imu.q[0]`. The
     table of a document is its longest list of objects, or the lists of one length beside each

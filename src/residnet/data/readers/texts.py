@@ -214,7 +214,7 @@ def _plain(table: pd.DataFrame, decimal: str) -> pd.DataFrame:
             cell = re.sub(between, "", cell)
         return cell.replace(decimal, ".") if re.search(r"\w", cell) else np.nan
 
-    table, units = table.copy(deep=False), {}
+    table, units = table.copy(deep=False), dict[Any, str]()
     for name, cells in table.items():
         if not pd.api.types.is_numeric_dtype(cells.dtype):
             unit, cells = _without_unit(cells)
