@@ -95,11 +95,12 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         note = "–".join(number(factor * end, 2) for end in span) if span else ""
         return Cell(number(factor * row[key], 2), note, "best" if row[key] == least else "")
 
+    def fault(row: Content) -> str:
+        return next(iter((known.get(row["model"]) or {}).get("faults") or []), "")
+
     def sound(row: Content) -> Cell:
-        faults = list((known.get(row["model"]) or {}).get("faults") or [])
-        faults += [note] if (note := diverged_note(row)) else []
-        if faults:
-            return Cell("✗", faults[0], "text")
+        if fault(row) or diverged_note(row):
+            return Cell("✗", diverged_note(row), "text")
         return Cell("✓" if row["model"] in known else DASH, mark="text")
 
     told = [
@@ -113,6 +114,7 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         "" if run.focus in UNSEEN else "These data are not unseen: read with care.",
         "Zero: no model at all, the first velocities are held." if "zero" in rows else "",
         "Measurements: where the measured velocities themselves lead." if measured else "",
+        *(f"✗ {run.label(row['model'])}: {why}." for row in table if (why := fault(row))),
     ]
     shown = table_of(
         table,
