@@ -108,6 +108,21 @@ class ValidationScore:
         return Score(diverged, float(axes.mean()), named, shown)
 
 
+def burden(members: Sequence[FittedModel]) -> FittedModel | None:
+    """Return the member that errs most, where it harms the mean even if errors are independent.
+
+    The variance of a mean of K is the sum of theirs over K**2: to leave out the largest lowers it
+    where that is larger than (2 K - 1) / (K - 1)**2 times the sum of the others'.
+    """
+    if len(members) < 2:
+        return None
+    worst = max(members, key=lambda one: one.notes["validation"])
+    others = sum(one.notes["validation"] ** 2 for one in members if one is not worst)
+    count = len(members)
+    most = (2 * count - 1) / (count - 1) ** 2 * others
+    return worst if worst.notes["validation"] ** 2 > most else None
+
+
 def choose_solution(
     model: HybridDynamics,
     part: nn.Module,
@@ -365,29 +380,40 @@ class Fitter:
     def mean(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         """Return the mean of what fitted models predict, each running by itself.
 
-        Members that diverge on a validation window are left out.
+        Members that diverge on a validation window are left out, and so is one that errs so much
+        more than the others that it harms a mean even where their errors are independent, unless
+        the mean of the others errs more.
 
         Raises:
             FitError: where less than two are left.
         """
-        steady = [one for one in members if not one.notes.get("validation_diverged")]
-        left = [one.name for one in members if one not in steady]
+        kept = [one for one in members if not one.notes.get("validation_diverged")]
+        left = [one.name for one in members if one not in kept]
         if left:
             say(f"  {name}: {', '.join(left)} diverged on validation logs and is left out")
-        if len(steady) < 2:
-            raise FitError("fewer than two of its members do not diverge on validation logs")
+        found = self._mean_of(name, kept) if len(kept) > 1 else None
+        while found is not None and (worst := burden(kept)) is not None:
+            others = [one for one in kept if one is not worst]
+            alone = self._mean_of(name, others) if len(others) > 1 else others[0]
+            if alone.notes["validation"] >= found.notes["validation"]:
+                break
+            say(f"  {name}: without {worst.name} it errs less on validation logs")
+            left, kept = [*left, worst.name], others
+            found = alone if len(kept) > 1 else None
+        if found is None:
+            raise FitError("no mean errs less on validation logs than one of its members")
+        found.notes["left_out"] = left
+        return self._kept(found)
+
+    def _mean_of(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         spec = self.spec(name, "ensemble", StillConfig()).model_copy(
-            update={"members": tuple(one.spec for one in steady), "of": "trajectories"}
+            update={"members": tuple(one.spec for one in members), "of": "trajectories"}
         )
-        parts = [copy.deepcopy(one.model).to(torch.float64) for one in steady]
+        parts = [copy.deepcopy(one.model).to(torch.float64) for one in members]
         single = [p.members[0] if isinstance(p, MeanOfTrajectories) else p for p in parts]
         model = spec.mean(single)
-        notes: dict[str, Any] = {
-            "members": [one.name for one in steady],
-            "left_out": left,
-            **self._validated(model),
-        }
-        return self._kept(FittedModel(spec, model, notes))
+        notes = {"members": [one.name for one in members], **self._validated(model)}
+        return FittedModel(spec, model, notes)
 
     def _train(
         self, name: str, model: HybridDynamics, residual: Samples, seed: int
