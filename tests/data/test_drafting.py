@@ -151,6 +151,11 @@ def test_words_of_a_language(language: str) -> None:
         ("Vy [m/s]", "v"),
         ("velocity_x_mps", "u"),
         ("wind speed x", "wind_speed"),
+        ("Motor L (%)", "n_port"),
+        ("Motor R (%)", "n_stbd"),
+        ("thr_port", "throttle_port"),
+        ("SpeedTrans_kn", "v"),
+        ("yaw rate r", "r"),
     ],
 )
 def test_what_a_name_is_about(column: str, channel: str | None) -> None:
@@ -163,6 +168,8 @@ def test_what_a_name_is_about(column: str, channel: str | None) -> None:
     [
         ("r [°/min]", "rad/s", "deg/min"),
         ("yaw_rate_deg_s", "rad/s", "deg/s"),
+        ("RollRate_deg_per_s", "rad/s", "deg/s"),
+        ("ROT_degmin", "rad/s", "deg/min"),
         ("speed (kn)", "m/s", "kn"),
         ("heading deg", "rad", "deg"),
         ("Winkel [Grad]", "rad", "deg"),

@@ -236,10 +236,11 @@ def test_json_lines(log: Log, tmp_path: Path) -> None:
         draft_tables([file], marks)
 
 
-def test_n_beside_e_is_north(log: Log, tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", [("N [m]", "E [m]"), ("N_m", "E_m")])
+def test_n_beside_e_is_north(names: tuple[str, str], log: Log, tmp_path: Path) -> None:
     frame = pd.DataFrame(
         {
-            **{"time [s]": log.t, "N [m]": log["x"], "E [m]": log["y"]},
+            **{"time [s]": log.t, names[0]: log["x"], names[1]: log["y"]},
             **{"heading [deg]": np.degrees(log["psi"]), "rpm": 60.0 * log["cmd_n"]},
         }
     )
@@ -277,3 +278,29 @@ def test_records_beside_each_other_are_told_from_vessels(log: Log, tmp_path: Pat
         np.testing.assert_allclose(read["u"], log["u"])
         np.testing.assert_allclose(read["delta"], log["delta"])
         assert any("hold a position each" in text for _, text in marks.guesses) == told
+
+
+@pytest.mark.parametrize("factor", [1.0, math.degrees(1.0), -60.0 * math.degrees(1.0)])
+def test_angles_tell_the_unit_and_the_sign_of_their_rates(
+    factor: float, log: Log, tmp_path: Path
+) -> None:
+    roll = 0.1 * np.sin(log.t)
+    rates = {"ROT": factor * log["r"], "rollrate": factor * 0.1 * np.cos(log.t)}
+    frame = pd.DataFrame({"t": log.t, "heading [rad]": log["psi"], "roll [rad]": roll, **rates})
+    read, marks = _drafted(frame, tmp_path / "log.csv")
+    np.testing.assert_allclose(read["r"], log["r"], atol=1e-9)
+    np.testing.assert_allclose(read["p"], 0.1 * np.cos(log.t), atol=1e-9)
+    said = " ".join(text for _, text in marks.guesses)
+    assert ("roll angles say that it is positive to port" in said) == (factor < 0.0)
+
+
+def test_a_speed_is_that_forward_where_no_heading_is_known(tmp_path: Path) -> None:
+    t = np.arange(0.0, 60.0, 0.2)
+    speed = 1.0 + 0.5 * np.sin(0.1 * t)
+    track = {"lat": 54.3 + np.cumsum(0.2 * speed) / 111_132.0, "lon": np.full(t.size, 10.15)}
+    frame = pd.DataFrame({"t": t, **track, "sog [m/s]": speed, "motor1 [%]": 50.0 * speed})
+    read, marks = _drafted(frame, tmp_path / "log.csv")
+    np.testing.assert_allclose(read["u"], speed)
+    assert _guessed(marks, "u")
+    frame["course over ground [deg]"] = 0.0
+    assert "u" not in _drafted(frame, tmp_path / "log.csv")[0].channels

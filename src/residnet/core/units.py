@@ -107,6 +107,7 @@ _WORDS: dict[str, str] = {
     "mph": "mi/h mile/h miles/h",
     "m/s": "mps",
     "deg/s": "dps",
+    "deg/min": "degmin",
     "-": "none dimensionless",
 }
 _TURNS = (

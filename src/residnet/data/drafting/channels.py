@@ -409,7 +409,13 @@ class Channels:
             entry["unit"] = self._psi_unit
             return entry | ({"frame": "enu"} if self._frame.from_east else {})
         if name in ("u", "v", "r") and {"x", "y", "psi"} <= set(self._names):
-            return entry | self._rate(name)
+            fit = follows(self._logs, self._motions, name)
+            return entry | self._rate(name, fit, "position and heading")
+        if name == "r" and "psi" in self._names:
+            return entry | self._rate(name, self._turned("psi", self._psi_unit, name), "headings")
+        if name == "p" and "phi" in self._names:
+            unit = self._unit("phi", mark=False)
+            return entry | self._rate(name, self._turned("phi", unit, name), "roll angles")
         if name not in STATE_NAMES and (throw := thrown(name, column, self._values(name))):
             self._marks.guess((*CHANNELS, name), throw.reason)
             return entry | throw.settings
@@ -424,30 +430,43 @@ class Channels:
         self._marks.guess((*CHANNELS, name), text)
         return -1
 
-    def _rate(self, name: str) -> dict[str, Any]:
-        """Return unit and sign of a velocity, checked against position and heading."""
+    def _turned(self, angle: str, unit: str, name: str) -> Fit:
+        """Return how a rate follows its angle, which is taken for a heading."""
+        held = [raw for raw in self._logs if {angle, name} <= set(raw.columns)]
+        angles = [Raw(raw.t, dict.fromkeys(("x", "y", "psi"), raw.columns[angle])) for raw in held]
+        frame = self._frame if angle == "psi" else FRAMES[0]
+        motions = [motion_of(raw, unit, frame) for raw in angles]
+        return follows([Raw(raw.t, {"r": raw.columns[name]}) for raw in held], motions, "r")
+
+    def _rate(self, name: str, fit: Fit, who: str) -> dict[str, Any]:
+        """Return unit and sign of a velocity, checked against what it is the rate of.
+
+        Args:
+            name: of the velocity.
+            fit: how it follows that.
+            who: what that is, for a reader.
+        """
         key, column = (*CHANNELS, name), self._names[name]
         si = CHANNEL_UNITS[name]
-        fit = follows(self._logs, self._motions, name)
         written = written_unit(column, si)
-        unit = self._measured_unit(name, written, fit)
+        unit = self._measured_unit(name, written, fit, who)
         entry: dict[str, Any] = {"unit": unit}
         if fit.telling and fit.factor < 0.0:
             entry["sign"] = -1
-            what = {"u": "astern", "v": "port", "r": "port"}[name]
-            text = f"position and heading say that it is positive to {what} (correlation"
+            what = {"u": "astern", "v": "port", "r": "port", "p": "port"}[name]
+            text = f"{who} say that it is positive to {what} (correlation"
             self._marks.guess(key, f"{text} {fit.correlation:.2f})")
         elif not fit.telling and self._sign_by_habit(name) < 0:
             entry["sign"] = -1
         if not fit.telling and written is None:
-            self._marks.guess(key, f"position and heading do not tell whether {unit} is right")
+            self._marks.guess(key, f"{who} do not tell whether {unit} is right")
         return entry
 
-    def _measured_unit(self, name: str, written: str | None, fit: Fit) -> str:
+    def _measured_unit(self, name: str, written: str | None, fit: Fit, who: str) -> str:
         key, si = (*CHANNELS, name), CHANNEL_UNITS[name]
         found = fit.unit(si) if fit.telling else None
         if written is None and found is not None:
-            text = f"the header has no unit; position and heading say {found}"
+            text = f"the header has no unit; {who} say {found}"
             self._marks.guess(key, f"{text} (correlation {fit.correlation:.2f})")
             return found
         if written is None:
@@ -457,5 +476,5 @@ class Channels:
         ratio = abs(fit.factor) / to_si(written, si)
         if 0.6 < ratio < 1.6:
             return written
-        text = f"the header says {written}, position and heading say {found} (factor {ratio:.3g})"
+        text = f"the header says {written}, {who} say {found} (factor {ratio:.3g})"
         return self._marks.ask(key, f"unit of '{self._names[name]}'", found, text, (found, written))

@@ -162,7 +162,7 @@ def _draft_joined(
     left_out: dict[Path, ResidnetError] = {}
     for word, files in trips.items():
         own = Marks()
-        parts[word], lost = draft_tables(files, own)
+        parts[word], lost = draft_tables(files, own, headed=True)
         left_out |= lost
         place = (*READER, "parts", word)
         for told, tell in ((own.guesses, marks.guess), (own.notes, marks.note)):

@@ -72,7 +72,7 @@ _LOOKED_AT = 24
 
 
 def draft_tables(
-    files: Sequence[Path], marks: Marks
+    files: Sequence[Path], marks: Marks, *, headed: bool = False
 ) -> tuple[dict[str, Any], dict[Path, ResidnetError]]:
     """Return the settings of a reader of tables, and file -> why it is not read.
 
@@ -81,6 +81,7 @@ def draft_tables(
     Args:
         files: at least one table.
         marks: is told what is not sure.
+        headed: whether other files may tell the heading.
 
     Raises:
         UsageError: where the tables have nothing in common.
@@ -117,7 +118,8 @@ def draft_tables(
         )
     attitudes = quaternions(numeric)
     parts = {column for attitude in attitudes for column in attitude.values()}
-    names = _of_one_vessel([name for name in numeric if name not in parts], first.numbers, marks)
+    rest = [name for name in numeric if name not in parts]
+    names = _of_one_vessel(rest, first.numbers, marks, headed=headed or bool(parts))
     names = _pulsed(names, sheets)
     # a vessel without roll is modelled too, so that no log is lost for it
     rolls = [name for name in ("phi", "p") if name in names]
@@ -206,7 +208,7 @@ def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, ResidnetErro
 
 
 def _of_one_vessel(
-    columns: Sequence[str], numbers: Mapping[str, np.ndarray], marks: Marks
+    columns: Sequence[str], numbers: Mapping[str, np.ndarray], marks: Marks, *, headed: bool
 ) -> dict[str, str]:
     """Return channel -> column; of `boat1_x` and `boat2_x`, side by side, those of the first.
 
@@ -233,19 +235,24 @@ def _of_one_vessel(
                 )
                 marks.guess(CHANNELS, text)
                 return {channel: its[rest] for channel, rest in named([*its], marks).items()}
-    return named(columns, marks)
+    return named(columns, marks, headed=headed)
 
 
-def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
+def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[str, str]:
     """Return channel -> column, by what the columns are called.
 
-    A speed is that forward where no position tells it.
+    A speed is that forward where no position and heading tell it.
+
+    Args:
+        columns: their names.
+        marks: is told what is not sure.
+        headed: whether something else may tell the heading.
     """
-    alone = {re.sub(r"\W*[\[(].*", "", column).strip().lower(): column for column in columns}
+    alone = {re.sub(r"\W*[\[(].*|_m$", "", column).strip().lower(): column for column in columns}
     if {"n", "e"} <= set(alone):
         pair = {"x": alone["n"], "y": alone["e"]}
         rest = Marks()
-        others = named([name for name in columns if name not in pair.values()], rest)
+        others = named([name for name in columns if name not in pair.values()], rest, headed=headed)
         if not {"x", "y", "latitude", "longitude"} & set(others):
             # beside E, N counts no revolutions
             marks.extend(rest)
@@ -305,7 +312,8 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
             # one rudder: the side says where positive angles turn it
             one = port if port in names else stbd
             names[one.rpartition("_")[0]] = names.pop(one)
-    if "u" not in names and speeds and ("v" in names or not placed):
+    headed = headed or "psi" in names or any("course" in words.about for words in about.values())
+    if "u" not in names and speeds and ("v" in names or not (placed and headed)):
         names["u"] = speeds[0]
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
     listed = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]

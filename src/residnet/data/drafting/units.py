@@ -29,7 +29,7 @@ def written_unit(column: str, expected: str | None) -> str | None:
         tail = re.split(r"[\s_,;]+", _IN_BRACKETS.sub("", column).strip())
         # `r_deg_s` and `speed_m_s` are quotients
         texts += ["/".join(tail[-2:]), tail[-1]] if len(tail) > 1 else []
-        texts += ["/".join(tail[-3:-1] + tail[-1:])] if len(tail) > 3 and tail[-2] == "per" else []
+        texts += [f"{tail[-3]}/{tail[-1]}"] if len(tail) > 3 and tail[-2] == "per" else []
     for text in texts:
         unit = _GERMAN.get(text.casefold(), text)
         if len(unit) == 1 and unit.isalpha() and text not in _IN_BRACKETS.findall(column):

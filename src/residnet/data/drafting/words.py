@@ -55,7 +55,7 @@ _ABOUT: dict[str, str] = {
     " ahead corredera",
     "sway": "sway quergeschw seitlich lateral dwars tverr sideveis sidelaens 左右 derive deriva"
     " transvers verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards"
-    " sideways 横向 sidled попереч | v vm quer",
+    " sideways 横向 sidled попереч | v vm quer trans",
     "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre руль 타각"
     " dumen | delta rudder rud ror rsa steering helm pala leme ster tiller rorkult barra pinne"
     " ruderpinne",
@@ -69,7 +69,7 @@ _ABOUT: dict[str, str] = {
     "torque": "torque drehmoment couple koppel dreiemoment トルク",
     "power": "power leistung puissance potencia vermogen effekt 出力",
     "throttle": "throttle actuator gashebel gashendel gasspak gasreglage acelerador accelerateur"
-    " manetta スロットル lever hebel 油门 | gas pwm gaz esc",
+    " manetta スロットル lever hebel 油门 | gas pwm gaz esc thr",
     "azimuth": "azimu schottel pod | azi nozzle alpha",
     "servo": "servo rcou",
     "force": "force kraft fuerza kracht 力 tau",
@@ -275,6 +275,10 @@ def _velocity(w: Words) -> str | None:
     return "speed" if w.has("speed") else None
 
 
+_LETTER = re.compile(r"(?<=\w) ([lr])(?= |$)")
+"""The side behind the name of an actuator."""
+
+
 def input_channel(words: Words) -> str | None:
     """Return the channel of an actuator that a name stands for; None where it names none."""
     w, name = words, words.text.replace(" ", "_")
@@ -286,6 +290,8 @@ def input_channel(words: Words) -> str | None:
         return None
     sides = {"port": "_port", "starboard": "_stbd", "bow": "_bow", "stern": "_stern"}
     side = next((end for name, end in sides.items() if w.has(name)), "")
+    if lettered := _LETTER.search(w.text):
+        side = side or {"l": "_port", "r": "_stbd"}[lettered[1]]
     side = side or (f"_{w.number}" if w.number is not None else "")
     if w.has("force") and (forced := _force(w)):
         return forced
