@@ -75,6 +75,18 @@ def test_two_runs_side_by_side(tmp_path: Path) -> None:
     assert "Error against horizon" in content
 
 
+def test_runs_of_other_velocities_are_compared_by_what_both_move(tmp_path: Path) -> None:
+    first, second = made_run(tmp_path / "first", 0.3), made_run(tmp_path / "second", 0.15)
+    metrics = json.loads((second / "metrics.json").read_text())
+    metrics["scales"] = {"u": 1.0}
+    metrics["rows"][0] |= {"rmse": {"u": 0.15}, "nrmse": {"u": 0.15, "mean": 0.15}}
+    (second / "metrics.json").write_text(json.dumps(metrics))
+    entry = paired(judged_runs([first, second]))["T2"]["second"]
+    assert entry["nrmse_mean"] == pytest.approx(-0.15)
+    text, page = compare_runs([first, second], tmp_path / "out")
+    assert "mean over u." in plain(page)
+
+
 def test_a_part_that_one_run_lacks_stands_in_one_line(tmp_path: Path) -> None:
     first, second = made_run(tmp_path / "first", 0.3), made_run(tmp_path / "second", 0.15)
     for folder, more in (

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from residnet.core.errors import UsageError
-from residnet.core.format import DEG, number
+from residnet.core.format import number, shown_unit
+from residnet.core.names import CHANNEL_UNITS
 from residnet.judge.metrics import blocks, difference
 from residnet.report.blocks import Block, Cell, Section, Table, table_of
 from residnet.report.figure import GLANCE, Case, Figure, Panel, family
@@ -42,7 +43,11 @@ class JudgedRun(RunFiles):
         self.split = next(found, self.splits[-1])
         self.model = str(self.metrics["selected"])
         told = self.metrics["scales"]
-        self.scales = np.array([float(told[name]) for name in self.live.channels])
+        self._told = {name: float(told[name]) for name in self.live.channels}
+
+    def scales_of(self, names: Sequence[str]) -> np.ndarray:
+        """Return the scales of some of what moves [n]."""
+        return np.array([self._told[name] for name in names])
 
     @cached_property
     def series(self) -> dict[Window, tuple[np.ndarray, np.ndarray]]:
@@ -107,13 +112,23 @@ def judged_runs(paths: Sequence[Path]) -> list[JudgedRun]:
         raise UsageError("compare: a run is named twice")
     runs = [JudgedRun(name, path) for name, path in zip(names, paths, strict=True)]
     for run in runs:
-        if run.live != runs[0].live:
+        if not shared_channels([runs[0], run]):
             raise UsageError(
                 f"compare: {run.name} predicts {', '.join(run.live.channels)}, and"
-                f" {runs[0].name} {', '.join(runs[0].live.channels)}; name runs of the same"
-                " velocities (signals.velocities)"
+                f" {runs[0].name} {', '.join(runs[0].live.channels)}; name runs that share a"
+                " velocity (signals.velocities)"
             )
     return runs
+
+
+def shared_channels(runs: Sequence[JudgedRun]) -> list[str]:
+    """Return what moves in all runs, in the order of the first: what they are compared by."""
+    return [name for name in runs[0].live.channels if all(name in r.live.channels for r in runs)]
+
+
+def _errors(run: JudgedRun, window: Window, names: Sequence[str], scales: np.ndarray) -> np.ndarray:
+    """Return the errors of a run in a window over scales [n], of some of what moves [T, n]."""
+    return run.series[window][1][:, [run.live.channels.index(name) for name in names]] / scales
 
 
 def _common(runs: Sequence[JudgedRun]) -> list[Window]:
@@ -125,14 +140,20 @@ def _common(runs: Sequence[JudgedRun]) -> list[Window]:
 def paired(runs: Sequence[JudgedRun]) -> dict[str, dict[str, Any]]:
     """Return protocol -> run -> difference to the first run over common windows.
 
-    Errors are normalised root mean squares, the mean over u, v, r, by the first run's scales.
+    Errors are normalised root mean squares, the mean over what moves in all runs, by the first
+    run's scales.
     """
     out: dict[str, dict[str, Any]] = {}
+    names = shared_channels(runs)
+    scales = runs[0].scales_of(names)
     shared = _common(runs)
     for protocol in dict.fromkeys(window[1] for window in shared):
         windows = [window for window in shared if window[1] == protocol]
-        squares = [[np.nanmean(run.series[w][1] ** 2, axis=0) for w in windows] for run in runs]
-        errors = (np.sqrt(np.array(squares)) / runs[0].scales).mean(axis=-1)
+        squares = [
+            [np.nanmean(_errors(run, w, names, scales) ** 2, axis=0) for w in windows]
+            for run in runs
+        ]
+        errors = np.sqrt(np.array(squares)).mean(axis=-1)
         known = np.isfinite(errors).all(axis=0)
         if not known.any():
             continue
@@ -163,9 +184,11 @@ def _metrics_table(runs: Sequence[JudgedRun]) -> Table:
             ("run", "run"),
             ("model", lambda row: f"{row['model']}{' (selected)' if row['chosen'] else ''}"),
             ("protocol", "protocol"),
-            ("u [m/s]", "rmse.u", number),
-            ("v [m/s]", "rmse.v", number),
-            ("r [deg/s]", "rmse.r", number, DEG),
+            *(
+                (f"{name} [{unit}]", f"rmse.{name}", number, factor)
+                for name in dict.fromkeys(name for run in runs for name in run.live.channels)
+                for unit, factor in [shown_unit(CHANNEL_UNITS[name])]
+            ),
             ("NRMSE [-]", "nrmse.mean", number),
             ("diverged", lambda row: Cell(f"{row['diverged']}/{row['windows']}")),
         ],
@@ -285,15 +308,17 @@ def _curves(runs: Sequence[JudgedRun], out: Path) -> Block:
     protocol = windows[0][1]
     chosen = [window for window in windows if window[1] == protocol]
     shortest = min(len(runs[0].series[window][0]) for window in chosen)
-    curves = {}
+    curves, names = {}, shared_channels(runs)
+    scales = runs[0].scales_of(names)
     for run in runs:
-        size = np.stack([run.series[window][1][:shortest] ** 2 for window in chosen])
-        growth = np.sqrt(np.nanmean(size, axis=0)) / runs[0].scales
+        size = np.stack([_errors(run, w, names, scales)[:shortest] ** 2 for w in chosen])
+        growth = np.sqrt(np.nanmean(size, axis=0))
         curves[run.name] = (run.series[chosen[0]][0][:shortest], growth.mean(axis=1))
     figure = Figure(
         "horizon",
         "Error against horizon",
-        f"Selected models over {len(chosen)} common windows of {protocol}, mean over u, v, r.",
+        f"Selected models over {len(chosen)} common windows of {protocol}, mean over"
+        f" {', '.join(names)}.",
         family(curves),
         [Panel("error [-]", "time from the start of a free run [s]", height=GLANCE)],
         [Case("", [curves])],
