@@ -250,6 +250,8 @@ class CExporter(Exporter):
         Where single precision does not determine the track, the file is in double precision alone.
         """
         exported.require_numbers()
+        # a header that is asked for names the pair
+        file = file.with_suffix(self.suffix) if file.suffix == ".h" else file
         card = exported.card() | {
             "format": "c",
             "dtype": "float32; float64 with the macro _DOUBLE",
