@@ -53,6 +53,48 @@ booklet:
     - {kind: zigzag, name: ten_ten, rudder: 10 deg, heading: 10 deg, drive: 0.8, start: 0 s,
        reversals: 2}
 """
+ROLL = """
+data:
+  kind: simulated
+  vessel: patrol_p06_linear
+  seed: 1
+  trials:
+    - {kind: zigzag, count: 10, heading: [10 deg, 20 deg], drive: [0.6, 0.8], steer: [0.3, 0.4]}
+  duration: 60 s
+  step: 0.25 s
+  noise:
+    u: 0.01
+    v: 0.01
+    r: 0.05 deg/s
+    sensors: {phi: {noise: 0.05 deg}, p: {noise: 0.05 deg/s}}
+  identification: {zigzag: 6}
+  validation: {zigzag: 2}
+prepare:
+  grid: {step: 0.25 s}
+  derivative: {kind: savitzky_golay, window: 1.75 s, order: 2}
+signals: {inputs: [delta, cmd_thrust], velocities: [u, v, r, p]}
+integrator: semi_implicit_euler
+baseline:
+  kind: regressors
+  ridge: 1.0e-4
+  terms: ["1", u, v, r, p, phi, u|u|, u v, u r, v|v|, u|u| delta, cmd_thrust]
+bands: null
+export: {models: []}
+evaluation:
+  protocols: {T10: {kind: windows, length: 10 s}}
+  selection: T10
+  scales: {u: 0.3, v: 0.3, r: 1 deg/s, p: 1 deg/s, phi: 1.5 deg}
+"""
+ROLL_BOOKLET = """
+length: 51.5 m
+scale: 1
+inputs: {cmd_thrust: {drive: 100000}, delta: {steer: 30 deg, rate: 10 deg/s}}
+initial: {u: 7 m/s}
+duration: 300 s
+manoeuvres:
+  - {kind: turning_circle, name: circle, until: 360 deg, rudder: 10 deg, drive: 0.8, start: 0 s}
+repeat: []
+"""
 
 
 def write(folder: Path, **changes: Any) -> Path:
@@ -89,6 +131,25 @@ def test_pages_hold_values_within_intervals_and_limits(run: Path) -> None:
     assert circle["time_90"]["ship"] == pytest.approx(2.0 * circle["time_90"]["value"])
     assert zigzag["initial_turning_distance"]["limit"] == pytest.approx(2.5 * 24.0)
     assert zigzag["first_overshoot"]["kept"] in (True, False)
+
+
+def test_a_vessel_that_rolls(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write(tmp_path, **yaml.safe_load(ROLL_BOOKLET))
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | yaml.safe_load(ROLL)))
+    assert call(monkeypatch, "run", file, "--out", tmp_path / "run") == 0
+    booklet = json.loads((tmp_path / "run" / "booklet.json").read_text())
+    circle = booklet["pages"][0]["indices"]
+    low, high = circle["largest_roll_angle"]["interval"]
+    assert 0.005 < low <= circle["largest_roll_angle"]["value"] <= high < 0.2
+    text = plain(tmp_path / "run" / "report.html")
+    assert "largest roll angle" in text
+    plan = ("plan-trial", tmp_path / "run", "--time", "60 s", "--out", tmp_path / "plan")
+    assert call(monkeypatch, *plan) == 0
+    assert "they narrow the intervals of predictions" in capsys.readouterr().out
+    tracks = (tmp_path / "plan" / "next_tracks.csv").read_text()
+    assert tracks.count("\n") > 100
 
 
 def test_measured_zigzags_are_repeated(run: Path) -> None:

@@ -26,7 +26,7 @@ UNITS: dict[str, str] = {
     "initial_turning_time": "s", "initial_turning_distance": "m",
     "first_overshoot": "rad", "second_overshoot": "rad", "time_to_check_yaw": "s",
     "overshoot_width": "m",
-    "reach": "s", "period": "s", "largest_yaw_rate": "rad/s",
+    "reach": "s", "period": "s", "largest_yaw_rate": "rad/s", "largest_roll_angle": "rad",
     "track_reach": "m", "head_reach": "m", "lateral_deviation": "m", "stopping_time": "s",
     "steers": "-", "yaw_rates": "rad/s", "loop_height": "rad/s",
     "largest_cross_track_error": "m", "rms_cross_track_error": "m", "course_time": "s",
@@ -64,6 +64,7 @@ class Track:
         self.t: np.ndarray = log.t[whole] - log.t[0]
         x, y, self.heading, self.u, self.v, self.r = motion[whole].T
         self.speed = np.hypot(self.u, self.v)
+        self._roll = log["phi"][whole] if "phi" in log.channels else np.zeros(0)
         path = np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))))
         self.psi, self.x, self.y, self.travelled = (
             scipy.interpolate.CubicSpline(self.t, values) for values in (self.heading, x, y, path)
@@ -77,6 +78,12 @@ class Track:
     def approach(self, start: float) -> float:
         """Return the speed at the last sample before or at the order at `start`."""
         return float(self.speed[max(int(np.searchsorted(self.t, start + 1e-9)) - 1, 0)])
+
+    def heel(self, start: float) -> dict[str, float]:
+        """Return the largest roll angle from `start` on to either side; empty without one."""
+        rolled = np.abs(self._roll[self.t >= start]) if self._roll.size else self._roll
+        known = rolled[np.isfinite(rolled)]
+        return {"largest_roll_angle": float(known.max())} if known.size else {}
 
     def crossing(self, level: float, after: float, sign: float = 1.0) -> float | None:
         """Return the first time after `after` at which sign * heading rises to sign * `level`.
@@ -152,7 +159,7 @@ def turning(
     if track.end <= start:
         return {}
     origin = float(track.psi(start))
-    indices: dict[str, Any] = {"approach_speed": track.approach(start)}
+    indices: dict[str, Any] = {"approach_speed": track.approach(start), **track.heel(start)}
     quarter, half = (
         track.crossing(origin + side * angle, start, side) for angle in (_TURN, 2 * _TURN)
     )
@@ -220,6 +227,7 @@ def zigzag(
     indices: dict[str, Any] = {
         "approach_speed": track.approach(start),
         "largest_yaw_rate": float(np.abs(track.r[track.t >= start]).max()),
+        **track.heel(start),
     }
     if reversals:
         turned = track.travelled(reversals[0]) - track.travelled(start)

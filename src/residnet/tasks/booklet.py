@@ -221,13 +221,19 @@ def _page(
     """One manoeuvre with its indices by flight, beside those of the log that it repeats.
 
     Raises:
-        DataError: where the fitted model itself does not end the manoeuvre.
+        DataError: where the fitted model itself does not end the manoeuvre, or diverges.
     """
     manoeuvre, name = flights[0].manoeuvre, flights[0].motion.name
     if flights[0].fault:
         raise DataError(
             f"booklet: {config.model}, {name}: {flights[0].fault}; give more"
             " duration, or another model"
+        )
+    if not sound(flights[0], limit):
+        raise DataError(
+            f"booklet: {config.model}, {name}: the model leaves the range of its training data as"
+            " far as a free run that diverges; ask for less rudder or drive, or add logs that"
+            " cover them"
         )
     indices = [
         manoeuvre.indices(flight.motion, None) if sound(flight, limit) else {} for flight in flights
