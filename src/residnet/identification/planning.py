@@ -15,7 +15,7 @@ from torch import Tensor
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.config import Config, Metres, MetresPerSecond, Seconds
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import MOVING, POSITION, SURGE, SWAY
+from residnet.core.layout import ALIVE, MOVING, POSITION, SURGE, SWAY, Live
 from residnet.data.sea import Disturbance, SensorNoise
 from residnet.data.simulated import Craft, Flight, Sea, fly
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, commanded
@@ -108,13 +108,17 @@ class TrialLimits(Config):
     count: int = Field(default=3, ge=1)
 
 
-def candidates(limits: TrialLimits) -> list[Manoeuvre]:
-    """Return zigzags, turns, 3-2-1-1, multi-sines and speed changes at several drives."""
+def candidates(limits: TrialLimits, live: Live = ALIVE) -> list[Manoeuvre]:
+    """Return zigzags, turns, 3-2-1-1, multi-sines and speed changes at several drives.
+
+    Those that wait for a heading are for a vessel that turns, and several drives and changes of
+    speed for one that moves ahead.
+    """
     out: list[Manoeuvre] = []
     time, full = limits.time, limits.rudder
-    for drive in (0.4, 0.7, 1.0):
+    for drive in (0.4, 0.7, 1.0) if live.moves else (1.0,):
         per = f"{round(100 * drive)}"
-        for angle in (10.0, 20.0):
+        for angle in (10.0, 20.0) if live.turns else ():
             for share in (0.5, 1.0):
                 name = f"zigzag_{angle:.0f}_steer_{round(100 * share * full)}_drive_{per}"
                 out.append(
@@ -127,7 +131,7 @@ def candidates(limits: TrialLimits) -> list[Manoeuvre]:
                         duration=time,
                     )
                 )
-        for side in (1.0, -1.0):
+        for side in (1.0, -1.0) if live.turns else ():
             name = f"turn_{'starboard' if side > 0 else 'port'}_drive_{per}"
             out.append(
                 TurningCircle(
@@ -155,6 +159,8 @@ def candidates(limits: TrialLimits) -> list[Manoeuvre]:
                 duration=time,
             )
         )
+    if not live.moves:
+        return out
     levels = (1.0, 0.0, 0.6, 0.2)
     times = tuple(0.25 * time * k for k in range(4))
     out.append(
@@ -179,7 +185,7 @@ def shares_of(spec: ModelSpec) -> Mapping[str, InputShare]:
             out[name] = InputShare(drive=0.6 * most, steer=0.6 * side * most, limit=most)
         else:
             out[name] = InputShare(drive=most, limit=most)
-    if not any(share.steer for share in out.values()):
+    if spec.signals.live.turns and not any(share.steer for share in out.values()):
         raise UsageError(
             f"model {spec.name}: none of {', '.join(spec.signals.inputs)} is known to steer; say"
             " how inputs follow drive and steer in the run's `booklet.inputs`"
@@ -268,13 +274,13 @@ def plan(
     """
     spec, model = fitted.spec, fitted.model.double()
     horizon = round(refit.horizon / spec.dt)
-    divisor = torch.from_numpy(scales)
+    divisor, offered = torch.from_numpy(scales), candidates(limits, spec.signals.live)
     flown = [
         (flight, _path(flight, spec.signals))
         for flight in _flights(
             fitted,
             shares,
-            Aim(sorted(candidates(limits), key=lambda one: one.kind), limits.time, {}),
+            Aim(sorted(offered, key=lambda one: one.kind), limits.time, {}),
         )
     ]
     kept = [(flight, states, w) for flight, (states, w) in flown if _allowed(states, limit, limits)]
