@@ -83,7 +83,7 @@ def test_runs_of_other_velocities_are_compared_by_what_both_move(tmp_path: Path)
     (second / "metrics.json").write_text(json.dumps(metrics))
     entry = paired(judged_runs([first, second]))["T2"]["second"]
     assert entry["nrmse_mean"] == pytest.approx(-0.15)
-    text, page = compare_runs([first, second], tmp_path / "out")
+    _, page = compare_runs([first, second], tmp_path / "out")
     assert "mean over u." in plain(page)
 
 
