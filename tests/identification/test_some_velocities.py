@@ -10,7 +10,10 @@ from residnet.core.errors import ConfigError, UsageError
 from residnet.core.layout import Live
 from residnet.core.log import Log
 from residnet.data.motion import MotionConfig, complete_motion
+from residnet.identification.planning import TrialLimits, candidates, shares_of
 from residnet.identification.settings import FitSettings
+from residnet.physics.signals import SignalsConfig
+from residnet.testing.examples import example_spec
 
 STEP = 0.2
 
@@ -93,3 +96,27 @@ def test_scales_are_of_the_velocities_of_the_model() -> None:
         wrong = {**content, part: {**content[part], key: value}}  # type: ignore[dict-item]
         with pytest.raises((ValueError, ConfigError), match=told):
             FitSettings.model_validate(wrong)
+
+
+def test_trials_are_those_that_a_vessel_can_run() -> None:
+    def kinds(*velocities: str) -> set[str]:
+        return {one.kind for one in candidates(TrialLimits(), Live(velocities))}
+
+    both = {"three_two_one_one", "multi_sine"}
+    assert kinds("u") == both | {"acceleration_deceleration"}
+    assert kinds("r") == both | {"zigzag", "turning_circle"}
+    assert kinds("u", "v", "r") == kinds("u") | kinds("r")
+    signals = SignalsConfig(inputs=("n_port", "n_stbd"), velocities=("u",))
+    named = {"inputs": ("n",), "velocities": ("u",)}
+    spec = example_spec(None, signals)
+    one = spec.model_copy(
+        update={
+            "signals": SignalsConfig.model_validate(named),
+            "low": spec.low[:4],
+            "high": spec.high[:4],
+        }
+    )
+    assert shares_of(one)["n"].drive == pytest.approx(max(abs(one.low[3]), one.high[3]))
+    turns = one.model_copy(update={"signals": SignalsConfig(inputs=("n",))})
+    with pytest.raises(UsageError, match="none of n is known to steer"):
+        shares_of(turns)
