@@ -128,7 +128,9 @@ def shared_channels(runs: Sequence[JudgedRun]) -> list[str]:
 
 def _errors(run: JudgedRun, window: Window, names: Sequence[str], scales: np.ndarray) -> np.ndarray:
     """Return the errors of a run in a window over scales [n], of some of what moves [T, n]."""
-    return run.series[window][1][:, [run.live.channels.index(name) for name in names]] / scales
+    columns = [run.live.channels.index(name) for name in names]
+    found: np.ndarray = run.series[window][1][:, columns] / scales
+    return found
 
 
 def _common(runs: Sequence[JudgedRun]) -> list[Window]:
