@@ -81,6 +81,9 @@ MANOEUVRES: dict[str, dict[str, Any]] = {
     "multi_sine": {"drive": 0.5, "band": [0.05, 0.3], "steer_amplitude": 0.3},
     "spiral": {"drive": 0.5, "start": 2, "steady": {"window": 1.5, "tolerance": 0.05}},
     "stopping": {"drive": 0.6, "start": 8},
+    "helix": {"drive": 0.6, "steer": 0.3, "dive": 0.2, "start": 2},
+    "vertical_zigzag": {"drive": 0.6, "dive": 0.3, "depth": 1, "start": 2},
+    "depth_step": {"drive": 0.6, "depth": 2, "start": 2},
     "waypoints": {"drive": 0.7, "points": [[8, 0], [8, 10]], "acceptance": 2, "lookahead": 4},
     "four_corner": {
         "duration": 60,
@@ -91,8 +94,10 @@ MANOEUVRES: dict[str, dict[str, Any]] = {
         },
     },
 }
-# of those that need a vessel with three forces of its own
-FERRY = "milliampere"
+# of those that need a vessel with three forces of its own, or one that dives
+VESSELS = {"four_corner": "milliampere"} | dict.fromkeys(
+    ("helix", "vertical_zigzag", "depth_step"), "remus_100"
+)
 
 
 def _canonical(log: Log, folder: Path) -> Path:
@@ -168,7 +173,7 @@ def test_manoeuvre(kind: str, tmp_path: Path) -> None:
         Log("flown", t, channels).save(tmp_path / "flown.parquet")
         settings = {"log": str(tmp_path / "flown.parquet")}
     manoeuvre = validate({"kind": kind, **settings}, ManoeuvreConfig, "here")
-    check_manoeuvre(manoeuvre, FERRY if kind == "four_corner" else "wam_v_cal")
+    check_manoeuvre(manoeuvre, VESSELS.get(kind, "wam_v_cal"))
 
 
 READERS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {

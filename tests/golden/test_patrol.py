@@ -109,7 +109,7 @@ def source_of(runs: list[Run], plant: HullPlant, t: torch.Tensor) -> Source:
         drive = torch.tensor([run.drive for run in steps], dtype=torch.float64)
         sources.append(
             ScheduleSource(
-                drive[:, None].expand(-1, len(t)), steer[:, None] * (t >= START), plant.demand
+                plant.demand(drive[:, None].expand(-1, len(t)), steer[:, None] * (t >= START))
             )
         )
     if zigzags:

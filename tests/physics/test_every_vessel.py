@@ -12,13 +12,15 @@ from residnet.core.config import load_config
 from residnet.core.names import CHANNEL_UNITS
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
+from residnet.physics.hull import SubmergedConfig
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.vessel import VesselConfig, load_vessel
 from residnet.physics.vessel_file import vessel_files
 
 HULLS = [name for name in vessel_files() if not name.startswith("nomoto")]
-# the forces of a real hull: the published series of the Mariner has Y_0 and N_0
-SYMMETRIC = [name for name in vessel_files() if name != "mariner"]
+# the forces of a real hull: the published series of the Mariner has Y_0 and N_0, and the screw of the
+# REMUS turns one way
+SYMMETRIC = [name for name in vessel_files() if name not in ("mariner", "remus_100")]
 ODD = {"y", "psi", "phi", "v", "r", "p", "delta", "nozzle", "tau_y", "tau_n", "force_y", "force_k",
        "force_n", "current_east", "force_east", "wind_dir", "_yaw_lag"}  # fmt: skip
 
@@ -180,7 +182,11 @@ def test_a_manoeuvre_in_a_current_is_the_manoeuvre_and_the_drift() -> None:
 
 _SKEW = ("rigid_body.x_G.value=0.4", "added_mass.Y_rdot.value=-60", "added_mass.N_vdot.value=-60")
 _EVEN = ("added_mass.K_vdot.value=-296000", "added_mass.N_vdot.value=-1.4e6")
-LOSSLESS = {"wam_v_cal": ("damping={}", *_SKEW), "patrol_p06": ("forces={}", *_EVEN)}
+LOSSLESS = {
+    "wam_v_cal": ("damping={}", *_SKEW),
+    "patrol_p06": ("forces={}", *_EVEN),
+    "remus_100": ("forces={}", "rigid_body.x_G.value=0.03", "buoyancy.volume.value=0.0305"),
+}
 BRAKED = (
     *_EVEN,
     "forces={X: {u|u|: {value: -1960, unit: kg/m, source: made}},"
@@ -192,17 +198,25 @@ BRAKED = (
 
 @pytest.mark.parametrize(
     ("name", "overrides"),
-    [*LOSSLESS.items(), ("patrol_p06", BRAKED), ("wam_v_vrx", ()), ("milliampere", ())],
+    [
+        *LOSSLESS.items(),
+        ("patrol_p06", BRAKED),
+        ("wam_v_vrx", ()),
+        ("milliampere", ()),
+        ("bluerov2_heavy", ()),
+    ],
 )
 def test_energy_is_kept_without_damping_and_falls_with_it(
     name: str, overrides: tuple[str, ...]
 ) -> None:
-    """Kinetic energy and that of the restoring moment, as if the mass matrix were symmetric."""
-    plant = load_config(vessel_files()[name], list(overrides), VesselConfig).build().in_calm_water()
+    """Kinetic energy and that of weight and buoyancy, as if the mass matrix were symmetric."""
+    vessel = load_config(vessel_files()[name], list(overrides), VesselConfig)
+    plant = vessel.build().in_calm_water()
     assert isinstance(plant, HullPlant)
     n, random = plant.n, torch.Generator().manual_seed(3)
     x0 = torch.zeros(16, len(plant.state), dtype=torch.float64)
-    spread = torch.tensor([1.5, 0.6, 0.4] if n == 3 else [6.0, 1.0, 0.2, 0.05], dtype=torch.float64)
+    sizes = {3: [1.5, 0.6, 0.4], 4: [6.0, 1.0, 0.2, 0.05], 6: [0.5, 0.05, 0.05, 1.0, 0.2, 0.2]}
+    spread = torch.tensor(sizes[n], dtype=torch.float64)
     x0[:, n : 2 * n] = torch.randn(16, n, generator=random, dtype=torch.float64) * spread
     w = torch.zeros(16, 300, len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
@@ -211,7 +225,48 @@ def test_energy_is_kept_without_damping_and_falls_with_it(
     energy = 0.5 * torch.einsum("bti,ij,btj->bt", nu, mass, nu)
     if n == 4:
         energy = energy + 0.5 * 1025 * 9.81 * 355.88 * states[..., 2] ** 2
+    if isinstance(vessel, SubmergedConfig):
+        # tumbles too: the mean energy is lifted, so that shares of it mean something
+        phi, theta = states[..., 3], states[..., 4]
+        body, water = vessel.rigid_body, vessel.buoyancy
+        weight, lift = body.m.value * 9.81, water.density.value * 9.81 * water.volume.value
+        x, z = (weight * g.value - lift * b.value for g, b in (
+            (body.x_G, water.x_B), (body.z_G, water.z_B)
+        ))
+        depth = (weight - lift) * states[..., 2]
+        upright = torch.cos(theta) * torch.cos(phi)
+        energy = energy - depth + x * torch.sin(theta) - z * upright + abs(x) + abs(z) + 10.0
+        assert float(phi.abs().max()) > 0.2
     if overrides == LOSSLESS.get(name):
         assert float((energy / energy[:, :1] - 1).abs().max()) < 1e-7
     else:
         assert bool((energy.diff(dim=1) < 0).all())
+
+
+def test_the_torpedo_makes_its_published_speed() -> None:
+    """2.5 m/s at 1525 rpm (Fossen, PythonVehicleSimulator, remus100.py), within 5 %."""
+    plant = load_vessel("remus_100").build()
+    w = torch.zeros(1, 150, len(plant.inputs), dtype=torch.float64)
+    w[:, :, plant.inputs.index("cmd_n")] = 1525.0 / 60.0
+    x0 = plant.approach(1)
+    with torch.no_grad():
+        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.2))(x0, w, x0[:, :0])
+    assert float(states[0, -1, plant.state.index("u")]) == pytest.approx(2.5, rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["remus_100", "bluerov2_heavy"])
+def test_a_submerged_vessel_rights_itself_and_settles(name: str) -> None:
+    """Heeled and pitched at rest it comes back upright, and what is heavier than water sinks."""
+    plant = load_vessel(name).build()
+    x0 = torch.zeros(1, len(plant.state), dtype=torch.float64)
+    x0[0, 3], x0[0, 4] = 0.5, 0.4
+    w = torch.zeros(1, 900, len(plant.inputs), dtype=torch.float64)
+    with torch.no_grad():
+        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.1, 2))(x0, w, x0[:, :0])
+    last = states[0, -1]
+    assert float(last[3:5].abs().max()) < 0.05
+    # of 13.5 kg in 13.4 l of fresh water 1 N weighs down, against 33 N s/m and 190 N s^2/m^2
+    assert float(last[plant.state.index("w")]) == pytest.approx(
+        0.025 if name == "bluerov2_heavy" else 0.0, abs=0.003
+    )
+    torch.testing.assert_close(plant.hull.mass, plant.hull.mass.T)  # type: ignore[union-attr]

@@ -12,7 +12,7 @@ from residnet.api.values import PartGiven, PathGiven, described, hearing, part, 
 from residnet.core.arrays import paged
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import ROLL, Live
+from residnet.core.layout import SIX, Live
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback, report, say
@@ -372,9 +372,9 @@ def prepare(
 def _named_live(given: Any) -> Live:
     names = [given] if isinstance(given, str) else list(given)
     for name in names:
-        if name not in (known := ROLL.velocities):
+        if name not in (known := SIX.velocities):
             raise UsageError(f"prepare: velocities: no velocity '{name}'{nearest(name, known)}")
-    return Live(tuple(name for name in ROLL.velocities if name in names))
+    return Live(tuple(name for name in SIX.velocities if name in names))
 
 
 def _prepared(

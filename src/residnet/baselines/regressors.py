@@ -37,7 +37,7 @@ from residnet.regression.least_squares import LeastSquares
 
 _BEYOND = 0.5
 """Share of a channel's training range, on either side, in which a bounded model is as fitted."""
-RowTerms = dict[Literal["u", "v", "r", "p"], tuple[str, ...]]
+RowTerms = dict[Literal["u", "v", "r", "w", "p", "q"], tuple[str, ...]]
 Penalty = Annotated[float, Field(ge=0)]
 
 
@@ -307,7 +307,7 @@ class RegressorsConfig(IdentifiedConfig):
             tells a propeller that turns astern); `wind`; `polynomial_1`, `polynomial_2` (all
             products of velocities and inputs, the ridge models of document 001 section 2.2).
         terms: further regressors of every axis, or of each axis `u`, `v`, `r` (and `p` of a
-            roll); with neither sets nor terms: the constant and every channel.
+            roll, `w`, `p`, `q` of six); with neither sets nor terms: the constant and every channel.
         drive: channels that the sets take as thrust; empty: n, or tau_x where the model makes
             forces.
         steer: channels that the sets take as steering; empty: delta, or tau_n where the model makes

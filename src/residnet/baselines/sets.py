@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 from typing import Literal, NamedTuple
 
 from residnet.core.errors import ConfigError
@@ -16,7 +16,7 @@ SetName = Literal["linear", "fossen", "abkowitz", "astern", "wind", "polynomial_
 
 # thrusters act through forces where the model makes them; two fixed thrusters make no sway force
 _DRIVES = ("n", "tau_x")
-_STEERS = ("delta", "tau_n")
+_STEERS = ("delta", "delta_s", "tau_n")
 
 
 class Roles(NamedTuple):
@@ -79,13 +79,19 @@ class Roles(NamedTuple):
         return self
 
 
+def is_force(name: str) -> bool:
+    """Return whether a channel is a force that acts as it is: tau_x, or a thruster's thrust."""
+    return name in FORCE_CHANNELS or name.removeprefix("cmd_").startswith("thrust_")
+
+
 def _linear(roles: Roles) -> list[str]:
-    return ["1", *roles.moving, *roles.drives, *roles.steers, *roles.others]
+    moving = [name for name in roles.moving if name != "z"]
+    return ["1", *moving, *roles.drives, *roles.steers, *roles.others]
 
 
 def _thrust(drive: str) -> list[str]:
     """Return a force as it is, or the thrust of a propeller, which falls with the inflow."""
-    return [drive] if drive in FORCE_CHANNELS else [drive, f"{drive}|{drive}|", f"|{drive}| u"]
+    return [drive] if is_force(drive) else [drive, f"{drive}|{drive}|", f"|{drive}| u"]
 
 
 def _turning(steer: str, drives: Sequence[str]) -> list[str]:
@@ -116,10 +122,35 @@ def _fossen(roles: Roles) -> list[str]:
     (7)-(9)). Of a roll its damping, what speed does to damping and restoring, and a restoring that
     is not linear (document 004).
     """
+    if "q" in roles.moving:
+        return submerged(roles)
     hull = ["u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|"]
     if "p" in roles.moving:
         hull += ["u p", "p|p|", "u|u| phi", "phi^3"]
     return ["1", *roles.moving, *hull, *_controls(roles.known("fossen"))]
+
+
+VERTICAL = ("sin(theta)", "cos(theta) sin(phi)", "cos(theta) cos(phi)")
+"""The vertical along the body axes, which weight and buoyancy act along."""
+
+
+def submerged(roles: Roles) -> list[str]:
+    """Return the terms of any axis of a vessel in six degrees of freedom.
+
+    Linear and quadratic damping, all products of two velocities (Coriolis forces of mass and added
+    mass, lift), weight and buoyancy (Fossen 2021, sections 6.3, 6.4 and 4.1); forces as they are,
+    thrust and torque of propellers, lift and drag of fins.
+    """
+    velocities = [name for name in roles.moving if name not in ("z", "phi", "theta")]
+    pairs = [" ".join(pair) for pair in combinations(velocities, 2)]
+    turns = [f"{name}^2" for name in velocities if name in ("p", "q", "r")]
+    driving = (*roles.drives, *roles.others)
+    thrust = [
+        t for n in driving for t in ([n] if is_force(n) else [f"{n}|{n}|", f"|{n}| u"])
+    ]
+    fins = [f"u^2 {fin}{power}" for fin in roles.steers for power in ("", "^2")]
+    damping = [f"{name}|{name}|" for name in velocities]
+    return [*velocities, *damping, *pairs, *turns, *VERTICAL, *thrust, *fins]
 
 
 def _abkowitz(roles: Roles) -> list[str]:
@@ -179,7 +210,7 @@ def _polynomial(roles: Roles, degree: int) -> list[str]:
     return [
         "1",
         *polynomial_terms(
-            (*roles.moving, *roles.drives, *roles.steers, *roles.others, *wind), degree
+            (*(n for n in roles.moving if n != "z"), *roles.drives, *roles.steers, *roles.others, *wind), degree
         ),
     ]
 

@@ -17,6 +17,10 @@ _TITLES = {
     "r": "yaw rate r",
     "p": "roll rate p",
     "phi": "roll angle phi",
+    "w": "heave w",
+    "q": "pitch rate q",
+    "z": "depth z",
+    "theta": "pitch angle theta",
 }
 _COMMON = (-4, 6)
 """Powers of ten between which a number is written without an exponent."""

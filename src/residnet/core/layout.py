@@ -1,7 +1,8 @@
 """Which states and degrees of freedom a model has, and where they stand in its tensors.
 
 The columns below are those of the planar model, three degrees of freedom; no other module counts
-them. A model with roll keeps them, with p and phi behind. Functions serve code that TorchScript
+them. A model with roll keeps them, with p and phi behind; one of all six degrees of freedom has w,
+p, q and the depth z, roll and pitch there. Functions serve code that TorchScript
 compiles, which takes no global slices; n is the number of what moves (`Live.size`).
 """
 
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from residnet.core import names
 from residnet.core.errors import UsageError
+from residnet.core.frames import upright
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,10 @@ PLANAR = StateLayout(names.POSE, names.VELOCITY)
 """Three degrees of freedom: x, y, psi, u, v, r."""
 ROLL = StateLayout(names.POSE, (*names.VELOCITY, "p"), ("phi",))
 """Four degrees of freedom: x, y, psi, u, v, r, p, phi."""
-_RATES = {"phi": "p"}
-"""The velocity that is the rate of an angle."""
+SIX = StateLayout(names.POSE, (*names.VELOCITY, "w", "p", "q"), ("z", "phi", "theta"))
+"""Six degrees of freedom: x, y, psi, u, v, r, w, p, q, z, phi, theta. Rotations are composed."""
+_RATES = {"phi": "p", "theta": "q"}
+"""The velocity about whose axis an angle turns, and, where nothing else turns, its rate."""
 
 
 def _moves(angle: np.ndarray) -> bool:
@@ -104,15 +108,15 @@ _FEW = 50
 
 @dataclass(frozen=True)
 class Live:
-    """Which velocities a model moves: those of u, v and r that were recorded, and p of the roll.
+    """Which velocities a model moves: those of u, v and r that were recorded, p of the roll, or six.
 
     Of u, v and r the others are zero at all times: they have no equation, no term and no error. The
     pose is what the live ones lead to, a straight line from surge alone, a turn on the spot from
     yaw alone; so the time loop, exports and windows are those of the planar state. With p the
-    states are those of `ROLL`.
+    states are those of `ROLL`; with w, p and q, which need all others, those of `SIX`.
 
     Attributes:
-        velocities: names of those that live, of u, v, r and p.
+        velocities: names of those that live, of u, v, r, w, p and q.
     """
 
     velocities: tuple[str, ...] = PLANAR.velocities
@@ -122,12 +126,16 @@ class Live:
         """Return the velocities that channels of a log tell; u, v and r where they tell none.
 
         They are measured, or follow from a heading (r), from position and heading (all) or from a
-        roll angle that moves (p, which nothing tells without it).
+        roll angle that moves (p, which nothing tells without it). Depth, roll and pitch of which
+        depth and pitch move tell all six.
 
         Args:
             channels: by name, [T] each.
         """
-        held = {name for name in channels if name != "phi" or _moves(channels[name])}
+        angles = ("phi", "theta", "z")
+        held = {name for name in channels if name not in angles or _moves(channels[name])}
+        if held >= {"theta", "z", "psi"} and channels.keys() >= {*SIX.velocities, "phi"}:
+            return cls(SIX.velocities)
         held |= set(PLANAR.velocities) if held.issuperset(PLANAR.pose) else set()
         held |= {"r"} if "psi" in held else set()
         found = [name for name in PLANAR.velocities if name in held] or [*PLANAR.velocities]
@@ -137,6 +145,8 @@ class Live:
     def shared(cls, told: Iterable[Live]) -> Live:
         """Return the velocities that each of several tells; u, v and r where they share none."""
         sets = [one.velocities for one in told]
+        if sets and all(one == SIX.velocities for one in sets):
+            return cls(SIX.velocities)
         found = [name for name in ROLL.velocities if all(name in one for one in sets)]
         planar = any(name in PLANAR.velocities for name in found)
         return cls(tuple(found) if planar else PLANAR.velocities)
@@ -144,6 +154,8 @@ class Live:
     @property
     def layout(self) -> StateLayout:
         """The states of the model."""
+        if "w" in self.velocities or "q" in self.velocities:
+            return SIX
         return ROLL if "p" in self.velocities else PLANAR
 
     @property
@@ -174,7 +186,17 @@ class Live:
     @property
     def rolls(self) -> bool:
         """Whether the vessel rolls."""
-        return self.layout is ROLL
+        return self.layout is not PLANAR
+
+    @property
+    def spatial(self) -> bool:
+        """Whether it moves in all six degrees of freedom, so that its rotations are composed."""
+        return self.layout is SIX
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of what moves and drives nothing: dead velocities, and the depth."""
+        return (*self.dead, *(("z",) if self.spatial else ()))
 
     @property
     def whole(self) -> bool:
@@ -219,6 +241,8 @@ class Live:
     @property
     def text(self) -> str:
         """What follows from the velocities not being u, v and r, for a reader; empty for these."""
+        if self.spatial:
+            return "all six degrees of freedom, with depth, roll and pitch"
         if self.whole:
             return "surge, sway, yaw and roll, with the roll angle" if self.rolls else ""
         text = f"the logs tell {' and '.join(self.velocities)} alone, and"
@@ -229,12 +253,25 @@ class Live:
             return f"{text}: positions are the distance run on a straight line"
         return f"{text}: the vessel moves over ground where it points, without drift"
 
+    def require_on_surface(self, who: str) -> None:
+        """Check that the vessel does not dive, for what knows no depth and pitch.
+
+        Raises:
+            UsageError: where it does.
+        """
+        if self.spatial:
+            raise UsageError(
+                f"{who} knows no depth and pitch, but the model moves"
+                f" {', '.join(self.velocities)}; fit one of signals.velocities: [u, v, r] for it"
+            )
+
     def require_no_roll(self, who: str) -> None:
         """Check that the vessel does not roll, for what knows no roll.
 
         Raises:
             UsageError: where it does.
         """
+        self.require_on_surface(who)
         if self.rolls:
             raise UsageError(
                 f"{who} knows no roll, but the model moves {', '.join(self.velocities)}; fit one"
@@ -257,7 +294,8 @@ class Live:
         """Return K [n, n] with nu K the rates of the angles, from what moves nu [..., n]."""
         out = torch.zeros(self.size, self.size, dtype=torch.float64)
         for angle in self.layout.attitude:
-            out[self.moving.index(_RATES[angle]), self.moving.index(angle)] = 1.0
+            if angle in _RATES:
+                out[self.moving.index(_RATES[angle]), self.moving.index(angle)] = 1.0
         return out
 
 
@@ -349,18 +387,42 @@ def roll_angle(x: Tensor) -> Tensor:
 
 
 def turning(nu: Tensor, n: int = 3) -> Tensor:
-    """Return the rate of the heading [..., 1] in rad/s from what moves [..., n]."""
+    """Return the rate of the heading [..., 1] in rad/s from what moves on the surface [..., n]."""
     r = nu[..., 2:3]
-    return r if n == 3 else r * torch.cos(nu[..., 4:5])
+    return r * torch.cos(nu[..., 4:5]) if n == 5 else r
+
+
+ATTITUDE = tuple(map(SIX.names.index, ("phi", "theta", "psi")))
+"""Columns of states of six degrees of freedom, those of an attitude."""
+
+
+def tilted(nu: Tensor) -> list[Tensor]:
+    """Return the velocity forward, to starboard and down [...] of what moves in six [..., 9]."""
+    return upright(nu[..., 0], nu[..., 1], nu[..., 3], nu[..., 7], nu[..., 8])
+
+
+def sinking(nu_dot: Tensor, nu: Tensor) -> Tensor:
+    """Return rates [..., 9] of what moves in six [..., 9] with that of the depth."""
+    down = tilted(nu)[2].unsqueeze(-1)
+    return torch.cat((nu_dot[..., :6], down, nu_dot[..., 7:]), dim=-1)
+
+
+_STEEP = 1e-3
+"""Least cosine of the pitch by which the rate of a heading is divided."""
 
 
 def levelled(nu: np.ndarray) -> np.ndarray:
     """Return what moves a pose [..., 3], u, v cos phi and r cos phi, from what moves [..., n].
 
-    Source: document 004, without heave and pitch.
+    Source: document 004, without heave and pitch; Fossen 2021, eq. (2.41) with them.
     """
     if nu.shape[-1] == PLANAR.dof:
         return nu
+    if nu.shape[-1] == len(SIX.moving):
+        ahead, across, _ = (part.numpy() for part in tilted(torch.from_numpy(np.array(nu))))
+        r, q, phi, theta = (nu[..., SIX.moving.index(name)] for name in ("r", "q", "phi", "theta"))
+        flat = np.maximum(np.cos(theta), _STEEP)
+        return np.stack((ahead, across, (q * np.sin(phi) + r * np.cos(phi)) / flat), axis=-1)
     level = np.cos(nu[..., ROLL.moving.index("phi")])
     return np.stack((nu[..., 0], nu[..., 1] * level, nu[..., 2] * level), axis=-1)
 

@@ -27,7 +27,7 @@ _GLANCE = 3.0
 _BEYOND = 0.9
 _FEWEST = 20
 """Samples below which a channel has no usual change; chosen by hand."""
-_MOVED = ("x", "y", "psi", "phi", "u", "v", "r", "p")
+_MOVED = ("x", "y", "psi", "phi", "u", "v", "r", "p", "w", "q", "z", "theta")
 
 
 def noise_of(values: np.ndarray) -> float:

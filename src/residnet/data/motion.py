@@ -84,7 +84,15 @@ def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
         DataError: where these hold hardly a value.
     """
     log = _turning(log if live.whole else _still(log, live))
-    log = _rolling(log) if live.rolls else log
+    log = _rolling(log) if live.rolls and not live.spatial else log
+    if live.spatial:
+        held = [name for name in live.states if name in log.channels and _dense(log[name])]
+        if lost := [name for name in live.states if name not in (*STATE, *held)]:
+            raise UsageError(
+                f"log {log.name}: {', '.join(lost)} {'are' if len(lost) > 1 else 'is'} not measured"
+                " at every sample, which a model of six degrees of freedom needs; name the"
+                " columns, or let it move on the surface alone (signals.velocities: [u, v, r])"
+            )
     told = without_held(log)
     lacking = [name for name in STATE if name not in log.channels]
     made = {name for name in STATE if name in lacking or not _dense(told[name])}

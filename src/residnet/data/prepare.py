@@ -13,7 +13,7 @@ from pydantic import Field
 from residnet.core.arrays import paged
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import ALIVE, POSE, Live
+from residnet.core.layout import ALIVE, POSE, Live, sinking
 from residnet.core.log import Log
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretch_numbers
@@ -153,7 +153,10 @@ def prepare(
     smooth = np.concatenate((y[:, POSE], np.where(valid[:, None], smooth_nu, nu)), axis=1)
     if live.rolls:
         # the rate of an angle is what its velocity says
-        known = smooth[:, live.columns] @ live.known_rates().numpy()
+        nu = smooth[:, live.columns]
+        known = nu @ live.known_rates().numpy()
+        if live.spatial:
+            known = sinking(torch.from_numpy(known), torch.from_numpy(nu)).numpy()
         nu_dot = np.where(live.mask().numpy() > 0.0, nu_dot, known)
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
     held = _means(w, piece) if config.hold == "mean" else w

@@ -16,7 +16,7 @@ from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.physics.plant import ROLLING, Plant
+from residnet.physics.plant import ROLLING, SUBMERGED, Plant
 from residnet.physics.symmetry import live_of
 
 _RATES = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
@@ -64,7 +64,7 @@ class PlantActuators(Actuators):
         super().__init__()
         self.plant = plant
         self.inputs, self.commands = plant.inputs, plant.commands
-        self.columns = [i for i, name in enumerate(plant.state) if name not in ROLLING.names]
+        self.columns = [i for i, name in enumerate(plant.state) if name not in (*ROLLING.names, *SUBMERGED.names)]
         self.state = tuple(plant.state[i] for i in self.columns)
         self.dynamics = TracedPlantDynamics(plant, dt, substeps) if self.columns else None
 

@@ -19,7 +19,16 @@ from torch import Tensor, nn
 from residnet.baselines.base import Baseline
 from residnet.core.config import Config, Seconds
 from residnet.core.frames import to_body, to_earth
-from residnet.core.layout import ALIVE, Live, heading, pose, turning, velocities
+from residnet.core.layout import (
+    ALIVE,
+    ATTITUDE,
+    Live,
+    heading,
+    pose,
+    sinking,
+    turning,
+    velocities,
+)
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals
@@ -130,7 +139,8 @@ class HybridDynamics(Dynamics):
         live = live_of(signals.names)
         self.dof = live.size
         self.whole, self.free = live.whole, len(live.learned) == live.size
-        self.rolls = live.rolls
+        self.rolls, self.level = live.rolls, not live.rolls
+        self.turn_about(ATTITUDE if live.spatial else ())
         for name, value in {
             "live": live.mask(),
             "living": live.alive(),
@@ -167,12 +177,22 @@ class HybridDynamics(Dynamics):
         if self.free:
             return nu_dot
         nu_dot = nu_dot * self.live.to(nu_dot.dtype)
-        return nu_dot + nu @ self.known_rates.to(nu.dtype) if self.rolls else nu_dot
+        if self.rolls:
+            nu_dot = nu_dot + nu @ self.known_rates.to(nu.dtype)
+        return sinking(nu_dot, nu) if self.spatial else nu_dot
 
     def angled(self, x: Tensor, after: Tensor) -> Tensor:
         """Return states [B, 3 + n] whose angles moved with the new velocities."""
         if not self.rolls:
             return after
+        if self.spatial:
+            # pose, depth and attitude move from where they were, by the new velocities
+            nu = velocities(after, self.dof)
+            nu = torch.where(self.live.to(x.dtype) > 0.0, nu, velocities(x, self.dof))
+            rate = sinking(nu @ self.known_rates.to(nu.dtype), nu)
+            held = torch.cat((pose(x), nu), dim=-1)
+            moved = torch.cat((self.kinematics(held), rate), dim=-1)
+            return self.moved_on(held, self.dt * moved)
         nu = self.turned(velocities(x, self.dof), velocities(after, self.dof))
         return torch.cat((pose(after), nu), dim=-1)
 
@@ -225,7 +245,7 @@ class HybridDynamics(Dynamics):
             p: what `signals.prepare` returned for the step's inputs.
             rho: residual of the step [B, n].
         """
-        if self.positions or self.signals.wind:
+        if self.positions or self.signals.wind or self.spatial:
             nu_dot = self.found(self.baseline(z), rho, velocities(x, self.dof))
             return self.integrate_from(torch.cat((self.kinematics(x), nu_dot), dim=-1), x, p, rho)
         row, held = self.baseline.ahead(p)
@@ -261,7 +281,7 @@ class HybridDynamics(Dynamics):
         """Return what a stretch of steps needs that no state decides; see `Dynamics.ahead`."""
         p = self.signals.prepare(w)
         rows: list[list[Tensor]] = []
-        if self.positions or self.signals.wind:
+        if self.positions or self.signals.wind or self.spatial:
             for row in p.unbind(1):
                 rows.append([row, row])
             return rows, [[], [], []]
@@ -271,7 +291,7 @@ class HybridDynamics(Dynamics):
         for k in range(len(ones)):
             rows.append([ones[k], others[k]])
         steps: list[Tensor] = []
-        if self.baseline.linear and not self.rolls:
+        if self.baseline.linear and self.level:
             # a step is linear in states, row and residual: what it does to the unit of each
             unit = torch.eye(12, dtype=w.dtype, device=w.device)
             x, row, rho = unit.split([6, 3, 3], dim=-1)
@@ -282,7 +302,7 @@ class HybridDynamics(Dynamics):
         self, x: Tensor, row: list[Tensor], shared: list[list[Tensor]], s: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the state and the memory one step later, by what `ahead` found."""
-        if self.positions or self.signals.wind:
+        if self.positions or self.signals.wind or self.spatial:
             return self.stepped(x, row[0], s)
         x = self.alive(x)
         nu = velocities(x, self.dof)
@@ -294,7 +314,7 @@ class HybridDynamics(Dynamics):
             seen = torch.cat((nu, unknown), dim=-1) if self.shown else nu
             rho, own = self.head.at(seen, row[1], s[:, : self.width], shared[1])
             rho = rho if self.shown else rho + unknown
-        if self.baseline.linear and not self.rolls:
+        if self.baseline.linear and self.level:
             after = torch.cat((x, row[0], rho), dim=-1) @ shared[2][0]
         else:
             after = self.moved(x, row[0], shared[0], rho)

@@ -20,7 +20,7 @@ from residnet.baselines import BaselineConfig
 from residnet.core.config import Config, validate
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.files import read_json, whole
-from residnet.core.layout import PLANAR, ROLL
+from residnet.core.layout import PLANAR, ROLL, SIX
 from residnet.core.names import nearest
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
@@ -44,6 +44,10 @@ class BandTable(Config):
         position: radius about the predicted position in m.
         p: half widths in rad/s, where the model rolls.
         phi: half widths in rad, where it does.
+        w: half widths in m/s, of all six degrees of freedom.
+        q: half widths in rad/s, of these.
+        z: half widths in m, of these.
+        theta: half widths in rad, of these.
         logs: number of logs that calibrated them.
         cautions: whole sentences about what they do not promise.
     """
@@ -57,6 +61,10 @@ class BandTable(Config):
     position: tuple[float, ...]
     p: tuple[float, ...] | None = None
     phi: tuple[float, ...] | None = None
+    w: tuple[float, ...] | None = None
+    q: tuple[float, ...] | None = None
+    z: tuple[float, ...] | None = None
+    theta: tuple[float, ...] | None = None
     logs: int = Field(ge=1)
     cautions: tuple[str, ...] = ()
 
@@ -69,6 +77,8 @@ class BandTable(Config):
     @property
     def channels(self) -> tuple[str, ...]:
         """What has half widths."""
+        if self.z is not None:
+            return SIX.banded
         return PLANAR.banded if self.p is None and self.phi is None else ROLL.banded
 
     @property
@@ -171,6 +181,10 @@ class ModelSpec(Stored):
         if self.role == "zero":
             # all is held, angles too
             model.known_rates.zero_()
+            if live.spatial:
+                # it goes on over the ground, level
+                model.rolls = False
+                model.turn_about(())
         return model
 
     @property

@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.layout import (
+    ATTITUDE,
     PLANAR,
     POSITION,
     actuators,
@@ -69,11 +70,16 @@ class GuardedDynamics(Dynamics):
         self.largest = _LARGEST
         self.n_state = model.n_state
         self.dof, self.rolls = model.dof, model.rolls
+        self.turn_about(ATTITUDE if model.spatial else ())
         low, high, reach = (
             torch.tensor(part, dtype=torch.float64) for part in (spec.low, spec.high, _reach(spec))
         )
         far = torch.full((len(PLANAR.pose),), _FARTHEST, dtype=torch.float64)
         far[POSITION.stop :] = _TURNS
+        if model.spatial:
+            # no training range bounds the depth
+            depth = spec.signals.live.moving.index("z")
+            low[depth], high[depth], reach[depth] = -_FARTHEST, _FARTHEST, 0.0
         first, last = model.memory_range()
         for name, value in {
             "low": torch.cat((-far, low)),

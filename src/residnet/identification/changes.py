@@ -69,6 +69,7 @@ class Change:
 
 def causes(signals: SignalsConfig) -> list[Change]:
     """Return the changes that a monitor looks for, given the inputs of a model."""
+    signals.live.require_on_surface("the monitor")
     units = signals.units()
     out = [Change("mass", "the vessel has become heavier", "share", 0.02, heavier=0.02)]
     live = signals.live

@@ -273,6 +273,7 @@ def plan(
         DataError: where no candidate stays within the limits, or nothing is open.
     """
     spec, model = fitted.spec, fitted.model.double()
+    spec.signals.live.require_on_surface("the plan of a trial")
     horizon = round(refit.horizon / spec.dt)
     divisor, offered = torch.from_numpy(scales), candidates(limits, spec.signals.live)
     flown = [

@@ -12,6 +12,7 @@ import torch
 
 from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
+from residnet.baselines.sets import Roles, submerged
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
@@ -174,7 +175,8 @@ _MANY = 3
 def linear_terms(facts: Facts) -> list[str]:
     """Return the terms of a model that is linear in velocities, inputs and wind."""
     wind = ["wind_u", "wind_v"] if facts.wind else []
-    return ["1", *live_of(facts.names).moving, *facts.inputs, *wind]
+    moving = [name for name in live_of(facts.names).moving if name != "z"]
+    return ["1", *moving, *facts.inputs, *wind]
 
 
 def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
@@ -221,6 +223,8 @@ def _terms(facts: Facts) -> list[str]:
     """Return the terms of all axes together."""
     forces, turning, driving = _acting_terms(facts)
     moving = live_of(facts.names).moving
+    if live_of(facts.names).spatial:
+        return submerged(Roles(moving, (*forces, *driving), tuple(turning), (), False))
     return [
         *("1", *moving, *_HULL, *(_ROLL if "p" in moving else ()), *forces),
         *(term for name in driving for term in _propeller(name, name in facts.astern)),

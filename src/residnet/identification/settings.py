@@ -156,6 +156,11 @@ class FitSettings(Parts):
                 "current: currents are told by u, v and r beside a position; leave `current` out of"
                 f" a model of {', '.join(self.signals.velocities)}"
             )
+        if self.signals.live.spatial and self.forces:
+            raise ValueError(
+                "forces: an unknown force is estimated in the horizontal plane; leave it out"
+                " of a model of six degrees of freedom"
+            )
         given, wanted = tuple(self.evaluation.scales.named()), self.signals.live.channels
         if given != wanted:
             raise ValueError(

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from residnet.core.frames import wrap_array
-from residnet.core.layout import ALIVE, HEADING, POSE, POSITION, Live, levelled
+from residnet.core.frames import turn_between, wrap_array
+from residnet.core.layout import ALIVE, ATTITUDE, HEADING, POSE, POSITION, Live, levelled
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.free_runs import compiled
@@ -99,12 +99,15 @@ class Errors:
         usable: which samples are [N].
         counts: samples of each window [W].
         live: velocities that the logs tell; others are zero, and no error counts.
+        attitude_end: angle of the rotation between the attitudes at the end of each window [W];
+            None on the surface.
     """
 
     error: np.ndarray
     usable: np.ndarray
     counts: np.ndarray
     live: Live = ALIVE
+    attitude_end: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -116,11 +119,19 @@ class Errors:
         error = np.concatenate([one.states - log.y[part] for one, (log, part) in pairs])
         # a turn too many is no error of where the vessel points
         error[:, HEADING] = wrap_array(error[:, HEADING])
+        live, ends = logs[windows[0].log].live, None
+        if live.spatial:
+            roll = live.states.index("phi")
+            error[:, roll] = wrap_array(error[:, roll])
+            last = [(one.states[-1], log.y[part][-1]) for one, (log, part) in zip(predictions, rows)]
+            found, wanted = (np.stack(side)[:, ATTITUDE] for side in zip(*last, strict=True))
+            ends = turn_between(found, wanted)
         return cls(
             error,
             np.concatenate([log.usable[part] for log, part in rows]),
             np.array([window.stop - window.start for window in windows]),
-            logs[windows[0].log].live,
+            live,
+            ends,
         )
 
     def nrmse(self, scales: np.ndarray) -> np.ndarray:
@@ -175,6 +186,12 @@ class Errors:
         return np.asarray(np.abs(self.error[self.begins + self.counts - 1, HEADING]))
 
     @property
+    def depth_end(self) -> np.ndarray:
+        """Absolute error of the depth at the end of each window [W]."""
+        last = self.begins + self.counts - 1
+        return np.asarray(np.abs(self.error[last, self.live.states.index("z")]))
+
+    @property
     def samples(self) -> np.ndarray:
         """Usable samples of each window [W]."""
         return np.asarray(np.add.reduceat(self.usable.astype(int), self.begins))
@@ -209,7 +226,8 @@ def free_run(
         out[mean.name] = []
         for i, each in enumerate(beside):
             states = [one.states for one in each]
-            nu = np.mean(states, axis=0)[:, logs[0].live.columns]
+            nu = np.mean(states, axis=0)
+            nu = nu if logs[0].live.spatial else nu[:, logs[0].live.columns]
             own = next(found) if i in alone else _prediction(windows[i], nu, logs, step, limit)
             out[mean.name].append(replace(own, spread=spread_of(states)))
     return {candidate.name: out[candidate.name] for candidate in candidates}
@@ -235,11 +253,12 @@ def _run(
     tables = {n: _inputs(candidate, logs[n]) for n in {window.log for window in windows}}
     # a copy: a validation in float32 must not round the model that it validates
     model = copy.deepcopy(candidate.model).to("cpu", dtype).eval()
-    # the pose is integrated from the velocities below
-    model.positions = False
+    # the pose is integrated from the velocities below, or composed of rotations by the model
+    model.positions = model.spatial
     live = logs[0].live
     names = candidate.state or live.states
-    columns = [names.index(name) for name in live.moving]
+    wanted = live.states if model.spatial else live.moving
+    columns = [names.index(name) for name in wanted]
     out: dict[int, Prediction] = {}
     width = len(names) + sum(table.shape[1] for table in list(tables.values())[:1])
     for rows in _batches(windows, width):
@@ -306,10 +325,12 @@ def _simulated(
 
 
 def _prediction(
-    window: Window, nu: np.ndarray, logs: Sequence[Prepared], step: float, limit: np.ndarray
+    window: Window, run: np.ndarray, logs: Sequence[Prepared], step: float, limit: np.ndarray
 ) -> Prediction:
-    """Return what moves [L, n] with its pose, or that of `zero` where it ran away."""
+    """Return states [L, 3 + n] or what moves [L, n] with its pose; those of `zero` if it ran away.
+    """
     log, rows = logs[window.log], slice(window.start, window.stop)
+    nu = run[:, -log.live.size :]
     recorded = np.abs(log.y[rows, log.live.columns][log.usable[rows]])
     # short training logs may hold far less than the window, and then it is the vessel that exceeds
     own = _OWN * recorded.max(0, initial=0.0)
@@ -317,6 +338,8 @@ def _prediction(
     bad = not np.isfinite(nu).all() or bool((np.abs(nu) > limit).any())
     if bad:
         nu = np.tile(window.nu, (len(nu), 1))
+    if not bad and nu.shape != run.shape:
+        return Prediction(run, bad)
     pose = integrate(logs[window.log].y[window.start, POSE], nu, step)
     return Prediction(np.concatenate((pose, nu), axis=1), bad)
 

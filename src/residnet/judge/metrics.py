@@ -274,9 +274,9 @@ class Judged:
 
     def _summary(self, name: str, chosen: np.ndarray) -> dict[str, Any]:
         found, drawn = self.found[name], blocks(self.numbers[chosen])
-        by_window = np.column_stack(
-            (found.rmse, self.nrmse[name], found.position_end, found.heading_end)
-        )[chosen]
+        ends = [found.position_end, found.heading_end]
+        ends += [] if found.attitude_end is None else [found.attitude_end, found.depth_end]
+        by_window = np.column_stack((found.rmse, self.nrmse[name], *ends))[chosen]
         live = self.live
         rmse, mae = by_window[:, : live.size].mean(0), found.mae[chosen].mean(0)
         nrmse = rmse / self.scale
@@ -313,7 +313,8 @@ class Judged:
         They stand behind the errors of what moves and their mean.
         """
         live, first = self.live, self.live.size + 1
-        return [(first, "position")] * live.moves + [(first + 1, "heading")] * live.turns
+        plane = [(first, "position")] * live.moves + [(first + 1, "heading")] * live.turns
+        return plane + [(first + 2, "attitude"), (first + 3, "depth")] * live.spatial
 
     def limits(self, step: float) -> dict[str, Any]:
         """Return the part of limits.json for one protocol and split; `step` of the grid in s."""
@@ -353,7 +354,11 @@ class Judged:
                 continue
             numbers = self.numbers[there]
 
-            names = [(column - self.live.size - 1, name) for column, name in self._ends]
+            names = [
+                (column - self.live.size - 1, name)
+                for column, name in self._ends
+                if name in ("position", "heading")
+            ]
 
             def off(
                 errors: Mapping[str, np.ndarray],

@@ -9,9 +9,16 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
+from residnet.core.config import (
+    Config,
+    Metres,
+    MetresPerSecond,
+    Radians,
+    RadiansPerSecond,
+    Seconds,
+)
 from residnet.core.errors import DataError
-from residnet.core.layout import PLANAR, ROLL
+from residnet.core.layout import PLANAR, ROLL, SIX
 from residnet.core.names import nearest
 from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
@@ -186,6 +193,10 @@ class Scales(Config):
         r: of the yaw rate in rad/s.
         p: of the roll rate in rad/s, for models that roll.
         phi: of the roll angle in rad, with p.
+        w: of the heave velocity in m/s, for models of six degrees of freedom.
+        q: of the pitch rate in rad/s, for these.
+        z: of the depth in m, for these.
+        theta: of the pitch angle in rad, for these.
     """
 
     u: Annotated[MetresPerSecond, Field(gt=0)] | None = None
@@ -193,15 +204,19 @@ class Scales(Config):
     r: Annotated[RadiansPerSecond, Field(gt=0)] | None = None
     p: Annotated[RadiansPerSecond, Field(gt=0)] | None = None
     phi: Annotated[Radians, Field(gt=0)] | None = None
+    w: Annotated[MetresPerSecond, Field(gt=0)] | None = None
+    q: Annotated[RadiansPerSecond, Field(gt=0)] | None = None
+    z: Annotated[Metres, Field(gt=0)] | None = None
+    theta: Annotated[Radians, Field(gt=0)] | None = None
 
     def array(self) -> np.ndarray:
         """Return the scales of what moves as one array [n], SI; 1 without a scale."""
-        layout = PLANAR if self.p is None else ROLL
+        layout = SIX if self.w is not None else PLANAR if self.p is None else ROLL
         return np.array([self.named().get(name, 1.0) for name in layout.moving])
 
     def named(self) -> dict[str, float]:
         """Return the scales by the name of what moves."""
-        found = {name: getattr(self, name) for name in ROLL.moving}
+        found = {name: getattr(self, name) for name in SIX.moving}
         return {name: float(value) for name, value in found.items() if value is not None}
 
 

@@ -9,6 +9,7 @@ from residnet.core.registry import Kinds
 if TYPE_CHECKING:
     from residnet.manoeuvres.base import Manoeuvre
     from residnet.manoeuvres.closed_loop import TurningCircleFamily, ZigzagFamily
+    from residnet.manoeuvres.diving import DepthStepFamily, HelixFamily, VerticalZigzagFamily
     from residnet.manoeuvres.open_loop import (
         AccelerationDecelerationFamily,
         ConstantFamily,
@@ -26,10 +27,13 @@ if TYPE_CHECKING:
         | ThreeTwoOneOneFamily
         | RandomStepsFamily
         | MultiSineFamily
+        | HelixFamily
+        | VerticalZigzagFamily
+        | DepthStepFamily
     )
 else:
-    _OPEN, _CLOSED, _COURSES = (
-        f"residnet.manoeuvres.{name}" for name in ("open_loop", "closed_loop", "courses")
+    _OPEN, _CLOSED, _COURSES, _DIVING = (
+        f"residnet.manoeuvres.{name}" for name in ("open_loop", "closed_loop", "courses", "diving")
     )
     ManoeuvreConfig = Annotated[
         Any,
@@ -44,6 +48,9 @@ else:
                 "three_two_one_one": f"{_OPEN}:ThreeTwoOneOne",
                 "random_steps": f"{_OPEN}:RandomSteps",
                 "multi_sine": f"{_OPEN}:MultiSine",
+                "helix": f"{_DIVING}:Helix",
+                "vertical_zigzag": f"{_DIVING}:VerticalZigzag",
+                "depth_step": f"{_DIVING}:DepthStep",
                 "spiral": f"{_CLOSED}:Spiral",
                 "stopping": f"{_CLOSED}:Stopping",
                 "waypoints": f"{_COURSES}:Waypoints",
@@ -65,6 +72,9 @@ else:
                 "three_two_one_one": f"{_OPEN}:ThreeTwoOneOneFamily",
                 "random_steps": f"{_OPEN}:RandomStepsFamily",
                 "multi_sine": f"{_OPEN}:MultiSineFamily",
+                "helix": f"{_DIVING}:HelixFamily",
+                "vertical_zigzag": f"{_DIVING}:VerticalZigzagFamily",
+                "depth_step": f"{_DIVING}:DepthStepFamily",
             },
         ),
     ]

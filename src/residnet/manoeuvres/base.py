@@ -46,6 +46,7 @@ class Helm:
             vessel that cannot make all three.
         side_force: largest commanded sway force in N; None for a vessel whose commands are no
             forces.
+        diving: commands [c] that make the vessel dive with all its force; None where it cannot.
     """
 
     demand: Demand
@@ -53,6 +54,23 @@ class Helm:
     inputs: tuple[str, ...] = ()
     forces: Callable[[Tensor], Tensor] | None = None
     side_force: float | None = None
+    diving: Tensor | None = None
+
+    def commanded(self, drive: Tensor, steer: Tensor, *dive: Tensor) -> Tensor:
+        """Return the commands [..., c] for shares of drive and steer, and of diving if any [...].
+
+        Raises:
+            UsageError: where the vessel cannot dive.
+        """
+        commands = self.demand(drive, steer)
+        for share in dive:
+            if self.diving is None:
+                raise UsageError(
+                    "the manoeuvre dives, and the vessel does not; give a vessel with all six"
+                    " degrees of freedom, or a manoeuvre without dive"
+                )
+            commands = commands + share.unsqueeze(-1) * self.diving.to(commands.dtype)
+        return commands
 
     @classmethod
     def from_plant(cls, plant: Plant) -> Helm:
@@ -65,7 +83,7 @@ class Helm:
             forces = torch.Tensor.clone
         elif isinstance(plant, HullPlant) and isinstance(plant.actuators, ForceActuators):
             forces = plant.actuators.allocate
-        return cls(plant.demand, plant.state, plant.inputs, forces, side_force)
+        return cls(plant.demand, plant.state, plant.inputs, forces, side_force, plant.diving)
 
     def column(self, name: str) -> int:
         """Return the column of a state.
@@ -97,11 +115,12 @@ def commanded(command: Tensor, w: Tensor) -> Tensor:
 
 @final
 class ScheduleSource(Source):
-    """Open-loop demands [B, T] given in advance."""
+    """Open-loop commands given in advance."""
 
-    def __init__(self, drive: Tensor, steer: Tensor, demand: Demand) -> None:
+    def __init__(self, commands: Tensor) -> None:
+        """From the commands [B, T, c]."""
         super().__init__()
-        self.commands = demand(drive, steer)
+        self.commands = commands
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         return commanded(self.commands[:, k].to(w.dtype), w), memory
@@ -129,7 +148,7 @@ class LawSource(Source):
         }
         self.numbers["dt"] = t[1] - t[0]
         self.columns = {name: helm.column(name) for name in self.kind.watches}
-        self.demand = helm.demand
+        self.commands = helm.commanded
         self.times = t.tolist()
         self.may_stop = any(manoeuvre.goal is not None for manoeuvre in manoeuvres)
 
@@ -139,8 +158,8 @@ class LawSource(Source):
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m]; what the motion says is tested at the start of the step."""
         seen, numbers = self._seen(x)
-        drive, steer, memory = self.kind.law(seen, numbers, self.times[k], memory)
-        return commanded(self.demand(drive, steer), w), memory
+        *demands, memory = self.kind.law(seen, numbers, self.times[k], memory)
+        return commanded(self.commands(*demands), w), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return the rows [B] whose manoeuvre has come to its end."""
@@ -291,17 +310,15 @@ class Scheduled(Manoeuvre):
     """An open-loop manoeuvre: its demands are known in advance."""
 
     @abstractmethod
-    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Return drive and steer [T] at times t [T] in s."""
+    def demands(self, t: Tensor) -> tuple[Tensor, ...]:
+        """Return drive and steer, and dive where it dives, [T] at times t [T] in s."""
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         pairs = [
             manoeuvre.demands(t) for manoeuvre in manoeuvres if isinstance(manoeuvre, Scheduled)
         ]
-        return ScheduleSource(
-            torch.stack([d for d, _ in pairs]), torch.stack([s for _, s in pairs]), helm.demand
-        )
+        return ScheduleSource(helm.commanded(*map(torch.stack, zip(*pairs, strict=True))))
 
 
 class ClosedLoop(Manoeuvre):
@@ -326,8 +343,11 @@ class ClosedLoop(Manoeuvre):
     @abstractmethod
     def law(
         cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return drive [B], steer [B] and the memory [B, k] for the step that begins at `time`."""
+    ) -> tuple[Tensor, ...]:
+        """Return drive [B], steer [B] and the memory [B, k] for the step that begins at `time`.
+
+        Before the memory stands dive [B] where it dives.
+        """
 
     @classmethod
     def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:

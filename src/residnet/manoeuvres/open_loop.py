@@ -182,7 +182,7 @@ def _ordered(band: tuple[float, float]) -> tuple[float, float]:
 
 Band = Annotated[tuple[Hertz, Hertz], AfterValidator(_ordered)]
 """Lowest and highest frequency."""
-_DRIVE, _STEER, _SWAY = range(3)
+_DRIVE, _STEER, _SWAY, _DIVE, _OWN = range(5)
 
 
 class Excitation(Scheduled, ABC):
@@ -194,6 +194,9 @@ class Excitation(Scheduled, ABC):
         steer_amplitude: how far the steer goes to either side of zero.
         sway_amplitude: how far the sway force goes to either side of zero, in shares of the
             largest; for vessels whose commands are forces.
+        dive_amplitude: how far the dive goes to either side of zero; for vessels that dive.
+        own_amplitude: how far each command moves by itself, in shares of full steer: what tells one
+            of several thrusters from the others.
         band: frequencies that the demands excite.
         seed: of everything random.
         start: when they begin; before, the drive is held and the steer is zero.
@@ -204,6 +207,8 @@ class Excitation(Scheduled, ABC):
     drive_amplitude: float = Field(default=0.0, ge=0, le=2)
     steer_amplitude: float = Field(default=0.0, ge=0, le=1)
     sway_amplitude: float = Field(default=0.0, ge=0, le=1)
+    dive_amplitude: float = Field(default=0.0, ge=0, le=1)
+    own_amplitude: float = Field(default=0.0, ge=0, le=1)
     band: Band
     seed: int = Field(default=0, ge=0)
     start: Seconds = Field(default=5.0, ge=0)
@@ -228,23 +233,26 @@ class Excitation(Scheduled, ABC):
             UsageError: where a sway force is asked of a vessel whose commands are no forces.
         """
         own = [manoeuvre for manoeuvre in manoeuvres if isinstance(manoeuvre, Excitation)]
-        sway = torch.stack([m.sway_amplitude * m._after_start(t, _SWAY) for m in own])
-        if not bool(sway.any()):
-            return super().source(manoeuvres, helm, t)
-        limit = helm.side_force
-        if limit is None or "tau_y" not in helm.inputs:
-            raise UsageError(
-                "sway_amplitude: a manoeuvre asks for a sway force, but the vessel's commands are"
-                f" {', '.join(helm.inputs[:2])} and no forces; leave it out"
-            )
         drive, steer = map(torch.stack, zip(*(m.demands(t) for m in own), strict=True))
-
-        def demand(drive: Tensor, steer: Tensor) -> Tensor:
-            forces = helm.demand(drive, steer)
-            forces[..., helm.inputs.index("tau_y")] += limit * sway
-            return forces
-
-        return ScheduleSource(drive, steer, demand)
+        dive = torch.stack([m.dive_amplitude * m._after_start(t, _DIVE) for m in own])
+        commands = helm.commanded(drive, steer, *([dive] if bool(dive.any()) else []))
+        sway = torch.stack([m.sway_amplitude * m._after_start(t, _SWAY) for m in own])
+        if bool(sway.any()):
+            limit = helm.side_force
+            if limit is None or "tau_y" not in helm.inputs:
+                raise UsageError(
+                    "sway_amplitude: a manoeuvre asks for a sway force, but the vessel's commands"
+                    f" are {', '.join(helm.inputs[:2])} and no forces; leave it out"
+                )
+            commands[..., helm.inputs.index("tau_y")] += limit * sway
+        if any(m.own_amplitude for m in own):
+            full = helm.demand(torch.zeros_like(steer[0, :1]), torch.ones_like(steer[0, :1])).abs()
+            if helm.diving is not None:
+                full = torch.maximum(full, helm.diving.abs())
+            for i in range(commands.shape[-1]):
+                waves = [m.own_amplitude * m._after_start(t, _OWN + i) for m in own]
+                commands[..., i] += full[0, i] * torch.stack(waves)
+        return ScheduleSource(commands)
 
 
 class RandomSteps(Excitation):
@@ -282,6 +290,7 @@ class MultiSine(Excitation):
 
     def _wave(self, t: Tensor, which: int) -> Tensor:
         demands = 3 if self.sway_amplitude else 2
+        demands = max(demands, which + 1)
         frequencies = np.geomspace(*self.band, demands * self.tones)[which % demands :: demands]
         random = np.random.default_rng([self.seed, which])
         trial = np.arange(0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0]))
@@ -307,6 +316,8 @@ class ExcitationFamily(Family):
         steer_amplitude: range of the steer's amplitude.
         sway_amplitude: range of the amplitude of the sway force, in shares of the largest; for
             vessels whose commands are forces.
+        dive_amplitude: range of the amplitude of the dive; for vessels that dive.
+        own_amplitude: range of the amplitude by which each command moves by itself.
         band: lowest and highest frequency that the demands excite in Hz.
         start: when they begin in s.
     """
@@ -315,6 +326,8 @@ class ExcitationFamily(Family):
     drive_amplitude: Range = (0.0, 0.3)
     steer_amplitude: Range = (0.2, 1.0)
     sway_amplitude: Range = (0.0, 0.0)
+    dive_amplitude: Range = (0.0, 0.0)
+    own_amplitude: Range = (0.0, 0.0)
     band: Band = (0.02, 0.2)
     start: Seconds = 5.0
 
@@ -324,8 +337,9 @@ class ExcitationFamily(Family):
             for name in ("drive", "drive_amplitude", "steer_amplitude")
         }
         out |= {"band": self.band, "seed": int(random.integers(2**31)), "start": self.start}
-        if self.sway_amplitude[1] > 0:
-            out["sway_amplitude"] = drawn(random, self.sway_amplitude)
+        for name in ("sway_amplitude", "dive_amplitude", "own_amplitude"):
+            if getattr(self, name)[1] > 0:
+                out[name] = drawn(random, getattr(self, name))
         return out
 
 

@@ -17,7 +17,12 @@ from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond
 from residnet.core.names import VELOCITY
-from residnet.physics.actuators import ActuatorConfig, ActuatorsConfig, RollingActuatorsConfig
+from residnet.physics.actuators import (
+    ActuatorConfig,
+    ActuatorsConfig,
+    RollingActuatorsConfig,
+    SubmergedActuatorsConfig,
+)
 from residnet.physics.environment import GRAVITY, WindLoadsConfig
 from residnet.physics.parameters import (
     Inertia,
@@ -32,11 +37,11 @@ from residnet.physics.parameters import (
     of_dimension,
     unit_text,
 )
-from residnet.physics.plant import ROLLING, Hull, HullPlant
+from residnet.physics.plant import ROLLING, SUBMERGED, Hull, HullPlant
 from residnet.physics.terms import read_rows
 from residnet.physics.vessel_file import VesselFile
 
-_METRES = {"X": 1, "Y": 1, "K": 2, "N": 2, "u": 1, "v": 1, "r": 0}
+_METRES = {"X": 1, "Y": 1, "Z": 1, "K": 2, "M": 2, "N": 2, "u": 1, "v": 1, "r": 0}
 """Power of metre in the unit of the force or acceleration of each axis."""
 
 
@@ -93,7 +98,7 @@ class TermRows(Config):
     def _units(self) -> TermRows:
         named = dict(zip(type(self).model_fields, self.rows(), strict=True))
         for axis, term, factors in read_rows(named, self.channels, functions=False):
-            metres = _METRES[axis] - sum(f.power for f in factors if f.name in ("u", "v"))
+            metres = _METRES[axis] - sum(f.power for f in factors if f.name in ("u", "v", "w"))
             seconds = -2 + sum(f.power for f in factors if f.name != "phi")
             unit = named[axis][term].unit
             if dimension(unit, self.mass) != (metres, seconds):
@@ -477,6 +482,161 @@ class PatrolConfig(HullVessel):
             for term, value in more.items():
                 row[term] = row.get(term, 0.0) + value
         return Hull(mass, rows, HullForces.channels, self.name)
+
+
+class SubmergedBody(RollingBody):
+    """The rigid body of a vessel under water, symmetric to port and starboard.
+
+    Attributes:
+        m: mass in kg.
+        I_x: moment of inertia in roll about the body origin in kg m^2.
+        I_y: moment of inertia in pitch about the body origin in kg m^2.
+        I_z: moment of inertia in yaw about the body origin in kg m^2.
+        x_G: centre of gravity ahead of the body origin in m.
+        z_G: centre of gravity below the body origin in m.
+    """
+
+    I_y: Inertia
+
+    _positive_pitch = field_validator("I_y")(above_zero)
+
+
+class SubmergedAddedMass(Config):
+    """The hydrodynamic derivatives of the accelerations (SNAME), of a hull with three planes.
+
+    Attributes:
+        X_udot: surge force by surge acceleration in kg.
+        Y_vdot: sway force by sway acceleration in kg.
+        Z_wdot: heave force by heave acceleration in kg.
+        K_pdot: roll moment by roll acceleration in kg m^2.
+        M_qdot: pitch moment by pitch acceleration in kg m^2.
+        N_rdot: yaw moment by yaw acceleration in kg m^2.
+    """
+
+    X_udot: Mass
+    Y_vdot: Mass
+    Z_wdot: Mass
+    K_pdot: Inertia
+    M_qdot: Inertia
+    N_rdot: Inertia
+
+
+class SubmergedForces(TermRows):
+    """The forces of the water on the hull as terms of (u, v, w, p, q, r).
+
+    Terms that brake are negative. What inertia does is not among them.
+
+    Attributes:
+        X: terms of the surge force, each in the SI unit that its term asks for.
+        Y: terms of the sway force.
+        Z: terms of the heave force.
+        K: terms of the roll moment.
+        M: terms of the pitch moment.
+        N: terms of the yaw moment.
+    """
+
+    channels = SUBMERGED.velocities
+
+    X: dict[str, Parameter] = Field(default_factory=dict)
+    Y: dict[str, Parameter] = Field(default_factory=dict)
+    Z: dict[str, Parameter] = Field(default_factory=dict)
+    K: dict[str, Parameter] = Field(default_factory=dict)
+    M: dict[str, Parameter] = Field(default_factory=dict)
+    N: dict[str, Parameter] = Field(default_factory=dict)
+
+
+class Buoyancy(Config):
+    """The water that the hull displaces.
+
+    Attributes:
+        density: of the water.
+        volume: displaced.
+        x_B: centre of buoyancy ahead of the body origin in m.
+        z_B: centre of buoyancy below the body origin in m; negative above it.
+    """
+
+    density: MassDensity
+    volume: Volume
+    x_B: Length
+    z_B: Length
+
+    _positive = field_validator("density", "volume")(above_zero)
+
+
+@final
+class SubmergedConfig(HullVessel):
+    """A vessel under water in six degrees of freedom.
+
+    Attributes:
+        actuators: fins and propeller, or thrusters that push in all directions.
+        buoyancy: what carries it.
+        rigid_body: mass, inertia and centre of gravity.
+        added_mass: hydrodynamic derivatives of the accelerations.
+        forces: terms of the forces of the water.
+        speed: that trials start from; 0 for at rest.
+    """
+
+    kind: Literal["submerged"]
+    speed: MetresPerSecond = Field(default=0.0, ge=0)
+    buoyancy: Buoyancy
+    rigid_body: SubmergedBody
+    added_mass: SubmergedAddedMass
+    forces: SubmergedForces
+    actuators: SubmergedActuatorsConfig
+
+    def start(self) -> Mapping[str, float]:
+        """Return the speed."""
+        return {"u": self.speed}
+
+    def hull(self) -> Hull:
+        """Build the hull: mass, Coriolis forces of the whole of it, weight and buoyancy.
+
+        With the momenta l of translation and h of rotation the rotating axes make the force -w x l
+        and the moment -v x l - w x h (Kirchhoff; Fossen 2021, section 6.3). Weight and buoyancy
+        act along the vertical in body axes (Fossen 2021, eq. (4.6)).
+        """
+        body, added, water = self.rigid_body, self.added_mass, self.buoyancy
+        m, x, z = (one.value for one in (body.m, body.x_G, body.z_G))
+        mass = torch.diag(
+            torch.tensor(
+                [m, m, m, body.I_x.value, body.I_y.value, body.I_z.value], dtype=torch.float64
+            )
+            - torch.tensor([one.value for one in dict(added).values()], dtype=torch.float64)
+        )
+        for force, moment, arm in ((0, 4, z), (1, 3, -z), (1, 5, x), (2, 4, -x)):
+            mass[force, moment] = mass[moment, force] = m * arm
+        rows = self.forces.values()
+
+        def add(axis: int, term: str, value: float) -> None:
+            if value:
+                rows[axis][term] = rows[axis].get(term, 0.0) + value
+
+        turns = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+        for k, name in enumerate(SUBMERGED.velocities):
+            straight, turning = mass[:3, k].tolist(), mass[3:, k].tolist()
+            v, w = SUBMERGED.velocities[:3], SUBMERGED.velocities[3:]
+            for axis, a, b in turns:
+                for sign, i, j in ((-1.0, a, b), (1.0, b, a)):
+                    add(axis, _pair(w[i], name), sign * straight[j])
+                    add(3 + axis, _pair(v[i], name), sign * straight[j])
+                    add(3 + axis, _pair(w[i], name), sign * turning[j])
+        weight = m * GRAVITY
+        lift = water.density.value * GRAVITY * water.volume.value
+        # the vertical along the body axes
+        down = ("sin(theta)", "cos(theta) sin(phi)", "cos(theta) cos(phi)")
+        signs, net = (-1.0, 1.0, 1.0), weight - lift
+        arm = (weight * x - lift * water.x_B.value, 0.0, weight * z - lift * water.z_B.value)
+        for axis, a, b in turns:
+            add(axis, down[axis], signs[axis] * net)
+            add(3 + axis, down[b], signs[b] * arm[a])
+            add(3 + axis, down[a], -signs[a] * arm[b])
+        channels = (*SUBMERGED.velocities, "phi", "theta")
+        return Hull(mass.tolist(), rows, channels, self.name)
+
+
+def _pair(a: str, b: str) -> str:
+    """Return the product of two velocities, the same whichever stands first."""
+    return f"{a}^2" if a == b else " ".join(sorted((a, b), key=SUBMERGED.velocities.index))
 
 
 Phase = Literal["displacement", "semi_displacement", "planing"]

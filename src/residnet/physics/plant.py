@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError
-from residnet.core.frames import to_body, to_earth
+from residnet.core.frames import cross, to_body, to_earth, upright
 from residnet.core.layout import PLANAR, StateLayout
 from residnet.physics.actuators import Actuators
 from residnet.physics.environment import WIND_INPUTS, WindLoadConfig
@@ -18,7 +18,16 @@ from residnet.physics.terms import TermLibrary
 
 ROLLING = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
 """Surge, sway, roll and yaw, without heave and pitch (document 004 and its corrections)."""
-_AXES = {PLANAR.dof: ("x", "y", "n"), ROLLING.dof: ("x", "y", "k", "n")}
+SUBMERGED = StateLayout(
+    ("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r")
+)
+"""All six degrees of freedom, z the depth."""
+_LAYOUTS = {one.dof: one for one in (PLANAR, ROLLING, SUBMERGED)}
+_AXES = {
+    PLANAR.dof: ("x", "y", "n"),
+    ROLLING.dof: ("x", "y", "k", "n"),
+    SUBMERGED.dof: ("x", "y", "z", "k", "m", "n"),
+}
 
 
 class Plant(nn.Module, ABC):
@@ -28,11 +37,17 @@ class Plant(nn.Module, ABC):
         state: names of the columns of x [B, nx]: pose, velocities, then states of the actuators.
         inputs: names of the columns of w [B, m]: commands, then exogenous inputs.
         commands: how many of the inputs are commands.
+        attitude: columns of roll, pitch and heading, where the vessel turns about all axes. The
+            rates that stand there are those about the body axes: whoever integrates them composes
+            rotations. Empty where angles add up.
+        diving: commands [c] that make the vessel dive with all its force; None where it cannot.
     """
 
     state: tuple[str, ...]
     inputs: tuple[str, ...]
     commands: int
+    attitude: tuple[int, ...] = ()
+    diving: Tensor | None = None
 
     @abstractmethod
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
@@ -102,7 +117,8 @@ class Hull(nn.Module):
     Args:
         mass: M with added mass, [n][n].
         rows: for each axis the coefficients C of its force by term; terms that brake are negative.
-        channels: of the motion: the velocities through the water, then phi where the hull rolls.
+        channels: of the motion: the velocities through the water, then phi where the hull rolls,
+            and theta where it pitches.
         vessel: name for messages.
 
     Raises:
@@ -161,15 +177,16 @@ class HullPlant(Plant):
     """A hull with actuators in current, wind and external forces.
 
     State x [B, 2 n + k]: pose, velocities over ground, then the actuators' states. In 3 degrees of
-    freedom these are x, y, psi and u, v, r; in 4 x, y, phi, psi and u, v, p, r.
+    freedom these are x, y, psi and u, v, r; in 4 x, y, phi, psi and u, v, p, r; in 6 those of
+    `SUBMERGED`.
 
-    Inputs: commands; force_x, force_y, (force_k,) force_n in body axes [N, N, (N m,) N m];
+    Inputs: commands; force_x, force_y, (force_z, force_k, force_m,) force_n in body axes [N, N m];
     current_north, current_east [m/s]; force_north, force_east [N], constant in earth axes; where
     the vessel file has a section `wind`, the true wind (`WIND_INPUTS`). Hull forces are those of
     the velocities relative to the water, wind loads those of the velocities relative to the air.
 
     Args:
-        hull: of 3 or 4 degrees of freedom.
+        hull: of 3, 4 or 6 degrees of freedom.
         actuators: that push it.
         wind: loads of the air; None where it feels none.
         start: states that trials start from, where not at rest, by name.
@@ -185,9 +202,13 @@ class HullPlant(Plant):
         super().__init__()
         self.hull, self.actuators, self.wind = hull, actuators, wind
         self.n = len(hull.mass)
-        self.rolls = self.n == ROLLING.dof
+        self.rolls, self.dives = self.n == ROLLING.dof, self.n == SUBMERGED.dof
         self.weather = True
-        self.state = (*(ROLLING if self.rolls else PLANAR).names, *actuators.state)
+        self.state = (*_LAYOUTS[self.n].names, *actuators.state)
+        self.attitude = (
+            tuple(map(self.state.index, ("phi", "theta", "psi"))) if self.dives else ()
+        )
+        self.diving = actuators.diving
         self.parts = [self.n, self.n, len(actuators.state)]
         self.commands = len(actuators.commands)
         self.inputs = (
@@ -264,11 +285,20 @@ class HullPlant(Plant):
         return torch.cat((moved, nu_dot, moving), dim=-1)
 
     def _motion(self, pose: Tensor, nu: Tensor) -> Tensor:
+        if self.dives:
+            return torch.cat((nu, pose[..., 3:5]), dim=-1)
         return torch.cat((nu, pose[..., 2:3]), dim=-1) if self.rolls else nu
 
     def _pose_rate(self, pose: Tensor, nu: Tensor) -> Tensor:
-        """Return the derivative [B, n] of the pose (document 003 eq. (1), document 004)."""
+        """Return the derivative [B, n] of the pose (document 003 eq. (1), document 004).
+
+        Where the vessel turns about all axes, what its angles have is p, q and r.
+        """
         u, v = nu[..., 0], nu[..., 1]
+        if self.dives:
+            forward, starboard, down = upright(u, v, nu[..., 2], pose[..., 3], pose[..., 4])
+            north, east = to_earth(forward, starboard, pose[..., 5])
+            return torch.cat((torch.stack((north, east, down), dim=-1), nu[..., 3:]), dim=-1)
         if not self.rolls:
             return torch.stack((*to_earth(u, v, pose[..., 2]), nu[..., 2]), dim=-1)
         cos_phi = torch.cos(pose[..., 2])
@@ -279,6 +309,11 @@ class HullPlant(Plant):
         """Return an earth-fixed horizontal vector along the (rolled) body axes, [B, n]."""
         along, across = to_body(north, east, pose[..., -1])
         zero = torch.zeros_like(along)
+        if self.dives:
+            phi, theta = pose[..., 3], pose[..., 4]
+            side, normal = to_body(across, along * torch.sin(theta), phi)
+            ahead = along * torch.cos(theta)
+            return torch.stack((ahead, side, normal, zero, zero, zero), dim=-1)
         if self.rolls:
             return torch.stack((along, across * torch.cos(pose[..., 2]), zero, zero), dim=-1)
         return torch.stack((along, across, zero), dim=-1)
@@ -287,6 +322,10 @@ class HullPlant(Plant):
         self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the current in body axes and its derivative while the body turns, each [B, n]."""
+        if self.dives:
+            body = self._body(north, east, pose)
+            turned = cross(body[..., :3], nu[..., 3:])
+            return body, torch.cat((turned, torch.zeros_like(turned)), dim=-1)
         along, across = to_body(north, east, pose[..., -1])
         zero, r = torch.zeros_like(along), nu[..., -1]
         if not self.rolls:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
-from residnet.core.layout import PLANAR, ROLL, Live, heading, surge, sway, velocities
+from residnet.core.layout import PLANAR, ROLL, SIX, Live, heading, surge, sway, velocities
 from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig
@@ -44,14 +44,15 @@ class SignalsConfig(Config):
             their sign too.
         velocities: those of u, v and r that the logs tell and the model moves; the others are zero
             at all times. A model of surge alone has [u]. With p behind them the model rolls: logs
-            need the roll angle phi, which is a state and a channel of it.
+            need the roll angle phi, which is a state and a channel of it. [u, v, r, w, p, q] are all
+            six degrees of freedom: logs need depth z, roll and pitch.
     """
 
     inputs: tuple[str, ...]
     exogenous: tuple[str, ...] = ()
     forces: str | DifferentialThrustConfig | None = None
     pairs: tuple[tuple[str, str], ...] = ()
-    velocities: tuple[Literal["u", "v", "r", "p"], ...] = Field(
+    velocities: tuple[Literal["u", "v", "r", "w", "p", "q"], ...] = Field(
         default=("u", "v", "r"), min_length=1
     )
 
@@ -70,7 +71,18 @@ class SignalsConfig(Config):
             raise ValueError(
                 f"forces are made by two thrusters, but inputs are {list(self.inputs)}"
             )
-        if list(self.velocities) != [name for name in ROLL.velocities if name in self.velocities]:
+        if self.live.spatial:
+            if self.velocities != SIX.velocities:
+                raise ValueError(
+                    "velocities: heave and pitch need all six, u, v, r, w, p, q in this order;"
+                    f" given {', '.join(self.velocities)}"
+                )
+            if self.exogenous or self.forces:
+                raise ValueError(
+                    "velocities: a model of six degrees of freedom knows neither wind nor forces"
+                    " of two thrusters; leave exogenous and forces out"
+                )
+        elif list(self.velocities) != [n for n in ROLL.velocities if n in self.velocities]:
             raise ValueError(
                 f"velocities are named once each, in the order u, v, r, p; given {self.velocities}"
             )
@@ -166,6 +178,10 @@ class Signals(nn.Module):
         self.thrusters: nn.Module = nn.Identity() if thrusters is None else thrusters.build().forces
         names = config.live.moving + config.inputs
         self.dof = config.live.size
+        self.spatial = config.live.spatial
+        seen = torch.tensor([name not in config.live.hidden for name in config.live.moving])
+        self.register_buffer("seen", seen.double(), persistent=False)
+        self.seen: Tensor
         names += FORCE_CHANNELS if self.forces else ()
         names += WIND_CHANNELS if self.wind else ()
         self.names: tuple[str, ...] = ChannelNames(names, config.pairs, config.live)
@@ -194,6 +210,9 @@ class Signals(nn.Module):
             x: state [..., nx] (pose, then what moves).
             p: what `prepare` returned for the step's inputs.
         """
+        if self.spatial:
+            # nothing depends on the depth
+            return torch.cat((velocities(x, self.dof) * self.seen.to(x.dtype), p), dim=-1)
         if not self.wind:
             return torch.cat((velocities(x, self.dof), p), dim=-1)
         known = p.shape[-1] - 2

@@ -10,7 +10,9 @@ from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 
 _PARITY = dict.fromkeys(
     ("v", "r", "p", "phi", "delta", "tau_y", "tau_n", "wind_v"), -1
-) | dict.fromkeys(("u", "n", "tau_x", "wind_u", "wind_mag"), 1)
+) | dict.fromkeys(
+    ("u", "w", "q", "z", "theta", "n", "delta_s", "tau_x", "wind_u", "wind_mag"), 1
+)
 _ANGLES = ("delta", "rudder", "azimuth")
 
 
@@ -52,14 +54,14 @@ def live_of(names: Sequence[str]) -> Live:
 
 
 def without_dead(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the channels without velocities that are zero at all times."""
-    dead = live_of(names).dead
+    """Return the channels without those that drive nothing."""
+    dead = live_of(names).hidden
     return tuple(name for name in names if name not in dead)
 
 
 def living(term: str, names: Sequence[str]) -> bool:
-    """Return whether a product of channels holds no velocity that is zero at all times."""
-    dead = live_of(names).dead
+    """Return whether a product of channels holds none that drives nothing."""
+    dead = live_of(names).hidden
     return not dead or all(factor.name not in dead for factor in parse_term(term, names))
 
 

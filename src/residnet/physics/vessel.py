@@ -12,7 +12,13 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.core.registry import vessel_files
 from residnet.physics.abkowitz import AbkowitzConfig
-from residnet.physics.hull import FossenConfig, MassMatrixConfig, OdinConfig, PatrolConfig
+from residnet.physics.hull import (
+    FossenConfig,
+    MassMatrixConfig,
+    OdinConfig,
+    PatrolConfig,
+    SubmergedConfig,
+)
 from residnet.physics.nomoto import NomotoConfig, SecondOrderNomotoConfig, SideslipNomotoConfig
 
 __all__ = [
@@ -29,6 +35,7 @@ AnyVessel = (
     | AbkowitzConfig
     | OdinConfig
     | PatrolConfig
+    | SubmergedConfig
     | NomotoConfig
     | SecondOrderNomotoConfig
     | SideslipNomotoConfig

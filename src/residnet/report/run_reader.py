@@ -16,7 +16,7 @@ from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_table
 from residnet.core.format import SHOWN_UNITS, shown_unit
-from residnet.core.layout import ALIVE, ROLL, Live
+from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.names import CHANNEL_UNITS, to_si
 from residnet.core.units import known_unit
 from residnet.judge.rollout_files import INPUT, columns_of
@@ -270,7 +270,7 @@ class RunFiles:
     @cached_property
     def live(self) -> Live:
         """The velocities that the logs tell; models leave the others at zero."""
-        return Live(tuple(name for name in ROLL.velocities if name in self.channels))
+        return Live(tuple(name for name in SIX.velocities if name in self.channels))
 
     @property
     def place(self) -> str:

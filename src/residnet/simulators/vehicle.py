@@ -83,6 +83,7 @@ def learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
     """
     spec, model = load_model(run / "models" / chosen_model(run, name))
     live = spec.signals.live
+    live.require_on_surface("a simulator")
     guarded = _Guarded(GuardedDynamics(model.float(), spec).float().eval().requires_grad_(False))
     driven = slice(live.size, live.size + len(spec.signals.inputs))
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)

@@ -14,7 +14,7 @@ import yaml
 
 from residnet.core.config import validate
 from residnet.core.errors import DataError, ResidnetError, UsageError
-from residnet.core.layout import ROLL, Live
+from residnet.core.layout import ROLL, SIX, Live
 from residnet.core.log import Log
 from residnet.core.progress import say
 from residnet.data.doctor import inspect
@@ -243,7 +243,8 @@ class _Read:
             for name in inputs
         }
         if channels := self.reader.get("channels"):
-            state = [*ROLL.names, *WIND_INPUTS]
+            layout = SIX if self.live.spatial else ROLL
+            state = [*layout.names, *WIND_INPUTS]
             state += [] if "x" in channels else ["latitude", "longitude"]
             state += [] if "psi" in channels else QUATERNION
             self.reader["channels"] = {

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from residnet.core.layout import ALIVE, Live
+from residnet.core.layout import SIX
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, STATE
 from residnet.data.drafting.questions import Marks
@@ -16,7 +17,7 @@ from residnet.data.readers.quantities import QUATERNION
 from residnet.physics.environment import WIND_INPUTS
 
 _PASSIVE = (
-    *(*STATE, *ACCELERATION, "phi", "p", "latitude", "longitude", *QUATERNION),
+    *(*STATE, *ACCELERATION, *SIX.moving, "latitude", "longitude", *QUATERNION),
     *(*WIND_INPUTS, "current_north", "current_east"),
 )
 _STILL = 2e-3

@@ -17,7 +17,7 @@ from residnet.core.config import dump_config, validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import whole
 from residnet.core.format import fixed, number, plural
-from residnet.core.layout import ROLL
+from residnet.core.layout import SIX
 from residnet.core.names import nearest
 from residnet.core.progress import say
 from residnet.data.prepare import Prepared, samples
@@ -448,7 +448,7 @@ class PlannedTrials:
         trials, tracks = folder / "next_trials.yaml", folder / "next_tracks.csv"
         flights = [trial.flight for trial in self.plan.chosen]
         chosen = [flight.manoeuvre.model_dump(mode="json") for flight in flights]
-        states = [name for name in ROLL.names if name in flights[0].motion.channels]
+        states = [name for name in SIX.names if name in flights[0].motion.channels]
         lines = [",".join(("manoeuvre", "t", *states))]
         for motion in (flight.motion for flight in flights):
             every = max(round(1.0 / float(motion.t[1] - motion.t[0])), 1)

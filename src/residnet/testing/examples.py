@@ -7,6 +7,7 @@ import functools
 import torch
 
 from residnet.baselines.regressors import RegressorsConfig
+from residnet.core.layout import PLANAR, ROLL, SIX
 from residnet.core.samples import Samples
 from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.simulated import SimulatedTrials, fly_trials
@@ -22,6 +23,11 @@ SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolve
 
 ROLLING = SignalsConfig(inputs=("delta", "cmd_thrust"), velocities=("u", "v", "r", "p"))
 """Inputs of example models of a patrol vessel that rolls."""
+
+SUBMERGED = SignalsConfig(inputs=("delta", "delta_s", "n"), velocities=SIX.velocities)
+"""Inputs of example models of a torpedo in six degrees of freedom."""
+
+_VESSELS = {PLANAR: "wam_v_cal", ROLL: "patrol_p06_linear", SIX: "remus_100"}
 
 STEP = 0.1
 """Step of the example models in s."""
@@ -40,20 +46,24 @@ def example_samples(
     tau_x, tau_y, tau_n.
 
     Args:
-        vessel: name of the vessel; that catamaran, or a patrol vessel for signals with roll.
+        vessel: name of the vessel; that catamaran, a patrol vessel for signals with roll, or a torpedo for six.
         signals: what drives the model; channels of the vessel's logs.
         duration: of each manoeuvre in s.
     """
     trials = SimulatedTrials.model_validate(
         {
-            "vessel": vessel or ("patrol_p06_linear" if signals.live.rolls else "wam_v_cal"),
+            "vessel": vessel or _VESSELS[signals.live.layout],
             "step": STEP,
             "substeps": 1,
             "duration": duration,
             "trials": [
                 {"kind": "constant", "drive": [0.5, 0.9], "steer": [-0.4, 0.0, 0.4]},
                 {"kind": "zigzag", "count": 4, "heading": ["15 deg"], "start": 2.0},
-                {"kind": "random_steps", "count": 4},
+                {
+                    "kind": "random_steps",
+                    "count": 4,
+                    "dive_amplitude": [0.0, 0.4 if signals.live.spatial else 0.0],
+                },
             ],
             "identification": {"zigzag": 3},
             "validation": {"zigzag": 1},

@@ -21,9 +21,13 @@ from torch import Tensor
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
+from residnet.core.frames import cross
 from residnet.core.layout import (
+    ATTITUDE,
     HEADING,
+    SIX,
     YAW_RATE,
+    pose,
     roll_angle,
     velocities_on,
     yaw_rate,
@@ -58,6 +62,8 @@ def step_sensitivities(
         p: prepared inputs, held over the step [B, k].
         s: sensitivities at the step's start [B, 1 + n, P].
     """
+    if model.spatial:
+        return _spatial_sensitivities(model, baseline, x, p, s)
     stage_x, stage_s = x, s
     after, stage_rate = s, s
     for node, weight in zip(model.nodes, model.weights, strict=True):
@@ -84,6 +90,100 @@ def step_sensitivities(
         turned = s[:, _HEADING_ROW] + model.dt * _turned(model, new, after)
         after = torch.cat((turned, after[:, _HEADING_ROW.stop :]), dim=1)
     return after
+
+
+# of the rows of sensitivities in six degrees of freedom: those of an attitude, and what turns it
+_ANGLES = [column - HEADING for column in ATTITUDE]
+_U, _V, _R, _W, _P, _Q, _Z = (SIX.names.index(name) - HEADING for name in "uvrwpqz")
+
+
+def _spatial_sensitivities(
+    model: HybridDynamics, baseline: ParametricBaseline, x: Tensor, p: Tensor, s: Tensor
+) -> Tensor:
+    """Return `step_sensitivities` where rotations are composed: those of the angles themselves."""
+    residual = zero_acceleration(x, model.dof)
+    stage_x, stage_s, rate, slope = x, s, x, s
+    change, moved = torch.zeros_like(x), torch.zeros_like(s)
+    total, sensed = torch.zeros_like(x), torch.zeros_like(s)
+    for node, weight in zip(model.nodes, model.weights, strict=True):
+        if node > 0.0:
+            change, moved = node * model.dt * rate, node * model.dt * slope
+            stage_x = model.moved_on(x, change)
+            stage_s = _composed(x, change, stage_x, s, moved)
+        z = model.signals(stage_x, p)
+        ahead = baseline.along(z, model.signals.slopes(stage_x, p)).permute(1, 2, 0)
+        nu_dot = torch.baddbmm(baseline.sensitivity(z), ahead, stage_s) * model.live[:, None]
+        slope = _known_slopes(stage_x, stage_s, torch.cat((torch.zeros_like(s[:, :1]), nu_dot), 1))
+        rate = model.rate(stage_x, p, residual)
+        if node > 0.0:
+            # the derivative of `Dynamics.from_start`
+            turn, own = (part[:, ATTITUDE].unsqueeze(-1) for part in (change, rate))
+            d_turn, d_own = moved[:, _ANGLES], slope[:, _ANGLES]
+            bent = _crossed(turn, own)
+            d_bent = _crossed(d_turn, own) + _crossed(turn, d_own)
+            twice = (_crossed(d_turn, bent) + _crossed(turn, d_bent)) / 12.0
+            slope[:, _ANGLES] = d_own + 0.5 * d_bent + twice
+            rate = model.from_start(change, rate)
+        total, sensed = total + weight * rate, sensed + weight * slope
+    change, moved = model.dt * total, model.dt * sensed
+    if model.semi_implicit:
+        velocities = slice(_U, _Z)
+        s = torch.cat((s[:, :_U], (s + moved)[:, velocities], s[:, _Z:]), dim=1)
+        x = torch.cat((pose(x), velocities_on(x + change)[:, : _Z - _U], x[:, _Z + HEADING :]), 1)
+        moved = model.dt * _known_slopes(x, s, torch.zeros_like(s))
+        rate = torch.zeros_like(x)
+        rate[:, ATTITUDE] = x[:, [HEADING + _P, HEADING + _Q, HEADING + _R]]
+        change = model.dt * rate
+    return _composed(x, change, model.moved_on(x, change), s, moved)
+
+
+def _known_slopes(x: Tensor, s: Tensor, rates: Tensor) -> Tensor:
+    """Return sensitivities [B, 10, P] of rates with those of depth and angles at states x."""
+    phi, theta = (x[:, column, None] for column in ATTITUDE[:2])
+    u, v, w = (x[:, HEADING + row, None] for row in (_U, _V, _W))
+    (cf, sf), (ct, st) = ((torch.cos(one), torch.sin(one)) for one in (phi, theta))
+    down = -st * s[:, _U] + ct * (sf * s[:, _V] + cf * s[:, _W])
+    down = down + ct * (cf * v - sf * w) * s[:, _ANGLES[0]]
+    rates[:, _Z] = down - (ct * u + st * (sf * v + cf * w)) * s[:, _ANGLES[1]]
+    rates[:, _ANGLES] = s[:, [_P, _Q, _R]]
+    return rates
+
+
+def _composed(x: Tensor, change: Tensor, after: Tensor, s: Tensor, moved: Tensor) -> Tensor:
+    """Return the sensitivities [B, 10, P] of states x after a change, from those of both.
+
+    A change of angles turns the vessel by E of it, which the rotation that follows sees from where
+    it leads; that rotation has the right Jacobian (Sola et al. 2018, A micro Lie theory, eqs. (143)
+    and (145)).
+    """
+    turn = change[:, ATTITUDE]
+    size = torch.sqrt(turn.square().sum(-1) + 1e-16)[:, None, None]
+    unit = torch.eye(3, dtype=x.dtype, device=x.device)
+    skew = torch.linalg.cross(unit.expand(len(x), 3, 3), turn[:, None].expand(-1, 3, -1), dim=-1)
+    square, even = skew @ skew, (1.0 - torch.cos(size)) / size.square()
+    back = unit - torch.sin(size) / size * skew + even * square
+    right = unit - even * skew + (size - torch.sin(size)) / size**3 * square
+    turned = back @ _axes(x) @ s[:, _ANGLES] + right @ moved[:, _ANGLES]
+    out = s + moved
+    out[:, _ANGLES] = torch.linalg.solve(_axes(after), turned)
+    return out
+
+
+def _axes(x: Tensor) -> Tensor:
+    """Return E [B, 3, 3], the rotation about body axes by changes of roll, pitch and heading.
+
+    Source: Fossen 2021, eq. (2.41), inverted.
+    """
+    phi, theta = (x[:, column] for column in ATTITUDE[:2])
+    (cf, sf), (ct, st) = ((torch.cos(one), torch.sin(one)) for one in (phi, theta))
+    zero, one = torch.zeros_like(cf), torch.ones_like(cf)
+    rows = ((one, zero, -st), (zero, cf, ct * sf), (zero, -sf, ct * cf))
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=1)
+
+
+def _crossed(a: Tensor, b: Tensor) -> Tensor:
+    """Return the vector products [B, 3, P] along the second axis."""
+    return cross(a.transpose(1, 2), b.transpose(1, 2)).transpose(1, 2)
 
 
 def _turned(model: HybridDynamics, x: Tensor, s: Tensor) -> Tensor:

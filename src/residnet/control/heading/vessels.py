@@ -285,7 +285,9 @@ class SteeredModel(SteeredVessel):
     def __init__(
         self, model: HybridDynamics, columns: tuple[str, ...], hold: str, vessel: SteeredPlant
     ) -> None:
-        states = live_of(model.signals.names).states
+        live = live_of(model.signals.names)
+        live.require_on_surface("an autopilot")
+        states = live.states
         self.hull, self.vessel, self.mean = model, vessel, hold == "mean"
         self.state = states if vessel.rate is None else (*states, "delta")
         self.inputs, self.rate = vessel.inputs, vessel.rate

@@ -123,7 +123,7 @@ def _on_grid(log: Record) -> list[Finding]:
         grid = align(log.log, GridConfig(step=log.step))
     except DataError as error:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
-    found = [*run("grid", Record(grid, log.inputs))]
+    found = [*run("grid", Record(values.upright(grid), log.inputs))]
     near = np.searchsorted(grid.t - grid.t[0], log.t - log.t[0] - 1e-9)
     near = np.minimum(near, len(grid) - 1)
     return [one if one.at is None else dataclasses.replace(one, at=one.at[near]) for one in found]

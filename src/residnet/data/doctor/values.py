@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from residnet.core.errors import ResidnetError
-from residnet.core.layout import Live
+from residnet.core.layout import Live, levelled
 from residnet.core.log import Log
 from residnet.core.names import POSE, STATE
 from residnet.core.stretches import stretches
@@ -68,6 +68,20 @@ def wraps(log: Record, found: Check) -> Iterator[Finding]:
                     " hold it continuous"
                 )
                 yield found(text, {"count": at.size, "t": log.t[at[0]]})
+
+
+def upright(log: Log) -> Log:
+    """Return a log of six degrees of freedom with u, v, r and p as rates of place and angles.
+
+    So do checks of the motion see a vessel under water as one on it. Any other log stays.
+    """
+    live = Live.told(log.channels)
+    if not live.spatial:
+        return log
+    nu = log.stack(live.moving)
+    u, v, r = levelled(nu).T
+    p = log["p"] + r * np.sin(log["theta"])
+    return log.replace(channels={**log.channels, "u": u, "v": v, "r": r, "p": p})
 
 
 def unwrapped(log: Log) -> Log:

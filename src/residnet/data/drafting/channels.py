@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -34,7 +34,14 @@ READER = ("data", "reader")
 CHANNELS = (*READER, "channels")
 _SURE = 0.9
 """Correlation from which a measured factor overrules a header."""
-STATE_NAMES = ("x", "y", "psi", "u", "v", "r", "phi", "p", "wind_speed", "wind_dir")
+_DEEP = {
+    "w": r"w|heave(?: (?:velocity|speed))?",
+    "q": r"q|pitch (?:rate|velocity|speed)",
+    "z": r"z|depth",
+    "theta": r"theta|pitch(?: angle)?",
+}
+"""What a vessel under water is told by, beside the channels of a roll."""
+STATE_NAMES = ("x", "y", "psi", "u", "v", "r", "phi", "p", *_DEEP, "wind_speed", "wind_dir")
 _FIXES = {"x": "latitude", "y": "longitude"}
 MAGNETIC = re.compile(r"magn|compass|kompass|\bhdm\b|\(m\)|\bmag(?![a-z])|_mag(?![a-z])", re.I)
 _QUATERNION = re.compile(
@@ -69,6 +76,25 @@ def quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
                 kind = f"{match['stem']} {number if part.isdigit() else 'named'}"
                 found.setdefault(kind, {}).setdefault(channel, column)
     return [parts for parts in found.values() if set(parts) == set(QUATERNION)]
+
+
+def submerged(columns: Sequence[str], named: Collection[str]) -> dict[str, str]:
+    """Return heave, pitch rate, depth and pitch -> column; none where any of them or a roll lacks.
+
+    Args:
+        columns: names.
+        named: channels that are known already.
+    """
+    if not {"phi", "p"} <= set(named):
+        return {}
+    texts = {column: words_of(column).text for column in columns}
+    found = {
+        name: column
+        for name, pattern in _DEEP.items()
+        for column, text in reversed(texts.items())
+        if re.fullmatch(pattern, text)
+    }
+    return found if len(found) == len(_DEEP) else {}
 
 
 def levelled(

@@ -23,6 +23,7 @@ from residnet.data.drafting.channels import (
     drafted_channels,
     levelled,
     quaternions,
+    submerged,
 )
 from residnet.data.drafting.physics import Raw
 from residnet.data.drafting.questions import Marks
@@ -125,6 +126,7 @@ def draft_tables(
     rolls = [name for name in ("phi", "p") if name in names]
     for name in [one for one in rolls if any(names[one] not in s.numbers for s in sheets)]:
         marks.note(CHANNELS, f"empty in some files, left out: {names.pop(name)}")
+    names |= submerged(numeric, names)
     refuse_written_positions(first, names)
     if "psi" not in names:
         names |= levelled(attitudes, [one.numbers for one in sheets])

@@ -24,18 +24,18 @@ Frame = Literal["as_measured", "ned", "enu", "body_fsd", "body_fpu"]
 _SAME = (1.0, 0.0)
 _FLIP = (-1.0, 0.0)
 _FROM_EAST = (-1.0, math.pi / 2.0)
-_EARTH = ("x", "y", "psi", "wind_dir", "current_north", "current_east")
+_EARTH = ("x", "y", "z", "psi", "wind_dir", "current_north", "current_east")
 QUATERNION = ("qx", "qy", "qz", "qw")
 """Channels of a table that become a heading together, where it has none."""
 _FORWARD = ("u", "p", "phi", "u_dot", "tau_x")
-_SIDEWAYS_OR_DOWN = ("v", "r", "v_dot", "r_dot", "tau_y", "tau_n")
+_SIDEWAYS_OR_DOWN = ("v", "r", "w", "q", "theta", "v_dot", "r_dot", "tau_y", "tau_n")
 # frame -> channel -> (factor, offset [SI]) that brings the channel to residnet's frame.
 # x and y have no entry in enu: "x" there means east to some and the north column to others, so the
 # map must name the north column itself.
 _FRAMES: dict[str, dict[str, tuple[float, float]]] = {
     "ned": dict.fromkeys((*_EARTH, "qw"), _SAME),
     # the frame of a quaternion is told at its scalar part
-    "enu": {"psi": _FROM_EAST, "wind_dir": _FROM_EAST, "qw": _SAME},
+    "enu": {"psi": _FROM_EAST, "wind_dir": _FROM_EAST, "z": _FLIP, "qw": _SAME},
     "body_fsd": dict.fromkeys((*_FORWARD, *_SIDEWAYS_OR_DOWN), _SAME),
     "body_fpu": {**dict.fromkeys(_FORWARD, _SAME), **dict.fromkeys(_SIDEWAYS_OR_DOWN, _FLIP)},
 }

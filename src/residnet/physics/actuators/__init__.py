@@ -11,6 +11,7 @@ from residnet.physics.actuators.rudders import (
     FoilRuddersConfig,
     LinearRuddersConfig,
     RudderPropellerConfig,
+    TorpedoFinsConfig,
     WaterJetsConfig,
 )
 from residnet.physics.actuators.thrusters import (
@@ -21,6 +22,7 @@ from residnet.physics.actuators.thrusters import (
     ForceCommandsConfig,
     Thrusters,
     ThrustersConfig,
+    VectoredThrustersConfig,
 )
 
 ActuatorsConfig = Annotated[
@@ -36,6 +38,10 @@ RollingActuatorsConfig = Annotated[
     FoilRuddersConfig | LinearRuddersConfig, Field(discriminator="kind")
 ]
 """Of a vessel that rolls: they make a roll moment too."""
+SubmergedActuatorsConfig = Annotated[
+    TorpedoFinsConfig | VectoredThrustersConfig, Field(discriminator="kind")
+]
+"""Of a vessel under water: they make all six forces and moments."""
 
 __all__ = [
     "ActuatorConfig",
@@ -48,6 +54,7 @@ __all__ = [
     "ForceCommands",
     "ForceCommandsConfig",
     "RollingActuatorsConfig",
+    "SubmergedActuatorsConfig",
     "Thrusters",
     "ThrustersConfig",
 ]

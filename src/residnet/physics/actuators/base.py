@@ -201,9 +201,11 @@ class Actuators(nn.Module, ABC):
         commands: names of the commands.
         in_flow: whether forces depend on the vessel's speed.
         held: whether forces stay the same over a step.
+        diving: commands [c] that dive with full force; None where nothing does.
     """
 
     commands: tuple[str, ...] = ()
+    diving: Tensor | None = None
     in_flow: bool = True
 
     def __init__(self, *servos: Servo) -> None:

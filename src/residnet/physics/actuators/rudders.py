@@ -434,3 +434,81 @@ class WaterJets(Actuators):
     def followed(self, command: Tensor) -> Tensor:
         """Return the commands [..., 2] without negative revolutions."""
         return torch.stack((command[..., 0].clamp(min=0.0), command[..., 1]), dim=-1)
+
+
+class TorpedoFinsConfig(ServoConfig, ActuatorConfig):
+    """A propeller, a rudder and stern planes at the tail of a torpedo, each behind the same lag.
+
+    Commands are cmd_delta [rad] (positive to starboard), cmd_delta_s [rad] (positive to dive) and
+    cmd_n [1/s].
+
+    Attributes:
+        limit: largest angle of rudder and planes.
+        n_max: largest revolutions.
+        density: of the water.
+        x: place of the fins ahead of the body origin; negative aft.
+        rudder: area times slope of the lift coefficient by angle.
+        planes: the same of the stern planes together.
+        diameter: of the propeller.
+        K_T: thrust coefficients at rest and per advance number.
+        K_Q: torque coefficients at rest and per advance number.
+        wake: speed at the propeller by that of the vessel.
+        thrust_deduction: share of the thrust that the hull loses again.
+    """
+
+    kind: Literal["torpedo_fins"] = "torpedo_fins"
+    limit: Radians = Field(gt=0, lt=1.5707)
+    n_max: RevsPerSecond = Field(gt=0)
+    density: Density = Field(gt=0)
+    x: Metres = Field(lt=0)
+    rudder: SquareMetres = Field(gt=0)
+    planes: SquareMetres = Field(gt=0)
+    diameter: Metres = Field(gt=0)
+    K_T: tuple[float, float]
+    K_Q: tuple[float, float]
+    wake: float = Field(gt=0, le=1)
+    thrust_deduction: float = Field(ge=0, lt=1)
+
+    def build(self) -> TorpedoFins:
+        return TorpedoFins(self)
+
+
+@final
+class TorpedoFins(Actuators):
+    """The forces tau [..., 6] of fins and propeller.
+
+    The lift of a fin is across the hull, its drag grows by the square of its angle. Astern the
+    propeller has its thrust at rest.
+
+    Source: Fossen's model of the REMUS 100 (PythonVehicleSimulator, vehicles/remus100.py).
+    """
+
+    commands = ("cmd_delta", "cmd_delta_s", "cmd_n")
+
+    def __init__(self, config: TorpedoFinsConfig) -> None:
+        super().__init__(
+            config.follow(config.limit, None, "delta", "delta_s"),
+            config.follow(config.n_max, None, "n"),
+        )
+        self.config = config
+        self.diving = torch.tensor([0.0, config.limit, 0.0], dtype=torch.float64)
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Return rudder, planes amidships and revolutions [..., 3], shares of their limits."""
+        angle = steer.clamp(-1.0, 1.0) * self.config.limit
+        turning = drive.clamp(0.0, 1.0) * self.config.n_max
+        return torch.stack((angle, torch.zeros_like(angle), turning), dim=-1)
+
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        c, position = self.config, self.positions(a, command)
+        delta, dive, n = position.unbind(-1)
+        square = 0.5 * c.density * nu[..., 0].square()
+        side, lift = -square * c.rudder * delta, -square * c.planes * dive
+        drag = -side * delta - lift * dive
+        advance = c.wake * nu[..., 0] / c.diameter * n.clamp(min=0.0)
+        thrust, torque = (
+            c.density * c.diameter**power * (rest * n * n.abs() + slope * advance)
+            for power, (rest, slope) in ((4, c.K_T), (5, c.K_Q))
+        )
+        ahead = (1.0 - c.thrust_deduction) * thrust - drag
+        return torch.stack((ahead, side, lift, torque, -c.x * lift, c.x * side), dim=-1)

@@ -437,3 +437,75 @@ class ForceCommands(ForceActuators):
     def followed(self, command: Tensor) -> Tensor:
         limit = self.limit.to(command.dtype)
         return torch.maximum(torch.minimum(command, limit), -limit)
+
+
+class VectoredThrusterConfig(PlaceConfig):
+    """One of several fixed thrusters that push in any direction, its thrust commanded.
+
+    Attributes:
+        name: ends its command, cmd_thrust_<name>, in N.
+        x: place ahead of the body origin in m.
+        y: place to starboard of the body origin in m.
+        z: place below the body origin in m.
+        push: direction of its force ahead, to starboard and down; made of length one.
+    """
+
+    z: Metres = 0.0
+    push: tuple[float, float, float]
+
+
+class VectoredThrustersConfig(ActuatorConfig):
+    """Equal thrusters that push a vessel in all six degrees of freedom.
+
+    Their drives follow the demanded thrust: the curve from current to thrust is inverted there.
+
+    Attributes:
+        thrusters: the thrusters, in the order of the commands.
+        limit: largest thrust of each in either direction.
+    """
+
+    kind: Literal["vectored_thrusters"] = "vectored_thrusters"
+    thrusters: Annotated[tuple[VectoredThrusterConfig, ...], Field(min_length=1)]
+    limit: Newtons = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _names(self) -> VectoredThrustersConfig:
+        _different([thruster.name for thruster in self.thrusters])
+        return self
+
+    def build(self) -> VectoredThrusters:
+        return VectoredThrusters(self)
+
+
+@final
+class VectoredThrusters(Actuators):
+    """Thrusts T [..., c] in N make forces and moments tau [..., 6] = T map.
+
+    Source: Fossen 2021, section 9.4 (thrust configuration matrix).
+    """
+
+    in_flow = False
+
+    def __init__(self, config: VectoredThrustersConfig) -> None:
+        names = [f"thrust_{one.name}" for one in config.thrusters]
+        super().__init__(ServoConfig().follow(config.limit, None, *names))
+        self.commands = tuple(f"cmd_{name}" for name in names)
+        place = torch.tensor([[t.x, t.y, t.z] for t in config.thrusters], dtype=torch.float64)
+        push = torch.tensor([t.push for t in config.thrusters], dtype=torch.float64)
+        push = nn.functional.normalize(push, dim=-1)
+        effect = torch.cat((push, torch.linalg.cross(place, push)), dim=-1)
+        self.register_buffer("map", effect, persistent=False)
+        self.map: Tensor
+        # ahead, about the vertical and down, as far as a thruster does any of it
+        wish = torch.stack((effect[:, 0], effect[:, 5], effect[:, 2]))
+        wish = torch.where(wish.abs() < 1e-9, 0.0, torch.sign(wish)) * config.limit
+        self.register_buffer("wish", wish[:2], persistent=False)
+        self.wish: Tensor
+        self.diving = wish[2]
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Return the thrusts [..., c]: each thruster's share of drive and steer; servos limit."""
+        return torch.stack((drive, steer), dim=-1) @ self.wish.to(drive.dtype)
+
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        return self.positions(a, command) @ self.map.to(command.dtype)

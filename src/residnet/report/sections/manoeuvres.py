@@ -77,10 +77,12 @@ _TELLING = (
 """The index of each kind of manoeuvre that stands on the first screen."""
 _CHANNELS = {
     "u": "surge velocity\nu", "v": "sway velocity\nv", "r": "yaw rate\nr", "p": "roll rate\np",
-    "psi": "heading\n", "phi": "roll angle\n",
+    "psi": "heading\n", "phi": "roll angle\n", "w": "heave velocity\nw", "q": "pitch rate\nq",
+    "z": "depth\n", "theta": "pitch angle\n",
     "cmd_delta": "rudder\ncommand", "cmd_n": "revolutions\ncommand", "cmd_port": "port command\n",
     "cmd_stbd": "starboard\ncommand",
 }  # fmt: skip
+_SHOWN = ("u", "v", "r", "p", "psi", "phi", "w", "q", "z", "theta")
 
 
 def index_title(name: str) -> str:
@@ -266,7 +268,7 @@ def flight_figures(flown: Mapping[str, Sequence[Flight]]) -> Iterator[Figure]:
     shown = [*stills, *(one for one in groups if one not in stills)][:_MOST_CASES]
     logs = [flight.motion for group in shown for flight in group]
     present = dict.fromkeys(name for log in logs for name in log.channels)
-    channels: list[str] = [name for name in ("u", "v", "r", "p", "psi", "phi") if name in present]
+    channels: list[str] = [name for name in _SHOWN if name in present]
     channels += [name for name in present if name.startswith("cmd_")]
     channels = channels[:_MOST_PANELS]
     units = {name: shown_unit(log.units[name]) for log in logs for name in log.channels}

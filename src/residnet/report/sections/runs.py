@@ -53,6 +53,10 @@ _MOTION = {
     "psi": "heading\n",
     "p": "roll rate\np",
     "phi": "roll angle\nphi",
+    "w": "heave velocity\nw",
+    "q": "pitch rate\nq",
+    "z": "depth\nz",
+    "theta": "pitch angle\ntheta",
 }
 _ERRORS = {
     "u": "u", "v": "v", "r": "r", "x": "position", "psi": "heading", "p": "p", "phi": "phi",
@@ -64,6 +68,8 @@ _AXES = (
     ("v_dot", "sway", "m/s²", 1.0),
     ("r_dot", "yaw", "deg/s²", DEG),
     ("p_dot", "roll", "deg/s²", DEG),
+    ("w_dot", "heave", "m/s²", 1.0),
+    ("q_dot", "pitch", "deg/s²", DEG),
 )
 # colour, line, order; the plant lies on the head that comes near it and shows it through its gaps
 _ROLES = {
