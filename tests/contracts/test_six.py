@@ -17,6 +17,7 @@ from residnet.core.frames import rotated, to_earth, turn_between, upright
 from residnet.core.layout import ATTITUDE, SIX, Live, levelled
 from residnet.core.registry import kinds
 from residnet.data.motion import MotionConfig, complete_motion
+from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.simulated import SimulatedTrials, fly_trials
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.rollout import Rollout, scripted
@@ -173,17 +174,29 @@ def test_zero_goes_on_level() -> None:
     assert float(after[0, 2]) == pytest.approx(0.1 * STEP)
 
 
-def test_what_logs_tell_and_lack() -> None:
-    config = SimulatedTrials.model_validate(
+def trials(count: int, duration: float) -> SimulatedTrials:
+    """Noiseless trials of the torpedo in depth and heading."""
+    kinds_of = [
+        {"kind": "depth_step", "depth": [3.0], "start": 1.0},
+        {"kind": "helix", "drive": [0.5, 0.9], "start": 1.0},
+        {"kind": "random_steps", "dive_amplitude": [0.2, 0.6], "drive_amplitude": [0.1, 0.3]},
+    ]
+    return SimulatedTrials.model_validate(
         {
             "vessel": "remus_100",
             "step": STEP,
-            "duration": 15.0,
-            "trials": [{"kind": "depth_step", "count": 2, "depth": [3.0], "start": 1.0}],
+            "substeps": 2,
+            "duration": duration,
+            "trials": [{**kind, "count": count} for kind in kinds_of],
             "identification": {},
             "validation": {},
+            "noise": {"u": 0.0, "v": 0.0, "r": 0.0},
         }
     )
+
+
+def test_what_logs_tell_and_lack() -> None:
+    config = trials(2, 15.0)
     log = fly_trials(config.draw(), config)[0].log
     live = Live.told(log.channels)
     assert live.spatial
@@ -206,8 +219,16 @@ def test_what_logs_tell_and_lack() -> None:
 
 def test_least_squares_find_the_vessel() -> None:
     """Of noiseless trials: what the trials determine is that of the vessel's file."""
-    samples = example_samples(signals=SUBMERGED, duration=40.0)
-    table = HULL.fit(HULL.build(samples.names), samples)
+    config, signals = trials(4, 40.0), SUBMERGED.build()
+    smoother = {"kind": "savitzky_golay", "window": 0.5, "order": 4}
+    how = PrepareConfig.model_validate({"grid": {"step": STEP}, "derivative": smoother})
+    logs = [
+        prepare(flight.log, "train", SUBMERGED.columns, how, SUBMERGED.live)
+        for flight in fly_trials(config.draw(), config)
+    ]
+    found_in = samples(logs, signals)
+    exact = RegressorsConfig(sets=("fossen",), ridge=1e-9)
+    table = exact.fit(exact.build(found_in.names), found_in)
     vessel = load_vessel("remus_100")
     assert isinstance(vessel, SubmergedConfig)
     terms, rows = vessel.hull().equations()
@@ -221,7 +242,10 @@ def test_least_squares_find_the_vessel() -> None:
         ("u", "u|u|", 0.05),
         ("r", "r|r|", 0.05),
         ("q", "sin(theta)", 0.05),
-        ("p", "cos(theta) sin(phi)", 0.1),
+        ("q", "q", 0.05),
+        ("v", "u r", 0.05),
+        ("w", "u q", 0.05),
+        ("p", "cos(theta) sin(phi)", 0.05),
     ):
         (found,) = (one.value for one in table if (one.axis, one.term) == (f"{axis}_dot", term))
         assert found == pytest.approx(true[axis, term], rel=most)

@@ -61,14 +61,22 @@ class Dynamics(nn.Module, ABC):
         self.n_state = 0
         self.dof, self.rolls = PLANAR.dof, False
         self.positions = True
-        self.turn_about(())
+        self.turn_about((), 0)
 
-    def turn_about(self, attitude: Sequence[int]) -> None:
-        """Take columns of roll, pitch and heading whose rates are those about the body axes."""
+    def turn_about(self, attitude: Sequence[int], width: int) -> None:
+        """Take columns of roll, pitch and heading whose rates are those about the body axes.
+
+        Args:
+            attitude: the columns; none where angles add up.
+            width: number of states.
+        """
         self.spatial = len(attitude) > 0
-        places = torch.tensor(attitude, dtype=torch.long)
-        self.register_buffer("attitude", places, persistent=False)
+        places = torch.arange(width)
+        places[list(attitude)] = width + torch.arange(len(attitude))
+        for name, value in (("attitude", torch.tensor(attitude).long()), ("rearranged", places)):
+            self.register_buffer(name, value, persistent=False)
         self.attitude: Tensor
+        self.rearranged: Tensor
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the derivative of the state [B, nx] at a stage, for models that integrate.
@@ -140,7 +148,8 @@ class Dynamics(nn.Module, ABC):
         """Return rates k [B, nx] after a change [B, nx] as those of the change itself."""
         turn, rate = change.index_select(-1, self.attitude), k.index_select(-1, self.attitude)
         bent = cross(turn, rate)
-        return k.index_copy(-1, self.attitude, rate + 0.5 * bent + cross(turn, bent) / 12.0)
+        rate = rate + 0.5 * bent + cross(turn, bent) / 12.0
+        return torch.cat((k, rate), dim=-1).index_select(-1, self.rearranged)
 
     def integrate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the state one step later, [B, nx]."""
@@ -154,7 +163,7 @@ class Dynamics(nn.Module, ABC):
         turned = rotated(
             x.index_select(-1, self.attitude), change.index_select(-1, self.attitude)
         )
-        return after.index_copy(-1, self.attitude, turned)
+        return torch.cat((after, turned), dim=-1).index_select(-1, self.rearranged)
 
     def integrate_from(self, k: Tensor, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the state one step later [B, nx], where its derivative k [B, nx] is known.

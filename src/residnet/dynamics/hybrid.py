@@ -140,7 +140,7 @@ class HybridDynamics(Dynamics):
         self.dof = live.size
         self.whole, self.free = live.whole, len(live.learned) == live.size
         self.rolls, self.level = live.rolls, not live.rolls
-        self.turn_about(ATTITUDE if live.spatial else ())
+        self.turn_about(ATTITUDE if live.spatial else (), len(live.states))
         for name, value in {
             "live": live.mask(),
             "living": live.alive(),

@@ -45,7 +45,7 @@ class PlantDynamics(Dynamics):
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
         super().__init__(dt / substeps, "rk4")
-        self.turn_about(plant.attitude)
+        self.turn_about(plant.attitude, len(plant.state))
         self.plant = plant
         self.substeps = substeps
 

@@ -184,7 +184,7 @@ class ModelSpec(Stored):
             if live.spatial:
                 # it goes on over the ground, level
                 model.rolls = False
-                model.turn_about(())
+                model.turn_about((), 0)
         return model
 
     @property

@@ -70,7 +70,7 @@ class GuardedDynamics(Dynamics):
         self.largest = _LARGEST
         self.n_state = model.n_state
         self.dof, self.rolls = model.dof, model.rolls
-        self.turn_about(ATTITUDE if model.spatial else ())
+        self.turn_about(ATTITUDE if model.spatial else (), len(spec.signals.live.states) + 1)
         low, high, reach = (
             torch.tensor(part, dtype=torch.float64) for part in (spec.low, spec.high, _reach(spec))
         )

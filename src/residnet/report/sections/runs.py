@@ -59,7 +59,8 @@ _MOTION = {
     "theta": "pitch angle\ntheta",
 }
 _ERRORS = {
-    "u": "u", "v": "v", "r": "r", "x": "position", "psi": "heading", "p": "p", "phi": "phi",
+    "u": "u", "v": "v", "r": "r", "x": "position", "psi": "heading", "w": "w", "p": "p", "q": "q",
+    "z": "depth", "phi": "phi", "theta": "theta",
 }  # fmt: skip
 """Channel whose unit an error has, and the name of the error."""
 _SI: Units = {name: (unit, *shown_unit(unit)) for name, unit in CHANNEL_UNITS.items()}
@@ -340,7 +341,7 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
 def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the error of every model against the horizon, on a logarithmic scale."""
     cases, units, shown = [], units_of(run), _errors_of(run)
-    named = [name for name in _ERRORS if name in units]
+    named = _told(run.live)
     factors = [units[name][2] for name in named]
     for protocol in run.protocols:
         members = [window for window in windows if window.protocol == protocol]
@@ -381,7 +382,12 @@ def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
 def _errors_of(run: RunFiles) -> dict[str, int]:
     """Return the channels of `_ERRORS` that the live velocities move, with their places there."""
     moved = _moved(run.live)
-    return {name: place for place, name in enumerate(_ERRORS) if name in moved}
+    return {name: place for place, name in enumerate(_told(run.live)) if name in moved}
+
+
+def _told(live: Live) -> list[str]:
+    """Return the channels of `_ERRORS` that free runs of a layout have errors of."""
+    return [name for name in _ERRORS if name in ("x", "psi", *live.moving)]
 
 
 def error_bars(run: RunFiles) -> Figure:
