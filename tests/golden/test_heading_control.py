@@ -99,9 +99,7 @@ def rudder_step(angle: str) -> Case:
     return Case(
         plant,
         NomotoDynamics(plant, 0.01),
-        lambda t: ScheduleSource(
-            plant.demand(torch.ones_like(t)[None], steer * (t >= 1.0)[None])
-        ),
+        lambda t: ScheduleSource(plant.demand(torch.ones_like(t)[None], steer * (t >= 1.0)[None])),
     )
 
 

@@ -18,8 +18,8 @@ from residnet.physics.vessel import VesselConfig, load_vessel
 from residnet.physics.vessel_file import vessel_files
 
 HULLS = [name for name in vessel_files() if not name.startswith("nomoto")]
-# the forces of a real hull: the published series of the Mariner has Y_0 and N_0, and the screw of the
-# REMUS turns one way
+# the forces of a real hull: the published series of the Mariner has Y_0 and N_0, and the screw of
+# the REMUS turns one way
 SYMMETRIC = [name for name in vessel_files() if name not in ("mariner", "remus_100")]
 ODD = {"y", "psi", "phi", "v", "r", "p", "delta", "nozzle", "tau_y", "tau_n", "force_y", "force_k",
        "force_n", "current_east", "force_east", "wind_dir", "_yaw_lag"}  # fmt: skip
@@ -230,9 +230,10 @@ def test_energy_is_kept_without_damping_and_falls_with_it(
         phi, theta = states[..., 3], states[..., 4]
         body, water = vessel.rigid_body, vessel.buoyancy
         weight, lift = body.m.value * 9.81, water.density.value * 9.81 * water.volume.value
-        x, z = (weight * g.value - lift * b.value for g, b in (
-            (body.x_G, water.x_B), (body.z_G, water.z_B)
-        ))
+        x, z = (
+            weight * g.value - lift * b.value
+            for g, b in ((body.x_G, water.x_B), (body.z_G, water.z_B))
+        )
         depth = (weight - lift) * states[..., 2]
         upright = torch.cos(theta) * torch.cos(phi)
         energy = energy - depth + x * torch.sin(theta) - z * upright + abs(x) + abs(z) + 10.0

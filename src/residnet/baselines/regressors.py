@@ -306,8 +306,8 @@ class RegressorsConfig(IdentifiedConfig):
             rudder); `abkowitz` (third-order Taylor series about straight ahead); `astern` (what
             tells a propeller that turns astern); `wind`; `polynomial_1`, `polynomial_2` (all
             products of velocities and inputs, the ridge models of document 001 section 2.2).
-        terms: further regressors of every axis, or of each axis `u`, `v`, `r` (and `p` of a
-            roll, `w`, `p`, `q` of six); with neither sets nor terms: the constant and every channel.
+        terms: further regressors of every axis, or of each axis `u`, `v`, `r` (and `p` of a roll,
+            `w`, `p`, `q` of six); with neither sets nor terms: the constant and every channel.
         drive: channels that the sets take as thrust; empty: n, or tau_x where the model makes
             forces.
         steer: channels that the sets take as steering; empty: delta, or tau_n where the model makes

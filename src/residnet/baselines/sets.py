@@ -145,9 +145,7 @@ def submerged(roles: Roles) -> list[str]:
     pairs = [" ".join(pair) for pair in combinations(velocities, 2)]
     turns = [f"{name}^2" for name in velocities if name in ("p", "q", "r")]
     driving = (*roles.drives, *roles.others)
-    thrust = [
-        t for n in driving for t in ([n] if is_force(n) else [f"{n}|{n}|", f"|{n}| u"])
-    ]
+    thrust = [t for n in driving for t in ([n] if is_force(n) else [f"{n}|{n}|", f"|{n}| u"])]
     fins = [f"u^2 {fin}{power}" for fin in roles.steers for power in ("", "^2")]
     damping = [f"{name}|{name}|" for name in velocities]
     return [*velocities, *damping, *pairs, *turns, *VERTICAL, *thrust, *fins]
@@ -210,7 +208,14 @@ def _polynomial(roles: Roles, degree: int) -> list[str]:
     return [
         "1",
         *polynomial_terms(
-            (*(n for n in roles.moving if n != "z"), *roles.drives, *roles.steers, *roles.others, *wind), degree
+            (
+                *(n for n in roles.moving if n != "z"),
+                *roles.drives,
+                *roles.steers,
+                *roles.others,
+                *wind,
+            ),
+            degree,
         ),
     ]
 

@@ -108,7 +108,7 @@ _FEW = 50
 
 @dataclass(frozen=True)
 class Live:
-    """Which velocities a model moves: those of u, v and r that were recorded, p of the roll, or six.
+    """Which velocities a model moves: those of u, v and r that were recorded, p, or all six.
 
     Of u, v and r the others are zero at all times: they have no equation, no term and no error. The
     pose is what the live ones lead to, a straight line from surge alone, a turn on the spot from

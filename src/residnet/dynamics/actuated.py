@@ -64,7 +64,11 @@ class PlantActuators(Actuators):
         super().__init__()
         self.plant = plant
         self.inputs, self.commands = plant.inputs, plant.commands
-        self.columns = [i for i, name in enumerate(plant.state) if name not in (*ROLLING.names, *SUBMERGED.names)]
+        self.columns = [
+            i
+            for i, name in enumerate(plant.state)
+            if name not in (*ROLLING.names, *SUBMERGED.names)
+        ]
         self.state = tuple(plant.state[i] for i in self.columns)
         self.dynamics = TracedPlantDynamics(plant, dt, substeps) if self.columns else None
 

@@ -160,9 +160,7 @@ class Dynamics(nn.Module, ABC):
         after = x + change
         if not self.spatial:
             return after
-        turned = rotated(
-            x.index_select(-1, self.attitude), change.index_select(-1, self.attitude)
-        )
+        turned = rotated(x.index_select(-1, self.attitude), change.index_select(-1, self.attitude))
         return torch.cat((after, turned), dim=-1).index_select(-1, self.rearranged)
 
     def integrate_from(self, k: Tensor, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:

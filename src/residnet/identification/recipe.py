@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from residnet.baselines.sets import Roles, submerged
 from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
-from residnet.baselines.sets import Roles, submerged
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches

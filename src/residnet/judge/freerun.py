@@ -123,7 +123,10 @@ class Errors:
         if live.spatial:
             roll = live.states.index("phi")
             error[:, roll] = wrap_array(error[:, roll])
-            last = [(one.states[-1], log.y[part][-1]) for one, (log, part) in zip(predictions, rows)]
+            last = [
+                (one.states[-1], log.y[part][-1])
+                for one, (log, part) in zip(predictions, rows, strict=True)
+            ]
             found, wanted = (np.stack(side)[:, ATTITUDE] for side in zip(*last, strict=True))
             ends = turn_between(found, wanted)
         return cls(
@@ -327,8 +330,7 @@ def _simulated(
 def _prediction(
     window: Window, run: np.ndarray, logs: Sequence[Prepared], step: float, limit: np.ndarray
 ) -> Prediction:
-    """Return states [L, 3 + n] or what moves [L, n] with its pose; those of `zero` if it ran away.
-    """
+    """Return states [L, 3 + n] or what moves [L, n] with its pose; of `zero` if it ran away."""
     log, rows = logs[window.log], slice(window.start, window.stop)
     nu = run[:, -log.live.size :]
     recorded = np.abs(log.y[rows, log.live.columns][log.usable[rows]])

@@ -18,9 +18,7 @@ from residnet.physics.terms import TermLibrary
 
 ROLLING = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
 """Surge, sway, roll and yaw, without heave and pitch (document 004 and its corrections)."""
-SUBMERGED = StateLayout(
-    ("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r")
-)
+SUBMERGED = StateLayout(("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r"))
 """All six degrees of freedom, z the depth."""
 _LAYOUTS = {one.dof: one for one in (PLANAR, ROLLING, SUBMERGED)}
 _AXES = {
@@ -205,9 +203,7 @@ class HullPlant(Plant):
         self.rolls, self.dives = self.n == ROLLING.dof, self.n == SUBMERGED.dof
         self.weather = True
         self.state = (*_LAYOUTS[self.n].names, *actuators.state)
-        self.attitude = (
-            tuple(map(self.state.index, ("phi", "theta", "psi"))) if self.dives else ()
-        )
+        self.attitude = tuple(map(self.state.index, ("phi", "theta", "psi"))) if self.dives else ()
         self.diving = actuators.diving
         self.parts = [self.n, self.n, len(actuators.state)]
         self.commands = len(actuators.commands)

@@ -44,8 +44,8 @@ class SignalsConfig(Config):
             their sign too.
         velocities: those of u, v and r that the logs tell and the model moves; the others are zero
             at all times. A model of surge alone has [u]. With p behind them the model rolls: logs
-            need the roll angle phi, which is a state and a channel of it. [u, v, r, w, p, q] are all
-            six degrees of freedom: logs need depth z, roll and pitch.
+            need the roll angle phi, which is a state and a channel of it. [u, v, r, w, p, q] are
+            all six degrees of freedom: logs need depth z, roll and pitch.
     """
 
     inputs: tuple[str, ...]

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from residnet.core.layout import ALIVE, Live
-from residnet.core.layout import SIX
+from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, STATE
 from residnet.data.drafting.questions import Marks

@@ -17,7 +17,23 @@ from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.data.channels import noise_of, spikes
 
-MEASURED = ("x", "y", "psi", "u", "v", "r", "phi", "p", "w", "q", "z", "theta", "u_dot", "v_dot", "r_dot")
+MEASURED = (
+    "x",
+    "y",
+    "psi",
+    "u",
+    "v",
+    "r",
+    "phi",
+    "p",
+    "w",
+    "q",
+    "z",
+    "theta",
+    "u_dot",
+    "v_dot",
+    "r_dot",
+)
 """Channels that a sensor or filter measures; all others drive the vessel."""
 STEERING = ("delta", "tau_n", "acting_tau_n", "cmd_delta", "nozzle", "cmd_nozzle")
 """Channels of which a positive value turns the vessel."""
