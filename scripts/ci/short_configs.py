@@ -49,6 +49,16 @@ _TRIALS = (
     "data.identification={zigzag: 4, acceleration_deceleration: 2, three_two_one_one: 2}",
     "data.validation={zigzag: 1, acceleration_deceleration: 1, three_two_one_one: 1}",
 )
+# and of those under water
+_DIVES = (
+    "data.trials=[{kind: depth_step, count: 4, depth: [1], drive: [0.1, 0.2], dive: [0.1, 0.2]},"
+    " {kind: random_steps, count: 4, drive: [0.1, 0.2], steer_amplitude: [0.0, 0.04],"
+    " dive_amplitude: [0.0, 0.1], own_amplitude: [0.01, 0.04]}]",
+    "data.identification={depth_step: 3, random_steps: 3}",
+    "data.validation={depth_step: 1, random_steps: 1}",
+    "refit={}",
+    "bands=null",
+)
 _ONE_STEP = "{epochs: 1, window: 2 s, batch: 32}"
 _MULTI_STEP = "[{horizon: 2 s, epochs: 1, batch: 32}]"
 
@@ -154,6 +164,8 @@ SHORT: dict[str, Short] = {
     "rudder_boat_trials": Short(_TRIALS),
     "patrol_identified": Short(_trained("mlp")),
     "patrol_roll": Short((*_TRIALS, "refit={}", "bands=null", *_trained("network"))),
+    "remus_100": Short((*_DIVES, *_trained("mlp", "lstm"))),
+    "bluerov2_heavy": Short((*_DIVES, *_trained("lstm"))),
     "kvlcc2": Short(
         (
             "prepare.grid={step: 0.5 s, held: [n, delta]}",

@@ -46,8 +46,8 @@ def example_samples(
     tau_x, tau_y, tau_n.
 
     Args:
-        vessel: name of the vessel; that catamaran, a patrol vessel for signals with roll, or a torpedo
-            for six degrees of freedom.
+        vessel: name of the vessel; that catamaran, a patrol vessel for signals with roll, or a
+            torpedo for six degrees of freedom.
         signals: what drives the model; channels of the vessel's logs.
         duration: of each manoeuvre in s.
     """
