@@ -69,7 +69,7 @@ def test_a_vessel_in_a_batch_with_gradients(name: str) -> None:
         moved = plant.end_step(x[one], w[one], 0.01)[0]
         torch.testing.assert_close(moved, plant.end_step(x, w, 0.01)[row])
     # what a log may hold has a unit; thrusters are named by the vessel file
-    free = ("_", "n_", "alpha_", "cmd_n_", "cmd_alpha_")
+    free = ("_", "n_", "alpha_", "cmd_n_", "cmd_alpha_", "cmd_thrust_")
     logged = [n for n in (*plant.state, *plant.inputs[: plant.commands]) if not n.startswith(free)]
     assert [n for n in logged if n not in CHANNEL_UNITS] == []
     assert {"x", "y", "psi", "u", "v", "r"} <= set(plant.state)
@@ -215,12 +215,14 @@ def test_energy_is_kept_without_damping_and_falls_with_it(
     assert isinstance(plant, HullPlant)
     n, random = plant.n, torch.Generator().manual_seed(3)
     x0 = torch.zeros(16, len(plant.state), dtype=torch.float64)
-    sizes = {3: [1.5, 0.6, 0.4], 4: [6.0, 1.0, 0.2, 0.05], 6: [0.5, 0.05, 0.05, 1.0, 0.2, 0.2]}
+    sizes = {3: [1.5, 0.6, 0.4], 4: [6.0, 1.0, 0.2, 0.05], 6: [0.4, 0.05, 0.05, 0.6, 0.15, 0.15]}
     spread = torch.tensor(sizes[n], dtype=torch.float64)
     x0[:, n : 2 * n] = torch.randn(16, n, generator=random, dtype=torch.float64) * spread
     w = torch.zeros(16, 300, len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.01))(x0, w, x0[:, :0])
+        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.01, 2 if n == 6 else 1))(
+            x0, w, x0[:, :0]
+        )
     nu, mass = states[..., n : 2 * n], 0.5 * (plant.hull.mass + plant.hull.mass.T)
     energy = 0.5 * torch.einsum("bti,ij,btj->bt", nu, mass, nu)
     if n == 4:

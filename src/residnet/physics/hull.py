@@ -625,11 +625,11 @@ class SubmergedConfig(HullVessel):
         # the vertical along the body axes
         down = ("sin(theta)", "cos(theta) sin(phi)", "cos(theta) cos(phi)")
         signs, net = (-1.0, 1.0, 1.0), weight - lift
-        arm = (weight * x - lift * water.x_B.value, 0.0, weight * z - lift * water.z_B.value)
+        levers = (weight * x - lift * water.x_B.value, 0.0, weight * z - lift * water.z_B.value)
         for axis, a, b in turns:
             add(axis, down[axis], signs[axis] * net)
-            add(3 + axis, down[b], signs[b] * arm[a])
-            add(3 + axis, down[a], -signs[a] * arm[b])
+            add(3 + axis, down[b], signs[b] * levers[a])
+            add(3 + axis, down[a], -signs[a] * levers[b])
         channels = (*SUBMERGED.velocities, "phi", "theta")
         return Hull(mass.tolist(), rows, channels, self.name)
 

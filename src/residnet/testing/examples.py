@@ -24,7 +24,9 @@ SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolve
 ROLLING = SignalsConfig(inputs=("delta", "cmd_thrust"), velocities=("u", "v", "r", "p"))
 """Inputs of example models of a patrol vessel that rolls."""
 
-SUBMERGED = SignalsConfig(inputs=("delta", "delta_s", "n"), velocities=SIX.velocities)
+SUBMERGED = SignalsConfig(
+    inputs=("delta", "delta_s", "n"), velocities=("u", "v", "r", "w", "p", "q")
+)
 """Inputs of example models of a torpedo in six degrees of freedom."""
 
 _VESSELS = {PLANAR: "wam_v_cal", ROLL: "patrol_p06_linear", SIX: "remus_100"}
