@@ -26,6 +26,7 @@ FAMILIES, MANOEUVRES = kinds(FamilyConfig), kinds(ManoeuvreConfig)
 NEEDS: dict[str, Any] = {
     "count": 5,
     "heading": (0.2, 0.4),
+    "depth": (1.0, 2.0),
     "drive": (0.3, 0.8),
     "steer": (-0.5, 0.4),
 }
@@ -78,8 +79,10 @@ def replays() -> list[Manoeuvre]:
     return out
 
 
+# of a vessel that dives; the contracts fly them
+DIVING = ("helix", "vertical_zigzag", "depth_step")
 # needs a vessel with all three forces; see test_closed_loop
-FLOWN = [kind for kind in MANOEUVRES if kind != "four_corner"]
+FLOWN = [kind for kind in MANOEUVRES if kind not in ("four_corner", *DIVING)]
 
 
 def times(seconds: float = DURATION, dt: float = DT) -> Tensor:
