@@ -49,6 +49,7 @@ HEADS: dict[str, dict[str, Any]] = {
     "kernel": {"folds": 2, "penalties": [0.1]},
     "mlp": {"hidden": [8]},
     "lstm": {"hidden_size": 6},
+    "recurrent": {"hidden_size": 6},
 }
 RUDDER = SignalsConfig(inputs=("n", "delta"))
 # what a baseline cannot do without, and whose trials it is identified from
@@ -105,18 +106,21 @@ def _canonical(log: Log, folder: Path) -> Path:
     return folder / f"{log.name}.parquet"
 
 
-@pytest.mark.parametrize("kind", kinds(HeadConfig))
-def test_head(kind: str) -> None:
+def head_of(kind: str) -> Any:
     if kind == "genetic":
         pytest.importorskip("deap", reason="genetic programming needs the extra gp")
-    check_head(validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here"))
+    return validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here")
+
+
+@pytest.mark.parametrize("signals", [SIGNALS, ROLLING], ids=["planar", "roll"])
+@pytest.mark.parametrize("kind", kinds(HeadConfig))
+def test_head(kind: str, signals: SignalsConfig) -> None:
+    check_head(head_of(kind), signals)
 
 
 @pytest.mark.parametrize("kind", sorted({*kinds(HeadConfig)} - {"sklearn"}))
 def test_a_head_flies_in_c_as_it_does_in_torch(kind: str) -> None:
-    if kind == "genetic":
-        pytest.importorskip("deap", reason="genetic programming needs the extra gp")
-    config = validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here")
+    config = head_of(kind)
     model, z = example_model(example_spec(config)).eval(), example_samples().z
     model.positions = False
     z = z[torch.arange(3)[:, None] * 100 + torch.arange(100)]
@@ -130,8 +134,8 @@ def test_a_head_flies_in_c_as_it_does_in_torch(kind: str) -> None:
     for dtype, share in ((torch.float64, 1e-9), (torch.float32, 1e-5)):
         x, w, s = (part.to(dtype) for part in given)
         slow = Rollout(model.to(dtype))
+        fast = CompiledRollout(slow, x, w, s)
         with torch.no_grad():
-            fast = CompiledRollout(slow, x, w, s)
             found, wanted = fast(x, w, s), slow(x, w, s)
             exact = wanted if dtype == torch.float64 else exact
         for one, other, true in zip(found, wanted, exact, strict=True):
@@ -142,7 +146,7 @@ def test_a_head_flies_in_c_as_it_does_in_torch(kind: str) -> None:
             )
             assert bool(((one - true).abs() <= share * (size + 1e-3) + 2.0 * rounded).all())
         if trained:
-            fast, w = CompiledRollout(slow, x, w, s), w[:, :40]
+            w = w[:, :40]
             slopes = []
             for run in (fast, slow):
                 start = (x.clone().requires_grad_(), s.clone().requires_grad_())
@@ -245,11 +249,8 @@ def _drawn(kind: str, signals: SignalsConfig = SIGNALS) -> SignalsConfig:
 
 @pytest.mark.parametrize("kind", kinds(HeadConfig))
 def test_a_head_leaves_dead_velocities_at_zero(kind: str) -> None:
-    if kind == "genetic":
-        pytest.importorskip("deap", reason="genetic programming needs the extra gp")
     signals = _drawn(kind)
-    config = validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here")
-    model = example_model(example_spec(config, signals))
+    model = example_model(example_spec(head_of(kind), signals))
     inner = getattr(model, "members", [model])[0].head
     seen = [part for part in inner.modules() if isinstance(part, Features)]
     assert seen

@@ -26,7 +26,6 @@ from residnet.dynamics.actuated import ActuatedDynamics, PlantActuators
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import ModelSpec, save_model
-from residnet.heads import HeadConfig
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
 from residnet.identification.changes import Change, ChangedDynamics
@@ -37,24 +36,10 @@ from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.vessel import load_vessel
 from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
 from residnet.simulators.vehicle import vehicle
-from residnet.testing import check_baseline, check_head, example_samples
+from residnet.testing import check_baseline, example_samples
 from residnet.testing.examples import ROLLING, example_model, example_spec
 
-HEADS: dict[str, dict[str, Any]] = {
-    "genetic": {"evolution": {"population": 60, "generations": 3}},
-    "kernel": {"folds": 2, "penalties": [0.1]},
-    "mlp": {"hidden": [8]},
-    "lstm": {"hidden_size": 6},
-    "recurrent": {"hidden_size": 6},
-}
 PHI, P = ROLL.names.index("phi"), ROLL.names.index("p")
-
-
-@pytest.mark.parametrize("kind", kinds(HeadConfig))
-def test_head(kind: str) -> None:
-    if kind == "genetic":
-        pytest.importorskip("deap", reason="genetic programming needs the extra gp")
-    check_head(validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here"), ROLLING)
 
 
 @pytest.mark.parametrize("kind", kinds(BaselineConfig))

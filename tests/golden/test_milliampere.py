@@ -30,7 +30,7 @@ from residnet.control import (
 from residnet.core.config import load_config
 from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Playback, Rollout
-from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
+from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.physics.hull import MassMatrixConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import vessel_files
@@ -332,6 +332,6 @@ def test_the_disturbed_plant_is_the_calm_one_without_disturbance() -> None:
     )
     w = torch.cat((command, torch.zeros(2, 1000, 7, dtype=torch.float64)), dim=-1)
     with torch.no_grad():
-        plain, _, _ = Rollout(PlantDynamics(full, DT))(x0, w, x0[:, :0])
-        fast, _, _ = Rollout(PlantDynamics(calm, DT))(x0, command, x0[:, :0])
+        plain, _, _ = Rollout(TracedPlantDynamics(full, DT))(x0, w, x0[:, :0])
+        fast, _, _ = Rollout(TracedPlantDynamics(calm, DT))(x0, command, x0[:, :0])
     torch.testing.assert_close(fast, plain, rtol=1e-10, atol=1e-11)

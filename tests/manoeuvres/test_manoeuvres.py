@@ -11,7 +11,6 @@ import pytest
 import torch
 from flown_manoeuvres import (
     DIVING,
-    DT,
     DURATION,
     EXAMPLES,
     FAMILIES,
@@ -20,6 +19,7 @@ from flown_manoeuvres import (
     drawn,
     fly,
     times,
+    traced,
 )
 from kinds import of_kind
 
@@ -28,7 +28,6 @@ from residnet.core.errors import ConfigError, UsageError
 from residnet.core.log import Log
 from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, ScheduleSource, StackedSource
 from residnet.manoeuvres.closed_loop import Zigzag
@@ -79,40 +78,29 @@ def test_draws_are_repeatable_by_seed(random_kind: str) -> None:
         assert len({m.model_dump_json() for m in drawn(kind)}) == 5
 
 
-def test_indices_follow_from_what_was_flown(kind: str, plant: Plant) -> None:
+def test_a_batch_is_single_flights_with_commands_in_bounds_and_indices(
+    kind: str, plant: Plant
+) -> None:
     """Every kind reads its indices off its own flight: finite numbers with a unit."""
-    manoeuvre = drawn(kind)[0].model_copy()
-    states, commands = fly(plant, [manoeuvre])
-    channels = dict(zip(plant.state, states[0, :-1].T.numpy(), strict=True))
-    channels |= dict(zip(("cmd_port", "cmd_stbd"), commands[0].T.numpy(), strict=True))
-    indices = manoeuvre.indices(Log(kind, times().numpy(), channels), length=5.0)
-    assert {name.removesuffix("_lengths") for name in indices} <= set(UNITS)
-    assert all(np.isfinite(value).all() for value in indices.values())
-    assert bool(indices) == (kind in WITH_INDICES)
-
-
-def test_what_was_drawn_can_be_written_down_and_read_back(kind: str) -> None:
-    for manoeuvre in drawn(kind):
+    manoeuvres = drawn(kind)
+    for manoeuvre in manoeuvres:
         assert validate(manoeuvre.model_dump(mode="json"), ManoeuvreConfig, "log") == manoeuvre
-
-
-def test_commands_are_within_bounds(kind: str, plant: Plant) -> None:
-    states, commands = fly(plant, drawn(kind))
+    states, commands = fly(plant, manoeuvres)
     n_max = float(of_kind(plant.actuators, Thrusters).n_max.max())
     assert bool(torch.isfinite(states).all())
-    assert float(commands.abs().max()) <= n_max
-    assert float(commands.abs().max()) > 0
+    assert 0 < float(commands.abs().max()) <= n_max
     # the propellers follow
     assert float(states[..., 6:].abs().max()) <= n_max
-
-
-def test_a_batch_equals_single_flights(kind: str, plant: Plant) -> None:
-    manoeuvres = drawn(kind)
-    states, commands = fly(plant, manoeuvres)
     for i, manoeuvre in enumerate(manoeuvres[:2]):
         alone, command = fly(plant, [manoeuvre])
         torch.testing.assert_close(alone[0], states[i], rtol=1e-10, atol=1e-12)
         assert torch.equal(command[0], commands[i])
+    channels = dict(zip(plant.state, states[0, :-1].T.numpy(), strict=True))
+    channels |= dict(zip(("cmd_port", "cmd_stbd"), commands[0].T.numpy(), strict=True))
+    indices = manoeuvres[0].indices(Log(kind, times().numpy(), channels), length=5.0)
+    assert {name.removesuffix("_lengths") for name in indices} <= set(UNITS)
+    assert all(np.isfinite(value).all() for value in indices.values())
+    assert bool(indices) == (kind in WITH_INDICES)
 
 
 def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
@@ -125,39 +113,40 @@ def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
     w = torch.zeros(len(x0), len(t), len(plant.inputs), dtype=torch.float64)
     w[:, :, 2] = 5.0
     with torch.no_grad():
-        states, inputs, _ = Rollout(PlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
+        states, inputs, _ = Rollout(traced(plant), source)(x0, w, x0[:, :0])
         assert bool((inputs[:, :, 2] == 5.0).all()), "disturbances pass through a manoeuvre"
         for i, group in enumerate(groups):
-            alone, _, _ = Rollout(
-                PlantDynamics(plant, DT), type(group[0]).source(group, Helm.from_plant(plant), t)
-            )(x0[:2], w[:2], x0[:2, :0])
+            source = type(group[0]).source(group, Helm.from_plant(plant), t)
+            alone, _, _ = Rollout(traced(plant), source)(x0[:2], w[:2], x0[:2, :0])
             torch.testing.assert_close(alone, states[2 * i : 2 * i + 2], rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("first", ["starboard", "port"])
-@pytest.mark.parametrize("psi", [0.0, 2.5, -7.0])
-def test_zigzag_switches_at_its_bound(
-    first: Literal["starboard", "port"], psi: float, plant: Plant
-) -> None:
+def test_zigzag_switches_at_its_bound(plant: Plant) -> None:
     bound = float(np.radians(15))
-    zigzag = Zigzag(drive=0.5, steer=0.4, start=4.0, heading=bound, first=first)
-    states, commands = fly(plant, [zigzag], seconds=40.0, psi=psi)
-    heading = states[0, :-1, 2].numpy() - psi
-    side = np.sign((commands[0, :, 0] - commands[0, :, 1]).numpy())
+    sides: list[Literal["starboard", "port"]] = ["starboard", "port"]
+    cases = [(first, psi) for first in sides for psi in (0.0, 2.5, -7.0)]
+    zigzags = [
+        Zigzag(drive=0.5, steer=0.4, start=4.0, heading=bound, first=first) for first, _ in cases
+    ]
+    begun = torch.tensor([psi for _, psi in cases], dtype=torch.float64)
+    states, commands = fly(plant, [*zigzags], seconds=40.0, psi=begun)
     t = times(40.0).numpy()
-    assert (side[t < 4.0 - 1e-9] == 0).all()
-    expected, current = [], 1.0 if first == "starboard" else -1.0
-    for k in range(len(t)):
-        if current * heading[k] >= bound:
-            current = -current
-        expected.append(current if t[k] >= 4.0 else 0.0)
-    np.testing.assert_array_equal(side, expected)
-    assert (np.diff(side[t >= 4.0]) != 0).sum() >= 4
-    # positive steer turns to starboard: the heading first grows for `starboard`
-    later = heading[(t > 5.0)][:20]
-    assert (np.sign(later) == (1.0 if first == "starboard" else -1.0)).all()
-    # and overshoots the bound
-    assert np.abs(heading).max() > bound
+    for row, (first, psi) in enumerate(cases):
+        heading = states[row, :-1, 2].numpy() - psi
+        side = np.sign((commands[row, :, 0] - commands[row, :, 1]).numpy())
+        assert (side[t < 4.0 - 1e-9] == 0).all()
+        expected, current = [], 1.0 if first == "starboard" else -1.0
+        for k in range(len(t)):
+            if current * heading[k] >= bound:
+                current = -current
+            expected.append(current if t[k] >= 4.0 else 0.0)
+        np.testing.assert_array_equal(side, expected)
+        assert (np.diff(side[t >= 4.0]) != 0).sum() >= 4
+        # positive steer turns to starboard: the heading first grows for `starboard`
+        later = heading[(t > 5.0)][:20]
+        assert (np.sign(later) == (1.0 if first == "starboard" else -1.0)).all()
+        # and overshoots the bound
+        assert np.abs(heading).max() > bound
 
 
 def test_three_two_one_one_pattern() -> None:

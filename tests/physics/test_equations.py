@@ -272,7 +272,7 @@ def test_forces_follow_by_the_thruster_dynamics() -> None:
     w = torch.zeros(1, 300, len(plant.inputs), dtype=torch.float64)
     w[..., 0], w[..., 1], w[..., 2] = 100.0, -5000.0, 30.0
     with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, 0.01))(x0, w, x0[:, :0])
+        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.01))(x0, w, x0[:, :0])
     t = 0.01 * np.arange(301)
     step = 1 - np.exp(-1.6 * t) * (np.cos(1.2 * t) + 1.6 / 1.2 * np.sin(1.2 * t))
     np.testing.assert_allclose(states[0, :, 6:9], step[:, None] * [100.0, -995.0, 30.0], atol=1e-5)

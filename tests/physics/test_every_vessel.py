@@ -174,7 +174,7 @@ def test_a_manoeuvre_in_a_current_is_the_manoeuvre_and_the_drift() -> None:
     x0 = plant.approach(2)
     x0[1, 3], x0[1, 4] = 0.3, 0.2
     with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, 0.04))(x0, w, x0[:, :0])
+        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.04))(x0, w, x0[:, :0])
     drift = states[1, -1, :3] - states[0, -1, :3]
     wanted = torch.tensor([0.3 * 20, 0.2 * 20, 0.0], dtype=torch.float64)
     torch.testing.assert_close(drift, wanted, rtol=0, atol=1e-4)

@@ -197,6 +197,7 @@ def test_cases_on_a_page_hold_their_curves_to_a_part_in_sixty_thousand() -> None
     assert draw([]) is None
 
 
+@pytest.mark.long
 @needs_browser
 def test_a_browser_draws_every_kind_and_cuts_a_surface(tmp_path: Path) -> None:
     figures = write_figures(tmp_path / "figures", [surfaces(), every_kind()])

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,8 @@ from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import actuators, autopilot, course, import_logs, manoeuvres, study
 
+needs_browser = pytest.mark.skipif(browser() is None, reason="no browser is installed")
+
 
 @dataclass(frozen=True)
 class Reported:
@@ -48,25 +51,31 @@ TASKS = {
 }
 
 
-def page_of(task: str, folder: Path) -> Path:
-    """Write the page of a made-up run of that task."""
-    reported = TASKS[task]
-    run = RunFiles(reported.make(folder))
-    return write_page(run.path, run.title, "Made by hand.", ["Done."], reported.sections(run))
+@pytest.fixture(scope="module")
+def page_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Writes the page of a made-up run of a task, once."""
+
+    def written(task: str) -> Path:
+        reported = TASKS[task]
+        run = RunFiles(reported.make(tmp_path_factory.mktemp(task) / "run"))
+        return write_page(run.path, run.title, "Made by hand.", ["Done."], reported.sections(run))
+
+    return cache(written)
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_every_task_has_a_page_whose_sections_hold_something(task: str, tmp_path: Path) -> None:
-    path = page_of(task, tmp_path / "run")
+def test_every_task_has_a_page_whose_sections_hold_something(
+    task: str, page_of: Callable[[str], Path]
+) -> None:
+    path = page_of(task)
     text = plain(path)
     page = Page(text)
     assert len(page.sections) == len(set(page.sections)) >= 3
     assert page.tables
     for table in page.tables:
         assert len(table) > 1, table
-    assert sum(source.startswith("data:image") for source in page.sources) == len(
-        list((tmp_path / "run" / "figures").glob("*.png"))
-    )
+    pictures = sum(source.startswith("data:image") for source in page.sources)
+    assert pictures == len(list((path.parent / "figures").glob("*.png")))
     shown = re.sub(r"data:image/png;base64,[^\"]+|<script.*?</script>", "", text, flags=re.DOTALL)
     shown = shown.partition('id="provenance"')[0]
     assert re.findall(r"\b(?:None|nan|inf|Undefined)\b|[{}]{2}", shown.partition("<body>")[2]) == []
@@ -77,32 +86,16 @@ def test_every_task_has_a_page_whose_sections_hold_something(task: str, tmp_path
     assert plain(path) == text
 
 
-@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
-@pytest.mark.parametrize(
-    "task",
-    [task if task == "autopilot" else pytest.param(task, marks=pytest.mark.long) for task in TASKS],
-)
-def test_nothing_is_wider_than_the_window_and_no_word_is_broken(task: str, tmp_path: Path) -> None:
-    page = page_of(task, tmp_path / "run")
+@pytest.mark.long
+@needs_browser
+@pytest.mark.parametrize("task", TASKS)
+def test_nothing_is_wider_than_the_window_and_no_word_is_broken(
+    task: str, page_of: Callable[[str], Path], tmp_path: Path
+) -> None:
+    page = page_of(task)
     for width in (360, 820):
         found = layout(page, width, tmp_path)
         assert (found.overflow, found.broken) == (0, []), width
-
-
-@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
-@pytest.mark.parametrize(("width", "height"), [(1400, 900), (390, 844)])
-def test_the_first_screen_holds_verdict_picture_and_the_best_rows(
-    width: int, height: int, tmp_path: Path
-) -> None:
-    run = RunFiles(made_run(tmp_path / "run"))
-    write_fit_figures(run)
-    found = layout(write_fit_page(run), width, tmp_path)
-    assert found.first["verdict"] < height
-    assert found.first["pictures"]
-    assert max(found.first["pictures"]) < height
-    # what is selected, the baseline, and zero
-    assert found.first["rows"][2] < height
-    assert found.first["words"] < 6_000
 
 
 def judged(run: Path, level: str) -> RunFiles:
@@ -133,14 +126,20 @@ def judged(run: Path, level: str) -> RunFiles:
     return found
 
 
-@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
+@needs_browser
 @pytest.mark.parametrize(
     "level", [pytest.param(one, marks=[] if one == "good" else pytest.mark.long) for one in LEVELS]
 )
 def test_five_questions_are_answered_by_the_first_screen_alone(level: str, tmp_path: Path) -> None:
     page = write_fit_page(judged(tmp_path / "run", level))
     for width, height in ((1400, 900), (390, 844)):
-        told = layout(page, width, tmp_path).first["told"]
+        first = layout(page, width, tmp_path).first
+        assert first["pictures"]
+        assert max(first["verdict"], *first["pictures"]) < height
+        # what is selected, the baseline, and zero
+        assert first["rows"][2] < height
+        assert first["words"] < 6_000
+        told = first["told"]
         seen = " | ".join(" ".join(text.split()) for text, end in told if end < height)
         # how far off after 30 s, better than doing nothing, and which model
         assert "error after 30 s" in seen
@@ -151,7 +150,8 @@ def test_five_questions_are_answered_by_the_first_screen_alone(level: str, tmp_p
         assert "1 of 2 logs hold something that would mislead a fit: gaps (1)." in seen
 
 
-@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
+@pytest.mark.long
+@needs_browser
 def test_the_browser_sees_what_is_too_wide_and_what_is_broken(tmp_path: Path) -> None:
     page = tmp_path / "bad.html"
     page.write_text(
@@ -163,8 +163,10 @@ def test_the_browser_sees_what_is_too_wide_and_what_is_broken(tmp_path: Path) ->
     assert found.broken == ["tacticaldiameter"]
 
 
-def test_controllers_are_compared_by_settling_time_and_effort(tmp_path: Path) -> None:
-    page = Page(plain(page_of("autopilot", tmp_path / "run")))
+def test_controllers_are_compared_by_settling_time_and_effort(
+    page_of: Callable[[str], Path],
+) -> None:
+    page = Page(plain(page_of("autopilot")))
     # the first screen has a picture and the first columns
     assert page.tables[0][1] == ["net", "15.00", "1.000", "15.00"]
     cells = {line[0]: line[1:] for line in page.tables[1]}
@@ -185,8 +187,8 @@ def test_controllers_are_compared_by_settling_time_and_effort(tmp_path: Path) ->
     )
 
 
-def test_a_course_shows_what_was_missed(tmp_path: Path) -> None:
-    text = plain(page_of("course", tmp_path / "run"))
+def test_a_course_shows_what_was_missed(page_of: Callable[[str], Path]) -> None:
+    text = plain(page_of("course"))
     page = Page(text)
     glance, entered, spread, sides, _ = page.tables
     assert glance[1] == ["net", "course", "61.50", "2 of 2", "1.0250"]
@@ -198,8 +200,10 @@ def test_a_course_shows_what_was_missed(tmp_path: Path) -> None:
     assert "The reference takes 60.00 s." in text
 
 
-def test_indices_stand_flight_by_flight_or_by_kind(tmp_path: Path) -> None:
-    few = Page(plain(page_of("simulate", tmp_path / "few")))
+def test_indices_stand_flight_by_flight_or_by_kind(
+    page_of: Callable[[str], Path], tmp_path: Path
+) -> None:
+    few = Page(plain(page_of("simulate")))
     # what did not end as it should comes first
     assert few.tables[0][1] == ["constant_01", "ship", "timed out after 60 s", "–"]
     assert few.tables[0][2] == ["zigzag_01", "ship", "first overshoot", "9.00 deg"]
@@ -232,8 +236,8 @@ def test_currents_of_logs_stand_with_their_errors(tmp_path: Path) -> None:
     assert "of other logs" in text
 
 
-def test_an_import_shows_gaps_channels_and_findings(tmp_path: Path) -> None:
-    text = plain(page_of("import", tmp_path / "run"))
+def test_an_import_shows_gaps_channels_and_findings(page_of: Callable[[str], Path]) -> None:
+    text = plain(page_of("import"))
     page = Page(text)
     cells = page.table("log", "first")
     assert cells["first"] == ["100", "0.1000", "9.900", "2", "9", "1", "1"]
@@ -244,18 +248,16 @@ def test_an_import_shows_gaps_channels_and_findings(tmp_path: Path) -> None:
     assert "first: will mislead: a gap of −5 s" in text
 
 
-def test_actuator_parameters_come_with_intervals(tmp_path: Path) -> None:
-    cells = Page(plain(page_of("actuators", tmp_path / "run"))).table(
-        "parameter", "largest revolutions"
-    )
+def test_actuator_parameters_come_with_intervals(page_of: Callable[[str], Path]) -> None:
+    cells = Page(plain(page_of("actuators"))).table("parameter", "largest revolutions")
     assert cells["largest revolutions"] == ["2400 rpm", "2160 to 2640"]
     assert cells["dead time"] == ["0.2500 s", "0.2250 to 0.2750"]
     assert cells["forward thrust, c0"][0].endswith(" N s²")
     assert cells["reverse thrust, rms residual"] == ["1.50 N", "–"]
 
 
-def test_variants_are_compared_with_the_reference(tmp_path: Path) -> None:
-    page = Page(plain(page_of("study", tmp_path / "run")))
+def test_variants_are_compared_with_the_reference(page_of: Callable[[str], Path]) -> None:
+    page = Page(plain(page_of("study")))
     cells = page.table("variant", "no_head")
     assert cells["no_head"][:4] == ["0.2500", "0.0100", "+0.0500", "+0.0250 to +0.0750"]
     assert cells["recipe"][2:4] == ["", ""]

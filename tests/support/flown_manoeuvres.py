@@ -14,7 +14,7 @@ from torch import Tensor
 from residnet.core.log import Log
 from residnet.core.registry import kinds
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.replay import Replay
@@ -89,12 +89,18 @@ def times(seconds: float = DURATION, dt: float = DT) -> Tensor:
     return torch.arange(round(seconds / dt), dtype=torch.float64) * dt
 
 
+@lru_cache
+def traced(plant: Plant, dt: float = DT) -> TracedPlantDynamics:
+    """The step of a vessel, recorded once."""
+    return TracedPlantDynamics(plant, dt)
+
+
 def fly(
     plant: Plant,
     manoeuvres: list[Manoeuvre],
     dt: float = DT,
     seconds: float = DURATION,
-    psi: float = 0.0,
+    psi: float | Tensor = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """States [B, T+1, 8] and commands [B, T, 2]."""
     t = times(seconds, dt)
@@ -103,5 +109,5 @@ def fly(
     x0[:, 2] = psi
     w = torch.zeros(len(manoeuvres), len(t), len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
-        states, inputs, _ = Rollout(PlantDynamics(plant, dt), source)(x0, w, x0[:, :0])
+        states, inputs, _ = Rollout(traced(plant, dt), source)(x0, w, x0[:, :0])
     return states, inputs[:, :, :2]

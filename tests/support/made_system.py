@@ -5,6 +5,7 @@ off.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 import torch
@@ -66,13 +67,14 @@ def inputs(count: int, steps: int, seed: int) -> Tensor:
     return torch.from_numpy(out)
 
 
+@cache
 def trials(
     count: int = 4,
     seconds: float = 40.0,
     noise: float = 0.01,
     seed: int = 0,
     window: float = 0.9,
-) -> list[Prepared]:
+) -> tuple[Prepared, ...]:
     """Logs of the vessel from rest, velocities noisy, derivatives over `window` seconds (a long one
     biases them).
     """
@@ -102,7 +104,7 @@ def trials(
                 config,
             )
         )
-    return out
+    return tuple(out)
 
 
 def free_run_error(model: HybridDynamics, seed: int = 99, seconds: float = 30.0) -> float:

@@ -17,6 +17,7 @@ from tiny import TINY, call
 from residnet.core.log import Log
 from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.simulated import SimulatedTrials, simulate
+from residnet.tasks.registry import load_task
 
 STEP = 0.1
 PATTERN = {"kind": "three_two_one_one", "drive": 0.5, "steer": 0.6, "unit": 2, "duration": 25}
@@ -37,13 +38,19 @@ VESSEL: dict[str, Any] = {
 
 
 def flown(
-    folder: Path, patch: pytest.MonkeyPatch, content: dict[str, Any], code: int = 0
+    folder: Path, content: dict[str, Any], patch: pytest.MonkeyPatch | None = None, code: int = 0
 ) -> dict[str, Log]:
-    """The logs of a run in `folder`, by the name of their file within it."""
+    """The logs of a run in `folder`, by the name of their file within it.
+
+    With a patch, of the command line with its report; without, of Python and without a report.
+    """
     file = folder.with_suffix(".yaml")
     task = {"task": "simulate", "name": "ship", **content}
     file.write_text(yaml.safe_dump(task, sort_keys=False))
-    assert call(patch, "run", file, "--out", folder) == code
+    if patch is None:
+        load_task(file).run(source=file, out=folder, report=False)
+    else:
+        assert call(patch, "run", file, "--out", folder) == code
     logs = sorted(folder.rglob("*.parquet"))
     return {
         f"{path.parent.name}/{path.stem}": CanonicalConfig().build().read(path) for path in logs
@@ -59,7 +66,7 @@ def indices(folder: Path) -> dict[tuple[str, str], dict[str, Any]]:
 def ship(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("programme") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        flown(folder, patch, {"programme": VESSEL})
+        flown(folder, {"programme": VESSEL}, patch)
     return folder
 
 
@@ -99,17 +106,15 @@ def test_a_vessel_leaves_logs_indices_and_figures(ship: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_model_flies_beside_its_vessel_and_alone(
-    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_flies_beside_its_vessel_and_alone(tiny_run: Path, tmp_path: Path) -> None:
     """The model of the tiny fit is no good one; here it only has to fly by itself, and both ways
     the same; with given inputs, without a vessel, they follow within their rate.
     """
     model: dict[str, Any] = {"run": str(tiny_run), "name": "ridge"}
     programme = VESSEL | {"manoeuvres": [PATTERN], "step": None, "duration": 20, "model": model}
-    both = flown(tmp_path / "both", monkeypatch, {"programme": programme})
+    both = flown(tmp_path / "both", {"programme": programme})
     programme |= {"vessel": None, "model": {**model, "actuators": "wam_v_cal"}}
-    alone = flown(tmp_path / "alone", monkeypatch, {"programme": programme})
+    alone = flown(tmp_path / "alone", {"programme": programme})
     names = {name.removeprefix("logs/") for name in alone}
     assert names == {"three_two_one_one_01", "random_steps_01", "random_steps_02"}
     assert set(both) == {f"{place}/{name}" for place in ("logs", "model_logs") for name in names}
@@ -126,7 +131,7 @@ def test_a_model_flies_beside_its_vessel_and_alone(
     sides = {"n_port": share | {"steer": "2380 rpm"}, "n_stbd": share | {"steer": "-2380 rpm"}}
     given = {"model": {"run": str(tiny_run), "inputs": sides}, "duration": 20, "length": 4.88}
     given |= {"noise": VESSEL["noise"], "manoeuvres": [ZIGZAG | {"drive": 0.5, "steer": 0.3}]}
-    log = flown(tmp_path / "given", monkeypatch, {"programme": given})["logs/zigzag_01"]
+    log = flown(tmp_path / "given", {"programme": given})["logs/zigzag_01"]
     assert np.abs(np.diff(log["n_port"])).max() == pytest.approx(10 * STEP, rel=1e-9)
     assert log["cmd_n_port"].max() == pytest.approx(0.8 * 2380 / 60)
 
@@ -138,7 +143,7 @@ def test_a_manoeuvre_that_never_ends(
     """Of those that are listed it is an error, whose log says it too; of those drawn a line."""
     lazy = ZIGZAG | {"steer": 0.0, "heading": "20 deg", "reversals": 2, "duration": 8}
     programme = VESSEL | {"manoeuvres": [lazy, PATTERN]}
-    logs = flown(tmp_path / "run", monkeypatch, {"programme": programme}, code=1)
+    logs = flown(tmp_path / "run", {"programme": programme}, monkeypatch, code=1)
     error = capsys.readouterr().err.strip()
     assert len(error.splitlines()) == 1
     assert "zigzag_01: timed out after 7.9 s before 2 reversals at 20 deg" in error
@@ -148,18 +153,16 @@ def test_a_manoeuvre_that_never_ends(
     assert indices(tmp_path / "run")["wam_v_cal", "zigzag_01"]["timed_out"]
     family = [{"kind": "turning_circle", "count": 1, "steer": [0.01, 0.02]}]
     programme |= {"manoeuvres": [], "families": family, "duration": 10}
-    flown(tmp_path / "drawn", monkeypatch, {"programme": programme})
+    flown(tmp_path / "drawn", {"programme": programme}, monkeypatch)
     assert "turning_circle_01: timed out" in capsys.readouterr().err
 
 
-def test_replay_gives_the_log_again(
-    ship: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_replay_gives_the_log_again(ship: Path, tmp_path: Path) -> None:
     """The same vessel from the recorded start with the recorded commands: the recorded motion."""
     names = ("random_steps_01", "circle")
     replay = [{"kind": "replay", "log": str(ship / "logs" / f"{name}.parquet")} for name in names]
     programme = VESSEL | {"manoeuvres": replay, "families": []}
-    logs = flown(tmp_path / "run", monkeypatch, {"programme": programme})
+    logs = flown(tmp_path / "run", {"programme": programme})
     for name, source in zip(("replay_01", "replay_02"), names, strict=True):
         mine, log = logs[f"logs/{name}"], Log.load(ship / "logs" / f"{source}.parquet")
         assert len(log) - len(mine) in (0, 1)
@@ -174,7 +177,7 @@ def test_trials_are_drawn_split_and_read_by_inspect(
     trials = [TINY["data"]["trials"][0], TINY["data"]["trials"][3]]
     counts = {"identification": {"three_two_one_one": 2}, "validation": {"constant": 2}}
     settings = {**TINY["data"], "duration": 12, "trials": trials, **counts}
-    logs = flown(tmp_path / "run", monkeypatch, {"data": settings})
+    logs = flown(tmp_path / "run", {"data": settings})
     data = SimulatedTrials.model_validate(settings)
     drawn = data.draw()
     found = zip(simulate(drawn, data), data.splits(drawn), strict=True)
@@ -203,7 +206,7 @@ def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(
     tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Baseline and ridge see the same numbers whether they are simulated or read back."""
-    logs = flown(tmp_path / "trials", monkeypatch, {"data": TINY["data"]})
+    logs = flown(tmp_path / "trials", {"data": TINY["data"]})
     data = SimulatedTrials.model_validate(TINY["data"])
     drawn = data.draw()
     split: dict[str, Any] = {"root": str(tmp_path / "trials" / "logs")}

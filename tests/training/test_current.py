@@ -5,6 +5,7 @@ coefficients come back.
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -50,17 +51,19 @@ TRIALS = {
 }
 
 
-def sailed(**change: object) -> tuple[list[Prepared], np.ndarray]:
+@cache
+def sailed(
+    *, drifting: bool = False, exact: bool = False, seed: int = 0
+) -> tuple[list[Prepared], np.ndarray]:
     """Logs of the simulated catamaran and the current of each."""
+    change: dict[str, object] = {"seed": seed}
+    change |= {"disturbance": {"current_each": [0.1, 0.5]}} if drifting else {}
+    change |= {"noise": {"u": 0, "v": 0, "r": 0}} if exact else {}
     config = validate({**TRIALS, **change}, SimulatedTrials, "here")
     logs = simulate(config.draw(), config)
     return [
         prepare(log, "train", SIGNALS.columns, PREPARE) for log in logs
     ], config.disturbance.currents(len(logs), config.seed)
-
-
-CURRENT = {"disturbance": {"current_each": [0.1, 0.5]}}
-EXACT = {"noise": {"u": 0, "v": 0, "r": 0}}
 
 
 def test_a_drifting_frame_is_calm_water() -> None:
@@ -69,8 +72,8 @@ def test_a_drifting_frame_is_calm_water() -> None:
     """
     fossen = RegressorsConfig(sets=("fossen",))
     signals = SIGNALS.build()
-    calm, _ = sailed(**EXACT)
-    logs, currents = sailed(**EXACT, **CURRENT)
+    calm, _ = sailed(exact=True)
+    logs, currents = sailed(exact=True, drifting=True)
     model = fossen.build(signals.names)
     fossen.fit(model, samples(calm, signals))
 
@@ -113,7 +116,7 @@ def test_currents_and_coefficients_come_back(seed: int) -> None:
     """Noise of 3 cm/s and 0.2 deg/s: currents to a centimetre per second, as their standard errors
     say; coefficients as in calm water.
     """
-    logs, truth = sailed(**CURRENT, seed=seed)
+    logs, truth = sailed(drifting=True, seed=seed)
     signals = SIGNALS.build()
     fossen = RegressorsConfig(sets=("fossen",))
     found, table = estimate_currents(fossen.build(signals.names), signals, logs, CurrentConfig())
@@ -143,7 +146,7 @@ def test_a_start_in_a_wrong_valley_is_left() -> None:
     """The cost has other minima, which the search over a grid leaves: from a current half a metre
     per second off the same ones come out.
     """
-    logs, truth = sailed(**CURRENT)
+    logs, truth = sailed(drifting=True)
     signals = SIGNALS.build()
     problem = module._Problem(
         RegressorsConfig(sets=("fossen",)).build(signals.names), signals, logs, 4.0
@@ -171,7 +174,7 @@ def test_calm_water_has_no_current() -> None:
 
 
 def test_a_narrow_prior_holds_currents_at_zero() -> None:
-    logs, _ = sailed(**CURRENT)
+    logs, _ = sailed(drifting=True)
     signals = SIGNALS.build()
     found, _ = estimate_currents(
         RegressorsConfig(sets=("linear",)).build(signals.names),
@@ -199,7 +202,7 @@ def test_a_log_without_samples_is_named() -> None:
 
 def test_standard_errors_hold_where_the_regressors_are_not_the_true_ones() -> None:
     """Lines in every channel cannot be this hull; the halves of the logs disagree, and say so."""
-    logs, truth = sailed(**CURRENT)
+    logs, truth = sailed(drifting=True)
     signals = SIGNALS.build()
     linear = RegressorsConfig(sets=("linear",)).build(signals.names)
     found, table = estimate_currents(linear, signals, logs[3:], CurrentConfig(), logs[:3])
@@ -215,7 +218,7 @@ def test_standard_errors_hold_where_the_regressors_are_not_the_true_ones() -> No
 
 
 def test_logs_kept_apart_change_nothing_for_the_others() -> None:
-    logs, _ = sailed(**CURRENT)
+    logs, _ = sailed(drifting=True)
     signals = SIGNALS.build()
     linear = RegressorsConfig(sets=("linear",)).build(signals.names)
     alone, _ = estimate_currents(linear, signals, logs[3:6], CurrentConfig())

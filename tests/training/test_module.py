@@ -36,7 +36,7 @@ HALF_SECOND = {"horizon": 0.5, "epochs": 2, "batch": 8}
 
 
 @pytest.fixture(scope="module")
-def logs() -> list[Prepared]:
+def logs() -> Sequence[Prepared]:
     return trials()
 
 
@@ -131,7 +131,7 @@ def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
     assert (tmp_path / "checkpoints" / "mlp" / "last.ckpt").is_file()
 
 
-def test_the_weights_that_validated_best_are_kept(logs: list[Prepared], tmp_path: Path) -> None:
+def test_the_weights_that_validated_best_are_kept(logs: Sequence[Prepared], tmp_path: Path) -> None:
     validate = Scripted([3.0, 1.0, 2.0, 2.0])
     model, notes = trained(logs, tmp_path, validate, multi_step=[HALF_SECOND])
     assert len(validate.seen) == 4
@@ -140,7 +140,9 @@ def test_the_weights_that_validated_best_are_kept(logs: list[Prepared], tmp_path
     assert (notes["best_validation"], notes["epochs"]) == (1.0, 4)
 
 
-def test_weights_that_diverge_never_beat_steady_ones(logs: list[Prepared], tmp_path: Path) -> None:
+def test_weights_that_diverge_never_beat_steady_ones(
+    logs: Sequence[Prepared], tmp_path: Path
+) -> None:
     validate = Scripted([1.0, 3.0, 2.0, 2.5], diverged=[1, 0, 2, 0])
     model, notes = trained(logs, tmp_path, validate, multi_step=[HALF_SECOND])
     assert same(state_of(model), validate.seen[3])
@@ -159,7 +161,7 @@ def test_weights_that_diverge_never_beat_steady_ones(logs: list[Prepared], tmp_p
     ],
 )
 def test_stops_by_patience_in_the_last_stage(
-    logs: list[Prepared], tmp_path: Path, stages: list[int], scores: list[float], epochs: int
+    logs: Sequence[Prepared], tmp_path: Path, stages: list[int], scores: list[float], epochs: int
 ) -> None:
     later = [{**HALF_SECOND, "epochs": length} for length in stages[1:]]
     validate = Scripted(scores)
@@ -174,7 +176,9 @@ def test_stops_by_patience_in_the_last_stage(
     assert notes["epochs"] == len(validate.seen) == epochs
 
 
-def test_validates_so_often_and_after_the_last_epoch(logs: list[Prepared], tmp_path: Path) -> None:
+def test_validates_so_often_and_after_the_last_epoch(
+    logs: Sequence[Prepared], tmp_path: Path
+) -> None:
     validate = Scripted([1.0])
     _, notes = trained(
         logs, tmp_path, validate, one_step={**ONE_STEP, "epochs": 5}, validate_every=2
@@ -182,13 +186,13 @@ def test_validates_so_often_and_after_the_last_epoch(logs: list[Prepared], tmp_p
     assert ["validation" in entry for entry in notes["curve"]] == [False, True, False, True, True]
 
 
-def test_no_finite_free_run_is_one_line(logs: list[Prepared], tmp_path: Path) -> None:
+def test_no_finite_free_run_is_one_line(logs: Sequence[Prepared], tmp_path: Path) -> None:
     with pytest.raises(FitError, match="mlp: no epoch gave a finite free run") as caught:
         trained(logs, tmp_path, Scripted([math.nan]))
     assert "\n" not in str(caught.value)
 
 
-def test_averaged_weights_are_validated_and_kept(logs: list[Prepared], tmp_path: Path) -> None:
+def test_averaged_weights_are_validated_and_kept(logs: Sequence[Prepared], tmp_path: Path) -> None:
     validate = Scripted([2.0, 1.0])
     model, _ = trained(logs, tmp_path, validate, average=0.9)
     assert validate.models[0] is validate.models[1]
@@ -215,7 +219,7 @@ def at_step(step: int) -> property:
 
 
 def test_the_average_is_the_recursion_written_out(
-    logs: list[Prepared], monkeypatch: pytest.MonkeyPatch
+    logs: Sequence[Prepared], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module, _ = untrained(logs, average=0.6)
     assert module.average is not None
@@ -234,7 +238,7 @@ def test_the_average_is_the_recursion_written_out(
 
 
 def test_learning_rates_fall_along_a_cosine_in_each_stage(
-    logs: list[Prepared], monkeypatch: pytest.MonkeyPatch
+    logs: Sequence[Prepared], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stages = [
         {"horizon": 0.5, "epochs": 5, "learning_rate": 0.1, "final": 0.1},
@@ -257,7 +261,7 @@ def test_learning_rates_fall_along_a_cosine_in_each_stage(
     assert rates == pytest.approx([0.2, 0.2, 0.2, *falling, 0.05])
 
 
-def test_weight_decay_acts_on_matrices_of_the_head_only(logs: list[Prepared]) -> None:
+def test_weight_decay_acts_on_matrices_of_the_head_only(logs: Sequence[Prepared]) -> None:
     module, _ = untrained(logs, weight_decay=0.3)
     decayed = {
         id(p): group["weight_decay"]
@@ -269,7 +273,7 @@ def test_weight_decay_acts_on_matrices_of_the_head_only(logs: list[Prepared]) ->
     assert id(module.model.baseline.theta) not in decayed
 
 
-def test_batches_hold_their_share_of_beginnings(logs: list[Prepared]) -> None:
+def test_batches_hold_their_share_of_beginnings(logs: Sequence[Prepared]) -> None:
     module, data = untrained(
         logs, beginnings={"share": 0.25, "initial": 0.3}, multi_step=[HALF_SECOND]
     )
@@ -291,7 +295,7 @@ def loss_of(module: HeadTraining, windows: Sequence[Windows]) -> float:
     return float(module.training_step(tuple(windows), 0).detach())
 
 
-def test_rollouts_start_from_the_measured_past(logs: list[Prepared]) -> None:
+def test_rollouts_start_from_the_measured_past(logs: Sequence[Prepared]) -> None:
     """The loss of one window, from the logs by hand: memory from the past, mean velocities at a
     beginning.
     """
@@ -352,7 +356,7 @@ def test_short_logs_need_no_room_for_a_stage_without_epochs(tmp_path: Path) -> N
 
 
 def test_beginnings_shorter_than_a_step_take_one_sample(
-    logs: list[Prepared], tmp_path: Path
+    logs: Sequence[Prepared], tmp_path: Path
 ) -> None:
     _, notes = trained(
         logs, tmp_path, Scripted([1.0]), multi_step=[HALF_SECOND], beginnings={"initial": STEP / 10}
@@ -361,7 +365,7 @@ def test_beginnings_shorter_than_a_step_take_one_sample(
 
 
 def test_tensorboard_shows_axes_rate_settings_and_a_free_run(
-    logs: list[Prepared], tmp_path: Path
+    logs: Sequence[Prepared], tmp_path: Path
 ) -> None:
     """A validation that knows its axes and a free run leaves them, with the final score."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator

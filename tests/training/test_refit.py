@@ -57,7 +57,7 @@ def theta_of(model: HybridDynamics) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def smoothed() -> list[Prepared]:
+def smoothed() -> Sequence[Prepared]:
     """Derivatives over 3 s of motions that take one: least squares finds the vessel too slow."""
     return trials(window=3.1)
 
@@ -65,7 +65,7 @@ def smoothed() -> list[Prepared]:
 @pytest.mark.long
 @pytest.mark.parametrize("terms", [QUADRATIC, LINEAR], ids=["quadratic", "linear"])
 def test_free_runs_on_fresh_data_improve_on_biased_least_squares(
-    smoothed: list[Prepared], terms: Sequence[str]
+    smoothed: Sequence[Prepared], terms: Sequence[str]
 ) -> None:
     model, known, store = fitted(terms, smoothed)
     before, start = free_run_error(copy.deepcopy(model)), theta_of(model).detach().clone()
@@ -79,14 +79,14 @@ def test_free_runs_on_fresh_data_improve_on_biased_least_squares(
     assert not torch.equal(theta_of(model), start)
 
 
-def test_a_strong_prior_holds_least_squares(smoothed: list[Prepared]) -> None:
+def test_a_strong_prior_holds_least_squares(smoothed: Sequence[Prepared]) -> None:
     model, known, store = fitted(LINEAR, smoothed)
     start = theta_of(model).detach().clone()
     refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, prior=1e9), SCALES)
     torch.testing.assert_close(theta_of(model).detach(), start, rtol=0, atol=1e-4)
 
 
-def test_windows_are_laid_every_so_often(smoothed: list[Prepared]) -> None:
+def test_windows_are_laid_every_so_often(smoothed: Sequence[Prepared]) -> None:
     model, known, store = fitted(LINEAR, smoothed)
     notes = refit(
         model, known, store, RefitConfig(horizon=8.0, every=4.0, iterations=1), SCALES
@@ -259,7 +259,7 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
         assert 2.0 * float(hessian[i, i]) == pytest.approx(curvature, rel=2e-3)
 
 
-def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: list[Prepared]) -> None:
+def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: Sequence[Prepared]) -> None:
     free, known, store = fitted(LINEAR, smoothed)
     held = copy.deepcopy(free)
     config = {"horizon": 8.0, "every": 4.0, "prior": 1e-4}
@@ -294,7 +294,7 @@ def failure(
     return str(caught.value)
 
 
-def test_errors(smoothed: list[Prepared]) -> None:
+def test_errors(smoothed: Sequence[Prepared]) -> None:
     model, known, store = fitted(LINEAR, smoothed)
     still = HybridDynamics(
         model.signals, StillConfig().build(model.signals.names), ZeroHead(), STEP
@@ -317,7 +317,7 @@ def test_errors(smoothed: list[Prepared]) -> None:
 
 
 def test_a_start_that_diverges_is_brought_near_over_shorter_free_runs(
-    smoothed: list[Prepared],
+    smoothed: Sequence[Prepared],
 ) -> None:
     model, known, store = fitted(LINEAR, smoothed)
     config = RefitConfig(horizon=4.0, every=4.0, prior=0.0)

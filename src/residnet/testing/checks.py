@@ -29,7 +29,7 @@ from residnet.data.readers.base import LogReader
 from residnet.data.sea import Disturbance, SensorNoise
 from residnet.data.simulated import Craft, Flight, Sea, fly, source_of
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
 from residnet.dynamics.store import load_model, save_model
 from residnet.export.base import Exporter
 from residnet.export.vessel import ExportedVessel
@@ -37,7 +37,6 @@ from residnet.heads import HeadConfig
 from residnet.heads.base import FeatureConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.physics.plant import Plant
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import live_of
 from residnet.physics.vessel import load_vessel
@@ -343,9 +342,10 @@ def check_manoeuvre(
     require(read == manoeuvre, f"{who}: changes when it is written and read back")
     plant = load_vessel(vessel).build()
     duration = manoeuvre.lasts(duration)
-    _check_batch(manoeuvre, plant, duration, who)
+    dynamics = TracedPlantDynamics(plant, _STEP)
+    _check_batch(manoeuvre, dynamics, duration, who)
     helm, length = Helm.from_plant(plant), load_vessel(vessel).length.value
-    craft = Craft(vessel, PlantDynamics(plant, _STEP), helm, plant.commands, plant.approach(1))
+    craft = Craft(vessel, dynamics, helm, plant.commands, plant.approach(1))
     sea = Sea(plant, Disturbance(), SensorNoise(), 0)
     flight = fly(craft, [manoeuvre], sea, duration, _STEP)[0]
     _check_indices(manoeuvre.indices(flight.motion, length), who)
@@ -358,8 +358,11 @@ def check_manoeuvre(
     return flight
 
 
-def _flown(manoeuvres: list[Manoeuvre], plant: Plant, seconds: float) -> tuple[Tensor, Tensor]:
+def _flown(
+    manoeuvres: list[Manoeuvre], dynamics: TracedPlantDynamics, seconds: float
+) -> tuple[Tensor, Tensor]:
     """Return states [B, T+1, nx] and inputs [B, T, m] of manoeuvres of one kind side by side."""
+    plant = dynamics.plant
     helm = Helm.from_plant(plant)
     t = torch.arange(max(round(seconds / _STEP), 2), dtype=torch.float64) * _STEP
     start = torch.stack([m.begin(plant.approach(1)[0], helm.state) for m in manoeuvres])
@@ -367,16 +370,18 @@ def _flown(manoeuvres: list[Manoeuvre], plant: Plant, seconds: float) -> tuple[T
     w[:, :, plant.commands :] = 0.01
     source = source_of(manoeuvres, helm, t)
     with torch.no_grad():
-        states, inputs, _ = Rollout(PlantDynamics(plant, _STEP), source)(start, w, start[:, :0])
+        states, inputs, _ = Rollout(dynamics, source)(start, w, start[:, :0])
     return states, inputs
 
 
-def _check_batch(manoeuvre: Manoeuvre, plant: Plant, seconds: float, who: str) -> None:
-    alone, inputs = _flown([manoeuvre], plant, seconds)
-    pair, commands = _flown([manoeuvre, manoeuvre], plant, seconds)
+def _check_batch(
+    manoeuvre: Manoeuvre, dynamics: TracedPlantDynamics, seconds: float, who: str
+) -> None:
+    alone, inputs = _flown([manoeuvre], dynamics, seconds)
+    pair, commands = _flown([manoeuvre, manoeuvre], dynamics, seconds)
     require_finite(alone, f"{who}: the motion is not finite")
     require_finite(inputs, f"{who}: a command is not finite")
-    count = plant.commands
+    count = dynamics.plant.commands
     require(
         bool((inputs[:, :, count:] == 0.01).all()),
         f"{who}: changes inputs that are no commands, such as wind and current",
