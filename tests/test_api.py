@@ -20,6 +20,7 @@ import residnet
 from residnet.core.config import validate
 from residnet.core.errors import ResidnetError
 from residnet.data.prepare import PrepareConfig
+from residnet.export import vessel
 from residnet.judge.metrics import metrics_table
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
@@ -164,7 +165,10 @@ def test_stepping_with_arrays(models: residnet.Models, data: residnet.Data) -> N
     assert model.warmup(log.y[:20], w).shape == (model.module.n_state,)
 
 
-def test_save_load_export(models: residnet.Models, data: residnet.Data, tmp_path: Path) -> None:
+def test_save_load_export(
+    models: residnet.Models, data: residnet.Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
     residnet.save(models["net"], tmp_path / "net")
     again = residnet.load(tmp_path / "net")
     log = data.logs("test")[0]

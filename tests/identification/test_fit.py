@@ -61,8 +61,23 @@ def store() -> MemoryStore:
 
 
 @pytest.fixture(scope="module")
-def identified(settings: FitSettings, logs: PreparedSplits, store: MemoryStore) -> Identified:
-    return fit(logs, settings, store=store)
+def heard() -> list[Progress]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def identified(
+    settings: FitSettings,
+    logs: PreparedSplits,
+    store: MemoryStore,
+    heard: list[Progress],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Identified:
+    with pytest.MonkeyPatch.context() as patch, listen(heard.append):
+        patch.chdir(tmp_path_factory.mktemp("here"))
+        found = fit(logs, settings, store=store)
+        assert not list(Path.cwd().iterdir())
+    return found
 
 
 @pytest.mark.long
@@ -113,30 +128,19 @@ def test_finished_heads_are_taken_from_the_store(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    heard: list[Progress] = []
-    with listen(heard.append):
+    told: list[Progress] = []
+    with listen(told.append):
         again = fit(logs, settings, store=store)
     assert again["lstm"].model is identified["lstm"].model
     assert again["baseline"] is not identified["baseline"]
-    assert not any(event.stage == "training lstm" for event in heard)
-    assert any("validation free-run error" in event.message for event in heard)
+    assert not any(event.stage == "training lstm" for event in told)
+    assert any("validation free-run error" in event.message for event in told)
     assert not list(tmp_path.iterdir())
 
 
-def test_training_reports_every_epoch_and_writes_nothing(
-    settings: FitSettings,
-    logs: PreparedSplits,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    only = settings.model_copy(update={"heads": {"lstm": settings.heads["lstm"]}, "ensembles": {}})
-    heard: list[Progress] = []
-    with listen(heard.append):
-        fit(logs, only)
+def test_training_reports_every_epoch(identified: Identified, heard: list[Progress]) -> None:
     epochs = [event.done for event in heard if event.stage == "training lstm"]
     assert epochs == list(range(1, 8))
-    assert not list(tmp_path.iterdir())
 
 
 def test_an_optional_head_is_left_out_where_its_package_is_absent(

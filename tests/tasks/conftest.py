@@ -10,6 +10,8 @@ import yaml
 from made_once import made_once
 from tiny import TINY, call
 
+from residnet.export import vessel
+
 
 @pytest.fixture(scope="session")
 def tiny_config(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -25,6 +27,7 @@ def tiny_run(tiny_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
     def make(folder: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(vessel, "PARITY_STEPS", 60)
             assert call(patch, "run", tiny_config, "--out", folder) == 0
 
     out = tmp_path_factory.mktemp("runs") / "tiny"

@@ -174,7 +174,7 @@ def test_replay_gives_the_log_again(ship: Path, tmp_path: Path) -> None:
 def test_trials_are_drawn_split_and_read_by_inspect(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    trials = [TINY["data"]["trials"][0], TINY["data"]["trials"][3]]
+    trials = [{**TINY["data"]["trials"][0], "drive": [0.4]}, TINY["data"]["trials"][3]]
     counts = {"identification": {"three_two_one_one": 2}, "validation": {"constant": 2}}
     settings = {**TINY["data"], "duration": 12, "trials": trials, **counts}
     logs = flown(tmp_path / "run", {"data": settings})
