@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import final
 
+import pytest
 import torch
 from torch import Tensor, nn
 
+from residnet.dynamics import free_runs
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import MANY, Rollout, Source, scripted
+from residnet.dynamics.rollout import MANY, FreeRun, Rollout, Source, scripted
 
 DT = 0.1
 
@@ -69,6 +71,28 @@ def test_a_step_of_the_optimiser_is_seen() -> None:
         rollout.model.damping.add_(0.2)  # type: ignore[operator]
     assert not torch.equal(run(*case())[0], before)
     assert torch.equal(run(*case())[0], rollout(*case())[0])
+
+
+def test_models_of_one_structure_are_scripted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Rollout] = []
+    monkeypatch.setattr(free_runs, "_SCRIPTED", {})
+
+    def counted(rollout: Rollout, steps: int) -> FreeRun:
+        made.append(rollout)
+        return scripted(rollout, steps)
+
+    monkeypatch.setattr(free_runs, "scripted", counted)
+    loops = [Rollout(Pendulum()) for _ in range(2)]
+    with torch.no_grad():
+        loops[1].model.damping.add_(0.2)  # type: ignore[operator]
+        runs = [free_runs.compiled(loop, 300) for loop in loops]
+        for k in (0, 1, 0):
+            assert torch.equal(runs[k](*case())[0], loops[k](*case())[0])
+        assert len(made) == 1
+        # a number that is neither parameter nor buffer is not handed over
+        loops[1].model.apart = torch.ones(1)
+        free_runs.compiled(loops[1], 300)(*case())
+    assert made[1:] == [loops[1]]
 
 
 def test_what_cannot_be_compiled_or_is_short_runs_as_it_is() -> None:

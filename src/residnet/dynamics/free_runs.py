@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import io
 import pickle
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.progress import say
-from residnet.dynamics.rollout import FreeRun, Rollout, scripted
+from residnet.dynamics.rollout import WORTH_SCRIPTING, FreeRun, Rollout, scripted
 
 if TYPE_CHECKING:
     from residnet.dynamics.compiled import CompiledRollout
@@ -25,17 +26,33 @@ takes .15 to 1.3 ms.
 
 
 class _Structure(pickle.Pickler):
-    """Writes all of a rollout but the numbers of its parameters and buffers."""
+    """Writes all of a rollout but the numbers of its parameters and buffers.
+
+    Attributes:
+        apart: whether it holds other numbers, which are not written either.
+    """
+
+    def __init__(self, out: io.BytesIO, rollout: Rollout) -> None:
+        super().__init__(out)
+        self.known = {id(number) for number in _numbers(rollout)}
+        self.apart = False
 
     def persistent_id(self, obj: Any) -> Any:
         """Return what a tensor is known by."""
         if not isinstance(obj, Tensor):
             return None
         if obj.is_floating_point():
+            self.apart |= id(obj) not in self.known
             return str(obj.dtype), tuple(obj.shape), obj.requires_grad
         return str(obj.dtype), obj.tolist()
 
 
+def _numbers(rollout: Rollout) -> list[Tensor]:
+    return [*rollout.parameters(), *rollout.buffers()]
+
+
+_SCRIPTED: dict[bytes, tuple[Rollout, FreeRun]] = {}
+"""Rollouts by structure, with numbers of their own, and as TorchScript."""
 _KNOWN: dict[bytes, CompiledRollout | Literal[False]] = {}
 """Rollouts by structure: compiled, or that they cannot be."""
 
@@ -63,15 +80,19 @@ def compiled(rollout: Rollout, steps: int) -> FreeRun:
 
 def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> FreeRun:
     apart = x0.device.type != "cpu" or not rollout.source.given or not w.numel()
-    if steps < _WORTH or apart:
+    if steps < WORTH_SCRIPTING or apart:
         return scripted(rollout, steps)
     out = io.BytesIO()
+    structure = _Structure(out, rollout)
     try:
-        _Structure(out).dump((rollout, x0.dtype, torch.is_grad_enabled()))
+        structure.dump((rollout, x0.dtype, torch.is_grad_enabled()))
     except Exception:
         # parts of somebody else's that cannot be pickled
         return scripted(rollout, steps)
     key = hashlib.sha256(out.getvalue()).digest()
+    if steps < _WORTH:
+        once = not (torch.is_grad_enabled() or structure.apart)
+        return _scripted_once(key, rollout, steps) if once else scripted(rollout, steps)
     known = _KNOWN.get(key)
     if known:
         return known.of(rollout)
@@ -87,6 +108,21 @@ def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> F
         _KNOWN[key] = False
         _tell(error)
         return scripted(rollout, steps)
+
+
+def _scripted_once(key: bytes, rollout: Rollout, steps: int) -> FreeRun:
+    """Return the rollout as TorchScript, made once for all that differ in their numbers alone."""
+    if key not in _SCRIPTED:
+        own = copy.deepcopy(rollout).requires_grad_(False)
+        _SCRIPTED[key] = own, scripted(own, steps)
+    own, fly = _SCRIPTED[key]
+
+    def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        for kept, number in zip(_numbers(own), _numbers(rollout), strict=True):
+            kept.copy_(number)
+        return fly(x0, w, s)
+
+    return run
 
 
 @cache

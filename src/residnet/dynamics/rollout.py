@@ -116,7 +116,7 @@ class Rollout(nn.Module):
 
 FreeRun = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 """A free run as `Rollout` gives it, from x0 [B, nx], w [B, T, m] and s [B, n_state]."""
-_WORTH = 200
+WORTH_SCRIPTING = 200
 """Steps of a rollout that take about as long as compiling it does."""
 MANY = 1_000_000
 """Steps of a training: enough for compiling to pay."""
@@ -133,7 +133,7 @@ def scripted(rollout: Rollout, steps: int) -> FreeRun:
         rollout: on its device, in its type, in training or in evaluation.
         steps: that will be run with it altogether.
     """
-    if steps < _WORTH:
+    if steps < WORTH_SCRIPTING:
         return rollout
     with warnings.catch_warnings():
         # TorchScript still works in torch 2.13 but announces its end
