@@ -50,6 +50,7 @@ HEADS: dict[str, dict[str, Any]] = {
     "mlp": {"hidden": [8]},
     "lstm": {"hidden_size": 6},
     "recurrent": {"hidden_size": 6},
+    "sklearn": {"pipeline": [{"sklearn.ensemble.HistGradientBoostingRegressor": {"max_iter": 9}}]},
 }
 RUDDER = SignalsConfig(inputs=("n", "delta"))
 # what a baseline cannot do without, and whose trials it is identified from
