@@ -191,22 +191,47 @@ def test_the_order_of_logs_says_nothing(vessel: tuple[str, int]) -> None:
         np.testing.assert_allclose(again, np.asarray(first), rtol=EXACT, atol=EXACT)
 
 
-def test_a_long_log_tells_by_stretches_what_it_tells_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    from residnet.data.doctor import kinematics
-    from residnet.data.doctor.statistics import Record
-
-    random, t = np.random.default_rng(3), 0.1 * np.arange(120_000)
-    r = 0.1 * np.sin(0.2 * t) + 0.05 * np.sin(0.53 * t)
+def sailed(rows: int) -> Log:
+    """A boat that weaves at 10 Hz, its rate late by .6 s, with a jump and spikes in it."""
+    random, t = np.random.default_rng(3), 0.1 * np.arange(rows)
+    delta = 0.3 * np.sign(np.sin(0.11 * t) + 0.4 * np.sin(0.041 * t))
+    r, u = np.zeros(rows), 4.0 + 0.5 * np.sin(0.013 * t)
+    for k in range(rows - 1):
+        r[k + 1] = r[k] + 0.1 * (0.4 * delta[k] - r[k])
+    v = -2.0 * r
     psi = np.append(0.0, np.cumsum(0.05 * (r[1:] + r[:-1])))
-    noise = random.normal(0.0, 1e-3, (2, t.size))
-    log = Log("long", t, {"psi": psi + noise[0], "r": 1.1 * r + noise[1]})
-    part = kinematics.evenly_spread(Record(log))
-    assert len(part) == 100_000
-    assert np.flatnonzero(np.isnan(part["r"])).tolist() == list(range(0, 100_000, 10_000))
-    found = kinematics.yaw_causes(Record(log))
-    monkeypatch.setattr(kinematics, "_LONG", 1_000_000)
-    whole = kinematics.yaw_causes(Record(log))
-    assert list(found) == list(whole) == ["gain"]
-    assert found["gain"].values == pytest.approx(whole["gain"].values, abs=1e-3)
-    # the share of r that psi does not follow
-    assert found["gain"].values == pytest.approx([1.0 - 1.0 / 1.1], abs=1e-3)
+    ground = (u + 1j * v) * np.exp(1j * psi)
+    place = np.append(0.0, np.cumsum(0.05 * (ground[1:] + ground[:-1])))
+    place[rows // 3 :] += 30.0
+    late = np.interp(t - 0.6, t, r)
+    channels = {"x": place.real, "y": place.imag, "psi": psi, "u": u, "v": v, "r": late}
+    size = {"x": 0.05, "y": 0.05, "psi": 3e-3, "u": 0.02, "v": 0.02, "r": 3e-3}
+    channels = {n: x + size[n] * random.standard_normal(rows) for n, x in channels.items()}
+    channels["u"][[rows // 5, rows // 2]] += 5.0
+    return Log("long", t, {**channels, "delta": delta})
+
+
+def test_a_long_log_tells_by_stretches_what_it_tells_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    from residnet.data import channels
+    from residnet.data.doctor import inspect, statistics
+
+    log = sailed(24_000)
+    whole = inspect(log, ["delta"])
+    monkeypatch.setattr(statistics, "_LONG", 12_000)
+    monkeypatch.setattr(channels, "LARGE", 12_000)
+    monkeypatch.setattr(channels, "_FEW", 6_000)
+    few = statistics.Record(log).few
+    assert len(few) == 12_000
+    assert np.flatnonzero(np.isnan(few["r"])).tolist() == list(range(0, 12_000, 2_000))
+    told = inspect(log, ["delta"])
+    assert [(one.level, one.code) for one in told.findings] == [
+        (one.level, one.code) for one in whole.findings
+    ]
+    assert {"lag", "position_jump", "spikes"} <= {one.code for one in told.findings}
+    for one, other in zip(told.findings, whole.findings, strict=True):
+        assert (one.at is None) == (other.at is None)
+        if one.at is not None and other.at is not None:
+            assert np.mean(one.at != other.at) < 1e-3
+        size = {name: one.figures[name] for name in {"size", "count"} & {*one.figures}}
+        assert size == pytest.approx({name: other.figures[name] for name in size}, rel=0.1, abs=0.02)
+

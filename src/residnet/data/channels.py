@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
-from residnet.core.arrays.paged import row_pieces
+from residnet.core.arrays.paged import LARGE
 from residnet.core.log import Log
 from residnet.core.stretches import stretches
 from residnet.data.readers.base import unwrap
@@ -27,6 +26,11 @@ _GLANCE = 3.0
 _BEYOND = 0.9
 _FEWEST = 20
 """Samples below which a channel has no usual change; chosen by hand."""
+_CACHED = 8_192
+"""Samples whose neighbours are compared at a time: they stay in a core's cache."""
+_FEW, _SPREAD = 40_000, 40
+"""Samples of a very long channel that tell how far samples usually lie from their neighbours, and
+in how many stretches these lie."""
 _MOVED = ("x", "y", "psi", "phi", "u", "v", "r", "p", "w", "q", "z", "theta")
 
 
@@ -40,6 +44,35 @@ def noise_of(values: np.ndarray) -> float:
     if known.size < 8:
         return 0.0
     return float(SIGMA_OF_MAD * np.median(np.abs(np.diff(known, 3))) / np.sqrt(20.0))
+
+
+def _medians(members: Callable[[slice], list[np.ndarray]], count: int) -> np.ndarray:
+    """Return the medians [T] of members, each [T], given for a part of the `count` samples.
+
+    By forgetful selection: of half of them and two more neither the least nor the largest is in
+    the middle. Both go, and the next comes, until the middle is left.
+    """
+    out = np.empty(count)
+    for start in range(0, count, _CACHED):
+        part = slice(start, min(start + _CACHED, count))
+        rest = members(part)
+        some, rest = rest[: len(rest) // 2 + 2], rest[len(rest) // 2 + 2 :]
+        while len(some) > 2:
+            half = len(some) // 2
+            for i in range(half):
+                a, b = some[i], some[-1 - i]
+                some[i], some[-1 - i] = np.minimum(a, b), np.maximum(a, b)
+            # one in the middle of an odd number may be either
+            for i in range(1, len(some) - half):
+                a, b = some[0], some[i]
+                some[0], some[i] = np.minimum(a, b), np.maximum(a, b)
+            for i in range(len(some) - 2, half - 1, -1):
+                a, b = some[-1], some[i]
+                some[-1], some[i] = np.maximum(a, b), np.minimum(a, b)
+            some = some[1:-1] + rest[:1]
+            rest = rest[1:]
+        out[part] = some[0] if len(some) == 1 else 0.5 * (some[0] + some[1])
+    return out
 
 
 def spikes(values: np.ndarray) -> np.ndarray:
@@ -57,31 +90,59 @@ def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarr
     reach = 2 * half
     if at.size <= 2 * reach:
         return out
-    known = values[at]
+    known, last = values[at], at.size - 1
     padded = np.pad(known, reach, mode="reflect", reflect_type="odd")
-    bent, median = np.empty(known.size), np.empty(known.size)
-    # how far a sample lies from the straight lines between its neighbours on both sides
-    for at_once in row_pieces(known.size):
-        around = sliding_window_view(
-            padded[at_once.start : at_once.stop + 2 * reach], 2 * reach + 1
-        )
-        pairs = 0.5 * (around[:, :reach] + around[:, : -reach - 1 : -1])
-        bent[at_once] = known[at_once] - np.median(pairs, axis=1)
-    windows = sliding_window_view(np.pad(bent, half, mode="reflect"), 2 * half + 1)
-    for at_once in row_pieces(known.size):
-        median[at_once] = np.median(windows[at_once], axis=1)
-    distance = np.abs(bent - median)
+
+    def straight(of: np.ndarray, i: int) -> np.ndarray:
+        """Return the middle [K] of the straight line between the i-th neighbours of samples [K]."""
+        return np.asarray(0.5 * (padded[of + i] + padded[of + 2 * reach - i]))
+
+    def look(of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return how far the neighbours [K, samples] of samples [K] lie from the straight lines
+        between theirs, the medians [K] of that, and the distances [K] from these.
+        """
+        near = last - np.abs(last - np.abs(of[:, None] + np.arange(-half, half + 1)))
+        there, bent = np.zeros(known.size, dtype=bool), np.empty(known.size)
+        there[near] = True
+        some = np.flatnonzero(there)
+        pairs = _medians(lambda k: [straight(some[k], i) for i in range(reach)], some.size)
+        bent[some] = known[some] - pairs
+        windows = bent[near]
+        median = _medians(lambda k: [*windows[k].T], of.size)
+        return windows, median, np.abs(bent[of] - median)
+
+    of = spread_rows(known.size, LARGE if known.size <= LARGE else _FEW, _SPREAD)
+    windows, median, distance = look(of)
     # a coarse channel flickers by single steps of its resolution, a spread at the level of rounding
     # is none
     resolution = 2.0 * float(np.quantile(distance[distance > 0.0], 0.1)) if distance.any() else 0.0
     floor = max(
         SIGMA_OF_MAD * float(np.median(distance)), resolution, 1e-9 * float(np.abs(known).max())
     )
+    if of.size < known.size:
+        # what stands out leaves half of the straight lines by more than this
+        least, seen = (sigmas - 1.0) * floor, np.zeros(known.size, dtype=bool)
+        for start in range(0, known.size, _CACHED):
+            part, stop = known[start : start + _CACHED], min(start + _CACHED, known.size)
+            for i in range(half - 1, reach):
+                sums = padded[start + i : stop + i] + padded[start + 2 * reach - i :][: part.size]
+                seen[start:stop] |= np.abs(sums - 2.0 * part) > 2.0 * least
+        of = np.flatnonzero(seen)
+        windows, median, distance = look(of)
     # what a smooth channel bends by anyhow is no outlier where it stops bending
     far = np.flatnonzero(distance > sigmas * np.maximum(floor, np.abs(median)))
     spread = SIGMA_OF_MAD * np.median(np.abs(windows[far] - median[far, None]), axis=1)
-    out[at[far]] = distance[far] > sigmas * spread
+    out[at[of[far]]] = distance[far] > sigmas * spread
     return out
+
+
+def spread_rows(count: int, most: int, stretches: int) -> np.ndarray:
+    """Return rows [K] of evenly spread stretches, `most` in all; every row of no more than that."""
+    if count <= most:
+        return np.arange(count)
+    size = most // stretches
+    first = np.linspace(0, count - size, stretches).astype(int)
+    return np.unique((first[:, None] + np.arange(size)).ravel())
 
 
 def steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
@@ -150,28 +211,40 @@ def _spikes(values: np.ndarray, moved: bool) -> np.ndarray:
     if at.size < _FEWEST:
         return out
     known = values[at]
-    span = float(np.quantile(known, 0.995) - np.quantile(known, 0.005))
     change = np.abs(np.diff(known))
+    # of very many samples some tell what is usual
+    some = slice(None, None, -(-known.size // LARGE))
+    low, high = (float(value) for value in np.quantile(known[some], (0.005, 0.995)))
+    span, most = high - low, float(np.quantile(change[some], 0.99))
     # a glance: without one large change there is no spike
     largest = float(change.max())
-    glance = 0.5 * span
-    if moved:
-        glance = min(_GLANCE * float(np.quantile(change, 0.99)), _BEYOND * span)
+    glance = min(_GLANCE * most, _BEYOND * span) if moved else 0.5 * span
     if largest <= glance or not largest:
         return out
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(known, 3, mode="edge"), 7)
-    distance = np.abs(known - np.median(windows, axis=1))
-    low, high = np.quantile(known, (0.005, 0.995))
+    # what leaves the median of its neighbours makes a step, or three of them do
+    near = np.flatnonzero(change > (glance / 3.0 if known.size > LARGE else -1.0))
+    seen = np.zeros(known.size, dtype=bool)
+    for shift in range(-2, 4):
+        seen[np.clip(near + shift, 0, known.size - 1)] = True
+    of = np.flatnonzero(seen)
+    padded = np.pad(known, 3, mode="edge")
+
+    def apart(of: np.ndarray) -> np.ndarray:
+        """Return the distance [K] of samples [K] from the median of seven neighbours."""
+        return np.abs(
+            known[of] - _medians(lambda k: [padded[of[k] + i] for i in range(7)], of.size)
+        )
+
+    distance, far = np.zeros(known.size), np.zeros(known.size, dtype=bool)
+    distance[of] = apart(of)
     beyond = np.maximum(low - known, known - high)
     if moved:
-        most = float(np.quantile(change, 0.99))
+        usual = apart(spread_rows(known.size, _FEW, _SPREAD)) if known.size > LARGE else distance
         # the neighbours of a spike in a steady channel leave their median by a few changes
-        usual = max(
-            min(_CHANGES * most, _DISTANCES * float(np.quantile(distance, 0.99))), _GLANCE * most
-        )
+        least = min(_CHANGES * most, _DISTANCES * float(np.quantile(usual, 0.99)))
         # what leaves the whole range of a noisy channel is a spike too
         whole = (beyond > _BEYOND * span) & (distance > _BEYOND * span) & (span > 0.0)
-        far = (distance > max(usual, 1e-6 * span)) | whole
+        far = (distance > max(least, _GLANCE * most, 1e-6 * span)) | whole
     else:
         far = (beyond > 0.5 * span) & (distance > 0.5 * span) if span > 0.0 else beyond < -1.0
     starts, stops = stretches(far)
@@ -223,11 +296,11 @@ def fills(values: np.ndarray) -> np.ndarray:
     Args:
         values: a column as it stands in the file [T], NaN where empty.
     """
-    known = np.isfinite(values)
     size = np.abs(values)
     # most columns hold nothing of the kind: one comparison is enough for them
-    if not known.any() or float(size[known].max()) < 99.0:
+    if not (size >= 99.0).any():
         return np.zeros(values.size, dtype=bool)
+    known = np.isfinite(values)
     candidate = np.zeros(values.size, dtype=bool)
     large = np.flatnonzero(known & (size >= 99.0))
     # single precision keeps seven digits of a fill value

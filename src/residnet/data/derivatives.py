@@ -108,19 +108,29 @@ class SavitzkyGolay(Derivative):
 
     def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
         """See `Derivative.piece`."""
-        # as scipy.signal.savgol_filter, whose import takes longer than most checks of a config
-        size, half = self.samples(step), self.samples(step) // 2
-        powers = np.vander(np.linspace(-1.0, 1.0, size), self.order + 1, increasing=True)
-        fit, slopes = np.linalg.pinv(powers), np.zeros_like(powers)
-        slopes[:, 1:] = powers[:, :-1] * np.arange(1, self.order + 1) / (half * step)
-        first, last = fit @ values[:size], fit @ values[-size:]
-        out = []
-        for rows in (powers, slopes):
-            weights = rows[half] @ fit
-            inner = [np.correlate(column, weights, "valid") for column in values.T]
-            ends = rows[:half] @ first, rows[half + 1 :] @ last
-            out.append(np.concatenate((ends[0], np.stack(inner, axis=1), ends[1])))
-        return out[0], out[1]
+        return local_polynomials(values, self.samples(step), self.order, step)
+
+
+def local_polynomials(
+    values: np.ndarray, size: int, order: int, step: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return values [T, n] smoothed by polynomials over `size` samples, an odd number, and rates.
+
+    As scipy.signal.savgol_filter, whose import takes longer than most checks of a config. The rates
+    are per s for a step in s.
+    """
+    half = size // 2
+    powers = np.vander(np.linspace(-1.0, 1.0, size), order + 1, increasing=True)
+    fit, slopes = np.linalg.pinv(powers), np.zeros_like(powers)
+    slopes[:, 1:] = powers[:, :-1] * np.arange(1, order + 1) / (half * step)
+    first, last = fit @ values[:size], fit @ values[-size:]
+    out = []
+    for rows in (powers, slopes):
+        weights = rows[half] @ fit
+        inner = [np.correlate(column, weights, "valid") for column in values.T]
+        ends = rows[:half] @ first, rows[half + 1 :] @ last
+        out.append(np.concatenate((ends[0], np.stack(inner, axis=1), ends[1])))
+    return out[0], out[1]
 
 
 @final

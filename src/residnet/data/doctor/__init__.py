@@ -119,11 +119,15 @@ def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask]
 
 def _on_grid(log: Record) -> list[Finding]:
     """Return the findings of the checks that need a uniform grid, told at the log's own samples."""
+    few = log.few
     try:
-        grid = align(log.log, GridConfig(step=log.step))
+        grid = few.on(values.upright(align(few.log, GridConfig(step=log.step))))
     except DataError as error:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
-    found = [*run("grid", Record(values.upright(grid), log.inputs))]
+    if few is not log:
+        # what single samples of a long log do is seen as they were recorded
+        return [*run("grid", Record(log.log, log.inputs, few=grid))]
+    found = [*run("grid", grid)]
     near = np.searchsorted(grid.t - grid.t[0], log.t - log.t[0] - 1e-9)
     near = np.minimum(near, len(grid) - 1)
     return [one if one.at is None else dataclasses.replace(one, at=one.at[near]) for one in found]

@@ -50,7 +50,7 @@ _LEAST_STEERING = 0.2
 """Share of full rudder from which on the turning of a vessel tells how fast its propellers are."""
 
 
-@check("actuators", "unit", fix="correct its unit in the channel map", certain=True)
+@check("actuators", "unit", fix="correct its unit in the channel map", certain=True, few=True)
 def propeller_unit(log: Record, found: Check) -> Iterator[Finding]:
     """Report revolutions that cannot be revolutions per second."""
     names = log.of(propellers)
@@ -86,7 +86,7 @@ def _steered(log: Record, names: Sequence[str]) -> float:
     return high(np.ptp(turns, axis=0)) / max(high(np.abs(turns).max(axis=0)), 1e-12)
 
 
-@check("actuators", "propeller_sign", fix=_TURN, needs=("u",), certain=True)
+@check("actuators", "propeller_sign", fix=_TURN, needs=("u",), certain=True, few=True)
 def propeller_sign(log: Record, found: Check) -> Iterator[Finding]:
     """Report propellers that turn against the way that the vessel goes, or slow it down."""
     names = log.of(propellers)
@@ -194,7 +194,7 @@ def _yaw_fit(log: Record, *further: np.ndarray) -> Fit | None:
     return found if found.rest.size >= 60 and varies else None
 
 
-@check("actuators", "rudder_bias", needs=("delta",), certain=True)
+@check("actuators", "rudder_bias", needs=("delta",), certain=True, few=True)
 def rudder_bias(log: Record, found: Check) -> Iterator[Finding]:
     """Report a rudder whose zero is not where the vessel goes straight, or that is reversed."""
     neutral = log.of(neutral_angle) if "delta" in log.inputs else None
@@ -225,7 +225,14 @@ _WIDER = "log with a wider range, or leave these parts out"
 _AT_END, _HARDER, _SURE_AT_END = 0.03, 1.3, 4.5
 
 
-@check("actuators", "rudder_clipped", fix=_WIDER, needs=("delta", "u", "r"), certain=True)
+@check(
+    "actuators",
+    "rudder_clipped",
+    fix=_WIDER,
+    needs=("delta", "u", "r"),
+    certain=True,
+    few=True,
+)
 def rudder_clipped(log: Record, found: Check) -> Iterator[Finding]:
     """Report a rudder at whose recorded limit the vessel turns harder than the angle explains."""
     size = high(log["delta"], 1.0)
@@ -281,7 +288,7 @@ def _unexplained(log: Record, at_end: np.ndarray) -> float:
 _BETTER, _WORTH = 1.3, 1.2
 
 
-@check("inputs", "rudder_sign", needs=("r",), certain=True)
+@check("inputs", "rudder_sign", needs=("r",), certain=True, few=True)
 def rudder_sign(log: Record, found: Check) -> Iterator[Finding]:
     """Report the side to which what steers turns the vessel."""
     name, steer = _steering(log)
@@ -361,7 +368,7 @@ def _answers(
     power = np.abs(np.fft.rfft(r - r.mean(), 2 * r.size)) ** 2
     memory = np.append(np.fft.irfft(power)[: r.size], -1.0)
     reach = max(min(int(np.argmax(memory < 0.0)), r.size // 8, round(30.0 / log.step)), 3)
-    gaps = ~good | (np.append(np.diff(log.t), log.step) > 3.0 * log.step)
+    gaps = ~good | (np.append(np.diff(log.t), log.step) > 3.0 * log.step) | log.torn(reach + size)
     margin = reach + WINDOW
     stride = max(round(0.2 / log.step), len(log) // _MOST_ROWS, 1)
     first = np.arange(margin, len(log) - margin - size, stride)
@@ -440,7 +447,7 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
         return None
     first = blocks.first
     inside = (first >= reach) & (first + blocks.size + reach < len(log))
-    blocks = replace(blocks, first=first[inside])
+    blocks = replace(blocks, first=first[inside & blocks.clear_of(log.torn(reach))])
     other = [name for name in log if name in ("n", "delta", "wind_speed") and name not in names]
     y = blocks.change(log[answer])
     sums: dict[int, np.ndarray] = {}
@@ -512,6 +519,7 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     "acausal",
     fix="the clocks of inputs and motion differ: shift one of them",
     certain=True,
+    few=True,
 )
 def acausal(log: Record, found: Check) -> Iterator[Finding]:
     """Report inputs that the motion answers before they are given.

@@ -56,7 +56,8 @@ class Together:
     def fleet(self) -> Fleet | None:
         """The logs, each predicted by a model of the others; None where that cannot be."""
         moving = any(name in self for name in VELOCITY)
-        return Fleet(self.logs, self.inputs) if moving and self.inputs else None
+        several = len(self.logs) > 1
+        return Fleet(self.logs, self.inputs) if several and moving and self.inputs else None
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
@@ -139,6 +140,10 @@ _STATES = ("x", "y", "u", "v", "r")
 def continued(logs: Together, found: Check) -> Iterator[Finding]:
     """Report a log that goes on where another ended: one run, cut into files."""
 
+    whole = [len(log) >= 20 and sum(n in log for n in _STATES) >= 4 for log in logs.logs]
+    if sum(whole) < 2:
+        return
+
     def each(of: Callable[[np.ndarray], float]) -> np.ndarray:
         """Return a figure of each log and state [L, 5], NaN where it is not measured."""
         return np.array(
@@ -148,8 +153,7 @@ def continued(logs: Together, found: Check) -> Iterator[Finding]:
     first, last = each(lambda x: float(x[:3].mean())), each(lambda x: float(x[-3:].mean()))
     noise, fast = each(noise_of), each(lambda x: float(high(x, 0.9)))
     usual = each(lambda x: float(np.nanmedian(np.abs(np.diff(x)))))
-    whole = [len(log) >= 20 and sum(n in log for n in _STATES) >= 4 for log in logs.logs]
-    for i, a in enumerate(logs.logs if sum(whole) > 1 else ()):
+    for i, a in enumerate(logs.logs):
         apart = np.abs(first - last[i]) / np.maximum(usual[i] + noise[i] + noise, 1e-12)
         most = np.nan_to_num(np.max(np.where(np.isnan(apart), 0.0, apart), axis=1))
         for j in np.flatnonzero(most <= 30.0):
@@ -301,7 +305,8 @@ def _awake(log: Record, name: str) -> float:
 def excitation(logs: Together, found: Check) -> Iterator[Finding]:
     """Report whether a fit to all logs together has something to learn from."""
     count, velocities = len(logs.logs), [name for name in VELOCITY if name in logs]
-    awake = {name: max(_awake(log, name) for log in logs.logs) for name in velocities}
+    members = [log.few for log in logs.logs]
+    awake = {name: max(_awake(log, name) for log in members) for name in velocities}
     if awake and max(awake.values()) < 1.0:
         text = (
             f"no velocity varies beyond its noise in any of {count} logs: a fit would find nothing"
@@ -309,8 +314,8 @@ def excitation(logs: Together, found: Check) -> Iterator[Finding]:
         )
         yield found(text, {f"{n}_over_noise": v for n, v in awake.items()}, level="fatal")
     driving = [name for name in logs.inputs if not name.startswith(("wind", "current"))]
-    within = {name: max(_relative(log[name]) for log in logs.logs) for name in driving}
-    among = {name: _relative(*(log[name] for log in logs.logs)) for name in driving}
+    within = {name: max(_relative(log[name]) for log in members) for name in driving}
+    among = {name: _relative(*(log[name] for log in members)) for name in driving}
     # constant in each, but not the same in all, tells something
     if driving and max(within.values()) < 1e-3 and max(among.values()) <= 1e-2:
         text = f"no input ({', '.join(driving)}) varies within any of {count} logs"
@@ -322,8 +327,8 @@ def excitation(logs: Together, found: Check) -> Iterator[Finding]:
         yield found(text, {"count": len(held)}, code="constant_inputs", level="note", fix="")
     moving = [name for name in (*velocities, *driving) if name not in held]
     # of very many samples evenly spread ones tell the same
-    every = -(-sum(len(log) for log in logs.logs) // LARGE)
-    columns = np.concatenate([log.log.stack(moving)[::every] for log in logs.logs])
+    every = -(-sum(len(log) for log in members) // LARGE)
+    columns = np.concatenate([log.log.stack(moving)[::every] for log in members])
     columns = columns[np.isfinite(columns).all(axis=1)]
     if driving and len(moving) > 1 and columns.shape[0] >= 10 * len(moving):
         number, worst = conditioning(columns, moving)

@@ -106,6 +106,7 @@ class Effects:
     """What single findings change in a one-step fit to a log, and in its dead reckoning."""
 
     def __init__(self, log: Record) -> None:
+        self._at, log = log.few_rows, log.few
         self._log, self._rows = log, OneStep(log)
         enough = len(self._rows) >= _ROWS_PER_COLUMN * self._rows.table.shape[1]
         self._fit = self._rows.fit() if enough else None
@@ -123,7 +124,7 @@ class Effects:
         elif finding.at is not None and finding.at.any():
             seen = {*self._log.moving, *self._log.inputs}
             effect = self.of_stretch(
-                finding.at, not finding.channels or not seen.isdisjoint(finding.channels)
+                finding.at[self._at], not finding.channels or not seen.isdisjoint(finding.channels)
             )
         else:
             return finding
@@ -137,6 +138,8 @@ class Effects:
 
         `learned` says whether a fit sees the channels concerned, and not dead reckoning alone.
         """
+        if not at.any():
+            return 0.0
         others = [np.roll(at, round(at.size * (k + 0.5) / _OTHERS)) for k in range(_OTHERS)]
         chance = [_beyond(self._astray, reckoning_error(self._log, one)) for one in others]
         astray = _beyond(self._astray, reckoning_error(self._log, at))
@@ -198,7 +201,7 @@ def reckoning_error(log: Record, without: np.ndarray | None = None) -> np.ndarra
             which none may begin or end.
     """
     size, out = min(round(_WINDOW / log.step), len(log) // 3), np.zeros(2)
-    bad = np.zeros(len(log), dtype=bool) if without is None else without
+    bad = log.torn(0) if without is None else without | log.torn(0)
     count = np.append(0, np.cumsum(bad))
     first = np.flatnonzero(count[size + 1 :] == count[: -size - 1])
     if first.size < 0.2 * (len(log) - size):

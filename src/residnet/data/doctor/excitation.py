@@ -90,7 +90,7 @@ def slow(log: Record, found: Check) -> Iterator[Finding]:
         yield found(text, {"share": share})
 
 
-@check("excitation", "condition", "note")
+@check("excitation", "condition", "note", few=True)
 def condition(log: Record, found: Check) -> Iterator[Finding]:
     """Report velocities and inputs that move together in a log."""
     names = [

@@ -89,6 +89,8 @@ class Check:
         needs: channels without which it has nothing to say.
         certain: see `Finding`.
         spoils: see `Finding`.
+        few: it tells nothing of single samples, and evenly spread stretches of a long log say what
+            the whole says (`Record.few`).
         body: the function; given a log under examination (or several) and the check.
     """
 
@@ -99,6 +101,7 @@ class Check:
     needs: tuple[str, ...]
     certain: bool
     spoils: bool
+    few: bool
     body: Callable[[Any, Check], Iterable[Finding]]
 
     def __call__(
@@ -143,11 +146,12 @@ def check(
     needs: tuple[str, ...] = (),
     certain: bool = False,
     spoils: bool = False,
+    few: bool = False,
 ) -> Callable[[_Body], _Body]:
     """Register a function as a check; the arguments are the attributes of `Check`."""
 
     def register(body: _Body) -> _Body:
-        CHECKS.append(Check(stage, code, level, fix, needs, certain, spoils, body))
+        CHECKS.append(Check(stage, code, level, fix, needs, certain, spoils, few, body))
         return body
 
     return register
@@ -160,7 +164,7 @@ def run(stage: str, subject: Any) -> Iterator[Finding]:
             # a stretch without a number is no news to who measured it
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RuntimeWarning)
-                found = list(one.body(subject, one))
+                found = list(one.body(subject.few if one.few else subject, one))
             yield from found
 
 

@@ -85,6 +85,7 @@ def rates(log: Record) -> Rates:
         out = np.full(values.shape, np.nan, dtype=values.dtype)
         if values.size > 2 * half:
             out[half:-half] = (values[2 * half :] - values[: -2 * half]) / (2 * half * log.step)
+        out[log.torn(half)] = np.nan
         return out
 
     def mean(values: np.ndarray, half: int) -> np.ndarray:
@@ -161,7 +162,7 @@ def convention(log: Record) -> Convention | None:
     return Convention(overlap, float(np.linalg.norm(declared) / np.linalg.norm(ground)))
 
 
-@check("grid", "frames", fix="correct it in the channel map", needs=_ALL)
+@check("grid", "frames", fix="correct it in the channel map", needs=_ALL, few=True)
 def frames(log: Record, found: Check) -> Iterator[Finding]:
     """Report frames, signs and units of position and velocities."""
     known = log.of(convention)
@@ -220,7 +221,7 @@ def frames(log: Record, found: Check) -> Iterator[Finding]:
 def position_jumps(log: Record, found: Check) -> Iterator[Finding]:
     """Report steps of the position that the velocities do not explain."""
     velocity = (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])
-    explained = 0.5 * log.step * (velocity[1:] + velocity[:-1])
+    explained = 0.5 * _bridged_steps(log) * (velocity[1:] + velocity[:-1])
     excess = np.abs(np.nan_to_num(np.diff(log["x"] + 1j * log["y"]) - explained))
     known = np.abs(explained[np.isfinite(explained)])
     fast = 0.5 * float(np.quantile(known, 0.95)) if known.size else 0.0
@@ -229,6 +230,12 @@ def position_jumps(log: Record, found: Check) -> Iterator[Finding]:
         f"position jumps {{}} times by more than {limit:.2g} m beyond u, v, at most by {{:.2g}} m"
     )
     yield from _jumps(log, found, excess, limit, what, ("x", "y"))
+
+
+def _bridged_steps(log: Record) -> np.ndarray:
+    """Return the steps [T - 1] in s, NaN where they are longer than a grid bridges."""
+    dt = np.diff(log.t)
+    return np.where(dt > 3.5 * log.step, np.nan, dt)
 
 
 def _jumps(
@@ -253,7 +260,7 @@ def _jumps(
         )
 
 
-@check("grid", "course_as_heading", fix="take psi from the compass", needs=_ALL)
+@check("grid", "course_as_heading", fix="take psi from the compass", needs=_ALL, few=True)
 def course_as_heading(log: Record, found: Check) -> Iterator[Finding]:
     """Report a heading that follows the course over ground where velocities tell of drift."""
     motion = log.of(rates)
@@ -286,7 +293,7 @@ def course_as_heading(log: Record, found: Check) -> Iterator[Finding]:
         )
 
 
-@check("grid", "follows", needs=_ALL)
+@check("grid", "follows", needs=_ALL, few=True)
 def follows_ground(log: Record, found: Check) -> Iterator[Finding]:
     """Report sign, gain and lag of u and v against the rate of the position."""
     known = log.of(convention)
@@ -350,7 +357,7 @@ def _follow(
     return {"text": text, "figures": figures, "code": f"follows_{name}", "level": level, "fix": fix}
 
 
-@check("grid", "position_causes", needs=_ALL)
+@check("grid", "position_causes", needs=_ALL, few=True)
 def causes_of_position(log: Record, found: Check) -> Iterator[Finding]:
     """Report what makes position and velocities differ, where the frames are right."""
     known = log.of(convention)
@@ -376,7 +383,7 @@ def _yaw_is_one(log: Record) -> bool:
 _YAW = (*POSE, "r")
 
 
-@check("grid", "follows", needs=_YAW)
+@check("grid", "follows", needs=_YAW, few=True)
 def follows_heading(log: Record, found: Check) -> Iterator[Finding]:
     """Report sign, gain and lag of r against the rate of psi."""
     told = log.of(yaw_follows)
@@ -393,7 +400,7 @@ def follows_heading(log: Record, found: Check) -> Iterator[Finding]:
 def heading_jumps(log: Record, found: Check) -> Iterator[Finding]:
     """Report steps of the heading that the yaw rate does not explain."""
     psi, r = log["psi"], log["r"]
-    change = np.diff(psi) - 0.5 * log.step * (r[1:] + r[:-1])
+    change = np.diff(psi) - 0.5 * _bridged_steps(log) * (r[1:] + r[:-1])
     scatter = float(np.nanmedian(np.abs(change))) if np.isfinite(change).any() else 0.0
     noise = max(log.noise("psi") * math.sqrt(2.0), SIGMA_OF_MAD * scatter)
     limit = max(10.0 * noise, math.radians(2.0))
@@ -405,13 +412,13 @@ def heading_jumps(log: Record, found: Check) -> Iterator[Finding]:
 @check("grid", "yaw_drift", needs=_YAW, certain=True)
 def yaw_drift(log: Record, found: Check) -> Iterator[Finding]:
     """Report the bias of r against psi."""
-    if not _yaw_is_one(log):
+    if not _yaw_is_one(log.few):
         return
     psi, r = bridged(log.t, log["psi"]), bridged(log.t, log["r"])
     drift = psi - psi[0] - np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (r[1:] + r[:-1])))
     end, most, span = float(drift[-1]), float(np.abs(drift).max()), float(log.t[-1] - log.t[0])
     spread, bias = max(float(np.nanstd(log["r"])), 1e-12), end / span
-    causes = log.of(yaw_causes)
+    causes = log.few.of(yaw_causes)
     known = causes.get("bias") or causes.get("ramp")
     # a bias misleads from 1.8 deg a minute and 5 % of the yaw rate on, or by what it adds up to
     large = abs(bias) > max(math.radians(0.03), 0.05 * spread) or most > math.radians(15.0)
@@ -427,7 +434,7 @@ def yaw_drift(log: Record, found: Check) -> Iterator[Finding]:
     yield found(text, {"end": end, "most": most, "bias": bias}, level=level, fix=fix, repair=repair)
 
 
-@check("grid", "yaw_causes", needs=_YAW)
+@check("grid", "yaw_causes", needs=_YAW, few=True)
 def causes_of_yaw(log: Record, found: Check) -> Iterator[Finding]:
     """Report gain and lag of r against psi."""
     if _yaw_is_one(log):
@@ -438,7 +445,7 @@ _TIED = 0.8
 """Correlation from which steps of an angle and integrals of its rate are measures of one motion."""
 
 
-@check("grid", "roll_rate", fix="correct the sign or the unit of one", needs=("phi", "p"))
+@check("grid", "roll_rate", fix="correct the sign or the unit of one", needs=("phi", "p"), few=True)
 def roll_rate(log: Record, found: Check) -> Iterator[Finding]:
     """Report a roll rate that is not the rate of the roll angle: another sign, or a unit."""
     phi, p = bridged(log.t, log["phi"]), bridged(log.t, log["p"])

@@ -226,7 +226,11 @@ def idle(log: Record, found: Check) -> Iterator[Finding]:
     psi, still = bridged(log.t, log["psi"]), np.ones(len(log) - 1, dtype=bool)
     for name in driving:
         still &= np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * high(log[name], 1.0)
-    for start, stop in zip(*stretches(still), strict=True):
+    starts, stops = stretches(still)
+    both = np.stack((starts, stops + 1), axis=1).ravel()
+    ends = [of.reduceat(np.append(psi, psi[-1]), both)[::2] for of in (np.maximum, np.minimum)]
+    wide = ends[0] - ends[1] >= _SWING if starts.size else np.zeros(0, dtype=bool)
+    for start, stop in zip(starts[wide], stops[wide], strict=True):
         run = psi[start : stop + 1]
         turns = reversals(run, _SWING)
         if turns >= 2:
@@ -240,7 +244,7 @@ def idle(log: Record, found: Check) -> Iterator[Finding]:
             yield found(text, {"seconds": seconds, "turns": turns, "t": first}, at=at)
 
 
-@check("inputs", "relative_wind", needs=("psi",))
+@check("inputs", "relative_wind", needs=("psi",), few=True)
 def relative_wind(log: Record, found: Check) -> Iterator[Finding]:
     """Report wind directions that turn against the heading: relative wind, not true wind."""
     directions = [name for name in log if "wind" in name and log.units[name] == "rad"]

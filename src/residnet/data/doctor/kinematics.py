@@ -21,6 +21,7 @@ import scipy
 
 from residnet.core.log import Log
 from residnet.data.channels import SIGMA_OF_MAD
+from residnet.data.derivatives import local_polynomials
 from residnet.data.doctor.findings import Check, Finding, Level, correction, with_channels
 from residnet.data.doctor.statistics import FEWEST, SECTIONS, WINDOW, Record, bridged, fit
 
@@ -57,23 +58,6 @@ class Cause:
 _TURNED = 3.0
 
 
-_LONG, _STRETCHES = 100_000, 10
-"""Samples of a log beyond which as many are looked at, and in how many evenly spread stretches."""
-
-
-def evenly_spread(log: Record) -> Record:
-    """Return stretches of a long log, each without its first motion; a short log whole.
-
-    No increment then leads from one to the next.
-    """
-    if len(log) <= _LONG:
-        return log
-    size = _LONG // _STRETCHES
-    first = np.linspace(0, len(log) - size, _STRETCHES).astype(int)
-    part = log.log.rows((first[:, None] + np.arange(size)).ravel())
-    return Record(part, log.inputs).without(np.arange(len(part)) % size == 0)
-
-
 def yaw_causes(log: Record) -> dict[str, Cause]:
     """Return what makes the increments of psi differ from the integral of r.
 
@@ -81,14 +65,13 @@ def yaw_causes(log: Record) -> dict[str, Cause]:
     negative of what psi gains over it) and `ramp` (its growth over the log, rad/s from start to
     end).
     """
-    log = log.of(evenly_spread)
     psi, r, t = log["psi"], log["r"], log.t
     dt = np.diff(t)
-    smooth = _around(r)
+    smooth = _around(log, "r")
     time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
     columns = {"bias": [-dt], "ramp": [-dt, -dt * time]}
     # where the heading does not move, a bias of r would be all gain
-    if _stands_out(log, "r") and float(np.nanstd(_around(psi))) > _TURNED * log.noise("psi"):
+    if _stands_out(log, "r") and float(np.nanstd(_around(log, "psi"))) > _TURNED * log.noise("psi"):
         columns = {"gain": [-_area(dt, smooth)], "lag": [np.diff(smooth)], **columns}
     rate = np.full(dt.size, log.noise("r"))
     return _explained(psi, _area(dt, r), dt, log.noise("psi"), rate, columns)
@@ -103,14 +86,13 @@ def position_causes(log: Record) -> dict[str, Cause]:
     starboard, m), `current` (u, v are through water that moves north, east, m/s), `bias` (of u, v,
     m/s).
     """
-    log = log.of(evenly_spread)
     dt, psi = np.diff(log.t), log["psi"]
     turn, mid = np.exp(1j * psi), np.exp(0.5j * (psi[1:] + psi[:-1]))
-    u, v = _around(log["u"]), _around(log["v"])
+    u, v = _around(log, "u"), _around(log, "v")
     along, across = _area(dt, turn * u), _area(dt, 1j * turn * v)
     lag_u, lag_v = mid * np.diff(u), 1j * mid * np.diff(v)
     ground = turn * (u + 1j * v)
-    lag_psi = 0.5j * np.diff(_around(psi)) * (ground[1:] + ground[:-1])
+    lag_psi = 0.5j * np.diff(_around(log, "psi")) * (ground[1:] + ground[:-1])
     columns = {
         "gain_u": [-along],
         "gain_v": [-across],
@@ -155,16 +137,17 @@ def _area(dt: np.ndarray, rate: np.ndarray) -> np.ndarray:
 
 def _stands_out(log: Record, name: str) -> bool:
     """Return whether a channel does more than its noise."""
-    return float(np.sqrt(np.nanmean(_around(log[name]) ** 2))) > 1.2 * log.noise(name)
+    return float(np.sqrt(np.nanmean(_around(log, name) ** 2))) > 1.2 * log.noise(name)
 
 
-def _around(values: np.ndarray) -> np.ndarray:
-    """Return the values [T] smoothed by a parabola over 15 samples; NaN stay where they are.
+def _around(log: Record, name: str) -> np.ndarray:
+    """Return a channel [T] smoothed by a parabola over 15 samples; NaN stay where they are.
 
     The parabola is that of the samples around each one, without it and its neighbours: columns then
     share no noise with what they explain, which holds the noise of these samples. Near the ends of
     a log they do.
     """
+    values = log[name]
     known = np.isfinite(values)
     if known.sum() < WINDOW:
         return values
@@ -172,9 +155,9 @@ def _around(values: np.ndarray) -> np.ndarray:
     offsets = np.arange(-_REACH, _REACH + 1)
     weights, others = np.zeros(WINDOW), np.abs(offsets) > 1
     weights[others] = np.linalg.pinv(np.vander(offsets[others], 3))[-1]
-    smooth = scipy.signal.savgol_filter(filled, WINDOW, 2)
+    smooth = local_polynomials(filled[:, None], WINDOW, 2, 1.0)[0][:, 0]
     smooth[_REACH:-_REACH] = np.convolve(filled, weights, "valid")
-    return np.where(known, smooth, np.nan)
+    return np.where(known & ~log.torn(_REACH), smooth, np.nan)
 
 
 def _explained(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from residnet.core.errors import ResidnetError
 from residnet.core.layout import Live, levelled
@@ -129,8 +130,12 @@ def missing(log: Record, found: Check) -> Iterator[Finding]:
 @check("values", "repeated_rows", fix="delete them, or log at the sensors' rate", certain=True)
 def repeated_rows(log: Record, found: Check) -> Iterator[Finding]:
     """Report rows that repeat the row before in every channel, which noise never does."""
-    same = np.append(False, (np.diff(log.log.stack(list(log)), axis=0) == 0.0).all(axis=1))
-    noisy = any(float((np.diff(log[n]) == 0.0).mean()) < 0.5 for n in log if n in MEASURED)
+    same, noisy = np.ones(len(log) - 1, dtype=bool), False
+    for name in log:
+        rests = log[name][1:] == log[name][:-1]
+        same &= rests
+        noisy |= name in MEASURED and float(rests.mean()) < 0.5
+    same = np.append(False, same)
     share = float(same.mean())
     # commands alone rest for as long as nobody moves them
     moved = any(name in MEASURED for name in log)
@@ -162,7 +167,8 @@ def absurd(log: Record, found: Check) -> Iterator[Finding]:
     """Report values that no vessel can have."""
     for name in log:
         values = log[name]
-        at = np.flatnonzero(beyond_belief(values, log.units[name]) & ~fills(values))
+        at = np.flatnonzero(beyond_belief(values, log.units[name]))
+        at = at[~fills(values)[at]] if at.size else at
         if at.size:
             text = (
                 f"{name} is {show(float(values[at[0]]), log.units[name])} at t ="
@@ -226,11 +232,13 @@ def frozen(log: Record, found: Check) -> Iterator[Finding]:
 def _held(log: Record, names: tuple[str, ...]) -> np.ndarray:
     """Return [T] bool: runs of equal values that neither chance nor rest explains."""
     out = np.zeros(len(log), dtype=bool)
-    values, together = log.log.stack(names), len(names) > 1
-    same = (np.diff(values, axis=0) == 0.0).all(axis=1)
+    together = len(names) > 1
+    same = np.logical_and.reduce([log[name][1:] == log[name][:-1] for name in names])
+    if not same.any():
+        return out
     starts, stops = stretches(same)
     # a slow sensor that repeats each value has steps of its own
-    shortest = _LEAST_RUN * usual_interval(values)
+    shortest = _LEAST_RUN * usual_interval(log.few.log.stack(names))
     long = stops - starts >= shortest
     outside = same.size - int((stops - starts)[long].sum())
     if outside < 0.02 * same.size:
@@ -242,11 +250,16 @@ def _held(log: Record, names: tuple[str, ...]) -> np.ndarray:
         shortest = max(shortest, int(np.ceil(np.log(1e-4 / same.size) / np.log(chance))))
     # the last digits of a noisy channel never rest, whatever the vessel does
     rare = chance < (0.15 if together else 1e-3)
-    for start, stop in zip(starts, stops, strict=True):
-        run = slice(start, stop + 1)
-        if stop - start >= shortest:
-            noisy = (rare or names[0] not in POSE) and _noisy(log, names[0])
-            out[run] |= noisy or _moves(log, names, run)
+    long = stops - starts >= shortest
+    if not long.any():
+        return out
+    starts, stops = starts[long], stops[long]
+    noisy = (rare or names[0] not in POSE) and _noisy(log, names[0])
+    moved = np.full(starts.size, noisy)
+    for name in () if noisy else names:
+        moved |= _moves(log[name], stops)
+    for start, stop in zip(starts[moved], stops[moved], strict=True):
+        out[start : stop + 1] = True
     return out
 
 
@@ -255,15 +268,19 @@ def _noisy(log: Record, name: str) -> bool:
     return log.noise(name) > 0.05 * float(np.nanstd(np.diff(log[name])))
 
 
-def _moves(log: Record, names: tuple[str, ...], run: slice) -> bool:
-    """Return whether channels have moved over a run: they go on far from where they stood."""
-    for name in names:
-        change = np.abs(np.diff(log[name]))
-        after = change[run.stop - 1 : run.stop + 5]
-        resolution = float(np.quantile(change[change > 0.0], 0.1)) if (change > 0.0).any() else 0.0
-        if after.size > 3 and after[0] > max(3.0 * float(np.nanmax(after[1:])), 3.0 * resolution):
-            return True
-    return False
+def _moves(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
+    """Return [R] bool: a channel [T] moves over runs that end at `stops` [R].
+
+    It goes on far from where it stood.
+    """
+    change = np.abs(np.diff(values))
+    resolution = float(np.quantile(change[change > 0.0], 0.1)) if (change > 0.0).any() else 0.0
+    # the steps from the run's end on, no longer than the log
+    after = sliding_window_view(np.append(change, np.full(5, np.nan)), 6)[
+        np.minimum(stops, change.size - 1)
+    ]
+    usual = np.nanmax(after[:, 1:], axis=1)
+    return (stops < change.size - 3) & (after[:, 0] > np.maximum(3.0 * usual, 3.0 * resolution))
 
 
 # share of the rows from which on repeats are no accident, and their longest run
@@ -339,10 +356,9 @@ def interpolated(log: Record, found: Check) -> Iterator[Finding]:
 
 def _straight(log: Record, name: str) -> np.ndarray:
     """Return [T] bool: samples within runs without curvature, in a channel that has some."""
-    values, out = log[name], np.zeros(len(log), dtype=bool)
-    slope = np.diff(values) / np.diff(log.t)
-    bend = np.abs(np.diff(slope))
-    known = bend[np.isfinite(bend)]
+    out, values = np.zeros(len(log), dtype=bool), log.few[name]
+    known = np.abs(np.diff(np.diff(values) / np.diff(log.few.t)))
+    known = known[np.isfinite(known)]
     if known.size < 100:
         return out
     usual = float(np.median(known))
@@ -355,6 +371,8 @@ def _straight(log: Record, name: str) -> np.ndarray:
     noisy = noise > 0.5 * float(np.nanmedian(np.abs(np.diff(values, 2))))
     if coarse or usual <= 10.0 * rounding or not noisy:
         return out
+    slope = np.diff(log[name]) / np.diff(log.t)
+    bend = np.abs(np.diff(slope))
     flat = np.nan_to_num(bend, nan=np.inf) <= max(1e-5 * usual, rounding, 2.1 * resolution)
     if float(flat.mean()) > _USUALLY_STRAIGHT:
         return out
@@ -421,12 +439,16 @@ def clipping(log: Record, found: Check) -> Iterator[Finding]:
     """Report samples exactly at an extreme, many compared with the levels beside it."""
     for name in log.measured:
         known = log[name][np.isfinite(log[name])]
-        levels, counts = np.unique(known, return_counts=True)
-        if name in ("x", "y", "psi") or levels.size < 10:
+        if name in ("x", "y", "psi"):
             continue
-        for end, beside in ((0, counts[1:4]), (-1, counts[-4:-1])):
-            count, share, limit = int(counts[end]), counts[end] / known.size, float(levels[end])
-            if count < max(5, 4 * int(beside.max()), 0.003 * known.size):
+        for limit in (float(known.min()), float(known.max())):
+            count = int((known == limit).sum())
+            share = count / known.size
+            if count < max(5, 0.003 * known.size):
+                continue
+            levels, counts = np.unique(known, return_counts=True)
+            beside = counts[1:4] if limit == levels[0] else counts[-4:-1]
+            if levels.size < 10 or count < 4 * int(beside.max()):
                 continue
             text = (
                 f"{name} is exactly at its limit {show(limit, log.units[name])} in {count} samples"
@@ -440,7 +462,7 @@ def clipping(log: Record, found: Check) -> Iterator[Finding]:
 _FEWEST_LEVELS = 50
 
 
-@check("values", "resolution", fix="decimals were dropped on the way: log more digits")
+@check("values", "resolution", fix="decimals were dropped on the way: log more digits", few=True)
 def resolution(log: Record, found: Check) -> Iterator[Finding]:
     """Report the step of a channel's values, too coarse where few lie between its ends."""
     for name in log.measured:
@@ -470,6 +492,7 @@ def resolution(log: Record, found: Check) -> Iterator[Finding]:
     "held",
     fix="leave the cells between two measurements empty: held values are late by half an interval"
     " and their derivative is spikes; a fit takes them out of the motion and smooths it",
+    few=True,
 )
 def held(log: Record, found: Check) -> Iterator[Finding]:
     """Report slow sensors whose last value is repeated until the next."""
@@ -494,10 +517,11 @@ def jumps(log: Record, found: Check) -> Iterator[Finding]:
         change = np.nan_to_num(change)
         low, high = np.nanquantile(values, (0.01, 0.99))
         # beyond noise, beyond what goes on beside it, and a good part of the whole range
-        least = max(8.0 * noise_of(values), 0.3 * float(high - low))
+        least = 0.3 * float(high - low)
+        least = max(8.0 * noise_of(values), least) if change.max() > least else np.inf
         over = change > least
         if over.any():
-            around = np.lib.stride_tricks.sliding_window_view(np.pad(change, 4, mode="edge"), 9)
+            around = sliding_window_view(np.pad(change, 4, mode="edge"), 9)
             over[over] = change[over] > 4.0 * np.sort(around[over], axis=1)[:, -2]
         if over.any():
             at = int(np.argmax(np.where(over, change, 0.0)))

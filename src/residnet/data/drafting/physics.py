@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from residnet.core.units import si_unit, to_si, units
+from residnet.data.derivatives import local_polynomials
 from residnet.data.motion import without_pauses
 
 _WINDOW = 1.0
@@ -113,8 +114,6 @@ def motion_of(raw: Raw, unit: str, frame: Frame) -> Motion | None:
         unit: of the heading.
         frame: that is tried.
     """
-    from scipy.signal import savgol_filter
-
     psi = heading_of(raw, unit, frame)
     north, east = ("y", "x") if frame.swapped else ("x", "y")
     known = np.isfinite(raw.columns[north]) & np.isfinite(raw.columns[east]) & np.isfinite(raw.t)
@@ -131,8 +130,7 @@ def motion_of(raw: Raw, unit: str, frame: Frame) -> Motion | None:
         return None
 
     def rate(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-        smooth: np.ndarray = savgol_filter(np.interp(grid, t, values), window, 2, 1, step)
-        return smooth
+        return local_polynomials(np.interp(grid, t, values)[:, None], window, 2, step)[1][:, 0]
 
     speed_north = rate(at, raw.columns[north][known])
     speed_east = rate(at, raw.columns[east][known])
