@@ -83,7 +83,14 @@ def copies(logs: Together, found: Check) -> Iterator[Finding]:
         members = list(itertools.compress(members, alike))
     if not names or not members:
         return
-    hashes = [row_hashes(log, names) for log in members]
+    # rows are hashed one by one, so that all logs are hashed at once
+    whole = Log(
+        "together",
+        np.concatenate([log.t for log in members]),
+        {name: np.concatenate([log[name] for log in members]) for name in names},
+        members[0].units,
+    )
+    hashes = np.split(row_hashes(whole, names), np.cumsum([len(log) for log in members])[:-1])
     owner = np.repeat(np.arange(len(members)), [part.size for part in hashes])
     row = np.concatenate([np.arange(part.size) for part in hashes])
     _, inverse, count = np.unique(np.concatenate(hashes), return_inverse=True, return_counts=True)

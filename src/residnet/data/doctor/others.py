@@ -37,6 +37,8 @@ _RIDGE = 1e-6
 """Of the mean of a diagonal: solves what moves together, and changes the rest by a millionth."""
 _MOST_ROWS = 1500
 """Blocks of a log that are looked at: more of them only overlap more."""
+_SAMPLES = 20_000
+"""Samples of blocks that are looked at at a time, of each of some thirty columns."""
 _OVERLAP = 4.0
 """Blocks that overlap each sample; so many of their residuals count as one."""
 _FEWEST = 12
@@ -55,6 +57,9 @@ _LEAST_SCATTER = 0.1
 _SUSPECTS, _SUSPICIOUS = 8, 0.5
 """Logs that are left out in turn, so that the time grows with the number of logs only, and how
 much a log must stand apart before it is."""
+_MOST_USUAL = 40
+"""Logs, evenly spread, that tell what is usual in a larger fleet: so that a score takes no longer
+the more logs there are."""
 _MATERIAL = 0.15
 """Share of what there is to predict that must be wrong: smaller differences mislead no fit."""
 _WIND = ("wind_speed", "wind_dir")
@@ -234,6 +239,7 @@ class Fleet:
         ]
         self.seconds = float(np.median(seconds)) if seconds else 1.0
         self.form: _Form = _quadratic
+        self._plain: dict[_Form, list[Rows]] = {}
         errors: dict[_Form, float] = {}
         for form in (_quadratic, _polynomial):
             self._take(form)
@@ -245,6 +251,7 @@ class Fleet:
         self._take(
             _polynomial if errors.get(_polynomial, simple) < _SIMPLER * simple else _quadratic
         )
+        self._plain.clear()
         self.apart: list[int] = []
         self._rests: dict[int, list[tuple[int, int]]] = {}
         self._settle(list(self.told))
@@ -254,7 +261,9 @@ class Fleet:
     def _take(self, form: _Form) -> None:
         """Make the rows of all logs in one form."""
         self.form = form
-        plain = [self._rows(log) for log in self.logs]
+        if form not in self._plain:
+            self._plain[form] = [self._rows(log) for log in self.logs]
+        plain = self._plain[form]
         self.told = [i for i, one in enumerate(plain) if one.known]
         own = [plain[i] for i in self.told]
         ones = np.ones(1)
@@ -267,14 +276,19 @@ class Fleet:
     def _rows(self, log: Record) -> Rows:
         size = max(round(self.seconds / log.step), 4) if len(log) >= FEWEST else len(log)
         stride = max(size // int(_OVERLAP), (len(log) - size) // _MOST_ROWS, 1)
-        first = np.arange(0, max(len(log) - size, 0), stride)
-        at = first[:, None] + np.arange(size + 1)
-        seen, dt = Sampled(log, at), np.diff(log.t[at], axis=1)
-        columns = [*self.form(seen, self.moving, self.driving), *_wind(seen, self.inputs)]
-        x = np.stack([0.5 * ((c[:, 1:] + c[:, :-1]) * dt).sum(1) for c in columns], axis=-1)
+        first, parts = np.arange(0, max(len(log) - size, 0), stride), []
+        # so many blocks at a time that their samples stay in a core's cache
+        for some in np.array_split(first, max(first.size * size // _SAMPLES, 1)):
+            at = some[:, None] + np.arange(size + 1)
+            seen, dt = Sampled(log, at), np.diff(log.t[at], axis=1)
+            columns = [*self.form(seen, self.moving, self.driving), *_wind(seen, self.inputs)]
+            parts.append(
+                np.stack([0.5 * ((c[:, 1:] + c[:, :-1]) * dt).sum(1) for c in columns], axis=-1)
+            )
+        x, seconds = np.concatenate(parts), log.t[first + size] - log.t[first]
         y = np.stack([log[n][first + size] - log[n][first] for n in self.moving], axis=-1)
         known = np.isfinite(x).all(1) & np.isfinite(y).all(1)
-        known &= dt.sum(1) <= (size + 3.0) * log.step
+        known &= seconds <= (size + 3.0) * log.step
         noise = np.array([2.0 * log.noise(name) ** 2 for name in self.moving])
         return Rows(x[known], y[known], first[known], size, noise)
 
@@ -337,19 +351,20 @@ class Fleet:
 
     def scores(self, core: Sequence[int], of: Sequence[int]) -> dict[int, Score]:
         """Return how logs stand to the others of the core."""
-        every = [i for i in dict.fromkeys((*core, *of)) if len(core) > (i in core)]
+        some = core[:: -(-len(core) // _MOST_USUAL)]
+        every = [i for i in dict.fromkeys((*some, *of)) if len(core) > (i in core)]
         models = self._others(core, every)
         left = {i: self._left(i, models[i]) for i in every}
-        known = self._beyond_noise(core, models)
-        together, own = np.median([*known.values()], axis=0), np.stack([known[j] for j in core])
+        known = self._beyond_noise(some, models)
+        together, own = np.median([*known.values()], axis=0), np.stack([known[j] for j in some])
         usual = {
-            i: np.median(np.delete(own, core.index(i), 0), 0) if i in core else together
+            i: np.median(np.delete(own, some.index(i), 0), 0) if i in some else together
             for i in every
         }
         beyond = {i: usual[i] + self.rows[i].noise for i in every}
         ratio = {i: np.sqrt(left[i] / beyond[i]) for i in every}
         parts = {i: self._parts(i, models[i], beyond[i]) for i in every}
-        inside = [i for i in core if i in ratio]
+        inside = [i for i in some if i in ratio]
         differ = np.array([parts[i][0] for i in inside])
         logs = np.log(np.maximum([ratio[i] for i in inside], 1e-6))
         out = {}
@@ -440,16 +455,18 @@ class Fleet:
 
     def _settle(self, core: list[int]) -> None:
         """Take logs for those that agree, and what is usually left of them."""
+        self.__dict__.pop("_whole", None)
         models = self._others(core, core) if len(core) > 1 else {}
         self.core, self._usually = core, self._beyond_noise(core, models)
 
     def unexplained_rests(
-        self, log: Record, rows: Rows, model: Model, at_zero: bool = False
+        self, log: Record, rows: Rows, without: int | None = None, at_zero: bool = False
     ) -> list[tuple[int, int]]:
         """Return first and last samples of rests of all inputs whose motion nothing explains.
 
         Where they take up more than a fifth of the log there are none: the log is a wrong one.
-        `at_zero` takes rests at exactly 0 only.
+        They are predicted by the model of the logs that agree, `without` one of them. `at_zero`
+        takes rests at exactly 0 only.
         """
         out: list[tuple[int, int]] = []
         given = log.log.stack(self.driving)
@@ -458,7 +475,7 @@ class Fleet:
             same &= (given[1:] == 0.0).all(1)
         starts, stops = stretches(np.append(same, False))
         long = stops - starts >= rows.size
-        rest = model.rest(rows) if long.any() else np.zeros(0)
+        rest = self.model(without).rest(rows) if long.any() else np.zeros(0)
         for start, stop in zip(starts[long].tolist(), stops[long].tolist(), strict=True):
             inside = (rows.first >= start) & (rows.first + rows.size <= stop)
             if inside.sum() > 1:
@@ -477,9 +494,7 @@ class Fleet:
             told = i in self.told and len(self.core) > 1 and bool(self.driving)
             log, rows = self.logs[i], self.rows[i]
             apart = i not in self.core
-            self._rests[i] = (
-                self.unexplained_rests(log, rows, self.model(without=i), apart) if told else []
-            )
+            self._rests[i] = self.unexplained_rests(log, rows, i, apart) if told else []
         return self._rests[i]
 
     def _without(self, i: int, rests: Sequence[tuple[int, int]]) -> Rows:
@@ -498,8 +513,22 @@ class Fleet:
     def model(self, without: int | None = None) -> Model:
         """Return the model of the logs that agree, one of them left out."""
         kept = [i for i in self.core if i != without]
-        usual = np.median([self._usually[i] for i in kept], axis=0)
-        return Model.of([self.rows[i] for i in kept], np.maximum(usual, 1e-12))
+        if len(self.core) <= _MOST_USUAL:
+            usual = np.median([self._usually[i] for i in kept], axis=0)
+            return Model.of([self.rows[i] for i in kept], np.maximum(usual, 1e-12))
+        gram, moments, usual = self._whole
+        if without in self.core:
+            own = self.rows[without]
+            gram, moments = gram - own.gram, moments - own.moments
+        return Model(gram, moments, usual)
+
+    @cached_property
+    def _whole(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sums over the rows of the logs that agree, and what is usually left of them [n]."""
+        sums = (np.sum([getattr(self.rows[i], of) for i in self.core], axis=0) for of in _SUMS)
+        gram, moments = sums
+        usual = np.median([*self._usually.values()], axis=0)
+        return gram, moments, np.maximum(usual, 1e-12)
 
     def harm(self, i: int) -> float:
         """Return by how much a log changes the predictions of a fit to all, as a share of them."""
@@ -693,7 +722,7 @@ def dead_commands(
     out = {log.name: fleet.rests(i) for i, log in enumerate(fit)}
     for log in further if len(fleet.core) > 1 and fleet.driving else ():
         if _usable(log, inputs) and set(fleet.moving) <= set(log):
-            out[log.name] = fleet.unexplained_rests(log, fleet.of(log), fleet.model())
+            out[log.name] = fleet.unexplained_rests(log, fleet.of(log))
     return {name: found for name, found in out.items() if found}
 
 
@@ -725,8 +754,10 @@ def nothing_steers(fleet: Fleet) -> tuple[list[str], float]:
         )
     ]
     left = float(fleet.unexplained()[fleet.moving.index("r")])
+    if not dead or left <= _UNSTEERED:
+        return [], left
     weaving = [reversals(_heading(log), _SWING) >= 2 for log in fleet.logs]
-    return (dead, left) if left > _UNSTEERED and np.mean(weaving) >= _WEAVE else ([], left)
+    return (dead, left) if np.mean(weaving) >= _WEAVE else ([], left)
 
 
 def _heading(log: Record) -> np.ndarray:
