@@ -9,7 +9,7 @@ from residnet.data.readers.clocks import steady_clock
 from residnet.data.readers.quantities import true_headings
 
 T = 0.1 * np.arange(300)
-ROWS = np.sin(T)[:, None]
+COLUMNS = [np.sin(T)]
 
 
 @pytest.mark.parametrize("bits", [16, 24, 32])
@@ -18,22 +18,22 @@ def test_a_counter_that_wraps_goes_on(bits: int, tick: float) -> None:
     length = 2.0**bits * tick
     step = min(0.1, 0.01 * length)
     true = step * np.arange(300) + 0.9 * length
-    mended, remarks = steady_clock(np.remainder(true, length), ROWS, tick)
+    mended, remarks = steady_clock(np.remainder(true, length), COLUMNS, tick)
     np.testing.assert_allclose(np.diff(mended), step, rtol=1e-6)
     assert [one["code"] for one in remarks] == ["clock_wraps"] * bool(true[-1] > length)
 
 
 def test_an_hour_that_comes_twice_is_told_from_a_restart() -> None:
     local = np.where(T > 15.0, T - 3600.0, T)
-    np.testing.assert_allclose(steady_clock(local, ROWS)[0], T)
+    np.testing.assert_allclose(steady_clock(local, COLUMNS)[0], T)
     restarted = np.where(T > 15.0, T - 15.0, T)
-    np.testing.assert_array_equal(steady_clock(restarted, ROWS)[0], restarted)
-    np.testing.assert_array_equal(steady_clock(restarted, ROWS, 1e-6)[0], restarted)
+    np.testing.assert_array_equal(steady_clock(restarted, COLUMNS)[0], restarted)
+    np.testing.assert_array_equal(steady_clock(restarted, COLUMNS, 1e-6)[0], restarted)
 
 
 @pytest.mark.parametrize("begin", [0.0, 0.35, 0.9])
 def test_rows_of_one_second_are_spread_over_it(begin: float) -> None:
-    mended, remarks = steady_clock(np.floor(T + begin + 1e-9), ROWS)
+    mended, remarks = steady_clock(np.floor(T + begin + 1e-9), COLUMNS)
     np.testing.assert_allclose(mended - mended[0], T, atol=1e-9)
     assert mended[0] == pytest.approx(begin, abs=0.051)
     assert remarks[0]["figures"] == {"rows": 10.0, "step": 1.0}
@@ -41,8 +41,8 @@ def test_rows_of_one_second_are_spread_over_it(begin: float) -> None:
 
 def test_copies_of_a_row_are_no_finer_clock() -> None:
     twice = np.repeat(T, 2)
-    np.testing.assert_array_equal(steady_clock(twice, np.repeat(ROWS, 2, axis=0))[0], twice)
-    np.testing.assert_array_equal(steady_clock(T, ROWS)[0], T)
+    np.testing.assert_array_equal(steady_clock(twice, np.repeat(COLUMNS, 2, axis=1))[0], twice)
+    np.testing.assert_array_equal(steady_clock(T, COLUMNS)[0], T)
 
 
 @pytest.mark.parametrize("times", [2.0, 3.3, 10.0])

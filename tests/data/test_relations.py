@@ -233,5 +233,6 @@ def test_a_long_log_tells_by_stretches_what_it_tells_whole(monkeypatch: pytest.M
         if one.at is not None and other.at is not None:
             assert np.mean(one.at != other.at) < 1e-3
         size = {name: one.figures[name] for name in {"size", "count"} & {*one.figures}}
-        assert size == pytest.approx({name: other.figures[name] for name in size}, rel=0.1, abs=0.02)
-
+        assert size == pytest.approx(
+            {name: other.figures[name] for name in size}, rel=0.1, abs=0.02
+        )

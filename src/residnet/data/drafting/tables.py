@@ -362,7 +362,7 @@ def _raw(
         way = -1 if (np.diff(clock.seconds[np.isfinite(clock.seconds)]) < 0.0).all() else 1
         columns = {channel: values[::way] for channel, values in columns.items()}
         t = clock.seconds[::way]
-        first = first_of_copies(t, np.stack([*columns.values()], axis=1)) if columns else t == t
+        first = first_of_copies(t, columns.values()) if columns else t == t
         logs.append(Raw(t[first], {name: values[first] for name, values in columns.items()}))
     return logs
 
@@ -582,16 +582,16 @@ def clock_of(sheet: Sheet) -> Clock:
 
 def _going_on(values: np.ndarray) -> np.ndarray:
     """Return whole numbers as a counter of them went on that wrapped."""
-    return steady_clock(values, values[:, None], 1.0)[0]
+    return steady_clock(values, [values], 1.0)[0]
 
 
 def _steady(sheet: Sheet, t: np.ndarray, tick: float | None = None) -> np.ndarray:
     """Return the times of a sheet as its reader will mend them."""
     known = np.isfinite(t)
     if known.sum() > 1 and sheet.numbers:
-        rows = np.stack([*sheet.numbers.values()], axis=1)
         t = t.copy()
-        t[known] = steady_clock(t[known], rows[known], tick)[0]
+        columns = (values[known] for values in sheet.numbers.values())
+        t[known] = steady_clock(t[known], columns, tick)[0]
     return t
 
 

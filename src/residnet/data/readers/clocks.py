@@ -4,6 +4,8 @@ hours, minutes and seconds in one number.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from residnet.data.readers.recording import Remark, remark
@@ -16,17 +18,27 @@ _USUAL_STEPS = 3.0
 """Usual steps within which the clock has gone on where its counter began anew."""
 
 
-def first_of_copies(t: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _as_before(columns: Iterable[np.ndarray], at: np.ndarray) -> np.ndarray:
+    """Return [K] bool: at rows [K] every column [T] holds what it holds in the row before."""
+    same = np.ones(at.size, dtype=bool)
+    for values in columns:
+        here, before = values[at], values[at - 1]
+        same &= (here == before) | (np.isnan(here) & np.isnan(before))
+    return same
+
+
+def first_of_copies(t: np.ndarray, columns: Iterable[np.ndarray]) -> np.ndarray:
     """Return [T] bool: rows that do not repeat the one before them, time and all.
 
     True everywhere where times repeat without that, for then the clock is coarser than the rows.
 
     Args:
         t: times [T] in s, as recorded.
-        rows: what was recorded [T, k].
+        columns: what was recorded, [T] each.
     """
-    same = (rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1]))
-    first = np.append(True, (np.diff(t) != 0.0) | ~same.all(axis=1))
+    again = np.flatnonzero(np.diff(t) == 0.0) + 1
+    first = np.ones(t.size, dtype=bool)
+    first[again] = ~_as_before(columns, again)
     return first if (np.diff(t[first]) != 0.0).all() else np.ones_like(first)
 
 
@@ -50,7 +62,7 @@ def _unpacked(t: np.ndarray) -> np.ndarray | None:
 
 
 def steady_clock(
-    t: np.ndarray, rows: np.ndarray, tick: float | None = None
+    t: np.ndarray, columns: Iterable[np.ndarray], tick: float | None = None
 ) -> tuple[np.ndarray, list[Remark]]:
     """Return times [T] in s as the clock went on, and what was mended.
 
@@ -63,7 +75,7 @@ def steady_clock(
 
     Args:
         t: as recorded; all finite.
-        rows: what was recorded [T, k].
+        columns: what was recorded, [T] each.
         tick: s that the counter counts by; None for a clock of dates.
     """
     step = np.diff(t)
@@ -94,13 +106,14 @@ def steady_clock(
             text = f"the clock leapt an hour after {first:.6g} s, as in spring; it is taken off"
             remarks.append(remark("note", "clock_leaps", text, count=float(ahead.sum())))
     t = t + added
+    shared = np.flatnonzero(np.diff(t) == 0.0) + 1
+    if not shared.size:
+        return t, remarks
     stamps, begins, counts = np.unique(t, return_index=True, return_counts=True)
     each = int(np.median(counts))
     if stamps.size < 3 or each < 2 or (np.diff(t) < 0.0).any():
         return t, remarks
-    shared = np.flatnonzero(np.diff(t) == 0.0)
-    before, after = rows[shared], rows[shared + 1]
-    if ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=1).mean() > 0.5:
+    if _as_before(columns, shared).mean() > 0.5:
         return t, remarks
     coarse = float(np.median(np.diff(stamps)))
     # a last stamp has none after it; a first one may have begun before the recording did

@@ -282,11 +282,17 @@ class TableReader(LogReader):
         with progress(path.name, path.stat().st_size, 1.0) as advance:
             table = config.load(path, [*columns, *sides], advance)
         above = table.attrs.get("above", 0)
+        rows = len(table) + bool(table.attrs.get("cut"))
         cells = {name: table.iloc[:, i] for i, name in enumerate([*columns, *sides])}
         self._require_units(path, table.attrs.get("units", ()))
         t, start, findings = self._times(path, cells, above)
         raw = {name: self._values(path, name, cells, above) for name in maps}
-        measured = np.logical_or.reduce([np.isfinite(values) for values in raw.values()])
+        cut = bool(table.attrs.get("cut"))
+        # each column is let go where its channel is made
+        del table, cells
+        measured = np.zeros(t.size, dtype=bool)
+        for values in raw.values():
+            measured |= np.isfinite(values)
         undated = np.flatnonzero(measured & ~np.isfinite(t))
         if undated.size:
             raise DataError(
@@ -304,45 +310,45 @@ class TableReader(LogReader):
             kept = kept[::-1]
             text = "the rows stand with the newest first, and are read from the last one on"
             findings.append(remark("note", "newest_first", text))
-        recorded = np.stack([values[kept] for values in raw.values()], axis=1)
-        fresh = first_of_copies(t[kept], recorded)
+        recorded = [*raw.values()]
+        fresh = first_of_copies(t[kept], (_at(values, kept) for values in recorded))
         if not fresh.all():
             text = f"{int((~fresh).sum())} rows repeat the one before them and are left out"
             findings.append(remark("note", "copied_rows", text, rows=float((~fresh).sum())))
-            kept, recorded = kept[fresh], recorded[fresh]
+            kept = kept[fresh]
         held = [name for name in raw if maps[name].hold]
         for name in held:
             raw[name] = raw[name][_last_known(raw[name])]
-        moving = [values[kept] for name, values in raw.items() if name not in held]
-        if held and moving:
+        if held and len(held) < len(raw):
             # a row of commands alone belongs to the next sample of the motion
-            there = np.isfinite(np.stack(moving)).any(axis=0)
-            kept, recorded = kept[there], recorded[there]
+            moving = [values[kept] for name, values in raw.items() if name not in held]
+            kept = kept[np.isfinite(np.stack(moving)).any(axis=0)]
         tick = None if config.time.unit == DATE else to_si(config.time.unit)
-        t[kept], said = steady_clock(t[kept], recorded, tick)
+        clock, said = steady_clock(t[kept], (_at(values, kept) for values in recorded), tick)
         findings += said
-        require_increasing(path, t[kept], lambda i: self._row(int(kept[i]) + above))
-        channels = {name: maps[name].convert(name, raw[name][kept]) for name in maps}
-        for name, values in channels.items():
-            require_values(path, name, maps[name].column, values)
-        if "psi" in channels and (text := told_headings(raw["psi"][kept], channels["psi"])):
-            findings.append(remark("note", "heading_interpolated", text))
+        del recorded, values
+        require_increasing(path, clock, lambda i: self._row(int(kept[i]) + above))
+        channels: dict[str, np.ndarray] = {}
+        for name in maps:
+            own = _at(raw.pop(name), kept)
+            channels[name] = maps[name].convert(name, own)
+            require_values(path, name, maps[name].column, channels[name])
+            if name == "psi" and (text := told_headings(own, channels[name])):
+                findings.append(remark("note", "heading_interpolated", text))
         units = {name: entry.si(name) for name, entry in maps.items()}
         findings += _placed(path, channels, units)
         _headed(path, channels, units, maps)
-        cut = bool(table.attrs.get("cut"))
         if cut:
             text = "the file ends within its last line, which is left out"
             findings.append(remark("note", "cut_line", text))
-        rows = len(table) + cut
         meta = provenance(path, rows, rows - kept.size)
         meta |= {"findings": findings} if findings else {}
         if start is not None:
-            first = start + int(np.rint(t[kept[0]] * 1e9))
+            first = start + int(np.rint(clock[0] * 1e9))
             meta |= {"epoch": first * 1e-9, "epoch_ns": first}
         kind = config.manoeuvre
         kind = path.resolve().parent.name if kind == "folder" else kind
-        return Log(path.stem, t[kept], channels, units, kind or "unknown", meta=meta)
+        return Log(path.stem, clock, channels, units, kind or "unknown", meta=meta)
 
     def _require_units(self, path: Path, written: Sequence[str]) -> None:
         """Stop where cells name another unit than the channel map; `written` are those of cells."""
@@ -445,6 +451,12 @@ class TableReader(LogReader):
                 f" ({bad.size} such cells); correct or empty them, or correct the unit"
             )
         return values, findings
+
+
+def _at(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return values [T] at rows [K]; themselves, and no copy, where these are all in order."""
+    every = rows.size == values.size and rows[0] == 0
+    return values if every else np.asarray(values[rows])
 
 
 def _last_known(values: np.ndarray) -> np.ndarray:

@@ -145,11 +145,13 @@ def read_csv(
                 one = f" (only one column found; is the delimiter really '{delimiter}'?)"
                 raise UsageError(f"{error}{one if wide == 1 else ''}") from None
             cut, comments = _check_lines(path, delimiter, header, file)
-            pieces = []
+            pieces: dict[int, list[pd.Series]] = {place: [] for place in where}
             with file.open("rb") as stream:
                 form = _form(delimiter, decimal, (header.above, comments), range(wide))
                 for piece in pd.read_csv(stream, **form, chunksize=_PIECE):
-                    pieces.append(piece[sorted(set(where))])
+                    for place, own in pieces.items():
+                        # a copy, or the other columns would stay
+                        own.append(piece[place].copy())
                     advance(min(1.0, stream.tell() / size))
         except UnicodeDecodeError as error:
             raise DataError(
@@ -164,11 +166,14 @@ def read_csv(
                 f"{path}: not a regular table, its header has {wide} columns ({reason}); check"
                 " `delimiter` and `decimal`"
             ) from error
-    pieces = pieces or [pd.DataFrame({place: [] for place in where})]
-    table = pieces[0] if len(pieces) == 1 else pd.concat(pieces)
-    table = _plain(table, decimal)
-    units = [table.attrs["units"].get(place, "") for place in where]
-    table = table[where].iloc[: -1 if cut else None]
+    whole = {
+        place: _plain(pd.concat(pieces.pop(place) or [pd.Series([])]), decimal)
+        for place in [*pieces]
+    }
+    table = pd.DataFrame({i: whole[place][0] for i, place in enumerate(where)}, copy=False)
+    table.columns = pd.Index(where)
+    table = table.iloc[: -1 if cut else None]
+    units = [whole[place][1] for place in where]
     table.attrs |= {"above": header.above - 1, "cut": cut, "units": units}
     return table
 
@@ -195,12 +200,12 @@ def _form(
     }
 
 
-def _plain(table: pd.DataFrame, decimal: str) -> pd.DataFrame:
-    """Return a table whose numbers have no signs between thousands, and no marks for none (---).
+def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
+    """Return a column whose numbers have no signs between thousands, and no marks for none (---).
 
-    Where each cell of a column names the same unit (`1450 rpm`), it stands in the `units` of the
-    table's `attrs` instead. A column that then still holds a word stays as it is, and so does one
-    in which every cell could as well have three decimals.
+    Where each cell names the same unit (`1450 rpm`), it is returned, and else nothing. A column
+    that then still holds a word stays as it is, and so does one in which every cell could as well
+    have three decimals.
     """
     import pandas as pd
 
@@ -214,18 +219,14 @@ def _plain(table: pd.DataFrame, decimal: str) -> pd.DataFrame:
             cell = re.sub(between, "", cell)
         return cell.replace(decimal, ".") if re.search(r"\w", cell) else np.nan
 
-    table, units = table.copy(deep=False), dict[Any, str]()
-    for name, cells in table.items():
-        if not pd.api.types.is_numeric_dtype(cells.dtype):
-            unit, cells = _without_unit(cells)
-            signs = {len(re.findall(r"[^\d+-]", str(cell).strip())) for cell in cells.dropna()}
-            bare = cells.map(number)
-            values = pd.to_numeric(bare, errors="coerce")
-            if (unit or signs != {1}) and values.isna().sum() == bare.isna().sum():
-                table[name] = values
-                units |= {name: unit} if unit else {}
-    table.attrs["units"] = units
-    return table
+    if pd.api.types.is_numeric_dtype(cells.dtype):
+        return cells, ""
+    unit, told = _without_unit(cells)
+    signs = {len(re.findall(r"[^\d+-]", str(cell).strip())) for cell in told.dropna()}
+    bare = told.map(number)
+    values = pd.to_numeric(bare, errors="coerce")
+    plain = (unit or signs != {1}) and values.isna().sum() == bare.isna().sum()
+    return (values, unit) if plain else (cells, "")
 
 
 def _without_unit(cells: pd.Series) -> tuple[str, pd.Series]:
@@ -298,7 +299,11 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
         except (ValueError, csv.Error) as error:
             reason = shown(" ".join(str(error).split()), 200)
             raise DataError(f"{path}: not a regular table ({reason})") from error
-    table = _plain(table, decimal)
+    units = dict[Any, str]()
+    for name in table:
+        table[name], unit = _plain(table[name], decimal)
+        units |= {name: unit} if unit else {}
+    table.attrs["units"] = units
     table.attrs["between"] = cells[at + 1 : above]
     about = {"kind": "csv"} | ({"delimiter": delimiter} if delimiter != "," else {})
     return table, about | ({"decimal": ","} if decimal == "," else {})
