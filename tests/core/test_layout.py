@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from residnet.core import layout
+from residnet.core import columns, layout
 from residnet.core.names import POSE, STATE, VELOCITY
 
 X = torch.arange(16.0).reshape(2, 8)
@@ -22,15 +22,15 @@ def test_columns_are_those_of_the_names() -> None:
 
 
 def test_functions_take_the_same_columns() -> None:
-    for function, columns in (
-        (layout.pose, layout.POSE),
-        (layout.velocities, layout.VELOCITIES),
-        (layout.motion, layout.MOTION),
-        (layout.actuators, layout.ACTUATORS),
+    for function, part in (
+        (columns.pose, layout.POSE),
+        (columns.velocities, layout.VELOCITIES),
+        (columns.motion, layout.MOTION),
+        (columns.actuators, layout.ACTUATORS),
     ):
-        assert torch.equal(function(X), X[:, columns])
-        assert torch.equal(torch.jit.script(function)(X), X[:, columns])
-    assert torch.equal(layout.zero_acceleration(X), torch.zeros(2, layout.PLANAR.dof))
+        assert torch.equal(function(X), X[:, part])
+        assert torch.equal(torch.jit.script(function)(X), X[:, part])
+    assert torch.equal(columns.zero_acceleration(X), torch.zeros(2, layout.PLANAR.dof))
 
 
 def test_other_degrees_of_freedom() -> None:

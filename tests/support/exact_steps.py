@@ -7,8 +7,8 @@ from typing import final
 import torch
 from torch import Tensor
 
+from residnet.core.columns import heading, surge
 from residnet.core.frames import to_earth
-from residnet.core.layout import heading, surge
 from residnet.dynamics.base import Dynamics
 from residnet.physics.nomoto import SteeringVessel
 

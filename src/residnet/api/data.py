@@ -18,7 +18,7 @@ from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback, report, say
 from residnet.data.doctor import inspect as examine
 from residnet.data.doctor import inspect_together
-from residnet.data.drafting.questions import Marks, Question
+from residnet.data.drafting.questions import Marks, Question, commented
 from residnet.data.drafting.reading import log_files, read_each
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.prepare import PrepareConfig, Prepared
@@ -31,7 +31,7 @@ from residnet.data.split import SPLITS, check_leaks, divided, log_names
 from residnet.identification.recipe import Preparation, judging
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.tasks.drafting import Draft, commented, drafted
+from residnet.tasks.drafting import Draft, drafted
 from residnet.tasks.driving import driving
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, require
+from residnet.core.columns import zero_acceleration
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, UsageError
-from residnet.core.layout import zero_acceleration
 from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
 from residnet.core.samples import Samples
 from residnet.physics.hull import HullConfig, OdinConfig

@@ -2,22 +2,22 @@
 
 The columns below are those of the planar model, three degrees of freedom; no other module counts
 them. A model with roll keeps them, with p and phi behind; one of all six degrees of freedom has w,
-p, q and the depth z, roll and pitch there. Functions serve code that TorchScript
-compiles, which takes no global slices; n is the number of what moves (`Live.size`).
+p, q and the depth z, roll and pitch there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from residnet.core import names
 from residnet.core.errors import UsageError
-from residnet.core.frames import upright
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -280,18 +280,24 @@ class Live:
 
     def mask(self) -> Tensor:
         """Return 1 for each that has an equation of its own and 0 for the others, [n] float64."""
+        import torch
+
         out = torch.zeros(self.size, dtype=torch.float64)
         out[self.learned] = 1.0
         return out
 
     def alive(self) -> Tensor:
         """Return 0 for each velocity that is zero at all times and 1 for the others, [n]."""
+        import torch
+
         out = torch.zeros(self.size, dtype=torch.float64)
         out[self.axes] = 1.0
         return out
 
     def known_rates(self) -> Tensor:
         """Return K [n, n] with nu K the rates of the angles, from what moves nu [..., n]."""
+        import torch
+
         out = torch.zeros(self.size, self.size, dtype=torch.float64)
         for angle in self.layout.attitude:
             if angle in _RATES:
@@ -326,85 +332,8 @@ RANGE_INPUTS = slice(PLANAR.dof, None)
 """Of training ranges: inputs follow the velocities."""
 
 
-def pose(x: Tensor) -> Tensor:
-    """Return the pose (x, y, psi) [..., 3] of states [..., nx]."""
-    return x[..., :3]
-
-
-def velocities(x: Tensor, n: int = 3) -> Tensor:
-    """Return what moves [..., n] of states [..., nx]: u, v, r, and p and phi of a roll."""
-    return x[..., 3 : 3 + n]
-
-
-def motion(x: Tensor, n: int = 3) -> Tensor:
-    """Return pose and what moves [..., 3 + n] of states [..., nx]."""
-    return x[..., : 3 + n]
-
-
-def actuators(x: Tensor, n: int = 3) -> Tensor:
-    """Return the states of actuators [..., nx - 3 - n] of states [..., nx]."""
-    return x[..., 3 + n :]
-
-
-def accelerations(x: Tensor) -> Tensor:
-    """Return the accelerations [..., 3] behind pose and velocities of a motion [..., 9]."""
-    return x[..., 6:9]
-
-
-def velocities_on(x: Tensor) -> Tensor:
-    """Return all but the pose [..., nx - 3] of states [..., nx]: velocities and what follows."""
-    return x[..., 3:]
-
-
-def position(x: Tensor) -> Tensor:
-    """Return the position (x, y) [..., 2] of states [..., nx]."""
-    return x[..., :2]
-
-
-def heading(x: Tensor) -> Tensor:
-    """Return the heading [...] in rad of states [..., nx]."""
-    return x[..., 2]
-
-
-def surge(x: Tensor) -> Tensor:
-    """Return the surge velocity [...] in m/s of states [..., nx]."""
-    return x[..., 3]
-
-
-def sway(x: Tensor) -> Tensor:
-    """Return the sway velocity [...] in m/s of states [..., nx]."""
-    return x[..., 4]
-
-
-def yaw_rate(x: Tensor) -> Tensor:
-    """Return the yaw rate [...] in rad/s of states [..., nx]."""
-    return x[..., 5]
-
-
-def roll_angle(x: Tensor) -> Tensor:
-    """Return the roll angle [...] in rad of states [..., nx] with roll."""
-    return x[..., 7]
-
-
-def turning(nu: Tensor, n: int = 3) -> Tensor:
-    """Return the rate of the heading [..., 1] in rad/s from what moves on the surface [..., n]."""
-    r = nu[..., 2:3]
-    return r * torch.cos(nu[..., 4:5]) if n == 5 else r
-
-
 ATTITUDE = tuple(map(SIX.names.index, ("phi", "theta", "psi")))
 """Columns of states of six degrees of freedom, those of an attitude."""
-
-
-def tilted(nu: Tensor) -> list[Tensor]:
-    """Return the velocity forward, to starboard and down [...] of what moves in six [..., 9]."""
-    return upright(nu[..., 0], nu[..., 1], nu[..., 3], nu[..., 7], nu[..., 8])
-
-
-def sinking(nu_dot: Tensor, nu: Tensor) -> Tensor:
-    """Return rates [..., 9] of what moves in six [..., 9] with that of the depth."""
-    down = tilted(nu)[2].unsqueeze(-1)
-    return torch.cat((nu_dot[..., :6], down, nu_dot[..., 7:]), dim=-1)
 
 
 _STEEP = 1e-3
@@ -419,14 +348,13 @@ def levelled(nu: np.ndarray) -> np.ndarray:
     if nu.shape[-1] == PLANAR.dof:
         return nu
     if nu.shape[-1] == len(SIX.moving):
+        import torch
+
+        from residnet.core.columns import tilted
+
         ahead, across, _ = (part.numpy() for part in tilted(torch.from_numpy(np.array(nu))))
         r, q, phi, theta = (nu[..., SIX.moving.index(name)] for name in ("r", "q", "phi", "theta"))
         flat = np.maximum(np.cos(theta), _STEEP)
         return np.stack((ahead, across, (q * np.sin(phi) + r * np.cos(phi)) / flat), axis=-1)
     level = np.cos(nu[..., ROLL.moving.index("phi")])
     return np.stack((nu[..., 0], nu[..., 1] * level, nu[..., 2] * level), axis=-1)
-
-
-def zero_acceleration(z: Tensor, n: int = 3) -> Tensor:
-    """Return accelerations of zero [..., n], alike in type to channels [..., nz]."""
-    return torch.zeros_like(z[..., :n])

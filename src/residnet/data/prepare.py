@@ -11,9 +11,10 @@ import torch
 from pydantic import Field
 
 from residnet.core.arrays import paged
+from residnet.core.columns import sinking
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import ALIVE, POSE, Live, sinking
+from residnet.core.layout import ALIVE, POSE, Live
 from residnet.core.log import Log
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretch_numbers

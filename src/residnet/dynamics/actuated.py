@@ -9,7 +9,7 @@ from typing import Literal, final
 import torch
 from torch import Tensor, nn
 
-from residnet.core import layout
+from residnet.core import columns
 from residnet.core.config import Config, Quantity
 from residnet.core.errors import ConfigError
 from residnet.core.names import CHANNEL_UNITS, nearest
@@ -237,10 +237,10 @@ class ActuatedDynamics(Dynamics):
         return self.actuators.approach(rows, self.hull)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        a = layout.actuators(x, self.dof)
+        a = columns.actuators(x, self.dof)
         moved = self.actuators.move(a, w)
         given = torch.cat((a, w), dim=-1)[:, self.take]
         if self.mean:
             given = 0.5 * (given + torch.cat((moved, w), dim=-1)[:, self.take])
-        y, s = self.model.step(layout.motion(x, self.dof), given, s)
+        y, s = self.model.step(columns.motion(x, self.dof), given, s)
         return torch.cat((y, moved), dim=-1), s

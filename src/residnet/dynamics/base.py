@@ -9,9 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from residnet.core.frames import cross, rotated, to_earth
-from residnet.core.layout import (
-    PLANAR,
+from residnet.core.columns import (
     heading,
     pose,
     roll_angle,
@@ -22,6 +20,8 @@ from residnet.core.layout import (
     velocities_on,
     yaw_rate,
 )
+from residnet.core.frames import cross, rotated, to_earth
+from residnet.core.layout import PLANAR
 
 Integrator = Literal["rk4", "heun", "euler", "semi_implicit_euler"]
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
 from residnet.baselines.given import StillConfig
-from residnet.core.layout import pose, velocities, zero_acceleration
+from residnet.core.columns import pose, velocities, zero_acceleration
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import FARTHEST, HybridDynamics
 from residnet.heads.base import ResidualHead

@@ -17,18 +17,10 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
+from residnet.core.columns import heading, pose, sinking, turning, velocities
 from residnet.core.config import Config, Seconds
 from residnet.core.frames import to_body, to_earth
-from residnet.core.layout import (
-    ALIVE,
-    ATTITUDE,
-    Live,
-    heading,
-    pose,
-    sinking,
-    turning,
-    velocities,
-)
+from residnet.core.layout import ALIVE, ATTITUDE, Live
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals

@@ -10,8 +10,9 @@ from typing import NamedTuple, final
 import torch
 from torch import Tensor
 
+from residnet.core.columns import actuators, motion
 from residnet.core.errors import ConfigError
-from residnet.core.layout import LATERAL, SWAY, actuators, motion
+from residnet.core.layout import LATERAL, SWAY
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.plant import Plant

@@ -28,16 +28,8 @@ from typing import final
 import torch
 from torch import Tensor
 
-from residnet.core.layout import (
-    ATTITUDE,
-    PLANAR,
-    POSITION,
-    actuators,
-    motion,
-    pose,
-    velocities,
-    velocities_on,
-)
+from residnet.core.columns import actuators, motion, pose, velocities, velocities_on
+from residnet.core.layout import ATTITUDE, PLANAR, POSITION
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec

@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from residnet.core.columns import motion
 from residnet.core.errors import ExportError
-from residnet.core.layout import SURGE, motion
+from residnet.core.layout import SURGE
 from residnet.core.version import __version__
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted

@@ -11,8 +11,9 @@ from typing import final
 import torch
 from torch import Tensor, nn
 
+from residnet.core.columns import zero_acceleration
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.layout import RANGE_VELOCITIES, zero_acceleration
+from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead

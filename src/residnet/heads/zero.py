@@ -6,7 +6,7 @@ from typing import final
 
 from torch import Tensor
 
-from residnet.core.layout import zero_acceleration
+from residnet.core.columns import zero_acceleration
 from residnet.heads.base import ResidualHead
 
 

@@ -9,7 +9,8 @@ from typing import final
 import torch
 from torch import Tensor
 
-from residnet.core.layout import HEADING, MOVING, SURGE, SWAY, YAW_RATE, turning
+from residnet.core.columns import turning
+from residnet.core.layout import HEADING, MOVING, SURGE, SWAY, YAW_RATE
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.signals import SignalsConfig

@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.layout import ALIVE, BESIDE, HEADING, PLANAR, POSITION, VELOCITIES, Live
+from residnet.core.layout import (
+    ALIVE,
+    BESIDE,
+    HEADING,
+    PLANAR,
+    POSITION,
+    VELOCITIES,
+    Live,
+)
 from residnet.data.prepare import Prepared
 from residnet.judge.band import (
     Activity,

@@ -16,8 +16,9 @@ from torch import Tensor
 
 from residnet.control.courses.config import PlannedCourse
 from residnet.control.courses.course_check import Asked, passages
+from residnet.core.columns import velocities_on
 from residnet.core.frames import wrap
-from residnet.core.layout import HEADING, POSITION, RANGE_VELOCITIES, velocities_on
+from residnet.core.layout import HEADING, POSITION, RANGE_VELOCITIES
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from residnet.core.columns import velocities_on
 from residnet.core.errors import DataError
 from residnet.core.format import interval, number, shown_unit
-from residnet.core.layout import LATERAL, POSE, SURGE, SWAY, velocities_on
+from residnet.core.layout import LATERAL, POSE, SURGE, SWAY
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
 from residnet.dynamics.ensemble import MeanOfTrajectories

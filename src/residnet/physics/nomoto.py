@@ -13,9 +13,10 @@ import torch
 from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
+from residnet.core.columns import heading, surge, sway, yaw_rate
 from residnet.core.config import MetresPerSecond
 from residnet.core.frames import to_earth
-from residnet.core.layout import SURGE, SWAY, heading, surge, sway, yaw_rate
+from residnet.core.layout import SURGE, SWAY
 from residnet.physics.actuators.rudders import SteeringGearConfig
 from residnet.physics.parameters import Parameter, measured_in
 from residnet.physics.plant import Plant

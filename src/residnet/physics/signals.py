@@ -13,10 +13,11 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from residnet.core.columns import heading, surge, sway, velocities
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
-from residnet.core.layout import PLANAR, ROLL, SIX, Live, heading, surge, sway, velocities
+from residnet.core.layout import PLANAR, ROLL, SIX, Live
 from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig

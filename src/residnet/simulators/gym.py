@@ -20,8 +20,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from residnet.core.columns import heading, pose, surge, sway, velocities, yaw_rate
 from residnet.core.errors import UsageError
-from residnet.core.layout import heading, pose, surge, sway, velocities, yaw_rate
 from residnet.core.names import nearest
 from residnet.simulators.vehicle import Vehicle
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from residnet.core.config import validate
 from residnet.core.errors import DataError, ResidnetError, UsageError
@@ -19,7 +16,7 @@ from residnet.core.log import Log
 from residnet.core.progress import say
 from residnet.data.doctor import inspect
 from residnet.data.drafting.channels import CHANNELS
-from residnet.data.drafting.questions import Answer, Marks
+from residnet.data.drafting.questions import Answer, Marks, commented
 from residnet.data.drafting.reading import INPUTS, log_files, read_drafted
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.prepare import PrepareConfig, prepare
@@ -35,10 +32,6 @@ _INSPECTED = 12
 """Logs that the data doctor looks at."""
 _SHOWN = 12
 """Guesses that the terminal shows."""
-_WIDTH = 96
-"""Columns of a drafted config."""
-Comments = Callable[[tuple[str, ...]], list[str]]
-"""Path of a key -> lines about it."""
 
 
 @dataclass(frozen=True)
@@ -365,46 +358,3 @@ def _judge_long_ones(
                 split["train"].append(entry)
                 splits["train"].append(log)
                 marks.note(("data", "split"), f"{log.name} is too short to be judged on")
-
-
-def commented(content: Mapping[str, Any], comments: Comments, head: Sequence[str] = ()) -> str:
-    """Return a mapping as YAML, with comments above its keys.
-
-    Args:
-        content: of the config.
-        comments: path of a key -> lines about it.
-        head: lines at the top.
-    """
-    lines = [line for text in head for line in _comment(text, "")]
-    return "\n".join([*lines, *_entries(content, (), comments)]) + "\n"
-
-
-def _entries(content: Mapping[str, Any], above: tuple[str, ...], comments: Comments) -> list[str]:
-    out, indent = [], "  " * len(above)
-    for key, value in content.items():
-        path, flow = (*above, str(key)), _flow(value)
-        out += [line for text in comments(path) for line in _comment(text, indent)]
-        short = len(indent) + len(str(key)) + 2 + len(flow) <= _WIDTH
-        if isinstance(value, Mapping) and value:
-            below = _entries(value, path, comments)
-            deep = any(isinstance(inner, Mapping) for inner in value.values())
-            if not short or deep or any(line.lstrip().startswith("#") for line in below):
-                out += [f"{indent}{_flow(key)}:", *below]
-                continue
-        if isinstance(value, list) and value and not short:
-            out += [f"{indent}{_flow(key)}:", *(f"{indent}  - {_flow(item)}" for item in value)]
-        else:
-            out.append(f"{indent}{_flow(key)}: {flow}")
-    return out
-
-
-def _flow(value: Any) -> str:
-    text: str = yaml.safe_dump(
-        value, default_flow_style=True, width=10**6, sort_keys=False, allow_unicode=True
-    )
-    return text.strip().removesuffix("...").strip()
-
-
-def _comment(text: str, indent: str) -> list[str]:
-    lines = textwrap.wrap(" ".join(text.split()), _WIDTH - len(indent) - 2, break_long_words=False)
-    return [f"{indent}# {line}" for line in lines]

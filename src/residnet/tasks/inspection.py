@@ -6,11 +6,10 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageError
 from residnet.core.files import whole
 from residnet.core.log import Log
@@ -25,15 +24,13 @@ from residnet.data.doctor import (
     inspection,
     summary,
 )
+from residnet.data.drafting.questions import commented
 from residnet.data.drafting.reading import log_files, read_each
-from residnet.data.prepare import prepare, samples
 from residnet.data.readers.compose import RecordingConfig
-from residnet.data.sources import MeasuredLogs
 from residnet.data.split import log_names
-from residnet.tasks.drafting import commented
-from residnet.tasks.fit import FitConfig
-from residnet.tasks.import_logs import ImportConfig
-from residnet.tasks.registry import load_task
+
+if TYPE_CHECKING:
+    from residnet.tasks.fit import FitConfig
 
 _ILL_CONDITIONED = 1e6
 """Condition number from which regressors leave their coefficients to the noise."""
@@ -78,8 +75,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
         ResidnetError: where a path does not exist, the config cannot be used, or the only log
             cannot be read.
     """
-    task = None if config is None else _logs_task(config)
-    fit = task if isinstance(task, FitConfig) else None
+    task, fit = (None, None) if config is None else _logs_task(config)
     inputs, masks = (fit.signals.columns, fit.prepare.masks) if fit is not None else (None, ())
     own = None if task is None else getattr(task, "reader", None) or task.data.reader
     files = log_files(paths, own is None or isinstance(own, RecordingConfig))
@@ -128,12 +124,18 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
     return Inspection("\n".join((*summary(content).lines, *lines, *maps)), content)
 
 
-def _logs_task(config: Path) -> Any:
-    """Return the task of a config that says how its logs are read.
+def _logs_task(config: Path) -> tuple[Any, FitConfig | None]:
+    """Return the task of a config that says how its logs are read, and the same if it is a fit.
 
     Raises:
         ConfigError: where it is no config of logs.
     """
+    # logs that need no config need neither models nor torch
+    from residnet.data.sources import MeasuredLogs
+    from residnet.tasks.fit import FitConfig
+    from residnet.tasks.import_logs import ImportConfig
+    from residnet.tasks.registry import load_task
+
     task = load_task(config)
     measured = isinstance(task, FitConfig) and isinstance(task.data, MeasuredLogs)
     if not measured and not isinstance(task, ImportConfig):
@@ -141,11 +143,13 @@ def _logs_task(config: Path) -> Any:
             f"{config}: has no channel map (data.kind is not 'measured'); leave --config out for"
             " logs that describe themselves"
         )
-    return task
+    return task, task if isinstance(task, FitConfig) else None
 
 
 def _splits(fit: FitConfig, names: Mapping[Path, str]) -> dict[str, str]:
     """Return the split of each log that the config names."""
+    from residnet.data.sources import MeasuredLogs
+
     assert isinstance(fit.data, MeasuredLogs)
     try:
         resolved = fit.data.split.resolve()
@@ -158,6 +162,9 @@ def _splits(fit: FitConfig, names: Mapping[Path, str]) -> dict[str, str]:
 
 def _regressors(logs: Sequence[Log], fit: FitConfig) -> list[Finding]:
     """Return how well the prepared logs condition the regressors of each baseline."""
+    from residnet.baselines.regressors import RegressorBaseline
+    from residnet.data.prepare import prepare, samples
+
     try:
         signals = fit.signals
         prepared = [

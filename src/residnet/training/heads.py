@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.given import GivenBaseline
-from residnet.core.layout import pose, velocities, velocities_on
+from residnet.core.columns import pose, velocities, velocities_on
 from residnet.core.samples import Samples
 from residnet.data.module import Windows, WindowsDataModule
 from residnet.data.windows import WindowStore

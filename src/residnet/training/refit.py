@@ -19,20 +19,17 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.baselines.base import ParametricBaseline
-from residnet.core.config import Config, Seconds
-from residnet.core.errors import FitError
-from residnet.core.frames import cross
-from residnet.core.layout import (
-    ATTITUDE,
-    HEADING,
-    SIX,
-    YAW_RATE,
+from residnet.core.columns import (
     pose,
     roll_angle,
     velocities_on,
     yaw_rate,
     zero_acceleration,
 )
+from residnet.core.config import Config, Seconds
+from residnet.core.errors import FitError
+from residnet.core.frames import cross
+from residnet.core.layout import ATTITUDE, HEADING, SIX, YAW_RATE
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics

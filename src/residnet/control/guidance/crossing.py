@@ -21,9 +21,9 @@ from residnet.control.motion.anticipation import (
     reference_row,
 )
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
+from residnet.core.columns import accelerations, heading, pose, position, velocities
 from residnet.core.config import Config, Metres, RadiansPerSecond, Seconds
 from residnet.core.frames import wrap
-from residnet.core.layout import accelerations, heading, pose, position, velocities
 from residnet.physics.force_model import ForceModel
 
 

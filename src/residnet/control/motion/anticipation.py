@@ -15,7 +15,7 @@ from torch import Tensor
 from residnet.control.base import Policy
 from residnet.control.motion.pid import MotionPID
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
-from residnet.core import layout
+from residnet.core import columns
 from residnet.core.config import Config, RadiansPerSecond, Seconds
 from residnet.core.frames import to_body
 from residnet.physics.force_model import ForceModel
@@ -87,9 +87,9 @@ def derivatives(
     w = torch.tensor(config.frequency, dtype=memory.dtype)
     d = 2.0 * torch.tensor(config.damping, dtype=memory.dtype) + 1.0
     pose, rate, change = (
-        layout.pose(memory),
-        layout.velocities(memory),
-        layout.accelerations(memory),
+        columns.pose(memory),
+        columns.velocities(memory),
+        columns.accelerations(memory),
     )
     jerk = w**3 * (target - pose) - d * w**2 * rate - d * w * change
     snap = w**3 * (target_rate - rate) - d * w**2 * change - d * w * jerk
@@ -217,9 +217,9 @@ def course(config: ReferenceFilterConfig, dt: float) -> Derivatives:
     for target in filtered.waypoints[0]:
         error = torch.stack(
             (
-                layout.pose(memory) - target,
-                layout.velocities(memory),
-                layout.accelerations(memory),
+                columns.pose(memory) - target,
+                columns.velocities(memory),
+                columns.accelerations(memory),
             ),
             dim=-1,
         )

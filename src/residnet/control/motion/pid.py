@@ -14,9 +14,9 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.control.base import Policy
+from residnet.core.columns import pose, velocities
 from residnet.core.config import Config
 from residnet.core.frames import to_body, wrap
-from residnet.core.layout import pose, velocities
 from residnet.physics.actuators import ForceActuators
 from residnet.physics.plant import Hull
 

@@ -13,10 +13,10 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.control.base import Reference
+from residnet.core.columns import accelerations, pose, velocities
 from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
-from residnet.core.layout import accelerations, pose, velocities
 
 Waypoint = tuple[Metres, Metres, Radians]
 """North, east and heading; headings are followed as they are written: from 0 to 180 deg clockwise,

@@ -9,13 +9,15 @@ import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event, Lock, Thread
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from residnet.core.errors import DataError
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 Item = TypeVar("Item")
 
@@ -132,8 +134,12 @@ def _file_of(values: np.ndarray) -> mmap.mmap | None:
     return owner if isinstance(owner, mmap.mmap) else None
 
 
-def rows(count: int, *shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+def rows(count: int, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
     """Return a tensor [count, *shape] to be filled: in memory, or in a file where it is large."""
+    # what reads logs imports no torch
+    import torch
+
+    dtype = torch.float64 if dtype is None else dtype
     if count <= LARGE:
         return torch.zeros(count, *shape, dtype=dtype)
     kind = torch.zeros(0, dtype=dtype).numpy().dtype

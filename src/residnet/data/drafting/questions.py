@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
+
+import yaml
 
 Key = tuple[str, ...]
 """Path of a key in the drafted config, for example `("data", "reader", "channels", "r")`."""
@@ -29,6 +32,10 @@ class Question:
     options: tuple[str, ...] = ()
 
 
+_WIDTH = 96
+"""Columns of a drafted config."""
+Comments = Callable[[tuple[str, ...]], list[str]]
+"""Path of a key -> lines about it."""
 Answer = Callable[[Question], str]
 
 
@@ -97,3 +104,46 @@ class Marks:
         return [f"guess: {text}" for at, text in self.guesses if at == key] + [
             text for at, text in self.notes if at == key
         ]
+
+
+def commented(content: Mapping[str, Any], comments: Comments, head: Sequence[str] = ()) -> str:
+    """Return a mapping as YAML, with comments above its keys.
+
+    Args:
+        content: of the config.
+        comments: path of a key -> lines about it.
+        head: lines at the top.
+    """
+    lines = [line for text in head for line in _comment(text, "")]
+    return "\n".join([*lines, *_entries(content, (), comments)]) + "\n"
+
+
+def _entries(content: Mapping[str, Any], above: tuple[str, ...], comments: Comments) -> list[str]:
+    out, indent = [], "  " * len(above)
+    for key, value in content.items():
+        path, flow = (*above, str(key)), _flow(value)
+        out += [line for text in comments(path) for line in _comment(text, indent)]
+        short = len(indent) + len(str(key)) + 2 + len(flow) <= _WIDTH
+        if isinstance(value, Mapping) and value:
+            below = _entries(value, path, comments)
+            deep = any(isinstance(inner, Mapping) for inner in value.values())
+            if not short or deep or any(line.lstrip().startswith("#") for line in below):
+                out += [f"{indent}{_flow(key)}:", *below]
+                continue
+        if isinstance(value, list) and value and not short:
+            out += [f"{indent}{_flow(key)}:", *(f"{indent}  - {_flow(item)}" for item in value)]
+        else:
+            out.append(f"{indent}{_flow(key)}: {flow}")
+    return out
+
+
+def _flow(value: Any) -> str:
+    text: str = yaml.safe_dump(
+        value, default_flow_style=True, width=10**6, sort_keys=False, allow_unicode=True
+    )
+    return text.strip().removesuffix("...").strip()
+
+
+def _comment(text: str, indent: str) -> list[str]:
+    lines = textwrap.wrap(" ".join(text.split()), _WIDTH - len(indent) - 2, break_long_words=False)
+    return [f"{indent}# {line}" for line in lines]

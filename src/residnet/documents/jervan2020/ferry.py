@@ -27,13 +27,7 @@ from residnet.core.errors import ConfigError, FitError, UsageError
 from residnet.core.files import read_json
 from residnet.core.format import DEG, number
 from residnet.core.frames import wrap
-from residnet.core.layout import (
-    ACCELERATIONS,
-    HEADING,
-    POSE,
-    POSITION,
-    VELOCITIES,
-)
+from residnet.core.layout import ACCELERATIONS, HEADING, POSE, POSITION, VELOCITIES
 from residnet.core.names import STATE, nearest
 from residnet.data.simulated import SimulatedTrials, fly_trials
 from residnet.documents.jervan2020.ferry_loop import (

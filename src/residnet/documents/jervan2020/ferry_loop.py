@@ -29,12 +29,7 @@ from residnet.core.config import (
     quantity,
 )
 from residnet.core.errors import ConfigError, DataError
-from residnet.core.layout import (
-    ACTUATORS,
-    MOTION,
-    POSE,
-    VELOCITIES,
-)
+from residnet.core.layout import ACTUATORS, MOTION, POSE, VELOCITIES
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.judge.courses import Tracking, tracking

@@ -1,0 +1,94 @@
+"""Parts of states as tensors, for code that TorchScript compiles, which takes no global slices.
+
+The columns are those of `layout`; n is the number of what moves (`Live.size`). They stand apart, so
+that what reads logs imports no torch.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from residnet.core.frames import upright
+
+
+def pose(x: Tensor) -> Tensor:
+    """Return the pose (x, y, psi) [..., 3] of states [..., nx]."""
+    return x[..., :3]
+
+
+def velocities(x: Tensor, n: int = 3) -> Tensor:
+    """Return what moves [..., n] of states [..., nx]: u, v, r, and p and phi of a roll."""
+    return x[..., 3 : 3 + n]
+
+
+def motion(x: Tensor, n: int = 3) -> Tensor:
+    """Return pose and what moves [..., 3 + n] of states [..., nx]."""
+    return x[..., : 3 + n]
+
+
+def actuators(x: Tensor, n: int = 3) -> Tensor:
+    """Return the states of actuators [..., nx - 3 - n] of states [..., nx]."""
+    return x[..., 3 + n :]
+
+
+def accelerations(x: Tensor) -> Tensor:
+    """Return the accelerations [..., 3] behind pose and velocities of a motion [..., 9]."""
+    return x[..., 6:9]
+
+
+def velocities_on(x: Tensor) -> Tensor:
+    """Return all but the pose [..., nx - 3] of states [..., nx]: velocities and what follows."""
+    return x[..., 3:]
+
+
+def position(x: Tensor) -> Tensor:
+    """Return the position (x, y) [..., 2] of states [..., nx]."""
+    return x[..., :2]
+
+
+def heading(x: Tensor) -> Tensor:
+    """Return the heading [...] in rad of states [..., nx]."""
+    return x[..., 2]
+
+
+def surge(x: Tensor) -> Tensor:
+    """Return the surge velocity [...] in m/s of states [..., nx]."""
+    return x[..., 3]
+
+
+def sway(x: Tensor) -> Tensor:
+    """Return the sway velocity [...] in m/s of states [..., nx]."""
+    return x[..., 4]
+
+
+def yaw_rate(x: Tensor) -> Tensor:
+    """Return the yaw rate [...] in rad/s of states [..., nx]."""
+    return x[..., 5]
+
+
+def roll_angle(x: Tensor) -> Tensor:
+    """Return the roll angle [...] in rad of states [..., nx] with roll."""
+    return x[..., 7]
+
+
+def turning(nu: Tensor, n: int = 3) -> Tensor:
+    """Return the rate of the heading [..., 1] in rad/s from what moves on the surface [..., n]."""
+    r = nu[..., 2:3]
+    return r * torch.cos(nu[..., 4:5]) if n == 5 else r
+
+
+def tilted(nu: Tensor) -> list[Tensor]:
+    """Return the velocity forward, to starboard and down [...] of what moves in six [..., 9]."""
+    return upright(nu[..., 0], nu[..., 1], nu[..., 3], nu[..., 7], nu[..., 8])
+
+
+def sinking(nu_dot: Tensor, nu: Tensor) -> Tensor:
+    """Return rates [..., 9] of what moves in six [..., 9] with that of the depth."""
+    down = tilted(nu)[2].unsqueeze(-1)
+    return torch.cat((nu_dot[..., :6], down, nu_dot[..., 7:]), dim=-1)
+
+
+def zero_acceleration(z: Tensor, n: int = 3) -> Tensor:
+    """Return accelerations of zero [..., n], alike in type to channels [..., nz]."""
+    return torch.zeros_like(z[..., :n])
