@@ -222,7 +222,7 @@ def test_a_long_log_tells_by_stretches_what_it_tells_whole(monkeypatch: pytest.M
     monkeypatch.setattr(channels, "_FEW", 6_000)
     few = statistics.Record(log).few
     assert len(few) == 12_000
-    assert np.flatnonzero(np.isnan(few["r"])).tolist() == list(range(0, 12_000, 2_000))
+    assert np.flatnonzero(np.isnan(few["r"])).tolist() == list(range(0, 12_000, 2_400))
     told = inspect(log, ["delta"])
     assert [(one.level, one.code) for one in told.findings] == [
         (one.level, one.code) for one in whole.findings

@@ -301,13 +301,14 @@ def fills(values: np.ndarray) -> np.ndarray:
     if not (size >= 99.0).any():
         return np.zeros(values.size, dtype=bool)
     known = np.isfinite(values)
+    least = float(np.min(values, where=known, initial=np.inf))
+    most = float(np.max(values, where=known, initial=-np.inf))
+    # what is far from all else is the least or the largest
+    if not _as_filled(np.array([least, most])).any():
+        return np.zeros(values.size, dtype=bool)
     candidate = np.zeros(values.size, dtype=bool)
     large = np.flatnonzero(known & (size >= 99.0))
-    # single precision keeps seven digits of a fill value
-    near = np.searchsorted(_SORTED, values[large])
-    for offset in (-1, 0):
-        fill = _SORTED[np.clip(near + offset, 0, _SORTED.size - 1)]
-        candidate[large] |= np.abs(values[large] - fill) <= 2e-7 * np.abs(fill)
+    candidate[large] = _as_filled(values[large])
     rest = values[known & ~candidate]
     if not candidate.any() or not rest.size:
         return np.zeros(values.size, dtype=bool)
@@ -315,6 +316,16 @@ def fills(values: np.ndarray) -> np.ndarray:
     span = high - low
     far: np.ndarray = (values < low - span) | (values > high + span)
     return np.asarray(candidate & far)
+
+
+def _as_filled(values: np.ndarray) -> np.ndarray:
+    """Return [K] bool: values that are a usual fill value."""
+    near, out = np.searchsorted(_SORTED, values), np.zeros(values.size, dtype=bool)
+    for offset in (-1, 0):
+        # single precision keeps seven digits of a fill value
+        fill = _SORTED[np.clip(near + offset, 0, _SORTED.size - 1)]
+        out |= np.abs(values - fill) <= 2e-7 * np.abs(fill)
+    return out
 
 
 def without_fills(values: np.ndarray) -> np.ndarray:

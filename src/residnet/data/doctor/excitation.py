@@ -31,10 +31,11 @@ def ranges(log: Record, found: Check) -> Iterator[Finding]:
         text = f"{name} from {show(low, unit)} to {show(top, unit)}, standard deviation"
         text += f" {show(std, unit)}"
         if name in log.inputs and values.size >= 20:
-            power = np.abs(np.fft.rfft(bridged(log.t, log[name]) - values.mean())[1:]) ** 2
+            few = log.few
+            power = np.abs(np.fft.rfft(bridged(few.t, few[name]) - values.mean())[1:]) ** 2
             total = np.cumsum(power)
             below = 1 + np.searchsorted(total, 0.95 * total[-1])
-            figures["band"] = float(below / (len(log) * log.step))
+            figures["band"] = float(below / (len(few) * log.step))
             text += f", 95 % of its power below {figures['band']:.3g} Hz"
         yield found(text, figures)
 

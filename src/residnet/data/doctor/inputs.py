@@ -113,7 +113,7 @@ def limits(log: Record, found: Check) -> Iterator[Finding]:
         low, most = float(known.min()), float(known.max())
         margin = 1e-3 * (most - low)
         shares = float((known <= low + margin).mean()), float((known >= most - margin).mean())
-        if np.unique(known).size <= 2 or max(shares) <= 0.01:
+        if max(shares) <= 0.01 or np.unique(known).size <= 2:
             continue
         text = (
             f"{name} rests at its limits {show(low, unit)} ({share_of(shares[0])}) and"

@@ -44,7 +44,7 @@ FEWEST = 50
 WINDOW = 15
 """Samples of the parabola that smooths a channel."""
 
-_LONG, _STRETCHES = 60_000, 6
+_LONG, _STRETCHES = 40_000, 5
 """Samples of a log beyond which statistics are of as many, and in how many stretches these lie.
 
 On a million rows of a shipped vessel at 50 Hz they say what all say (`tests/data/test_long_logs`).
@@ -62,6 +62,7 @@ class Record:
         inputs: channels that drive the vessel.
         seams: times in s at which the later of two stretches begins that are not of one moment.
         few: what `few` is, where it is known; None takes evenly spread stretches of a long log.
+        bad: [T] bool, samples whose measured channels are not known; None where all are as logged.
     """
 
     def __init__(
@@ -70,9 +71,11 @@ class Record:
         inputs: Sequence[str] = (),
         seams: np.ndarray | None = None,
         few: Record | None = None,
+        bad: np.ndarray | None = None,
     ) -> None:
         self.log, self.t, self.units, self.name = log, log.t, log.units, log.name
         self.inputs, self._seams, self._few = tuple(inputs), seams, few
+        self._bad = bad
         self.noise = cache(lambda name: noise_of(self.few[name]))
         """Standard deviation of a channel's white noise."""
         self.spikes = cache(lambda name: spikes(log[name]))
@@ -88,7 +91,9 @@ class Record:
         return iter(self.log.channels)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        return self.log[name]
+        values = self.log[name]
+        hidden = self._bad is not None and name in MEASURED
+        return np.where(self._bad, np.nan, values) if hidden else values
 
     def __len__(self) -> int:
         return len(self.log)
@@ -96,7 +101,7 @@ class Record:
     @cached_property
     def step(self) -> float:
         """Usual time between samples in s."""
-        return float(np.median(np.diff(self.t)))
+        return float(np.median(np.diff(self.t)[:: max(len(self) // _LONG, 1)]))
 
     @cached_property
     def measured(self) -> list[str]:
@@ -142,6 +147,10 @@ class Record:
         """Return the record of the same samples on a grid."""
         return Record(grid, self.inputs, self._seams)
 
+    def told_by(self, few: Record) -> Record:
+        """Return the record whose statistics are those of others of its samples."""
+        return Record(self.log, self.inputs, self._seams, few, self._bad)
+
     def torn(self, reach: int) -> np.ndarray:
         """Return [T] bool: samples within so many of where two stretches meet."""
         out = np.zeros(len(self), dtype=bool)
@@ -165,6 +174,10 @@ class Record:
         }
         if not bad.any():
             return self
+        if len(self) > _LONG:
+            # copies of all channels of a long log would be as large again
+            few = self.few.without(bad[self.few_rows])
+            return Record(self.log, self.inputs, self._seams, few, bad)
         return Record(self.log.replace(channels=channels), self.inputs, self._seams)
 
 
@@ -196,7 +209,8 @@ def averaged(values: np.ndarray, samples: int) -> np.ndarray:
 
 def high(values: np.ndarray, share: float = 0.95) -> float:
     """Return the size that a channel reaches, by a quantile of its absolute values."""
-    return float(np.nanquantile(np.abs(values), share))
+    size = np.abs(values)
+    return float(np.nanmax(size) if share == 1.0 else np.nanquantile(size, share))
 
 
 def reversals(heading: np.ndarray, swing: float) -> int:

@@ -102,8 +102,11 @@ def unwrap(angle: np.ndarray) -> np.ndarray:
 
     A turn of more than half a circle between two finite samples is ambiguous.
     """
-    known = np.isfinite(angle)
     out = np.asarray(angle, dtype=np.float64).copy()
+    if out.size and np.abs(np.diff(out)).max(initial=0.0) < np.pi:
+        # nothing to unwrap, and no sample missing
+        return out
+    known = np.isfinite(angle)
     out[known] = np.unwrap(out[known])
     return out
 

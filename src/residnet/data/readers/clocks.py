@@ -14,6 +14,8 @@ _BITS = (16, 24, 32, 48)
 """Widths of the counters that microcontrollers stamp with."""
 _DAY = 86_400.0
 """s"""
+_SOME = 1000
+"""Stamps, evenly spread, of which most clocks have one that is no time of day."""
 _USUAL_STEPS = 3.0
 """Usual steps within which the clock has gone on where its counter began anew."""
 
@@ -47,6 +49,9 @@ def _unpacked(t: np.ndarray) -> np.ndarray | None:
 
     They tell themselves where a minute ends: the number goes on by 40 more than the clock.
     """
+    some = np.floor(t[:: max(t.size // _SOME, 1)])
+    if some.min() < 0.0 or some.max() >= 240_000 or (some % 100).max() >= 60:
+        return None
     whole = np.floor(t)
     hours, minutes, seconds = whole // 10_000, whole // 100 % 100, t - whole // 100 * 100
     if t.min() < 0.0 or hours.max() >= 24 or max(minutes.max(), seconds.max()) >= 60.0:

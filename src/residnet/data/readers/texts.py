@@ -287,12 +287,14 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
         )
         decimal = "," if delimiter != "," and comma > point else "."
         names = numbered(cells[at])
-        comments = [
-            line + i
-            for line, block, _ in _blocks(file)
-            for i in _passed(block, delimiter, cells[at])
-            if line + i >= above
-        ]
+        comments, held = [], 0
+        for line, block, _ in _blocks(file):
+            said = [i for i in _passed(block, delimiter, cells[at]) if line + i >= above]
+            comments += [line + i for i in said]
+            held += sum(bool(one.strip()) for one in _lines(block)) - len(said)
+            if held >= above + rows:
+                # behind the rows that are read nothing has to be passed over
+                break
         form = _form(delimiter, decimal, (above, comments), [*names, _BEYOND])
         try:
             table = pd.read_csv(file, **form | {"skip_blank_lines": True}, nrows=rows)[names]
