@@ -218,7 +218,6 @@ def test_a_long_log_tells_by_stretches_what_it_tells_whole(monkeypatch: pytest.M
     log = sailed(24_000)
     whole = inspect(log, ["delta"])
     monkeypatch.setattr(statistics, "_LONG", 12_000)
-    monkeypatch.setattr(channels, "LARGE", 12_000)
     monkeypatch.setattr(channels, "_FEW", 6_000)
     few = statistics.Record(log).few
     assert len(few) == 12_000

@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection
 
 import numpy as np
 
-from residnet.core.arrays.paged import LARGE
 from residnet.core.log import Log
 from residnet.core.stretches import stretches
 from residnet.data.readers.base import unwrap
@@ -29,8 +28,8 @@ _FEWEST = 20
 _CACHED = 8_192
 """Samples whose neighbours are compared at a time: they stay in a core's cache."""
 _FEW, _SPREAD = 40_000, 40
-"""Samples of a very long channel that tell how far samples usually lie from their neighbours, and
-in how many stretches these lie."""
+"""Samples of a long channel that tell how far samples usually lie from their neighbours, and in how
+many stretches these lie."""
 _MOVED = ("x", "y", "psi", "phi", "u", "v", "r", "p", "w", "q", "z", "theta")
 
 
@@ -111,7 +110,7 @@ def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarr
         median = _medians(lambda k: [*windows[k].T], of.size)
         return windows, median, np.abs(bent[of] - median)
 
-    of = spread_rows(known.size, LARGE if known.size <= LARGE else _FEW, _SPREAD)
+    of = spread_rows(known.size, _FEW, _SPREAD)
     windows, median, distance = look(of)
     # a coarse channel flickers by single steps of its resolution, a spread at the level of rounding
     # is none
@@ -213,7 +212,7 @@ def _spikes(values: np.ndarray, moved: bool) -> np.ndarray:
     known = values[at]
     change = np.abs(np.diff(known))
     # of very many samples some tell what is usual
-    some = slice(None, None, -(-known.size // LARGE))
+    some = slice(None, None, -(-known.size // _FEW))
     low, high = (float(value) for value in np.quantile(known[some], (0.005, 0.995)))
     span, most = high - low, float(np.quantile(change[some], 0.99))
     # a glance: without one large change there is no spike
@@ -222,7 +221,7 @@ def _spikes(values: np.ndarray, moved: bool) -> np.ndarray:
     if largest <= glance or not largest:
         return out
     # what leaves the median of its neighbours makes a step, or three of them do
-    near = np.flatnonzero(change > (glance / 3.0 if known.size > LARGE else -1.0))
+    near = np.flatnonzero(change > (glance / 3.0 if known.size > _FEW else -1.0))
     seen = np.zeros(known.size, dtype=bool)
     for shift in range(-2, 4):
         seen[np.clip(near + shift, 0, known.size - 1)] = True
@@ -239,7 +238,7 @@ def _spikes(values: np.ndarray, moved: bool) -> np.ndarray:
     distance[of] = apart(of)
     beyond = np.maximum(low - known, known - high)
     if moved:
-        usual = apart(spread_rows(known.size, _FEW, _SPREAD)) if known.size > LARGE else distance
+        usual = apart(spread_rows(known.size, _FEW, _SPREAD)) if known.size > _FEW else distance
         # the neighbours of a spike in a steady channel leave their median by a few changes
         least = min(_CHANGES * most, _DISTANCES * float(np.quantile(usual, 0.99)))
         # what leaves the whole range of a noisy channel is a spike too

@@ -30,6 +30,8 @@ from residnet.tasks.fit import FitConfig
 _UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
 _INSPECTED = 12
 """Logs that the data doctor looks at."""
+_PART = 40_000
+"""First samples of a long log that mostly tell whether it can be prepared."""
 _SHOWN = 12
 """Guesses that the terminal shows."""
 
@@ -259,7 +261,11 @@ class _Read:
         out: dict[Path, Log] = {}
         for path, log in self.logs.items():
             try:
-                if prepare(log, "train", columns, config, self.live).good.any():
+                # of a long log a part tells, but for one with nothing that is usable
+                parts = [log.rows(slice(_PART)), log] if len(log) > _PART else [log]
+                if any(
+                    prepare(part, "train", columns, config, self.live).good.any() for part in parts
+                ):
                     out[path] = self.whole[path]
                 else:
                     self.left_out[path] = "no stretch is as long as the window of the derivative"
