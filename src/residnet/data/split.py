@@ -120,7 +120,9 @@ def stretch_of(log: Log, start: float, stop: float) -> Log:
     name = "_".join([log.name, *(f"{end:.13g}s".replace(".", "p") for end in ends)])
     at = int(np.argmax(inside))
     # a slice, and no copy
-    part = log.rows(slice(at, at + int(inside.sum()))).replace(name=name, meta={**log.meta, "stretch": ends})
+    part = log.rows(slice(at, at + int(inside.sum()))).replace(
+        name=name, meta={**log.meta, "stretch": ends}
+    )
     return part.on_disk() if lies_on_disk(log.t) else part
 
 
