@@ -126,7 +126,7 @@ def _on_grid(log: Record) -> list[Finding]:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
     if few is not log:
         # what single samples of a long log do is seen as they were recorded
-        return [*run("grid", log.told_by(grid))]
+        return [*run("grid", log.told_by(grid, values.upright(log.log)))]
     found = [*run("grid", grid)]
     near = np.searchsorted(grid.t - grid.t[0], log.t - log.t[0] - 1e-9)
     near = np.minimum(near, len(grid) - 1)

@@ -147,9 +147,9 @@ class Record:
         """Return the record of the same samples on a grid."""
         return Record(grid, self.inputs, self._seams)
 
-    def told_by(self, few: Record) -> Record:
-        """Return the record whose statistics are those of others of its samples."""
-        return Record(self.log, self.inputs, self._seams, few, self._bad)
+    def told_by(self, few: Record, log: Log) -> Record:
+        """Return the record of the same samples as another log holds them, with `few` of them."""
+        return Record(log, self.inputs, self._seams, few, self._bad)
 
     def torn(self, reach: int) -> np.ndarray:
         """Return [T] bool: samples within so many of where two stretches meet."""
