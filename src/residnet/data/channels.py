@@ -230,9 +230,8 @@ def _spikes(values: np.ndarray, moved: bool) -> np.ndarray:
 
     def apart(of: np.ndarray) -> np.ndarray:
         """Return the distance [K] of samples [K] from the median of seven neighbours."""
-        return np.abs(
-            known[of] - _medians(lambda k: [padded[of[k] + i] for i in range(7)], of.size)
-        )
+        median = _medians(lambda k: [padded[of[k] + i] for i in range(7)], of.size)
+        return np.asarray(np.abs(known[of] - median))
 
     distance, far = np.zeros(known.size), np.zeros(known.size, dtype=bool)
     distance[of] = apart(of)

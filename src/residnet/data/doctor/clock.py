@@ -165,12 +165,12 @@ def _dated_columns(path: Path) -> pd.DataFrame | None:
             return None
         with as_utf8(path) as file:
             with file.open(encoding="utf-8-sig", newline="") as stream:
-                names = stream.readline(_LINE)
-            if not _NAMED.search(names):
+                line = stream.readline(_LINE)
+            if not _NAMED.search(line):
                 return None
             return pd.read_csv(
                 file,
-                sep=csv.Sniffer().sniff(names).delimiter,
+                sep=csv.Sniffer().sniff(line).delimiter,
                 skipinitialspace=True,
                 nrows=_ROWS,
                 usecols=lambda name: bool(_NAMED.search(str(name))),

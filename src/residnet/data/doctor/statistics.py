@@ -92,8 +92,9 @@ class Record:
 
     def __getitem__(self, name: str) -> np.ndarray:
         values = self.log[name]
-        hidden = self._bad is not None and name in MEASURED
-        return np.where(self._bad, np.nan, values) if hidden else values
+        if self._bad is None or name not in MEASURED:
+            return values
+        return np.where(self._bad, np.nan, values)
 
     def __len__(self) -> int:
         return len(self.log)

@@ -280,7 +280,8 @@ def _moves(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
         np.minimum(stops, change.size - 1)
     ]
     usual = np.nanmax(after[:, 1:], axis=1)
-    return (stops < change.size - 3) & (after[:, 0] > np.maximum(3.0 * usual, 3.0 * resolution))
+    far = after[:, 0] > np.maximum(3.0 * usual, 3.0 * resolution)
+    return np.asarray((stops < change.size - 3) & far)
 
 
 # share of the rows from which on repeats are no accident, and their longest run
