@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (880, 128),
     "control": (3259, 351),
     "core": (1556, 242),
-    "data": (9555, 857),
+    "data": (9558, 857),
     "documents": (2505, 230),
     "dynamics": (2143, 270),
     "export": (1496, 169),
