@@ -116,8 +116,8 @@ def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
         states, inputs, _ = Rollout(traced(plant), source)(x0, w, x0[:, :0])
         assert bool((inputs[:, :, 2] == 5.0).all()), "disturbances pass through a manoeuvre"
         for i, group in enumerate(groups):
-            source = type(group[0]).source(group, Helm.from_plant(plant), t)
-            alone, _, _ = Rollout(traced(plant), source)(x0[:2], w[:2], x0[:2, :0])
+            own = type(group[0]).source(group, Helm.from_plant(plant), t)
+            alone, _, _ = Rollout(traced(plant), own)(x0[:2], w[:2], x0[:2, :0])
             torch.testing.assert_close(alone, states[2 * i : 2 * i + 2], rtol=1e-10, atol=1e-12)
 
 
