@@ -82,7 +82,8 @@ def test_rotations_are_those_of_quaternions() -> None:
     after = rotated(angles, turn)
     wanted = known(angles) * Rotation.from_rotvec(turn.numpy())
     assert float((known(after).inv() * wanted).magnitude().max()) < 1e-7
-    ahead, across, down = upright(*vector.T, angles[:, 0], angles[:, 1])
+    u, v, w = vector.T
+    ahead, across, down = upright(u, v, w, angles[:, 0], angles[:, 1])
     north, east = to_earth(ahead, across, angles[:, 2])
     np.testing.assert_allclose(
         torch.stack((north, east, down), dim=1), known(angles).apply(vector.numpy()), atol=1e-12
@@ -176,7 +177,7 @@ def test_zero_goes_on_level() -> None:
 
 def trials(count: int, duration: float) -> SimulatedTrials:
     """Noiseless trials of the torpedo in depth and heading."""
-    kinds_of = [
+    kinds_of: list[dict[str, Any]] = [
         {"kind": "depth_step", "depth": [3.0], "start": 1.0},
         {"kind": "helix", "drive": [0.5, 0.9], "start": 1.0},
         {"kind": "random_steps", "dive_amplitude": [0.2, 0.6], "drive_amplitude": [0.1, 0.3]},

@@ -47,7 +47,7 @@ WINDOW = 15
 _LONG, _STRETCHES = 40_000, 5
 """Samples of a log beyond which statistics are of as many, and in how many stretches these lie.
 
-On a million rows of a shipped vessel at 50 Hz they say what all say (`tests/data/test_long_logs`).
+By choice; `tests/data/test_relations.py` compares what they say with what all samples say.
 """
 _PAUSE = 5
 """Steps between such stretches: more than a grid bridges."""
