@@ -12,6 +12,7 @@ import pytest
 import torch
 import written_logs
 import written_recorders
+from kinds import HEADS
 from torch import Tensor
 
 from residnet.baselines import BaselineConfig
@@ -43,15 +44,6 @@ from residnet.testing import (
 )
 from residnet.testing.examples import ROLLING, SIGNALS, example_model, example_spec
 
-# what makes a kind quick enough for a contract
-HEADS: dict[str, dict[str, Any]] = {
-    "genetic": {"evolution": {"population": 60, "generations": 3}},
-    "kernel": {"folds": 2, "penalties": [0.1]},
-    "mlp": {"hidden": [8]},
-    "lstm": {"hidden_size": 6},
-    "recurrent": {"hidden_size": 6},
-    "sklearn": {"pipeline": [{"sklearn.ensemble.HistGradientBoostingRegressor": {"max_iter": 9}}]},
-}
 RUDDER = SignalsConfig(inputs=("n", "delta"))
 # what a baseline cannot do without, and whose trials it is identified from
 BASELINES: dict[str, tuple[dict[str, Any], str]] = {

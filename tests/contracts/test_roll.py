@@ -10,12 +10,11 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+from kinds import check_or_refused
 
 from residnet.baselines import BaselineConfig
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.control.heading.vessels import SteeredModel, SteeredPlant
-from residnet.core.config import validate
-from residnet.core.errors import ResidnetError
 from residnet.core.layout import ROLL, Live, levelled
 from residnet.core.log import Log
 from residnet.core.registry import kinds
@@ -36,7 +35,7 @@ from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.vessel import load_vessel
 from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
 from residnet.simulators.vehicle import vehicle
-from residnet.testing import check_baseline, example_samples
+from residnet.testing import example_samples
 from residnet.testing.examples import ROLLING, example_model, example_spec
 
 PHI, P = ROLL.names.index("phi"), ROLL.names.index("p")
@@ -44,22 +43,7 @@ PHI, P = ROLL.names.index("phi"), ROLL.names.index("p")
 
 @pytest.mark.parametrize("kind", kinds(BaselineConfig))
 def test_baseline(kind: str) -> None:
-    given: dict[str, dict[str, Any]] = {
-        "believed": {"vessel": "wam_v_cal"},
-        "equations": {"r": {"r": -1.0}},
-        "linear_steady": {"settled": 10, "speed": ["zigzag"], "steering": ["zigzag"]},
-        "mmg": {
-            "hull": {"length": 6, "beam": 2, "draught": 0.4, "mass": 1500, "x_G": 0},
-            "propeller": {"diameter": 0.3, "x": -0.48, "thrust": [0.29, -0.28, -0.14]},
-            "rudder": {"area": 0.1, "aspect": 1.5, "race": 0.6},
-        },
-    }
-    config = validate({"kind": kind, **given.get(kind, {})}, BaselineConfig, "here")
-    if kind in ("regressors", "still"):
-        check_baseline(config, example_samples(signals=ROLLING))
-        return
-    with pytest.raises(ResidnetError, match="knows no roll"):
-        config.build(ROLLING.build().names)
+    check_or_refused(kind, ROLLING, "knows no roll")
 
 
 def test_an_angle_has_no_equation_of_its_own_and_restores() -> None:

@@ -7,6 +7,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+from kinds import HEADS, check_or_refused
 from scipy.spatial.transform import Rotation
 
 from residnet.baselines import BaselineConfig
@@ -29,17 +30,10 @@ from residnet.identification.changes import causes
 from residnet.physics.hull import SubmergedConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
-from residnet.testing import check_baseline, check_head, example_samples
+from residnet.testing import check_head, example_samples
 from residnet.testing.examples import STEP, SUBMERGED, example_model, example_spec
 from residnet.training import refit
 
-HEADS: dict[str, dict[str, Any]] = {
-    "genetic": {"evolution": {"population": 60, "generations": 3}},
-    "kernel": {"folds": 2, "penalties": [0.1]},
-    "mlp": {"hidden": [8]},
-    "lstm": {"hidden_size": 6},
-    "recurrent": {"hidden_size": 6},
-}
 DEPTH = SIX.names.index("z")
 HULL = RegressorsConfig(sets=("fossen",), ridge=1e-4)
 
@@ -53,22 +47,7 @@ def test_head(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", kinds(BaselineConfig))
 def test_baseline(kind: str) -> None:
-    given: dict[str, dict[str, Any]] = {
-        "believed": {"vessel": "wam_v_cal"},
-        "equations": {"r": {"r": -1.0}},
-        "linear_steady": {"settled": 10, "speed": ["zigzag"], "steering": ["zigzag"]},
-        "mmg": {
-            "hull": {"length": 6, "beam": 2, "draught": 0.4, "mass": 1500, "x_G": 0},
-            "propeller": {"diameter": 0.3, "x": -0.48, "thrust": [0.29, -0.28, -0.14]},
-            "rudder": {"area": 0.1, "aspect": 1.5, "race": 0.6},
-        },
-    }
-    config = validate({"kind": kind, **given.get(kind, {})}, BaselineConfig, "here")
-    if kind in ("regressors", "still"):
-        check_baseline(config, example_samples(signals=SUBMERGED))
-        return
-    with pytest.raises(ResidnetError, match="knows no depth and pitch"):
-        config.build(SUBMERGED.build().names)
+    check_or_refused(kind, SUBMERGED, "knows no depth and pitch")
 
 
 def test_rotations_are_those_of_quaternions() -> None:

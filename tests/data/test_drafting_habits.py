@@ -304,3 +304,29 @@ def test_a_speed_is_that_forward_where_no_heading_is_known(tmp_path: Path) -> No
     assert _guessed(marks, "u")
     frame["course over ground [deg]"] = 0.0
     assert "u" not in _drafted(frame, tmp_path / "log.csv")[0].channels
+
+
+def test_a_document_of_geojson_holds_fixes(log: Log, tmp_path: Path) -> None:
+    latitude, longitude = _fixes(log)
+    rudder, rpm = np.degrees(log["delta"]), 60.0 * log["n"]
+    features = [
+        {"type": "Feature", "geometry": {"type": "Point", "coordinates": [east, north]}}
+        | {"properties": {"time": t, "rudder_deg": f"{angle:.3f} deg", "rpm": n}}
+        for t, north, east, angle, n in zip(log.t, latitude, longitude, rudder, rpm, strict=True)
+    ]
+    file = tmp_path / "trip.json"
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    marks = Marks()
+    read = validate(draft_tables([file], marks)[0], ReaderConfig, "test").build().read(file)
+    _at(read, log)
+    np.testing.assert_allclose(read["delta"], log["delta"], atol=1e-4)
+
+
+def test_a_document_of_several_tables_is_refused(log: Log, tmp_path: Path) -> None:
+    motors = {"time": log.t.tolist(), "rpm": (60.0 * log["n"]).tolist()}
+    fixes = [{"time": t, "north_m": x} for t, x in zip(log.t[::5], log["x"][::5], strict=True)]
+    notes = [{"crew": "Ada"}, {"crew": "Bo"}]
+    file = tmp_path / "trip.json"
+    file.write_text(json.dumps({"motors": motors, "gnss": fixes, "notes": notes}))
+    with pytest.raises(DataError, match=r"several tables, motors \(\d+ rows\), gnss \(\d+ rows\);"):
+        draft_tables([file], Marks())

@@ -11,6 +11,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.config import Metres, Seconds
+from residnet.core.frames import upright
 from residnet.manoeuvres.base import (
     ClosedLoop,
     Family,
@@ -155,7 +156,7 @@ class DepthStep(ClosedLoop):
         pitch_damping: dive per rad/s of pitch rate.
     """
 
-    watches: ClassVar[tuple[str, ...]] = ("z", "theta", "phi", "u", "w", "q")
+    watches: ClassVar[tuple[str, ...]] = ("z", "u", "v", "w", "phi", "theta", "q")
     kind: Literal["depth_step"] = "depth_step"
     drive: float = Field(ge=-1, le=1)
     dive: float = Field(default=0.5, gt=0, le=1)
@@ -182,9 +183,7 @@ class DepthStep(ClosedLoop):
         """Dive by what lacks of the depth, less its rate."""
         ordered = torch.where(time >= numbers["start"], numbers["depth"], 0.0)
         lacking = memory[:, 0] + ordered - seen["z"]
-        theta = seen["theta"]
-        descent = torch.cos(theta) * torch.cos(seen["phi"]) * seen["w"]
-        descent = descent - torch.sin(theta) * seen["u"]
+        descent = upright(*(seen[name] for name in ("u", "v", "w", "phi", "theta")))[2]
         dive = numbers["gain"] * lacking - numbers["damping"] * descent
         dive = dive + numbers["pitch_damping"] * seen["q"]
         dive = torch.minimum(torch.maximum(dive, -numbers["dive"]), numbers["dive"])

@@ -473,12 +473,12 @@ def peek(path: Path, rows: int = 20_000) -> Sheet:
 
 def _described(table: pd.DataFrame) -> dict[str, str]:
     """Return the names of columns with the units beneath them or in cells -> their names alone."""
-    held = table.attrs.get("units", {})
+    held = table.attrs.get("units", ())
     names = [str(name).strip() for name in table.columns]
     rows = [[_unit_in(cell) for cell in row] for row in table.attrs.get("between", [])]
     units = max(rows, key=lambda row: sum(map(bool, row)), default=[])
     units = units if 2 * sum(map(bool, units)) >= len([name for name in names if name]) else []
-    units = [held.get(name, "") for name in table.columns] if held else units
+    units = held if any(held) else units
     out = {}
     for name, below in zip(names, [*units, *[""] * len(names)], strict=False):
         # physicists write a quantity by its unit, `u / m/s`

@@ -40,7 +40,14 @@ from residnet.data.readers.clocks import first_of_copies, steady_clock
 from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
 from residnet.data.readers.quantities import QUATERNION, ChannelMap, factor, told_headings
 from residnet.data.readers.recording import Remark, remark
-from residnet.data.readers.texts import as_utf8, found_header, numbered, positions, read_csv
+from residnet.data.readers.texts import (
+    as_utf8,
+    found_header,
+    numbered,
+    plain,
+    positions,
+    read_csv,
+)
 from residnet.data.readers.written import Order, degrees_of, parse_texts, side_signs, zone_of
 
 if TYPE_CHECKING:
@@ -60,6 +67,8 @@ _SEARCHED = 60
 """Rows of a sheet among which names are looked for."""
 _LONGEST = 16
 """Most entries of a list in JSON that become columns."""
+_TABLE = 20
+"""Rows of a JSON document that are no note beside its log but a table; by choice."""
 
 
 class TimeColumn(Config):
@@ -206,7 +215,7 @@ class ExcelConfig(TableConfig):
         table = excel_sheet(path, self.sheet)
         wanted = table.iloc[:, positions(path, [str(name) for name in table.columns], columns)]
         wanted.attrs["above"] = table.attrs["above"] - 1
-        return wanted
+        return plain(wanted)
 
 
 @final
@@ -253,7 +262,7 @@ class JsonLinesConfig(TableConfig):
         table = table.infer_objects()
         table.columns = pd.Index(list(columns))
         table.attrs["cut"] = lines.cut
-        return table
+        return plain(table)
 
 
 @final
@@ -617,7 +626,7 @@ def json_rows(path: Path, rows: int) -> pd.DataFrame:
     found = list(islice(_JsonLines(path), rows))
     if not found:
         raise DataError(f"{path}: the file is empty; an object a line was expected")
-    return pd.DataFrame(found).infer_objects()
+    return plain(pd.DataFrame(found).infer_objects())
 
 
 def column_names(path: Path) -> tuple[str, ...]:
@@ -680,31 +689,37 @@ def _table_in(path: Path, file: Path) -> Sequence[Mapping[str, Any]] | None:
         document = json.loads(file.read_text("utf-8-sig", errors="replace"))
     except (ValueError, RecursionError):
         return None
-    tables = list(_tables(document))
+    tables = dict(_tables(document))
     if not tables:
         raise DataError(
             f"{path}: holds no table; a list of objects, or lists of one length by name, were"
             " expected"
         )
-    return max(tables, key=len)
+    longest = max(tables, key=lambda name: len(tables[name]))
+    others = [name for name, rows in tables.items() if len(rows) >= _TABLE and name != longest]
+    if others:
+        held = ", ".join(f"{name} ({len(tables[name])} rows)" for name in [longest, *others])
+        raise DataError(
+            f"{path}: holds several tables, {held}; write each into a file of its own, all with a"
+            " time: files whose names differ in that word alone are read as one log"
+        )
+    return tables[longest]
 
 
-def _tables(value: Any) -> Iterator[Sequence[Mapping[str, Any]]]:
-    """Yield the tables in a value and the values within: lists of objects, and lists by name."""
-    if isinstance(value, list):
-        if value and all(isinstance(row, dict) for row in value):
-            yield value
-        return
+def _tables(value: Any, name: str = "") -> Iterator[tuple[str, Sequence[Mapping[str, Any]]]]:
+    """Yield name and rows of the tables in a value: lists of objects, and lists side by side."""
+    if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
+        yield name, value
     if not isinstance(value, dict):
         return
-    columns = {name: cells for name, cells in value.items() if isinstance(cells, list)}
-    plain = {n: c for n, c in columns.items() if not any(isinstance(cell, dict) for cell in c)}
-    longest = max(map(len, plain.values()), default=0)
-    plain = {name: cells for name, cells in plain.items() if len(cells) == longest}
-    if len(plain) > 1:
-        yield [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
-    for inner in value.values():
-        yield from _tables(inner)
+    columns = {key: cells for key, cells in value.items() if isinstance(cells, list)}
+    bare = {n: c for n, c in columns.items() if not any(isinstance(cell, dict) for cell in c)}
+    longest = max(map(len, bare.values()), default=0)
+    bare = {key: cells for key, cells in bare.items() if len(cells) == longest}
+    if len(bare) > 1:
+        yield name, [dict(zip(bare, row, strict=True)) for row in zip(*bare.values(), strict=True)]
+    for key, inner in value.items():
+        yield from _tables(inner, f"{name}.{key}" if name else str(key))
 
 
 def _object(text: str) -> dict[str, Any]:
@@ -727,6 +742,10 @@ def _rows_of(value: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def _flat(value: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     out: dict[str, Any] = {}
+    if value.get("type") == "Point" and isinstance(value.get("coordinates"), list):
+        # of GeoJSON (RFC 7946, section 3.1.1)
+        pair = zip(("longitude", "latitude"), value["coordinates"], strict=False)
+        value = dict(pair)
     for key, entry in value.items():
         name = f"{before}{key}"
         if isinstance(entry, dict):

@@ -200,6 +200,20 @@ def _form(
     }
 
 
+def plain(table: pd.DataFrame, decimal: str = ".") -> pd.DataFrame:
+    """Return a table whose texts are numbers where they hold some; `attrs` hold `units` in cells.
+
+    The units are those of each column, empty where its cells name none.
+    """
+    import pandas as pd
+
+    found = [_plain(table.iloc[:, i], decimal) for i in range(table.shape[1])]
+    out = pd.DataFrame({i: cells for i, (cells, _) in enumerate(found)}, table.index)
+    out.columns = table.columns
+    out.attrs = {**table.attrs, "units": [unit for _, unit in found]}
+    return out
+
+
 def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
     """Return a column whose numbers have no signs between thousands, and no marks for none (---).
 
@@ -219,7 +233,7 @@ def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
             cell = re.sub(between, "", cell)
         return cell.replace(decimal, ".") if re.search(r"\w", cell) else np.nan
 
-    if pd.api.types.is_numeric_dtype(cells.dtype):
+    if pd.api.types.is_numeric_dtype(cells.dtype) or not cells.dropna().map(_is_text).all():
         return cells, ""
     unit, told = _without_unit(cells)
     signs = {len(re.findall(r"[^\d+-]", str(cell).strip())) for cell in told.dropna()}
@@ -227,6 +241,11 @@ def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
     values = pd.to_numeric(bare, errors="coerce")
     plain = (unit or signs != {1}) and values.isna().sum() == bare.isna().sum()
     return (values, unit) if plain else (cells, "")
+
+
+def _is_text(cell: object) -> bool:
+    """Return whether a cell is a text or a number, and no date."""
+    return isinstance(cell, str | float | int)
 
 
 def _without_unit(cells: pd.Series) -> tuple[str, pd.Series]:
@@ -301,11 +320,7 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
         except (ValueError, csv.Error) as error:
             reason = shown(" ".join(str(error).split()), 200)
             raise DataError(f"{path}: not a regular table ({reason})") from error
-    units = dict[Any, str]()
-    for name in table:
-        table[name], unit = _plain(table[name], decimal)
-        units |= {name: unit} if unit else {}
-    table.attrs["units"] = units
+    table = plain(table, decimal)
     table.attrs["between"] = cells[at + 1 : above]
     about = {"kind": "csv"} | ({"delimiter": delimiter} if delimiter != "," else {})
     return table, about | ({"decimal": ","} if decimal == "," else {})
