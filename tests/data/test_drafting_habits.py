@@ -330,3 +330,51 @@ def test_a_document_of_several_tables_is_refused(log: Log, tmp_path: Path) -> No
     file.write_text(json.dumps({"motors": motors, "gnss": fixes, "notes": notes}))
     with pytest.raises(DataError, match=r"several tables, motors \(\d+ rows\), gnss \(\d+ rows\);"):
         draft_tables([file], Marks())
+
+
+@pytest.fixture(scope="module")
+def breeze(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Speed in m/s of a true wind in gusts, and where it comes from in rad."""
+    return 6.0 + np.sin(0.3 * log.t), 1.0 + 0.05 * np.cos(0.2 * log.t)
+
+
+@pytest.mark.parametrize("pose", [True, False], ids=["heading", "yaw rate alone"])
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["clockwise", "anticlockwise"])
+def test_a_wind_from_the_bow_by_cosine_and_sine_becomes_the_true_wind(
+    log: Log, breeze: tuple[np.ndarray, np.ndarray], tmp_path: Path, side: float, pose: bool
+) -> None:
+    speed, direction = breeze
+    angle = side * (direction - log["psi"])
+    columns = {name: log[name] for name in ("u", "v", "r")}
+    columns |= {"psi": log["psi"]} if pose else {}
+    columns |= {"Vw": speed, "alpha_x": np.cos(angle), "alpha_y": np.sin(angle)}
+    rudders = {"deltal": log["delta"], "deltar": 0.9 * log["delta"], "n": log["n"]}
+    frame = pd.DataFrame({"time": log.t, **columns, **rudders})
+    read, marks = _drafted(frame, tmp_path / "ship.tab", sep="\t")
+    assert {"delta_port", "delta_stbd", "n"} <= read.channels.keys()
+    np.testing.assert_allclose(read["wind_speed"], speed)
+    begin = 0.0 if pose else log["psi"][0]
+    np.testing.assert_allclose(
+        np.exp(1j * read["wind_dir"]), np.exp(1j * (direction - begin)), atol=0.02
+    )
+    assert _guessed(marks, "wind_angle_cos")
+
+
+def test_what_the_own_speed_adds_is_taken_from_an_apparent_wind(
+    log: Log, breeze: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    speed, direction = breeze
+    felt = speed * np.exp(1j * (direction - log["psi"])) + log["u"] + 1j * log["v"]
+    columns = {name: log[name] for name in ("x", "y", "psi", "u", "v", "r")}
+    for names in (("AWS [m/s]", "AWA [deg]"), ("wind speed [m/s]", "wind direction [deg]")):
+        wind = dict(zip(names, (np.abs(felt), np.degrees(np.angle(felt))), strict=True))
+        read, _ = _drafted(_frame(log, **columns, **wind), tmp_path / "ship.csv")
+        np.testing.assert_allclose(read["wind_speed"], speed, rtol=1e-6)
+        np.testing.assert_allclose(np.exp(1j * read["wind_dir"]), np.exp(1j * direction), atol=1e-6)
+
+
+def test_a_heading_by_cosine_and_sine_is_a_heading(log: Log, tmp_path: Path) -> None:
+    columns = {"x": log["x"], "y": log["y"]}
+    columns |= {"cos(psi)": np.cos(log["psi"]), "sin(psi)": np.sin(log["psi"])}
+    read, _ = _drafted(_frame(log, **columns), tmp_path / "ship.csv")
+    np.testing.assert_allclose(np.exp(1j * read["psi"]), np.exp(1j * log["psi"]), atol=1e-9)

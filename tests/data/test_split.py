@@ -242,3 +242,20 @@ def test_rows_between_two_fixes_are_no_copies() -> None:
     with pytest.raises(DataError, match="share 200 identical rows"):
         check_leaks({"train": [sailed(1)], "test": [copied]}, rows=2)
     assert [log.name for log in without_copies([sailed(1), sailed(2), copied])] == ["run1", "run2"]
+
+
+def test_folders_called_after_the_splits_are_the_splits(tmp_path: Path) -> None:
+    logs = []
+    for number, folder in enumerate(("train", "train", "train", "test", "valid")):
+        t = np.arange(0.0, 20.0, 0.1)
+        source = str(tmp_path / folder / f"{number}.csv")
+        channels = {"u": np.random.default_rng(number).normal(size=t.size)}
+        logs.append(Log(f"log{number}", t, channels, {"u": "m/s"}, meta={"source": source}))
+    found = {split: [log.name for log in part] for split, part in divided(logs).items()}
+    assert found == {"train": ["log0", "log1", "log2"], "validation": ["log4"], "test": ["log3"]}
+    # without a folder for validation some of training are
+    found = {split: [log.name for log in part] for split, part in divided(logs[:4]).items()}
+    assert found == {"train": ["log0", "log1"], "validation": ["log2"], "test": ["log3"]}
+    # `trials/test_3.csv` alone says nothing
+    named = [log.replace(meta={"source": f"trials/test_{i}.csv"}) for i, log in enumerate(logs)]
+    assert [len(part) for part in divided(named).values()] == [3, 1, 1]

@@ -14,6 +14,7 @@ from residnet.core.units import si_unit, to_si, units
 
 __all__ = [
     "ACCELERATION",
+    "BOW_WIND",
     "CHANNEL_UNITS",
     "POSE",
     "STATE",
@@ -33,6 +34,9 @@ STATE = POSE + VELOCITY
 """
 
 ACCELERATION = tuple(f"{name}_dot" for name in VELOCITY)
+
+BOW_WIND = ("wind_angle", "apparent_wind_speed", "apparent_wind_angle")
+"""A wind that is told from the bow: where the true wind comes from, and the wind that is felt."""
 
 # SI unit of the channels that residnet knows by name; any other channel keeps the SI unit that its
 # map declares
@@ -74,6 +78,9 @@ CHANNEL_UNITS: dict[str, str] = {
     "acting_tau_n": "N m",
     "wind_speed": "m/s",
     "wind_dir": "rad",
+    "wind_angle": "rad",
+    "apparent_wind_speed": "m/s",
+    "apparent_wind_angle": "rad",
     "current_north": "m/s",
     "current_east": "m/s",
 }

@@ -71,7 +71,8 @@ class MotionConfig(Config):
 def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
     """Return the log with the states of a model at every sample, measured or smoothed.
 
-    What was smoothed stands in `meta["smoothed"]`, and as a note in `meta["findings"]`.
+    What was smoothed stands in `meta["smoothed"]`, and as a note in `meta["findings"]`. A wind that
+    is told from the bow becomes the true wind.
 
     Args:
         log: in SI.
@@ -83,6 +84,10 @@ def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
         UsageError: where the log lacks position or heading, or the roll angle of a roll.
         DataError: where these hold hardly a value.
     """
+    return with_true_wind(_completed(log, config, live))
+
+
+def _completed(log: Log, config: MotionConfig, live: Live) -> Log:
     log = _turning(log if live.whole else _still(log, live))
     log = _rolling(log) if live.rolls and not live.spatial else log
     if live.spatial:
@@ -121,6 +126,36 @@ def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
         channels={**log.channels, **{n: smooth[n] if n in made else log[n] for n in STATE}},
         units={**log.units, **{name: CHANNEL_UNITS[name] for name in STATE}},
         meta={**log.meta, "smoothed": names, "findings": findings},
+    )
+
+
+def with_true_wind(log: Log) -> Log:
+    """Return the log with the true wind where it tells a wind from the bow.
+
+    `wind_angle` is where the true wind comes from, clockwise from the bow; `apparent_wind_angle`
+    and `apparent_wind_speed` are of the wind that the moving vessel feels. Without a heading it is
+    counted from where the integral of the yaw rate begins.
+    """
+    felt = {"apparent_wind_angle", "apparent_wind_speed"} <= log.channels.keys()
+    names = ("u", "v") if felt else ("wind_angle", "wind_speed")
+    turning = "psi" if "psi" in log.channels else "r"
+    if "wind_dir" in log.channels or not {turning, *names} <= log.channels.keys():
+        return log
+    if not _dense(log[turning]) or (felt and not all(_dense(log[name]) for name in names)):
+        # the smoother will tell the motion at every sample
+        return log
+    if felt:
+        # what the vessel's own speed adds comes from ahead
+        wind = log["apparent_wind_speed"] * np.exp(1j * log["apparent_wind_angle"])
+        wind = wind - (log["u"] + 1j * log["v"])
+        speed, angle = np.abs(wind), np.angle(wind)
+    else:
+        speed, angle = log["wind_speed"], log["wind_angle"]
+    psi = log["psi"] if turning == "psi" else _integral(log.t, log["r"])
+    told = {"wind_speed": speed, "wind_dir": unwrap(psi + angle)}
+    return log.replace(
+        channels={**log.channels, **told},
+        units={**log.units, **{name: CHANNEL_UNITS[name] for name in told}},
     )
 
 
@@ -205,22 +240,22 @@ def _turned_by(log: Log, angle: np.ndarray, name: str) -> tuple[np.ndarray, np.n
     return turning[:, 0, 0], turning[:, 1, 0]
 
 
+def _integral(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Return the integral [T] of a rate [T] from the first sample on."""
+    dt, known = np.diff(t, prepend=t[:1]), np.nan_to_num(rate)
+    return np.asarray(np.cumsum(0.5 * dt * (known + np.concatenate((known[:1], known[:-1])))))
+
+
 def _integrated(log: Log, missing: Sequence[str]) -> Log:
     """Return a log of velocities with the pose that they lead to, from the origin on.
 
     A model of velocities needs no pose. Errors of position and heading are then those of the
     integrated velocities, and not of a place.
     """
-    dt = np.diff(log.t, prepend=log.t[:1])
-
-    def integral(rate: np.ndarray) -> np.ndarray:
-        known = np.nan_to_num(rate)
-        return np.asarray(np.cumsum(0.5 * dt * (known + np.concatenate((known[:1], known[:-1])))))
-
-    pose = {"psi": integral(log["r"]) if "psi" in missing else np.asarray(log["psi"])}
+    pose = {"psi": _integral(log.t, log["r"]) if "psi" in missing else np.asarray(log["psi"])}
     heading = np.exp(1j * np.nan_to_num(pose["psi"]))
     ground = heading * (np.nan_to_num(log["u"]) + 1j * np.nan_to_num(log["v"]))
-    pose |= {"x": integral(ground.real), "y": integral(ground.imag)}
+    pose |= {"x": _integral(log.t, ground.real), "y": _integral(log.t, ground.imag)}
     made = {name: pose[name] for name in missing}
     text = (
         f"{', '.join(missing)} were not measured and are integrated from the velocities: errors of"

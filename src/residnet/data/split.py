@@ -6,6 +6,7 @@ divided here, and no two splits may share measurements.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,12 @@ _ENOUGH = 5
 """Logs from which whole ones are taken for each split."""
 _SHARES = (("train", 0.0, 0.3), ("validation", 0.3, 0.5), ("train", 0.5, 0.8), ("test", 0.8, 1.0))
 """Stretches of each log where there are fewer."""
+_CALLED = {
+    **dict.fromkeys(("train", "training"), "train"),
+    **dict.fromkeys(("validation", "valid", "val", "dev"), "validation"),
+    **dict.fromkeys(("test", "testing"), "test"),
+}
+"""What folders and files of a split are called."""
 _COPIED = 100
 """Rows that two logs may share before one is a copy of part of the other."""
 
@@ -275,13 +282,23 @@ def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
 
     Of each five logs, in the order of their manoeuvres, the third is for validation and the fifth
     for the test. Where there are fewer than five, each is cut in time: its first three tenths and
-    those from the middle on are for training, the rest for validation and test.
+    those from the middle on are for training, the rest for validation and test. Where folders or
+    files are called train and test (and validation), that is the split.
 
     Raises:
         DataError: where a log is too short to be cut.
     """
     kept = without_copies(logs)
     out: dict[str, list[Log]] = {split: [] for split in SPLITS}
+    if owners := called_splits(kept):
+        for log, owner in zip(kept, owners, strict=True):
+            out[owner].append(log)
+        if not out["validation"]:
+            known = out["train"]
+            places = range(2, len(known), 4) or range(len(known) - 1, 0, -len(known))
+            out["validation"] = [known[place] for place in places]
+            out["train"] = [log for place, log in enumerate(known) if place not in places]
+        return out
     if len(kept) >= _ENOUGH:
         for place, log in enumerate(sorted(kept, key=lambda log: log.manoeuvre)):
             out[{2: "validation", 4: "test"}.get(place % 5, "train")].append(log)
@@ -297,6 +314,20 @@ def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
             start, stop = low if shares[0] else -np.inf, high if shares[1] < 1.0 else np.inf
             out[split].append(stretch_of(log, start, stop))
     return out
+
+
+def called_splits(logs: Sequence[Log]) -> list[str]:
+    """Return for each log the split that its folder or file is called after; empty for no split.
+
+    All must be called so, two of them for training and one for the test at least.
+    """
+    owners = []
+    for log in logs:
+        path = Path(str(log.meta.get("source", "")).lower())
+        words = [re.split(r"[\W_\d]+", path.stem)[0], *reversed(path.parent.parts)]
+        owners.append(next((_CALLED[word] for word in words if word in _CALLED), ""))
+    many = owners.count("train") + owners.count("validation") > 1
+    return owners if many and "" not in owners and {"train", "test"} <= {*owners} else []
 
 
 def without_copies(logs: Sequence[Log]) -> list[Log]:

@@ -13,7 +13,7 @@ import torch
 from residnet.baselines.sets import Roles, submerged
 from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS
+from residnet.core.names import BOW_WIND, CHANNEL_UNITS
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
 from residnet.data.motion import BRIDGED, without_pauses
@@ -431,9 +431,10 @@ class Preparation:
         step = float(f"{interval * max(1, int(quick / 40.0 / interval)):.4g}")
         samples = min(max(7, 2 * round(0.5 * quick / 5.0 / step) + 1), 41)
         held = tuple(name for name in inputs if _rests(logs, name))
-        # a true wind acts from where the vessel points
+        # a true wind acts from where the vessel points, and one from the bow tells it by itself
         wind = not live.dead and all(
-            set(WIND_INPUTS) <= set(log.channels) and "psi" not in log.meta.get("integrated", ())
+            {*WIND_INPUTS} <= {*log.channels}
+            and ("psi" not in log.meta.get("integrated", ()) or {*BOW_WIND} & {*log.channels})
             for log in logs
         )
         return cls(

@@ -13,6 +13,7 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.layout import ROLL, SIX, Live
 from residnet.core.log import Log
+from residnet.core.names import BOW_WIND
 from residnet.core.progress import say
 from residnet.data.doctor import inspect
 from residnet.data.drafting.channels import CHANNELS
@@ -20,8 +21,8 @@ from residnet.data.drafting.questions import Answer, Marks, commented
 from residnet.data.drafting.reading import INPUTS, log_files, read_drafted
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.prepare import PrepareConfig, prepare
-from residnet.data.readers.quantities import QUATERNION
-from residnet.data.split import SPLITS, divided, without_copies
+from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
+from residnet.data.split import SPLITS, called_splits, divided, without_copies
 from residnet.identification.recipe import Preparation, judging, protocols, window_length
 from residnet.physics.environment import WIND_INPUTS
 from residnet.tasks.driving import driving, lacks
@@ -239,7 +240,8 @@ class _Read:
         }
         if channels := self.reader.get("channels"):
             layout = SIX if self.live.spatial else ROLL
-            state = [*layout.names, *WIND_INPUTS]
+            state = [*layout.names, *WIND_INPUTS, *BOW_WIND]
+            state += [f"{name}{part}" for name in state for part in (COSINE, SINE)]
             state += [] if "x" in channels else ["latitude", "longitude"]
             state += [] if "psi" in channels else QUATERNION
             self.reader["channels"] = {
@@ -333,6 +335,8 @@ def _split(
         "of each five logs, in the order of their manoeuvres, one is for validation and one for the"
         " test"
     )
+    if called_splits(list(usable.values())):
+        why = "folders or files are called after the splits"
     for split, logs in splits.items():
         for log in logs:
             ends = log.meta.get("stretch")

@@ -8,7 +8,7 @@ import numpy as np
 
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.log import Log
-from residnet.core.names import ACCELERATION, STATE
+from residnet.core.names import ACCELERATION, BOW_WIND, STATE
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.reading import INPUTS
 from residnet.data.drafting.words import input_channel, state_channel, words_of
@@ -17,7 +17,7 @@ from residnet.physics.environment import WIND_INPUTS
 
 _PASSIVE = (
     *(*STATE, *ACCELERATION, *SIX.moving, "latitude", "longitude", *QUATERNION),
-    *(*WIND_INPUTS, "current_north", "current_east"),
+    *(*WIND_INPUTS, *BOW_WIND, "current_north", "current_east"),
 )
 _STILL = 2e-3
 """Spread of an input, as a share of its size, below which it stays where it is."""

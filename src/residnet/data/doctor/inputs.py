@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from residnet.core.names import BOW_WIND
 from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import (
     Check,
@@ -247,7 +248,7 @@ def idle(log: Record, found: Check) -> Iterator[Finding]:
 @check("inputs", "relative_wind", needs=("psi",), few=True)
 def relative_wind(log: Record, found: Check) -> Iterator[Finding]:
     """Report wind directions that turn against the heading: relative wind, not true wind."""
-    directions = [name for name in log if "wind" in name and log.units[name] == "rad"]
+    directions = [n for n in log if "wind" in n and log.units[n] == "rad" and n not in BOW_WIND]
     for name in directions:
         slope, error = _slope_against_heading(log, name)
         others = (one for one in directions if one != name and _same_direction(log, name, one))

@@ -8,7 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
-from residnet.core.names import CHANNEL_UNITS
+from residnet.core.names import BOW_WIND, CHANNEL_UNITS
 from residnet.core.units import to_si
 from residnet.data.channels import STILL
 from residnet.data.drafting.physics import (
@@ -28,12 +28,16 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.units import thrown, unit_by_size, written_unit
 from residnet.data.drafting.words import axis_velocity, words_of
 from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
-from residnet.data.readers.quantities import QUATERNION
+from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
 
 READER = ("data", "reader")
 CHANNELS = (*READER, "channels")
 _SURE = 0.9
 """Correlation from which a measured factor overrules a header."""
+_TURNED = 0.1
+"""How much steadier a wind is from north than from the bow, where it is told from the bow."""
+_STEADIER = 0.8
+"""Spread of the true wind by that of the felt one, where its speed is that of the felt one."""
 _DEEP = {
     "w": r"w|heave(?: (?:velocity|speed))?",
     "q": r"q|pitch (?:rate|velocity|speed)",
@@ -41,7 +45,10 @@ _DEEP = {
     "theta": r"theta|pitch(?: angle)?",
 }
 """What a vessel under water is told by, beside the channels of a roll."""
-STATE_NAMES = ("x", "y", "psi", "u", "v", "r", "phi", "p", *_DEEP, "wind_speed", "wind_dir")
+STATE_NAMES = (
+    *("x", "y", "psi", "u", "v", "r", "phi", "p", *_DEEP, "wind_speed", "wind_dir"),
+    *BOW_WIND,
+)
 _FIXES = {"x": "latitude", "y": "longitude"}
 MAGNETIC = re.compile(r"magn|compass|kompass|\bhdm\b|\(m\)|\bmag(?![a-z])|_mag(?![a-z])", re.I)
 _QUATERNION = re.compile(
@@ -140,6 +147,41 @@ def _frames(names: Mapping[str, str], texts: Iterable[str]) -> tuple[Frame, ...]
     return FRAMES if not headed or not posed or any(map(_NED.search, texts)) else POSE_FRAMES
 
 
+_CIRCLE = re.compile(
+    r"(?P<stem>.*?)[\W_]*(?P<part>cosine|cos|sine|sin|(?<![^\W_])[csxy])"
+    r"|(?P<head>cos|sin)[\W_]*(?P<tail>.+?)\W*",
+    re.IGNORECASE,
+)
+
+
+def circles(
+    columns: Sequence[str], tables: Sequence[Mapping[str, np.ndarray]]
+) -> dict[str, tuple[str, str]]:
+    """Return stem -> columns of an angle's cosine and sine: their squares add up to one.
+
+    Args:
+        columns: names, such as `psi_cos` and `psi_sin`, or `alpha_x` and `alpha_y`.
+        tables: column -> values of each table.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for column in columns:
+        name = column.strip()
+        match = _CIRCLE.fullmatch(name) or _CIRCLE.fullmatch(re.sub(r"\s*[\[(].*", "", name))
+        if match is not None:
+            part = (match["part"] or match["head"])[0].lower()
+            side = COSINE if part in "cx" else SINE
+            found.setdefault(match["stem"] or match["tail"] or "", {}).setdefault(side, column)
+    out = {}
+    for stem, parts in found.items():
+        pair = (parts.get(COSINE, ""), parts.get(SINE, ""))
+        both = [[table[name] for name in pair] for table in tables if {*pair} <= table.keys()]
+        size = np.concatenate([np.hypot(*one) for one in both] or [np.zeros(0)])
+        size = size[np.isfinite(size)]
+        if stem and size.size and np.quantile(np.abs(size - 1.0), 0.9) < 0.02:
+            out[stem] = pair
+    return out
+
+
 def drafted_channels(
     names: Mapping[str, str], logs: Sequence[Raw], marks: Marks, texts: Iterable[str] = ()
 ) -> dict[str, dict[str, Any]]:
@@ -154,6 +196,12 @@ def drafted_channels(
     attitude = {name: column for name, column in names.items() if name in QUATERNION}
     frames = _frames(names, texts)
     rest = {name: column for name, column in names.items() if name not in QUATERNION}
+    angles = {}
+    for name in [one.removesuffix(COSINE) for one in names if one.endswith(COSINE)]:
+        pair = (rest.pop(name + COSINE), rest.pop(name + SINE))
+        rest[name] = f"angle of {' and '.join(pair)} [rad]"
+        angles[rest[name]] = pair
+        logs = [_on_circle(raw, name) for raw in logs]
     if attitude:
         rest["psi"] = "heading of the quaternion [rad]"
         logs = [_headed(raw) for raw in logs]
@@ -161,6 +209,15 @@ def drafted_channels(
     entries = Channels(rest, logs, marks, fixes, frames).drafted()
     if fixes:
         entries = {_FIXES.get(name, name): entry for name, entry in entries.items()}
+    for name in [one for one, entry in entries.items() if entry["column"] in angles]:
+        entry = entries.pop(name)
+        cosine, sine = angles[entry["column"]]
+        if entry.pop("frame", ""):
+            cosine, sine = sine, cosine
+        turned = {"sign": entry["sign"]} if "sign" in entry else {}
+        entries[name + COSINE] = {"column": cosine, "unit": "-"}
+        entries[name + SINE] = {"column": sine, "unit": "-", **turned}
+        marks.move((*CHANNELS, name), (*CHANNELS, name + COSINE))
     if not attitude:
         return entries
     psi = entries.pop("psi")
@@ -176,6 +233,14 @@ def drafted_channels(
         text = f"'{attitude['qw']}' is taken as the scalar part, which leaves the vessel level"
         marks.guess((*CHANNELS, "qw"), text)
     return entries
+
+
+def _on_circle(raw: Raw, name: str) -> Raw:
+    """Return a log with an angle in rad from its cosine and sine."""
+    if not {name + COSINE, name + SINE} <= raw.columns.keys():
+        return raw
+    angle = np.arctan2(raw.columns[name + SINE], raw.columns[name + COSINE])
+    return Raw(raw.t, {**raw.columns, name: angle})
 
 
 def _headed(raw: Raw) -> Raw:
@@ -246,6 +311,7 @@ class Channels:
         self._frame = self._frames[0]
         self._motions: list[Motion | None] = [None] * len(logs)
         self._psi_unit = "rad"
+        self._flipped: set[str] = set()
 
     def drafted(self) -> dict[str, dict[str, Any]]:
         """Return channel -> entry."""
@@ -381,36 +447,85 @@ class Channels:
                 self._marks.note(CHANNELS, f"{text} {name} follows from them")
 
     def _settle_wind(self) -> None:
-        """Leave out a wind that turns with the vessel, and a wind without its other half."""
-        pair = {"wind_speed", "wind_dir"} & set(self._names)
-        if not pair:
+        """Find whether the wind is told from north or from the bow; one without its half goes."""
+        for pair in (BOW_WIND[1:], ("wind_speed", "wind_dir")):
+            if len(held := {*pair} & {*self._names}) == 1:
+                column = self._names.pop(held.pop())
+                self._marks.note(CHANNELS, f"'{column}' alone is no wind; left out")
+        felt = BOW_WIND[2] in self._names
+        if "wind_dir" in self._names and felt:
+            columns = ", ".join(self._names.pop(name) for name in BOW_WIND[1:])
+            self._marks.note(CHANNELS, f"the true wind stands beside it; left out: {columns}")
+        name = "wind_dir" if "wind_dir" in self._names else BOW_WIND[2]
+        if name not in self._names:
             return
-        if len(pair) == 1:
-            column = self._names.pop(pair.pop())
-            self._marks.note(CHANNELS, f"'{column}' alone is no wind; left out")
+        turns = {sign: self._turns_with_vessel(name, sign) for sign in (1, -1)}
+        sign = max(turns, key=lambda one: turns[one])
+        key, true = (*CHANNELS, name), words_of(self._names[name]).has("true")
+        if name == "wind_dir" and (true or turns[sign] <= _TURNED):
+            text = "the direction is taken as that which the true wind comes from, clockwise from"
+            self._marks.guess(key, f"{text} north")
             return
-        words = words_of(self._names["wind_dir"])
-        if not words.has("true") and self._turns_with_vessel():
-            columns = [self._names.pop(name) for name in ("wind_speed", "wind_dir")]
-            text = "turns against the heading, as a relative wind does; a model needs the true wind"
-            self._marks.note(CHANNELS, f"'{columns[1]}' {text}: {', '.join(columns)} left out")
-            return
-        text = "the direction is taken as that which the true wind comes from, clockwise from north"
-        self._marks.guess((*CHANNELS, "wind_dir"), text)
+        if turns[sign] > _TURNED and sign < 0:
+            self._flipped.add(name)
+        felt = felt or self._is_felt(name)
+        old = ("wind_speed", "wind_dir")
+        new = BOW_WIND[1:] if felt else ("wind_speed", BOW_WIND[0])
+        if name == "wind_dir":
+            self._rename(dict(zip(old, new, strict=True)))
+        told = "turns against the heading" if turns[sign] > _TURNED else "is relative by its name"
+        text = f"it {told}: the angle from the bow that the {'apparent' if felt else 'true'} wind"
+        text += " comes from, which heading"
+        text += " and velocities make the true wind" if felt else " makes one from north"
+        self._marks.guess((*CHANNELS, new[1]), text)
 
-    def _turns_with_vessel(self) -> bool:
-        if "psi" not in self._names:
-            return False
-        unit = self._unit("wind_dir", mark=False)
-        shares = [
-            explained_turn(
-                raw.columns["wind_dir"] * to_si(unit, "rad"),
-                heading_of(raw, self._psi_unit, self._frame),
-            )
+    def _rename(self, new: Mapping[str, str]) -> None:
+        """Give channels other names."""
+        self._names = {new.get(name, name): column for name, column in self._names.items()}
+        self._flipped = {new.get(name, name) for name in self._flipped}
+        self._logs = [
+            Raw(raw.t, {new.get(name, name): values for name, values in raw.columns.items()})
             for raw in self._logs
-            if {"wind_dir", "psi"} <= set(raw.columns)
         ]
-        return bool(shares) and float(np.mean(shares)) > 0.1
+
+    def _headings(self, raw: Raw) -> np.ndarray | None:
+        """Return the heading [T] in rad of a log, from any zero where only a rate tells it."""
+        if {"psi"} <= self._names.keys() & raw.columns.keys():
+            return heading_of(raw, self._psi_unit, self._frame)
+        if {"r"} <= self._names.keys() & raw.columns.keys():
+            rate = raw.columns["r"] * to_si(self._unit("r", mark=False), "rad/s")
+            step = np.diff(raw.t, prepend=raw.t[:1])
+            return np.asarray(np.cumsum(np.nan_to_num(rate * step)))
+        return None
+
+    def _turns_with_vessel(self, name: str, sign: int) -> float:
+        """Return how much steadier a wind is from north than from the bow, from 0 to 1."""
+        size = sign * to_si(self._unit(name, mark=False), "rad")
+        shares = [
+            explained_turn(raw.columns[name] * size, psi)
+            for raw in self._logs
+            if name in raw.columns and (psi := self._headings(raw)) is not None
+        ]
+        return float(np.mean(shares)) if shares else 0.0
+
+    def _is_felt(self, name: str) -> bool:
+        """Return whether a wind is steadier without what the vessel's own speed adds to it."""
+        if not {"u", "v"} <= self._names.keys():
+            return False
+        sign = -1 if name in self._flipped else 1
+        sizes = {n: to_si(self._unit(n, mark=False), CHANNEL_UNITS[n]) for n in ("u", "v", name)}
+        sizes["wind_speed"] = to_si(self._unit("wind_speed", mark=False), "m/s")
+        spreads = []
+        for raw in self._logs:
+            psi = self._headings(raw)
+            if psi is None or not sizes.keys() <= raw.columns.keys():
+                continue
+            u, v, angle, speed = (raw.columns[n] * size for n, size in sizes.items())
+            told = speed * np.exp(1j * (psi + sign * angle))
+            winds = np.stack((told, told - (u + 1j * v) * np.exp(1j * psi)))
+            spreads.append(np.nanstd(winds[:, np.isfinite(winds).all(axis=0)], axis=1))
+        true, felt = np.mean(spreads, axis=0) if spreads else (0.0, 0.0)
+        return bool(felt < _STEADIER * true)
 
     def _unit(self, name: str, *, mark: bool = True) -> str:
         """Return the unit of a channel from its header or its size."""
@@ -445,7 +560,7 @@ class Channels:
         if name not in STATE_NAMES and (throw := thrown(name, column, self._values(name))):
             self._marks.guess((*CHANNELS, name), throw.reason)
             return entry | throw.settings
-        sign = self._sign_by_habit(name)
+        sign = -1 if name in self._flipped else self._sign_by_habit(name)
         return entry | {"unit": self._unit(name)} | ({"sign": sign} if sign < 0 else {})
 
     def _sign_by_habit(self, name: str) -> int:

@@ -20,6 +20,7 @@ from residnet.data.drafting.channels import (
     MAGNETIC,
     READER,
     STATE_NAMES,
+    circles,
     drafted_channels,
     levelled,
     quaternions,
@@ -31,7 +32,7 @@ from residnet.data.drafting.units import other_dimension, written_unit
 from residnet.data.drafting.words import input_channel, plain, state_channel, words_of
 from residnet.data.readers.base import require_file
 from residnet.data.readers.clocks import first_of_copies, steady_clock
-from residnet.data.readers.quantities import QUATERNION
+from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
 from residnet.data.readers.tables import TABLES, excel_sheet, json_rows, parquet_rows, sheet_names
 from residnet.data.readers.texts import first_rows
 from residnet.data.readers.written import (
@@ -119,9 +120,13 @@ def draft_tables(
         )
     attitudes = quaternions(numeric)
     parts = {column for attitude in attitudes for column in attitude.values()}
+    angles = circles(numeric, [one.numbers for one in sheets])
+    parts |= {column for pair in angles.values() for column in pair}
     rest = [name for name in numeric if name not in parts]
-    names = _of_one_vessel(rest, first.numbers, marks, headed=headed or bool(parts))
+    psi = any(state_channel(words_of(stem)) == "psi" for stem in angles)
+    names = _of_one_vessel(rest, first.numbers, marks, headed=headed or psi or bool(attitudes))
     names = _pulsed(names, sheets)
+    names = _angles(names, angles)
     # a vessel without roll is modelled too, so that no log is lost for it
     rolls = [name for name in ("phi", "p") if name in names]
     for name in [one for one in rolls if any(names[one] not in s.numbers for s in sheets)]:
@@ -320,6 +325,24 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
     listed = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
     return {name: names[name] for name in listed if name in names}
+
+
+def _angles(names: dict[str, str], pairs: Mapping[str, tuple[str, str]]) -> dict[str, str]:
+    """Return channel -> column with angles that are told by a cosine and a sine.
+
+    A direction of nothing known is that of the wind, where its speed stands alone.
+    """
+    told = {*names}
+    for stem, pair in pairs.items():
+        words = words_of(stem)
+        channel = state_channel(words)
+        if channel is None and told & {"wind_speed", "wind_dir"} == {"wind_speed"}:
+            channel = "wind_dir"
+        channel = channel or input_channel(words)
+        if channel and CHANNEL_UNITS.get(channel, "rad") == "rad" and channel not in told:
+            told.add(channel)
+            names = {**names, channel + COSINE: pair[0], channel + SINE: pair[1]}
+    return names
 
 
 def _pulsed(names: Mapping[str, str], sheets: Sequence[Sheet]) -> dict[str, str]:

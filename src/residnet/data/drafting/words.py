@@ -10,7 +10,7 @@ import re
 import unicodedata
 from typing import NamedTuple
 
-from residnet.core.names import ACCELERATION, CHANNEL_UNITS
+from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS
 
 # what a name may be about -> parts of words, and whole words behind a bar
 _ABOUT: dict[str, str] = {
@@ -49,7 +49,7 @@ _ABOUT: dict[str, str] = {
     " gyro gyrz acisal",
     "speed": "speed velo 風速 geschwind vitesse velocidad velocita snelheid hastighet 速度 船速"
     " fahrt vaart 速力 скорост predkosc 속도 속력 | velo sog stw fart vel spd log tws hiz hizi"
-    " surat",
+    " surat vw aws",
     "surge": "surge langsgeschw laengsgeschw longitudinal avance avante voraus vooruit voorwaart"
     " fremover forover fremad 前後 langs avanzamento avanco 纵向 framat продольн | u forward"
     " ahead corredera",
@@ -73,11 +73,12 @@ _ABOUT: dict[str, str] = {
     "azimuth": "azimu schottel pod | azi nozzle alpha",
     "servo": "servo rcou",
     "force": "force kraft fuerza kracht 力 tau",
-    "wind": "wind vind vent viento 風 风 ветер wiatr 풍속 풍향 ruzgar | tws twd vento",
+    "wind": "wind vind vent viento 風 风 ветер wiatr 풍속 풍향 ruzgar | tws twd vento vw twa aws"
+    " awa",
     "true": "true wahr vrai verdadero real reel ware sann 真 | tws twd",
-    "relative": "relativ apparent scheinb aparente schijnb tilsyn 相対 gemessen measured",
+    "relative": "relativ apparent scheinb aparente schijnb tilsyn 相対 gemessen measured | aws awa",
     "direction": "direction direzion richtung riktning direccion richting retning angle winkel"
-    " 方向 風向 | dir twd from angulo hoek vinkel",
+    " 方向 風向 | dir twd from angulo hoek vinkel twa awa",
     "angle": "angle winkel angulo hoek vinkel lage 角 | ang angolo",
     "roll": "roll roulis balanceo krenging 横揺 kranken slagside 横摇 横倾 крен przechyl 횡동요 |"
     " phi heel yalpa",
@@ -107,7 +108,7 @@ _WORDS = frozenset(
     word for words in _ABOUT.values() for word in words.split() if len(word) > 2 and word.isascii()
 )
 """All words that compounds are made of."""
-MOTION = ("x", "y", "psi", "u", "v", "r", "p", "phi", "wind_speed", "wind_dir")
+MOTION = ("x", "y", "psi", "u", "v", "r", "p", "phi", "wind_speed", "wind_dir", *BOW_WIND)
 """Channels of the motion and of the wind."""
 
 
@@ -155,8 +156,8 @@ def plain(name: str) -> str:
 
 def words_of(name: str) -> Words:
     """Return what a column's name is about."""
-    text = plain(name)
-    tokens = text.split()
+    tokens = [part for token in plain(name).split() for part in _sided(token)]
+    text = " ".join(tokens)
     if len(tokens) > 1 and re.search(r"[\s_][VAW]$", _IN_BRACKETS.sub(" ", name).strip()):
         # volts, amperes and watts are no names of channels
         tokens, text = tokens[:-1], text[:-2]
@@ -169,6 +170,22 @@ def words_of(name: str) -> Words:
     bare += [piece for token in bare for piece in _pieces(token)]
     about = {thing for thing in _ABOUT if _fits(thing, text, bare)}
     return Words(text, frozenset(about), number)
+
+
+_KNOWN = frozenset(
+    word for words in _ABOUT.values() for word in words.replace("|", " ").split() if word.isascii()
+)
+_DRIVING = frozenset(
+    word
+    for thing in ("rudder", "propeller", "engine", "revolutions", "throttle", "servo")
+    for word in _ABOUT[thing].replace("|", " ").split()
+)
+
+
+def _sided(token: str) -> tuple[str, ...]:
+    """Return an actuator and its side, of `deltal` or `rpmr`; other tokens as they are."""
+    glued = token[-1:] in ("l", "r") and token not in _KNOWN and token[:-1] in _DRIVING
+    return (token[:-1], token[-1]) if glued else (token,)
 
 
 def _pieces(token: str) -> tuple[str, ...]:
@@ -205,11 +222,10 @@ def state_channel(words: Words) -> str | None:
     if w.has("machinery") and w.lacks("speed", "surge"):
         return None
     if w.has("wind"):
-        if w.has("relative") and not w.has("true"):
-            return None
+        felt = "apparent_" if w.has("relative") and not w.has("true") else ""
         if w.has("speed") and "dir" not in w.text.split():
-            return "wind_speed"
-        return "wind_dir" if w.has("direction") else None
+            return f"{felt}wind_speed"
+        return (f"{felt}wind_angle" if felt else "wind_dir") if w.has("direction") else None
     if not w.lacks("command", "acceleration", "rudder", "propeller", "current", "depth", "age"):
         return None
     driven = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")

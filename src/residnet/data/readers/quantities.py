@@ -27,6 +27,8 @@ _FROM_EAST = (-1.0, math.pi / 2.0)
 _EARTH = ("x", "y", "z", "psi", "wind_dir", "current_north", "current_east")
 QUATERNION = ("qx", "qy", "qz", "qw")
 """Channels of a table that become a heading together, where it has none."""
+COSINE, SINE = "_cos", "_sin"
+"""What stands behind an angle's name in those of its cosine and sine."""
 _FORWARD = ("u", "p", "phi", "u_dot", "tau_x")
 _SIDEWAYS_OR_DOWN = ("v", "r", "w", "q", "theta", "v_dot", "r_dot", "tau_y", "tau_n")
 # frame -> channel -> (factor, offset [SI]) that brings the channel to residnet's frame.

@@ -24,6 +24,7 @@ from residnet.core.log import Log
 from residnet.core.names import nearest, shown
 from residnet.core.units import known_unit, to_si
 from residnet.data.channels import beyond_belief, fills, largest
+from residnet.data.motion import with_true_wind
 from residnet.data.readers.base import (
     Advance,
     LogReader,
@@ -38,7 +39,14 @@ from residnet.data.readers.base import (
 )
 from residnet.data.readers.clocks import first_of_copies, steady_clock
 from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
-from residnet.data.readers.quantities import QUATERNION, ChannelMap, factor, told_headings
+from residnet.data.readers.quantities import (
+    COSINE,
+    QUATERNION,
+    SINE,
+    ChannelMap,
+    factor,
+    told_headings,
+)
 from residnet.data.readers.recording import Remark, remark
 from residnet.data.readers.texts import (
     as_utf8,
@@ -123,7 +131,8 @@ class TableConfig(Config, ABC):
         time: column of the time.
         channels: canonical names (or names of your own) and the columns that they are taken from,
             all of which must exist; `latitude` and `longitude` become x, y where these are not
-            there, and `qx`, `qy`, `qz`, `qw` become the heading psi where there is none.
+            there, `qx`, `qy`, `qz`, `qw` become the heading psi where there is none, and of any
+            angle its cosine and sine do, as `psi_cos` and `psi_sin`.
         manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder,
             null says that it is not known.
     """
@@ -347,6 +356,7 @@ class TableReader(LogReader):
         units = {name: entry.si(name) for name, entry in maps.items()}
         findings += _placed(path, channels, units)
         _headed(path, channels, units, maps)
+        _angled(channels, units)
         if cut:
             text = "the file ends within its last line, which is left out"
             findings.append(remark("note", "cut_line", text))
@@ -357,7 +367,8 @@ class TableReader(LogReader):
             meta |= {"epoch": first * 1e-9, "epoch_ns": first}
         kind = config.manoeuvre
         kind = path.resolve().parent.name if kind == "folder" else kind
-        return Log(path.stem, clock, channels, units, kind or "unknown", meta=meta)
+        log = Log(path.stem, clock, channels, units, kind or "unknown", meta=meta)
+        return with_true_wind(log)
 
     def _require_units(self, path: Path, written: Sequence[str]) -> None:
         """Stop where cells name another unit than the channel map; `written` are those of cells."""
@@ -527,6 +538,16 @@ def _headed(
     for name in QUATERNION:
         del units[name]
     units["psi"] = "rad"
+
+
+def _angled(channels: dict[str, np.ndarray], units: dict[str, str]) -> None:
+    """Put angles in place of their cosines and sines."""
+    for name in [one.removesuffix(COSINE) for one in channels if one.endswith(COSINE)]:
+        if name + SINE in channels and name not in channels:
+            sine, cosine = channels.pop(name + SINE), channels.pop(name + COSINE)
+            channels[name] = unwrap(np.arctan2(sine, cosine))
+            del units[name + SINE], units[name + COSINE]
+            units[name] = "rad"
 
 
 @contextmanager
