@@ -8,7 +8,7 @@ import numpy as np
 
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.log import Log
-from residnet.core.names import ACCELERATION, BOW_WIND, STATE
+from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS, STATE
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.reading import INPUTS
 from residnet.data.drafting.words import input_channel, state_channel, words_of
@@ -64,8 +64,11 @@ def driving(logs: Sequence[Log], marks: Marks) -> tuple[str, ...]:
         twin = next((other for other in out if _alike(values[name], values[other])), None)
         if twin is None:
             out.append(name)
-        else:
-            marks.guess(INPUTS, f"{name} moves as {twin} does in every log, and is left out")
+            continue
+        if name in CHANNEL_UNITS and twin not in CHANNEL_UNITS:
+            # an angle or revolutions say more than a share or pulses
+            out[out.index(twin)], name, twin = name, twin, name
+        marks.guess(INPUTS, f"{name} moves as {twin} does in every log, and is left out")
     if len(out) > _MOST:
         marks.guess(INPUTS, f"of {len(out)} possible inputs the first {_MOST} are taken")
     return tuple(out[:_MOST])
@@ -145,6 +148,8 @@ def _measured(names: Sequence[str], marks: Marks) -> list[str]:
         found = next((other for other in partners if other in names and other != name), None)
         if found is not None:
             marks.guess(INPUTS, f"{found} is taken as measured, and not what was ordered ({name})")
+        elif name.removesuffix("_rate") in {*names} - {name}:
+            marks.note(INPUTS, f"{name} is left out beside {name.removesuffix('_rate')}")
         elif name.startswith("thrust") and turning:
             marks.note(INPUTS, f"{name} is left out beside {turning[0]}: it follows from it")
         else:

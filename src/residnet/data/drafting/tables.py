@@ -571,12 +571,17 @@ def clock_of(sheet: Sheet) -> Clock:
         for name, values in sheet.numbers.items()
         if values.size > 1
         and bool((np.diff(_going_on(values[np.isfinite(values)])) > 0.0).all())
-        # pandas writes the number of each row under no name
-        and not name.startswith("Unnamed: ")
+        # pandas writes the number of each row under no name, or the time
+        and not (name.startswith("Unnamed: ") and bool((np.diff(values) == 1.0).all()))
     ]
     called = [name for name in named if name in sheet.numbers]
     # one that is called time and does not increase is refused where it is read; a counter is none
-    others = [name for name in rising if words_of(name).lacks("index")] if not called else []
+    others = [
+        name
+        for name in rising
+        if not called and words_of(name).lacks("index") and state_channel(words_of(name)) is None
+    ]
+    others.sort(key=lambda name: _unsteady(sheet.numbers[name]))
     chosen = next((name for name in rising if name in named), next(iter([*called, *others]), None))
     if chosen is None:
         if not named:
@@ -601,6 +606,12 @@ def clock_of(sheet: Sheet) -> Clock:
         guess = f"no column is called time; this one increases as time does. {guess}".strip()
     seconds = _steady(sheet, values * to_si(unit), to_si(unit))
     return Clock({"column": chosen, "unit": unit}, seconds, guess, (chosen,))
+
+
+def _unsteady(values: np.ndarray) -> float:
+    """Return the spread of steps, as a share of the usual one and without the last digit."""
+    steps = np.diff(values[np.isfinite(values)])
+    return round(float(np.std(steps) / np.median(steps)), 2)
 
 
 def _going_on(values: np.ndarray) -> np.ndarray:

@@ -264,6 +264,7 @@ def axis_velocity(words: Words) -> str | None:
     return None if twist is None else "u" if twist["axis"] == "x" else "v"
 
 
+_AXIS = re.compile(r"[xy](?: ?0)?(?: m)?")
 _COMPASS = ("gyro", "compass", "gyro compass", "gyrocompass")
 
 
@@ -271,9 +272,10 @@ def _place(w: Words) -> str | None:
     if (w.has("heading") and w.lacks("ground")) or w.text in _COMPASS:
         return "psi"
     if w.lacks("speed", "angle", "force"):
-        if w.has("north") or (w.has("x") and (w.has("position") or w.text in ("x", "x m"))):
+        # some write 0 for what is fixed to the earth
+        if w.has("north") or (w.has("x") and (w.has("position") or _AXIS.fullmatch(w.text))):
             return "x"
-        if w.has("east") or (w.has("y") and (w.has("position") or w.text in ("y", "y m"))):
+        if w.has("east") or (w.has("y") and (w.has("position") or _AXIS.fullmatch(w.text))):
             return "y"
     return None
 
