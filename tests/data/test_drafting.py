@@ -114,8 +114,8 @@ def test_words_of_a_language(language: str) -> None:
 @pytest.mark.parametrize(
     ("column", "channel"),
     [
-        ("wind_dir_relative_mid [rad]", None),
-        ("scheinbare Windrichtung [°]", None),
+        ("wind_dir_relative_mid [rad]", "apparent_wind_angle"),
+        ("scheinbare Windrichtung [°]", "apparent_wind_angle"),
         ("wind_velo_true [m/s]", "wind_speed"),
         ("Kurs über Grund [°]", None),
         ("course over ground", None),
@@ -133,7 +133,7 @@ def test_words_of_a_language(language: str) -> None:
         ("thruster right", "thrust_stbd"),
         ("TWS", "wind_speed"),
         ("TWD", "wind_dir"),
-        ("AWA", None),
+        ("AWA", "apparent_wind_angle"),
         ("local_x", "x"),
         ("Posición Y", "y"),
         ("Taux de virage", "r"),

@@ -378,3 +378,19 @@ def test_a_heading_by_cosine_and_sine_is_a_heading(log: Log, tmp_path: Path) -> 
     columns |= {"cos(psi)": np.cos(log["psi"]), "sin(psi)": np.sin(log["psi"])}
     read, _ = _drafted(_frame(log, **columns), tmp_path / "ship.csv")
     np.testing.assert_allclose(np.exp(1j * read["psi"]), np.exp(1j * log["psi"]), atol=1e-9)
+
+
+def test_a_model_basin_names_its_columns_by_groups_and_its_time_not_at_all(
+    log: Log, tmp_path: Path
+) -> None:
+    columns = {"Hull/Acc/Z3": 0.01 * np.sin(log.t), "Prop/PS/Rpm": 60.0 * log["n"]}
+    columns |= {"Rudder/Angle": np.degrees(log["delta"]), "Rudder/MaxAngle": 35.0 + 0.0 * log.t}
+    columns |= {"psi": log["psi"], "x0": log["x"], "y0": log["y"], "z0": 0.01 * np.cos(log.t)}
+    frame = pd.DataFrame(columns, index=log.t)
+    file = tmp_path / "22605.csv"
+    frame.to_csv(file)
+    content = draft_tables([file], Marks())[0]
+    read = validate(content, ReaderConfig, "test").build().read(file)
+    np.testing.assert_allclose(read.t, log.t, atol=1e-6)
+    for name in ("x", "y", "psi", "delta"):
+        np.testing.assert_allclose(read[name], log[name], atol=1e-6)
