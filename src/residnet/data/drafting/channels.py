@@ -214,9 +214,9 @@ def drafted_channels(
         cosine, sine = angles[entry["column"]]
         if entry.pop("frame", ""):
             cosine, sine = sine, cosine
-        turned = {"sign": entry["sign"]} if "sign" in entry else {}
+        signed = {"sign": entry["sign"]} if "sign" in entry else {}
         entries[name + COSINE] = {"column": cosine, "unit": "-"}
-        entries[name + SINE] = {"column": sine, "unit": "-", **turned}
+        entries[name + SINE] = {"column": sine, "unit": "-", **signed}
         marks.move((*CHANNELS, name), (*CHANNELS, name + COSINE))
     if not attitude:
         return entries
