@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from known_logs import wavy
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation
 
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
+from residnet.core.layout import Live
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.align import GridConfig
@@ -159,3 +162,32 @@ def test_a_fit_is_prepared_from_velocities_alone() -> None:
     prepared = prepare(TRUTH.replace(channels=channels), "train", ("delta",), config)
     assert prepared.usable.all()
     np.testing.assert_array_equal(prepared.y[:, 3], TRUTH["u"])
+
+
+@pytest.mark.parametrize("lost", [("w",), ("p", "q"), ("u", "v", "w", "p", "q", "r")])
+def test_what_was_not_measured_under_water_follows_from_attitude_and_depth(
+    lost: tuple[str, ...],
+) -> None:
+    t = np.arange(0.0, 60.0, 0.05)
+    attitude = {
+        "phi": 0.1 * np.sin(0.9 * t),
+        "theta": 0.2 * np.sin(0.4 * t),
+        "psi": 0.5 * t + 0.1 * np.cos(t),
+    }
+    nu = {"u": 1.5 + 0.2 * np.sin(0.3 * t), "v": 0.1 * np.cos(0.5 * t), "w": 0.1 * np.sin(0.6 * t)}
+    turn = Rotation.from_euler("ZYX", np.stack([attitude[n] for n in ("psi", "theta", "phi")], 1))
+    ground = turn.apply(np.stack([nu[name] for name in "uvw"], 1))
+    place = cumulative_trapezoid(ground, t, axis=0, initial=0.0)
+    rates = (turn[:-1].inv() * turn[1:]).as_rotvec() / 0.05
+    rates = np.stack([np.interp(t, t[:-1] + 0.025, rate) for rate in rates.T], 1)
+    truth = nu | dict(zip("pqr", rates.T, strict=True))
+    channels = attitude | dict(zip("xyz", place.T, strict=True)) | truth
+    kept = {name: values for name, values in channels.items() if name not in lost}
+    log = Log("dive", t, kept)
+    live = Live.told(log.channels)
+    assert live.spatial
+    whole = complete_motion(log, MotionConfig(), live)
+    for name in lost:
+        inside = slice(40, -40)
+        np.testing.assert_allclose(whole[name][inside], truth[name][inside], atol=0.01)
+    assert any("not measured" in one["text"] for one in whole.meta["findings"])

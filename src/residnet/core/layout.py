@@ -104,6 +104,35 @@ def _moves(angle: np.ndarray) -> bool:
 
 _FEW = 50
 """Samples of an angle that tell nothing yet."""
+_SPANS = 50
+"""Spans of a log over which its depth changes as its motion says, or does not."""
+
+
+def _dives(channels: Mapping[str, np.ndarray]) -> bool:
+    """Return whether the depth follows from where the vessel points and moves.
+
+    The waves that lift a boat, the water below it and the drift of a receiver's height do not.
+    """
+    z, theta = np.asarray(channels["z"]), np.asarray(channels["theta"])
+    if {"u", "v"} <= channels.keys():
+        sinking = -channels["u"] * np.sin(theta)
+        sideways = channels["v"] * np.sin(channels["phi"]) * np.cos(theta)
+        down = channels.get("w", np.zeros(z.size)) * np.cos(channels["phi"]) * np.cos(theta)
+        change = sinking + sideways + down
+    else:
+        way = np.hypot(*(np.diff(channels[name], prepend=np.nan) for name in ("x", "y")))
+        change = -way * np.tan(theta)
+    span = max(1, z.size // _SPANS)
+    said = np.cumsum(np.nan_to_num(change))
+    said, seen = said[span:] - said[:-span], z[span:] - z[:-span]
+    known = np.isfinite(seen)
+    if min(float(np.std(said[known])), float(np.std(seen[known]))) == 0.0:
+        return False
+    return float(np.corrcoef(said[known], seen[known])[0, 1]) > _EXPLAINED
+
+
+_EXPLAINED = 0.5
+"""Correlation of the depth's changes with those that the motion makes, of a vessel that dives."""
 
 
 @dataclass(frozen=True)
@@ -126,15 +155,17 @@ class Live:
         """Return the velocities that channels of a log tell; u, v and r where they tell none.
 
         They are measured, or follow from a heading (r), from position and heading (all) or from a
-        roll angle that moves (p, which nothing tells without it). Depth, roll and pitch of which
-        depth and pitch move tell all six.
+        roll angle that moves (p, which nothing tells without it). Heading, depth, roll and pitch
+        tell all six beside u and v or a position, where the depth follows from the motion.
 
         Args:
             channels: by name, [T] each.
         """
         angles = ("phi", "theta", "z")
         held = {name for name in channels if name not in angles or _moves(channels[name])}
-        if held >= {"theta", "z", "psi"} and channels.keys() >= {*SIX.velocities, "phi"}:
+        placed = held >= {"u", "v"} or held >= {"x", "y"}
+        if held >= {"theta", "z", "psi"} and "phi" in channels and placed and _dives(channels):
+            # what turns and sinks the vessel follows from its attitude and depth
             return cls(SIX.velocities)
         held |= set(PLANAR.velocities) if held.issuperset(PLANAR.pose) else set()
         held |= {"r"} if "psi" in held else set()

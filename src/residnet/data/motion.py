@@ -14,7 +14,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Metres, Seconds
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import ALIVE, Live
+from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, POSE, STATE
 from residnet.data.channels import noise_of, spikes, without_held
@@ -91,6 +91,7 @@ def _completed(log: Log, config: MotionConfig, live: Live) -> Log:
     log = _turning(log if live.whole else _still(log, live))
     log = _rolling(log) if live.rolls and not live.spatial else log
     if live.spatial:
+        log = _submerged(log)
         held = [name for name in live.states if name in log.channels and _dense(log[name])]
         if lost := [name for name in live.states if name not in (*STATE, *held)]:
             raise UsageError(
@@ -222,6 +223,43 @@ def _rolling(log: Log) -> Log:
     return log.replace(
         channels={**log.channels, **{n: np.where(near, made[n], np.nan) for n in lacking}},
         units={**log.units, **{n: CHANNEL_UNITS[n] for n in lacking}},
+        meta={**log.meta, "findings": [*log.meta.get("findings", ()), note]},
+    )
+
+
+def _submerged(log: Log) -> Log:
+    """Return a log under water with velocities and rates of turn that were not measured.
+
+    They follow from attitude and depth, and from the position where u or v were not measured.
+    """
+    lacking = [n for n in SIX.velocities if n not in log.channels or not _dense(log[n])]
+    linear = {"u", "v"} & {*lacking}
+    needed = ("z", "phi", "theta", "psi", *(("x", "y") if linear else ()))
+    if not lacking or not all(n in log.channels and _dense(log[n]) for n in needed):
+        return log
+    rate = {name: _turned_by(log, log[name], "")[1] for name in needed}
+    phi, theta = log["phi"], log["theta"]
+    # of the angles of Euler, roll within pitch within heading
+    turned = np.stack((rate["theta"], rate["psi"] * np.cos(theta)))
+    made = {
+        "p": rate["phi"] - rate["psi"] * np.sin(theta),
+        "q": turned[0] * np.cos(phi) + turned[1] * np.sin(phi),
+        "r": turned[1] * np.cos(phi) - turned[0] * np.sin(phi),
+    }
+    if linear:
+        ahead, side = _turned(rate["x"], rate["y"], -log["psi"])
+        down = ahead * np.sin(theta) + rate["z"] * np.cos(theta)
+        made["u"] = ahead * np.cos(theta) - rate["z"] * np.sin(theta)
+        made["v"] = side * np.cos(phi) + down * np.sin(phi)
+        made["w"] = down * np.cos(phi) - side * np.sin(phi)
+    else:
+        sunk = rate["z"] + log["u"] * np.sin(theta) - log["v"] * np.cos(theta) * np.sin(phi)
+        made["w"] = sunk / (np.cos(theta) * np.cos(phi))
+    text = f"{', '.join(lacking)} are not measured and follow from {', '.join(needed)}"
+    note = remark("note", "smoothed_motion", text, channels=len(lacking))
+    return log.replace(
+        channels={**log.channels, **{name: made[name] for name in lacking}},
+        units={**log.units, **{name: CHANNEL_UNITS[name] for name in lacking}},
         meta={**log.meta, "findings": [*log.meta.get("findings", ()), note]},
     )
 

@@ -147,6 +147,11 @@ def drafted(
         signals["velocities"] = list(live.velocities)
         marks.guess(("signals", "velocities"), live.text)
     signals |= {"exogenous": list(chosen.exogenous)} if chosen.exogenous else {}
+    held = {name for log in read.logs.values() for name in log.channels}
+    deep = [name for name in SIX.moving if name in held and name not in ROLL.moving]
+    if deep and not live.spatial:
+        text = f"{', '.join(deep)}: left out: six degrees of freedom need depth, pitch and roll"
+        marks.note(CHANNELS, f"{text} angles, and u and v or a position, in all logs")
     if not chosen.exogenous and all(
         {*WIND_INPUTS} <= {*log.channels} for log in read.logs.values()
     ):

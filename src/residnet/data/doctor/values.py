@@ -48,6 +48,9 @@ def absent(log: Record, found: Check) -> Iterator[Finding]:
     if "p" in log and not live.rolls:
         text = "p of the roll is measured and not modelled: a model that rolls needs the angle phi"
         yield found(text, code="roll")
+    if {"z", "theta"} & {*log} and not live.spatial and {"x", "u"} & {*log}:
+        text = "depth or pitch is measured and not modelled: six degrees of freedom need both, phi,"
+        yield found(f"{text} psi, and u and v or a position", code="depth")
 
 
 # one full circle in rad, and in degrees that were taken for rad
@@ -79,6 +82,8 @@ def upright(log: Log) -> Log:
     live = Live.told(log.channels)
     if not live.spatial:
         return log
+    if not log.channels.keys() >= {*live.moving}:
+        log = complete_motion(log, MotionConfig(), live)
     nu = log.stack(live.moving)
     u, v, r = levelled(nu).T
     p = log["p"] + r * np.sin(log["theta"])

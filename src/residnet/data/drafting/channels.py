@@ -86,13 +86,13 @@ def quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
 
 
 def submerged(columns: Sequence[str], named: Collection[str]) -> dict[str, str]:
-    """Return heave, pitch rate, depth and pitch -> column; none where any of them or a roll lacks.
+    """Return heave, pitch rate, depth and pitch -> column; none without depth, pitch and roll.
 
     Args:
         columns: names.
         named: channels that are known already.
     """
-    if not {"phi", "p"} <= set(named):
+    if "phi" not in named:
         return {}
     texts = {column: words_of(column).text for column in columns}
     found = {
@@ -101,7 +101,7 @@ def submerged(columns: Sequence[str], named: Collection[str]) -> dict[str, str]:
         for column, text in reversed(texts.items())
         if re.fullmatch(pattern, text)
     }
-    return found if len(found) == len(_DEEP) else {}
+    return found if {"z", "theta"} <= found.keys() else {}
 
 
 def levelled(
