@@ -184,9 +184,9 @@ def test_what_logs_tell_and_lack() -> None:
     assert live.channels == ("u", "v", "r", "w", "p", "q", "z", "phi", "theta")
     assert Live.shared([live, live]) == live
     assert Live.shared([live, Live()]).planar
-    held = {name: values for name, values in log.channels.items() if name != "w"}
+    held = {name: values for name, values in log.channels.items() if name != "z"}
     assert not Live.told(held).spatial
-    with pytest.raises(UsageError, match="w is not measured at every sample"):
+    with pytest.raises(UsageError, match="z is not measured at every sample"):
         complete_motion(log.replace(channels=held), MotionConfig(), live)
     with pytest.raises(ResidnetError, match="all six"):
         validate({"inputs": ["n"], "velocities": ["u", "w"]}, SignalsConfig, "here")

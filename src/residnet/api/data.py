@@ -87,7 +87,7 @@ def read_logs(
     if reader is not None and channels is not None:
         raise UsageError("read_logs: give channels or a reader, not both")
     with hearing(progress):
-        files = log_files([file for entry in given for file in _matching(entry)], folders=True)
+        files = log_files([file for entry in given for file in _matching(entry)])
         logs = dict[Path, Log]()
         settings: Any = None if reader is None else part(reader, "reader")
         if channels is not None:

@@ -123,7 +123,7 @@ def drafted(
         DataError: where no log can be used.
     """
     marks = Marks(answer)
-    read = _Read(log_files(paths, folders=True), marks)
+    read = _Read(log_files(paths), marks)
     inputs = driving(list(read.whole.values()), marks)
     if not inputs:
         held = ", ".join(next(iter(read.whole.values())).channels)
@@ -147,8 +147,8 @@ def drafted(
         signals["velocities"] = list(live.velocities)
         marks.guess(("signals", "velocities"), live.text)
     signals |= {"exogenous": list(chosen.exogenous)} if chosen.exogenous else {}
-    held = {name for log in read.logs.values() for name in log.channels}
-    deep = [name for name in SIX.moving if name in held and name not in ROLL.moving]
+    measured = {name for log in read.logs.values() for name in log.channels}
+    deep = [name for name in SIX.moving if name in measured and name not in ROLL.moving]
     if deep and not live.spatial:
         text = f"{', '.join(deep)}: left out: six degrees of freedom need depth, pitch and roll"
         marks.note(CHANNELS, f"{text} angles, and u and v or a position, in all logs")

@@ -310,9 +310,6 @@ def evaluate_on(
     return config.conduct(folder, made_from, judge)
 
 
-_PLAIN_TABLES = ("csv", "parquet", "canonical")
-
-
 def external_logs(
     config: FitConfig, paths: Sequence[Path]
 ) -> tuple[list[Path], list[Log], list[Prepared]]:
@@ -326,7 +323,7 @@ def external_logs(
     data = config.data
     own = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
     # a folder may be one log, as a ROS 2 bag is, or hold sheets and lines of JSON
-    files = own.build().logs_among(log_files(paths, own.kind not in _PLAIN_TABLES))
+    files = own.build().logs_among(log_files(paths))
     readers = {path: (CanonicalConfig() if Log.recognises(path) else own).build() for path in files}
     read = [readers[path].read(path).replace(name=name) for path, name in log_names(files).items()]
     signals = config.signals

@@ -26,7 +26,6 @@ from residnet.data.doctor import (
 )
 from residnet.data.drafting.questions import commented
 from residnet.data.drafting.reading import log_files, read_each
-from residnet.data.readers.compose import RecordingConfig
 from residnet.data.split import log_names
 
 if TYPE_CHECKING:
@@ -78,7 +77,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
     task, fit = (None, None) if config is None else _logs_task(config)
     inputs, masks = (fit.signals.columns, fit.prepare.masks) if fit is not None else (None, ())
     own = None if task is None else getattr(task, "reader", None) or task.data.reader
-    files = log_files(paths, own is None or isinstance(own, RecordingConfig))
+    files = log_files(paths)
     read, maps = dict[Path, Log | ResidnetError](), list[str]()
     if own is None:
         for draft in read_each(files):

@@ -190,7 +190,7 @@ def _logs(paths: Sequence[Path]) -> tuple[list[Log], str]:
         splits = config.logs()
         logs = [*splits["train"], *splits["validation"]]
         return logs, f"the logs of run {paths[0]}"
-    read = read_drafted(log_files(list(paths), folders=True), Marks(None))
+    read = read_drafted(log_files(list(paths)), Marks(None))
     logs = list(read.logs.values())
     if not logs:
         raise DataError(f"{paths[0]}: no log can be used")

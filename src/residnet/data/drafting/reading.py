@@ -39,13 +39,14 @@ INPUTS = ("signals", "inputs")
 _TABLES = (".csv", ".parquet")
 
 
-def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
+def log_files(paths: Sequence[Path]) -> list[Path]:
     """Return the files, and the logs below folders, in order; each once.
+
+    A folder may itself be a log, as a ROS 2 bag is, and where a folder holds neither such nor
+    tables, logs of any other format are taken.
 
     Args:
         paths: files and folders.
-        folders: a folder may itself be a log, as a ROS 2 bag is, and where a folder holds neither
-            such nor tables, logs of any other format are taken.
 
     Raises:
         UsageError: where a path does not exist or a folder holds no log.
@@ -53,14 +54,11 @@ def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            below = logs_below(path) if folders else sorted(path.rglob("*"))
+            below = logs_below(path)
             # notes and settings often lie beside tables
-            found = [p for p in below if (folders and p.is_dir()) or p.suffix in _TABLES]
-            if not found and folders:
-                found = below
+            found = [p for p in below if p.is_dir() or p.suffix in _TABLES] or below
             if not found:
-                what = "log of a format that is known" if folders else "csv or Parquet file"
-                raise UsageError(f"{path}: holds no {what}{others_in(path)}")
+                raise UsageError(f"{path}: holds no log of a format that is known{others_in(path)}")
             files += found
         elif path.is_file():
             files.append(path)
