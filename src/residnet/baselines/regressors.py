@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, final
 
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor, nn
+from torch import Tensor
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres
 from residnet.baselines.sets import Roles, SetName, expand, merged
@@ -134,10 +134,12 @@ class RegressorBaseline(ParametricBaseline):
     def sensitivity(self, z: Tensor) -> Tensor:
         """Return d nu_dot / d theta [B, n, P]: a coefficient moves its own axis by its term."""
         free = self.free_indices()
-        axis, column = free // self.library.count, free % self.library.count
-        own = nn.functional.one_hot(axis, self.dof).T.to(z.dtype)
-        seen = z if self.bound is None else self.bound.held(z)
-        out: Tensor = self.library(seen).index_select(1, column).unsqueeze(1) * own
+        phi = self.library(z if self.bound is None else self.bound.held(z))
+        out, begin = z.new_zeros(len(z), self.dof, len(free)), 0
+        for axis in range(self.dof):
+            own = free[free // self.library.count == axis] % self.library.count
+            out[:, axis, begin : begin + len(own)] = phi[:, own]
+            begin += len(own)
         return out
 
     def along(self, z: Tensor, ahead: Tensor) -> Tensor:

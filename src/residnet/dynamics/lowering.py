@@ -14,10 +14,12 @@ from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import casadi as ca
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.fx import GraphModule, Node
 from torch.utils import _pytree as tree
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from residnet.core.errors import ExportError
 
@@ -365,25 +367,84 @@ def recorded(step: Callable[..., Any], examples: Sequence[Tensor], what: str) ->
     Raises:
         ExportError: where Python decides by values.
     """
-    from torch._decomp import core_aten_decompositions
     from torch.func import functionalize
-    from torch.fx.experimental.proxy_tensor import make_fx
 
-    # make_fx counts the parameters of what it records
     wrapped = functionalize(lambda *given: step(*given), remove="mutations")
     try:
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")
-            table: Any = core_aten_decompositions()
-            # else it would be recorded as an alias, as much else is
-            table.pop(torch.ops.aten.detach.default, None)
-            return make_fx(wrapped, decomposition_table=table)(*examples)
+            return _Recorder().graph_of(wrapped, examples)
     except (RuntimeError, TypeError, ValueError, NotImplementedError) as error:
         first = str(error).strip().splitlines()
         raise ExportError(
             f"{what}: its step cannot be recorded as a fixed sequence of operations"
             f" ({first[0] if first else type(error).__name__}); export it as torchscript"
         ) from error
+
+
+class _Recorder(TorchDispatchMode):
+    """Writes down the core operations that are carried out within it.
+
+    `make_fx` of torch does so too, and imports torch's compiler, which takes 2 s.
+    """
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Return whether torch's compiler is told to leave this alone, and imported for that."""
+        return False
+
+    def __init__(self) -> None:
+        super().__init__()
+        from torch._decomp import core_aten_decompositions
+
+        self._rules: Any = core_aten_decompositions()
+        # else it would be recorded as an alias, as much else is
+        self._rules.pop(torch.ops.aten.detach.default, None)
+        self._graph, self._owner = torch.fx.Graph(), nn.Module()
+        # numbers are kept, so that none is taken for another that had its place in memory
+        self._nodes: dict[int, tuple[Node, Tensor]] = {}
+
+    def graph_of(self, step: Callable[..., Any], examples: Sequence[Tensor]) -> GraphModule:
+        """Return the graph of a step."""
+        for k, example in enumerate(examples):
+            self._nodes[id(example)] = self._graph.placeholder(f"given_{k}"), example
+        with self:
+            found = step(*examples)
+        self._graph.output(tree.tree_map(self._node, found))
+        self._graph.eliminate_dead_code()
+        return GraphModule(self._owner, self._graph)
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        given = kwargs or {}
+        if func is torch.ops.aten._local_scalar_dense.default and id(args[0]) in self._nodes:
+            raise RuntimeError("a number is taken out of a tensor")
+        if func in self._rules:
+            with self:
+                found = self._rules[func](*args, **given)
+            if found is not NotImplemented:
+                return found
+        found = func(*args, **given)
+        called = tree.tree_map(self._node, (args, given))
+        self._told(self._graph.call_function(func, *called), found)
+        return found
+
+    def _told(self, node: Node, found: Any) -> None:
+        """Remember what a node has made."""
+        if isinstance(found, Tensor):
+            self._nodes[id(found)] = node, found
+        elif isinstance(found, list | tuple):
+            for k, part in enumerate(found):
+                self._told(self._graph.call_function(operator.getitem, (node, k)), part)
+
+    def _node(self, value: Any) -> Any:
+        """Return the node of a tensor, anything else as it is."""
+        if not isinstance(value, Tensor):
+            return value
+        if id(value) not in self._nodes:
+            name = f"constant_{len(self._nodes)}"
+            self._owner.register_buffer(name, value)
+            self._nodes[id(value)] = self._graph.get_attr(name), value
+        return self._nodes[id(value)][0]
 
 
 @dataclass
@@ -432,7 +493,7 @@ def _each(op: str, example: Tensor, *given: Any) -> _Value:
     """Return an operation on each element of values that are brought to one shape."""
     columns = []
     for value in map(_value, given):
-        places = value.places.expand(torch.broadcast_shapes(value.example.shape, example.shape))
+        places = value.places.expand(np.broadcast_shapes(value.example.shape, example.shape))
         alone = value.example.numel() == 1
         columns.append(value.column if alone else _taken(value.column, places))
     out = _ELEMENTWISE[op](*columns)

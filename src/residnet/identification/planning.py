@@ -27,7 +27,7 @@ from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
 from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne
 from residnet.physics.signals import SignalsConfig
 from residnet.training.left_out import LeftOpen
-from residnet.training.refit import RefitConfig, step_sensitivities
+from residnet.training.refit import RefitConfig, sensitivities
 
 
 @torch.no_grad()
@@ -57,11 +57,9 @@ def moments(
     number = torch.tensor([run for run, _ in places])
     x = torch.stack([runs[run][0][start : start + horizon] for run, start in places])
     w = torch.stack([runs[run][1][start : start + horizon] for run, start in places])
-    s = torch.zeros(len(places), 1 + model.dof, size, dtype=scales.dtype)
-    for k in range(horizon):
-        s = step_sensitivities(model, baseline, x[:, k], model.signals.prepare(w[:, k]), s)
-        seen = s[:, 1:] / scales[:, None]
-        out.index_add_(0, number, seen.transpose(1, 2) @ seen)
+    for _, s in sensitivities(model, baseline, x, w):
+        for seen in s[:, :, 1:] / scales[:, None]:
+            out.index_add_(0, number, seen.transpose(1, 2) @ seen)
     return out
 
 

@@ -62,8 +62,8 @@ def left_open(
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
     problem = problem_of(model, baseline, samples, store, config, scales).at_rest(still)
-    level, squares = level_of(model, problem)
-    hessian, _ = normal_equations(model, problem, baseline, level, squares)
+    level, states = level_of(model, problem)
+    hessian, _ = normal_equations(model, problem, baseline, level, states)
     covariance = problem.share(level) * problem.inverse(hessian)
     return LeftOpen(covariance, float(level.square() - config.robust**2))
 
@@ -99,14 +99,14 @@ def without_logs(
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
     problem = problem_of(model, baseline, samples, store, config, scales).at_rest(still)
-    level, squares = level_of(model, problem)
+    level, states = level_of(model, problem)
     fitted = baseline.theta.detach().clone()
     parameters = fitted.flatten()[problem.active]
     of_window = fold[problem.log]
     folds = int(fold.max()) + 1
     count = torch.bincount(of_window, minlength=folds).to(parameters.dtype)
     parts = [
-        _part(model, _rows(problem, of_window == k), squares[of_window == k], level)
+        _part(model, _rows(problem, of_window == k), states[of_window == k], level)
         for k in range(folds)
     ]
     # at the minimum all logs together pull as hard as the prior holds
@@ -165,12 +165,12 @@ def _rows(problem: Problem, chosen: Tensor) -> Problem:
 
 
 def _part(
-    model: HybridDynamics, part: Problem, squares: Tensor, level: Tensor
+    model: HybridDynamics, part: Problem, states: Tensor, level: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return Hessian [P, P] and half the gradient [P] of the mean cost of some windows alone."""
     size = int(part.active.numel())
     if len(part.x0) == 0:
-        return torch.zeros(size, size, dtype=squares.dtype), torch.zeros(size, dtype=squares.dtype)
+        return torch.zeros(size, size, dtype=states.dtype), torch.zeros(size, dtype=states.dtype)
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
     theta = baseline.theta.detach().flatten()[part.active]
@@ -181,4 +181,4 @@ def _part(
         belief=torch.zeros_like(part.belief),
         start=theta,
     )
-    return normal_equations(model, nothing, baseline, level, squares)
+    return normal_equations(model, nothing, baseline, level, states)

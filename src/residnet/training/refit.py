@@ -10,7 +10,7 @@ a baseline that holds beliefs about its parameters adds them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -32,7 +32,9 @@ from residnet.core.frames import cross
 from residnet.core.layout import ATTITUDE, HEADING, SIX, YAW_RATE
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
+from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
 from residnet.regression.least_squares import Descent, descend
 
 # sensitivities have a row for the heading and one for each of what moves
@@ -47,7 +49,7 @@ def step_sensitivities(
     p: Tensor,
     s: Tensor,
 ) -> Tensor:
-    """Return the sensitivities of heading and what moves one step later, [B, 1 + n, P].
+    """Return the sensitivities of heading and what moves one step later, [B, 1 + n, Q].
 
     They are the exact derivative of `Dynamics.integrate` with the residual at zero, whatever the
     integrator.
@@ -57,10 +59,12 @@ def step_sensitivities(
         baseline: its baseline.
         x: states at the step's start [B, 3 + n].
         p: prepared inputs, held over the step [B, k].
-        s: sensitivities at the step's start [B, 1 + n, P].
+        s: sensitivities at the step's start [B, 1 + n, Q], those to the P free parameters last;
+            those before them are to what the step itself does not depend on.
     """
     if model.spatial:
         return _spatial_sensitivities(model, baseline, x, p, s)
+    count = int(baseline.free_indices().numel())
     stage_x, stage_s = x, s
     after, stage_rate = s, s
     for node, weight in zip(model.nodes, model.weights, strict=True):
@@ -70,7 +74,8 @@ def step_sensitivities(
             stage_x = x + node * model.dt * model.rate(stage_x, p, residual)
         z = model.signals(stage_x, p)
         slopes = baseline.along(z, model.signals.slopes(stage_x, p)).permute(1, 2, 0)
-        nu_dot = torch.baddbmm(baseline.sensitivity(z), slopes, stage_s)
+        nu_dot = slopes @ stage_s
+        nu_dot[..., -count:] += baseline.sensitivity(z)
         if model.rolls:
             nu_dot = nu_dot * model.live[:, None] + model.known_rates.T @ stage_s[:, 1:]
         stage_rate = torch.cat((_turned(model, stage_x, stage_s), nu_dot), dim=1)
@@ -89,6 +94,38 @@ def step_sensitivities(
     return after
 
 
+_AT_ONCE = 1_024
+"""Rows whose steps are differentiated at once: enough for torch, and few enough for a cache."""
+
+
+def sensitivities(
+    model: HybridDynamics, baseline: ParametricBaseline, x: Tensor, w: Tensor
+) -> Iterator[tuple[slice, Tensor]]:
+    """Yield sensitivities of free runs after some steps, and which: [K, B, 1 + n, P].
+
+    What a step does to them does not depend on them, and is found for many steps at once.
+
+    Args:
+        model: that ran.
+        baseline: its baseline.
+        x: states at the start of each step [B, T, 3 + n].
+        w: inputs of the steps [B, T, m].
+    """
+    batch, total = w.shape[:2]
+    count, own = int(baseline.free_indices().numel()), 1 + model.dof
+    s, start = x.new_zeros(batch, own, count), torch.eye(own, own + count, dtype=x.dtype)
+    length = max(_AT_ONCE // max(batch, 1), 1)
+    for begin in range(0, total, length):
+        steps, found = slice(begin, min(begin + length, total)), []
+        rows = [part[:, steps].transpose(0, 1).flatten(0, 1) for part in (x, w)]
+        p = model.signals.prepare(rows[1])
+        each = step_sensitivities(model, baseline, rows[0], p, start.expand(len(p), -1, -1))
+        for one in each.unflatten(0, (-1, batch)):
+            s = torch.baddbmm(one[..., own:], one[..., :own], s)
+            found.append(s)
+        yield steps, torch.stack(found)
+
+
 # of the rows of sensitivities in six degrees of freedom: those of an attitude, and what turns it
 _ANGLES = [column - HEADING for column in ATTITUDE]
 _U, _V, _R, _W, _P, _Q, _Z = (SIX.names.index(name) - HEADING for name in "uvrwpqz")
@@ -99,6 +136,7 @@ def _spatial_sensitivities(
 ) -> Tensor:
     """Return `step_sensitivities` where rotations are composed: those of the angles themselves."""
     residual = zero_acceleration(x, model.dof)
+    count = int(baseline.free_indices().numel())
     stage_x, stage_s, rate, slope = x, s, x, s
     change, moved = torch.zeros_like(x), torch.zeros_like(s)
     total, sensed = torch.zeros_like(x), torch.zeros_like(s)
@@ -109,7 +147,9 @@ def _spatial_sensitivities(
             stage_s = _composed(x, change, stage_x, s, moved)
         z = model.signals(stage_x, p)
         ahead = baseline.along(z, model.signals.slopes(stage_x, p)).permute(1, 2, 0)
-        nu_dot = torch.baddbmm(baseline.sensitivity(z), ahead, stage_s) * model.live[:, None]
+        nu_dot = ahead @ stage_s
+        nu_dot[..., -count:] += baseline.sensitivity(z)
+        nu_dot = nu_dot * model.live[:, None]
         slope = _known_slopes(stage_x, stage_s, torch.cat((torch.zeros_like(s[:, :1]), nu_dot), 1))
         rate = model.rate(stage_x, p, residual)
         if node > 0.0:
@@ -239,6 +279,11 @@ class Problem:
         return replace(
             self, w=self.w[:, :steps], nu=self.nu[:, :steps], weight=self.weight[:, :steps]
         )
+
+    def squares(self, states: Tensor) -> Tensor:
+        """Return the mean square error in scales [B] of free runs of some steps [B, T+1, 3+n]."""
+        error = (velocities_on(states[:, 1:]) - self.nu) * self.weight
+        return error.square().mean((1, 2))
 
     def share(self, level: Tensor) -> Tensor:
         """Return half of what one unit of minus the logarithm of a probability costs.
@@ -508,11 +553,11 @@ def _values(baseline: ParametricBaseline, problem: Problem) -> Tensor:
 
 
 class _Reached(NamedTuple):
-    """Free parameters [P], and the level and the windows' errors [B] of free runs with them."""
+    """Free parameters [P], and level and states [B, T + 1, 3 + n] of free runs with them."""
 
     values: Tensor
     level: Tensor
-    squares: Tensor
+    states: Tensor
 
 
 def _minimised(
@@ -526,7 +571,7 @@ def _minimised(
 
     def near(point: _Reached) -> tuple[float, Callable[[float], tuple[float, _Reached]]]:
         place(baseline, point.values, problem.active)
-        hessian, gradient = normal_equations(model, problem, baseline, point.level, point.squares)
+        hessian, gradient = normal_equations(model, problem, baseline, *point[1:])
         share = problem.share(point.level)
 
         def trial(damping: float) -> tuple[float, _Reached]:
@@ -550,28 +595,24 @@ def place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
         baseline.theta.copy_(flat.reshape(baseline.theta.shape))
 
 
-def _of_velocities(model: HybridDynamics) -> HybridDynamics:
-    """Return the same model without positions: the cost is that of velocities."""
-    moving = HybridDynamics(model.signals, model.baseline, model.head, model.dt, model.integrator)
-    moving.positions = False
-    return moving
-
-
 def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
     """The step of the rollout, without a residual."""
     return model.advanced(x, model.signals(x, p), p, zero_acceleration(x, model.dof))
 
 
+_SEARCHED = 10
+"""Times that the free runs of a problem are flown, about."""
+
+
 @torch.no_grad()
 def level_of(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:
-    """Return the mean error of the windows in scales, and the mean square error of each [B]."""
-    x, total, moving = problem.x0, [], _of_velocities(model)
-    for k in range(problem.w.shape[1]):
-        x = _ahead(moving, x, model.signals.prepare(problem.w[:, k]))
-        total.append(velocities_on(x))
-    error = (torch.stack(total, dim=1) - problem.nu) * problem.weight
-    squares = error.square().mean((1, 2))
-    return torch.sqrt(squares + problem.robust**2).mean(), squares
+    """Return the mean error of the windows in scales, and their free runs [B, T + 1, 3 + n]."""
+    # the cost is that of velocities
+    moving = HybridDynamics(model.signals, model.baseline, model.head, model.dt, model.integrator)
+    moving.positions = False
+    run = compiled(Rollout(moving), _SEARCHED * problem.w.shape[1])
+    states, _, _ = run(problem.x0, problem.w, problem.x0[:, :0])
+    return torch.sqrt(problem.squares(states) + problem.robust**2).mean(), states
 
 
 @torch.no_grad()
@@ -580,31 +621,25 @@ def normal_equations(
     problem: Problem,
     baseline: ParametricBaseline,
     level: Tensor,
-    squares: Tensor,
+    states: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return the Gauss-Newton Hessian [P, P] and half the gradient [P] of the robust cost.
 
-    The windows' weights follow from their errors
-    `squares` [B], which the search for this point has computed; so one matrix product a step sums
-    over all windows.
+    The windows' weights follow from their errors in the free runs `states` [B, T + 1, 3 + n], which
+    the search for this point has flown; so one matrix product sums over all windows and some steps.
     """
     batch, steps = problem.w.shape[:2]
-    count, moving = int(problem.active.numel()), _of_velocities(model)
-    x = problem.x0
-    sensitivity = torch.zeros(batch, 1 + model.dof, count, dtype=x.dtype)
-    hessian = torch.zeros(count, count, dtype=x.dtype)
-    gradient = torch.zeros(count, dtype=x.dtype)
-    window = 0.5 / torch.sqrt(squares + problem.robust**2) / (model.dof * steps * batch)
-    root = window.sqrt()[:, None, None] * problem.weight
-    for k in range(steps):
-        p = model.signals.prepare(problem.w[:, k])
-        sensitivity = step_sensitivities(moving, baseline, x, p, sensitivity)
-        x = _ahead(moving, x, p)
-        error = (velocities_on(x) - problem.nu[:, k]) * root[:, k]
-        seen = sensitivity[:, 1:] * root[:, k].unsqueeze(-1)
-        flat = seen.reshape(-1, count)
+    count = int(problem.active.numel())
+    hessian = torch.zeros(count, count, dtype=states.dtype)
+    gradient = torch.zeros(count, dtype=states.dtype)
+    size = torch.sqrt(problem.squares(states) + problem.robust**2)
+    window = 0.5 / size / (model.dof * steps * batch)
+    root = (window.sqrt()[:, None, None] * problem.weight).transpose(0, 1)
+    error = (velocities_on(states[:, 1:]) - problem.nu).transpose(0, 1) * root
+    for part, found in sensitivities(model, baseline, states[:, :-1], problem.w):
+        flat = (found[:, :, 1:] * root[part].unsqueeze(-1)).flatten(0, 2)
         hessian.addmm_(flat.T, flat)
-        gradient.addmv_(flat.T, error.reshape(-1))
+        gradient.addmv_(flat.T, error[part].flatten())
     theta = baseline.theta.flatten()[problem.active]
     belief = problem.share(level) * problem.belief
     prior = (
