@@ -216,19 +216,20 @@ def high(values: np.ndarray, share: float = 0.95) -> float:
 
 def reversals(heading: np.ndarray, swing: float) -> int:
     """Return how often a heading [T] rad turns round after having gone `swing` rad one way."""
-
-    def turns(side: np.ndarray) -> bool:
-        """Whether a heading comes down by a swing somewhere after it rose by one."""
-        rose = side - np.minimum.accumulate(side)
-        falls = side - np.minimum.accumulate(side[::-1])[::-1]
-        return bool((np.minimum(rose, falls) >= swing).any())
-
-    if not (turns(heading) or turns(-heading)):
-        # importing scipy.signal takes longer than most of what the doctor does
+    fall, rise = np.maximum.accumulate(heading) - heading, heading - np.minimum.accumulate(heading)
+    if min(fall.max(), rise.max()) < swing:
         return 0
-    from scipy.signal import find_peaks
-
-    return sum(find_peaks(side, prominence=swing)[0].size for side in (heading, -heading))
+    # where it goes the same way on, nothing turns
+    change = np.diff(heading, prepend=heading[0], append=heading[-1])
+    way = np.sign(change)
+    count, going, low, high = 0, 0, float(heading[0]), float(heading[0])
+    for here in heading[way[1:] * way[:-1] <= 0.0].tolist():
+        if going >= 0 and high - here >= swing:
+            count, going, low = count + going, -1, here
+        elif going <= 0 and here - low >= swing:
+            count, going, high = count - going, 1, here
+        low, high = min(low, here), max(high, here)
+    return count
 
 
 def resolution_of(values: np.ndarray) -> float:
