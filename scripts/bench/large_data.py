@@ -2,6 +2,8 @@
 
     python scripts/bench/large_data.py [--samples 1000000 10000000] [--logs 1000] [--folder DIR]
         [--in-memory]
+    python scripts/bench/large_data.py --inspected 250 1000 4000
+    python scripts/bench/large_data.py --rows 1000000
 
 The logs (10 Hz, twin propellers, random steps of both, sensor noise) are written as canonical
 Parquet files; four logs of 10,000 samples for validation and test stand beside them. Each head is
@@ -9,6 +11,10 @@ fitted by a run of its own, in a process of its own: PLSR, ridge, and an MLP for
 training. Printed are the largest resident memory of the process (VmHWM), its time from start to
 end, and the samples a second, each for every number of samples. With --in-memory each fit is made
 a second time with all arrays in memory, as those of few samples are, and the rates are compared.
+
+With --inspected so many logs of 600 rows are written as csv and looked at together by `residnet
+inspect`; with --rows a csv of so many rows by `inspect` and by `new`. Printed are processor time,
+start-up included, and the largest resident memory.
 """
 
 from __future__ import annotations
@@ -16,6 +22,7 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import resource
 import subprocess
 import sys
 import tempfile
@@ -23,6 +30,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 import yaml
 
@@ -146,15 +154,50 @@ def carried_out(file: Path, out: Path, in_memory: bool = False) -> tuple[float, 
     """
     started = time.perf_counter()
     module = ["-c", _IN_MEMORY] if in_memory else ["-m", "residnet"]
-    argument = [sys.executable, *module, "run", str(file), "--out", str(out), "--workers", "1"]
-    said = out.with_suffix(".log")
+    argument = [*module, "run", str(file), "--out", str(out), "--workers", "1"]
+    usage = _called(argument, out.with_suffix(".log"))
+    return time.perf_counter() - started, usage.ru_maxrss * 1024.0
+
+
+def _called(argument: list[str], said: Path, most: int = 0) -> resource.struct_rusage:
+    """Run Python with arguments, and return what it used; what it says goes to a file.
+
+    Raises:
+        RuntimeError: where it ends with a code above `most`, with the end of what it said.
+    """
     with said.open("w") as stream:
-        process = subprocess.Popen(argument, stdout=stream, stderr=subprocess.STDOUT)
+        call = [sys.executable, *argument]
+        process = subprocess.Popen(call, stdout=stream, stderr=subprocess.STDOUT)
         _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode != 0:
+    if not 0 <= process.returncode <= most:
         raise RuntimeError("\n".join(said.read_text().splitlines()[-12:]))
-    return time.perf_counter() - started, usage.ru_maxrss * 1024.0
+    return usage
+
+
+def write_csv(folder: Path, logs: list[Log]) -> None:
+    """Write logs as tables whose columns have units."""
+    folder.mkdir(parents=True)
+    for log in logs:
+        columns = {f"{name} [{unit}]": log[name] for name, unit in log.units.items()}
+        table = pd.DataFrame({"t [s]": log.t, **columns})
+        table.to_csv(folder / f"{log.name}.csv", index=False, float_format="%.6g")
+
+
+def looked_at(folder: Path, commands: tuple[str, ...], count: int, what: str) -> None:
+    """Print what commands need for a folder of tables."""
+    for command in commands:
+        further = ["--defaults", "--out", str(folder / "drafted.yaml")] if command == "new" else []
+        argument = ["-m", "residnet", command, str(folder), "--quiet", *further]
+        # a fault that is found is no failure
+        usage = _called(argument, folder.with_suffix(".log"), most=1)
+        seconds, peak = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024.0
+        each = f"{1e3 * seconds / count:.1f} ms a log, " if what == "logs" else ""
+        print(
+            f"{command} on {count} {what}: {seconds:.1f} s of processor time, {each}"
+            f"{peak / 1e6:.0f} MB",
+            flush=True,
+        )
 
 
 def main() -> int:
@@ -165,8 +208,19 @@ def main() -> int:
     parser.add_argument("--heads", nargs="+", default=list(HEADS), choices=list(HEADS))
     parser.add_argument("--in-memory", action="store_true", help="compare with arrays in memory")
     parser.add_argument("--folder", type=Path, help="keeps the logs; a temporary one otherwise")
+    parser.add_argument("--inspected", type=int, nargs="+", default=[], help="logs of 600 rows")
+    parser.add_argument("--rows", type=int, nargs="+", default=[], help="of one table")
     given = parser.parse_args()
     print(f"residnet {residnet.__version__}, torch {torch.__version__}, {platform.machine()}")
+    with tempfile.TemporaryDirectory() as name:
+        for count in given.inspected:
+            write_csv(Path(name) / f"logs_{count}", simulate(count, 600, 5))
+            looked_at(Path(name) / f"logs_{count}", ("inspect",), count, "logs")
+        for rows in given.rows:
+            write_csv(Path(name) / f"rows_{rows}", simulate(1, rows, 6))
+            looked_at(Path(name) / f"rows_{rows}", ("inspect", "new"), rows, "rows")
+    if given.inspected or given.rows:
+        return 0
     print(f"{'samples':>11}{'head':>8}{'peak GB':>9}{'seconds':>9}{'samples/s':>11}")
     for samples in given.samples:
         with tempfile.TemporaryDirectory() as name:
