@@ -1,6 +1,7 @@
 """How many planted faults the data doctor finds, and what it says about clean logs.
 
     python scripts/bench/doctor.py [--vessels N] [--seed S] [--shipped SEEDS] [FAULT...]
+    python scripts/bench/doctor.py --long ROWS [--seed S] [FAULT...]
 
 The hosts are vessels drawn at random, measured logs where RESIDNET_DATA names them, and with
 --shipped the shipped vessels. For each fault and kind of host: logs in which a finding above a note
@@ -11,6 +12,7 @@ names it. Then the clean logs that have a finding above a note. Limits were tune
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -22,12 +24,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
 
+from large_data import simulate
 from planted import FAULTS, SHIPS, Fault, Ship, Undecidable, clean
 from random_vessels import KINDS, random_logs, ship_of
 
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
-from residnet.data.doctor import Finding, inspect, inspect_together
+from residnet.data.doctor import Finding, inspect, inspect_together, statistics
 from residnet.data.masks import Mask
 
 _CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -119,6 +122,40 @@ def _named(fault: Fault, host: Host, logs: list[Log], verbose: bool) -> bool:
     return named
 
 
+def loud(log: Log, longest: float) -> set[str]:
+    """Return the codes above a note where logs of more than `longest` samples are told by a part.
+
+    An unreadable log has none but `unreadable`.
+    """
+    statistics._LONG = longest
+    try:
+        return {f.code for f in inspect(log).findings if f.level != "note"}
+    except ResidnetError:
+        return {"unreadable"}
+
+
+def long_logs(rows: int, seed: int, faults: Sequence[Fault]) -> None:
+    """Print of each fault in a long log what either look alone finds."""
+    usual, alike, count = statistics._LONG, 0, 0
+    ship = next(one for one in SHIPS if one.name == "wam_v")
+    host = simulate(1, rows, seed)[0]
+    for number, fault in enumerate([None, *faults]):
+        if fault is not None and ship.name not in fault.ships and "twin" not in fault.hosts:
+            continue
+        random = np.random.default_rng([seed, number])
+        try:
+            log = host if fault is None else fault.plant(ship, [host], random)[0]
+        except (Undecidable, KeyError):
+            # the boat has no such channel
+            continue
+        few, whole = loud(log, usual), loud(log, math.inf)
+        alike, count = alike + (few == whole), count + 1
+        told = f"by stretches alone {sorted(few - whole)}, by all rows {sorted(whole - few)}"
+        said = "alike" if few == whole else told
+        print(f"{'none' if fault is None else fault.name}: {said}; {sorted(whole)}", flush=True)
+    print(f"both looks say the same of {alike} of {count} logs of {rows} rows")
+
+
 def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -126,9 +163,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--shipped", type=int, default=0, help="seeds of the shipped vessels")
     parser.add_argument("--measured", type=int, default=4, help="sets of three measured logs")
+    parser.add_argument("--long", type=int, help="rows of long logs")
     parser.add_argument("--verbose", action="store_true")
     parser.add_argument("faults", nargs="*")
     given = parser.parse_args()
+    if given.long:
+        chosen = [f for f in FAULTS if not given.faults or f.name in given.faults]
+        long_logs(given.long, given.seed, chosen)
+        return
     hosts = [
         *simulated(given.seed, given.vessels),
         *shipped(given.shipped),

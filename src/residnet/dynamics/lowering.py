@@ -394,7 +394,7 @@ class _Recorder(TorchDispatchMode):
         return False
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         from torch._decomp import core_aten_decompositions
 
         self._rules: Any = core_aten_decompositions()
@@ -403,11 +403,13 @@ class _Recorder(TorchDispatchMode):
         self._graph, self._owner = torch.fx.Graph(), nn.Module()
         # numbers are kept, so that none is taken for another that had its place in memory
         self._nodes: dict[int, tuple[Node, Tensor]] = {}
+        self._varying: set[Node] = set()
 
     def graph_of(self, step: Callable[..., Any], examples: Sequence[Tensor]) -> GraphModule:
         """Return the graph of a step."""
         for k, example in enumerate(examples):
             self._nodes[id(example)] = self._graph.placeholder(f"given_{k}"), example
+        self._varying.update(node for node, _ in self._nodes.values())
         with self:
             found = step(*examples)
         self._graph.output(tree.tree_map(self._node, found))
@@ -416,16 +418,19 @@ class _Recorder(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         given = kwargs or {}
-        if func is torch.ops.aten._local_scalar_dense.default and id(args[0]) in self._nodes:
-            raise RuntimeError("a number is taken out of a tensor")
-        if func in self._rules:
+        rules = [func.decompose, *([self._rules[func]] if func in self._rules else [])]
+        for rule in reversed(rules):
             with self:
-                found = self._rules[func](*args, **given)
+                found = rule(*args, **given)
             if found is not NotImplemented:
                 return found
+        node = self._graph.call_function(func, *tree.tree_map(self._node, (args, given)))
+        if not self._varying.isdisjoint(node.all_input_nodes):
+            self._varying.add(node)
+            if torch.Tag.data_dependent_output in func.tags:
+                raise RuntimeError(f"{_name(func)} takes a number out of what varies")
         found = func(*args, **given)
-        called = tree.tree_map(self._node, (args, given))
-        self._told(self._graph.call_function(func, *called), found)
+        self._told(node, found)
         return found
 
     def _told(self, node: Node, found: Any) -> None:
@@ -434,7 +439,9 @@ class _Recorder(TorchDispatchMode):
             self._nodes[id(found)] = node, found
         elif isinstance(found, list | tuple):
             for k, part in enumerate(found):
-                self._told(self._graph.call_function(operator.getitem, (node, k)), part)
+                member = self._graph.call_function(operator.getitem, (node, k))
+                self._varying |= {member} if node in self._varying else set()
+                self._told(member, part)
 
     def _node(self, value: Any) -> Any:
         """Return the node of a tensor, anything else as it is."""

@@ -343,10 +343,15 @@ class Blocks:
         """Return values [T] at the samples of each block [K, size + 1], `shift` samples early."""
         return np.asarray(values[self.first[:, None] + np.arange(-shift, self.size + 1 - shift)])
 
+    @cached_property
+    def half(self) -> np.ndarray:
+        """Half of each time between the samples of the blocks [K, size]."""
+        return np.asarray(0.5 * np.diff(self.sampled(self.t), axis=1))
+
     def summed(self, columns: Sequence[np.ndarray]) -> np.ndarray:
         """Return the integrals [K, k] of columns that were sampled, each [K, size + 1]."""
-        half = 0.5 * np.diff(self.sampled(self.t), axis=1)
-        return np.stack([((c[:, 1:] + c[:, :-1]) * half).sum(axis=1) for c in columns], axis=-1)
+        parts = [((c[:, 1:] + c[:, :-1]) * self.half).sum(axis=1) for c in columns]
+        return np.stack(parts, axis=-1)
 
 
 def blocks_of(log: Record, *moving: str) -> Blocks:

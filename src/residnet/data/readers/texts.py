@@ -390,7 +390,8 @@ def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str])
     rows: list[tuple[int, list[str]]] = []
 
     def holding() -> list[int]:
-        return [i for i, (_, row) in enumerate(rows) if wanted <= {*row, *numbered(row)}][:1]
+        own = (i for i, (_, row) in enumerate(rows) if wanted <= {*row, *numbered(row)})
+        return [*islice(own, 1)]
 
     with file.open(newline="", encoding="utf-8-sig") as stream:
         try:
