@@ -191,10 +191,12 @@ def test_the_order_of_logs_says_nothing(vessel: tuple[str, int]) -> None:
         np.testing.assert_allclose(again, np.asarray(first), rtol=EXACT, atol=EXACT)
 
 
-def sailed(rows: int) -> Log:
-    """A boat that weaves at 10 Hz, its rate late by .6 s, with a jump and spikes in it."""
+def sailed(rows: int, helm: float) -> Log:
+    """A boat that weaves at 10 Hz, its rate late by .6 s, with a jump and spikes in it; with a mean
+    rudder angle `helm` in rad it turns round many times.
+    """
     random, t = np.random.default_rng(3), 0.1 * np.arange(rows)
-    delta = 0.3 * np.sign(np.sin(0.11 * t) + 0.4 * np.sin(0.041 * t))
+    delta = helm + 0.3 * np.sign(np.sin(0.11 * t) + 0.4 * np.sin(0.041 * t))
     r, u = np.zeros(rows), 4.0 + 0.5 * np.sin(0.013 * t)
     for k in range(rows - 1):
         r[k + 1] = r[k] + 0.1 * (0.4 * delta[k] - r[k])
@@ -211,11 +213,16 @@ def sailed(rows: int) -> Log:
     return Log("long", t, {**channels, "delta": delta})
 
 
-def test_a_long_log_tells_by_stretches_what_it_tells_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("helm", "gap"), [(0.0, 0), (0.03, 0), (0.0, 900)])
+def test_a_long_log_tells_by_stretches_what_it_tells_whole(
+    monkeypatch: pytest.MonkeyPatch, helm: float, gap: int
+) -> None:
     from residnet.data import channels
     from residnet.data.doctor import inspect, statistics
 
-    log = sailed(24_000)
+    log = sailed(24_000 + gap, helm)
+    # far from the stretches
+    log = log.rows(np.r_[0:8_500, 8_500 + gap : len(log)])
     whole = inspect(log, ["delta"])
     monkeypatch.setattr(statistics, "_LONG", 12_000)
     monkeypatch.setattr(channels, "_FEW", 6_000)

@@ -135,12 +135,18 @@ def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarr
     return out
 
 
-def spread_rows(count: int, most: int, stretches: int) -> np.ndarray:
-    """Return rows [K] of evenly spread stretches, `most` in all; every row of no more than that."""
+def spread_rows(count: int, most: int, stretches: int, about: int | None = None) -> np.ndarray:
+    """Return rows [K] of evenly spread stretches, `most` in all; every row of no more than that.
+
+    With a row `about` the stretch nearest to it lies about it.
+    """
     if count <= most:
         return np.arange(count)
     size = most // stretches
     first = np.linspace(0, count - size, stretches).astype(int)
+    if about is not None:
+        begin = min(max(about - size // 2, 0), count - size)
+        first[np.argmin(np.abs(first - begin))] = begin
     return np.unique((first[:, None] + np.arange(size)).ravel())
 
 

@@ -120,8 +120,10 @@ def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask]
 def _on_grid(log: Record) -> list[Finding]:
     """Return the findings of the checks that need a uniform grid, told at the log's own samples."""
     few = log.few
+    # from one stretch to the next a heading may have turned round many times
+    whole = few.log if few is log else values.unwrapped(few.log)
     try:
-        grid = few.on(values.upright(align(few.log, GridConfig(step=log.step))))
+        grid = few.on(values.upright(align(whole, GridConfig(step=log.step))))
     except DataError as error:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
     if few is not log:

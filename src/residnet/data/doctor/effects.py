@@ -103,10 +103,16 @@ def _counted(place: np.ndarray) -> float:
 
 
 class Effects:
-    """What single findings change in a one-step fit to a log, and in its dead reckoning."""
+    """What single findings change in a one-step fit to a log, and in its dead reckoning.
 
-    def __init__(self, log: Record) -> None:
-        self._at, log = log.few_rows, log.few
+    Args:
+        log: of which a long one is told by a part.
+        about: [T] bool, samples that this part has to hold; None for evenly spread ones.
+    """
+
+    def __init__(self, log: Record, about: np.ndarray | None = None) -> None:
+        self._whole = log
+        self._at, log = (log.few_rows, log.few) if about is None else log.near(about)
         self._log, self._rows = log, OneStep(log)
         enough = len(self._rows) >= _ROWS_PER_COLUMN * self._rows.table.shape[1]
         self._fit = self._rows.fit() if enough else None
@@ -122,6 +128,8 @@ class Effects:
         if finding.repair is not None:
             effect = self.of_repair(finding.repair(self._log.log), finding)
         elif finding.at is not None and finding.at.any():
+            if not finding.at[self._at].any():
+                return Effects(self._whole, finding.at).measured(finding)
             seen = {*self._log.moving, *self._log.inputs}
             effect = self.of_stretch(
                 finding.at[self._at], not finding.channels or not seen.isdisjoint(finding.channels)

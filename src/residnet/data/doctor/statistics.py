@@ -14,6 +14,7 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
+from residnet.core.stretches import stretches as runs_of
 from residnet.data.channels import noise_of, spikes, spread_rows
 from residnet.data.derivatives import local_polynomials
 
@@ -127,9 +128,27 @@ class Record:
         """
         if self._few is not None:
             return self._few
-        if self._seams is not None or len(self) <= _LONG:
+        return self if self._seams is not None else self._of_rows(self.few_rows)
+
+    @cached_property
+    def few_rows(self) -> np.ndarray:
+        """Rows [K] that `few` holds, all of a short log."""
+        return spread_rows(len(self), _LONG, _STRETCHES)
+
+    def near(self, at: np.ndarray) -> tuple[np.ndarray, Record]:
+        """Return rows [K] and their record as `few` has them, one stretch about samples at [T].
+
+        Of several runs of such samples it is about the longest.
+        """
+        starts, stops = runs_of(at)
+        longest = int(np.argmax(stops - starts))
+        rows = spread_rows(len(self), _LONG, _STRETCHES, int(starts[longest] + stops[longest]) // 2)
+        part = self._of_rows(rows)
+        return rows, part if self._bad is None else part.without(self._bad[rows])
+
+    def _of_rows(self, rows: np.ndarray) -> Record:
+        if rows.size == len(self):
             return self
-        rows = self.few_rows
         log = self.log.rows(rows)
         first = np.append(True, np.diff(rows) > 1)
         shift = np.where(first, np.diff(log.t, prepend=log.t[0]) - _PAUSE * self.step, 0.0)
@@ -138,11 +157,6 @@ class Record:
         # no increment leads from one stretch to the next
         seams = log.t[np.flatnonzero(first)[1:]]
         return Record(log, self.inputs, seams).without(first)
-
-    @cached_property
-    def few_rows(self) -> np.ndarray:
-        """Rows [K] that `few` holds, all of a short log."""
-        return spread_rows(len(self), _LONG, _STRETCHES)
 
     def on(self, grid: Log) -> Record:
         """Return the record of the same samples on a grid."""
