@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (882, 128),
     "control": (3259, 351),
     "core": (1576, 243),
-    "data": (9759, 872),
+    "data": (9774, 874),
     "documents": (2505, 230),
     "dynamics": (2193, 276),
     "export": (1496, 169),
