@@ -138,7 +138,9 @@ class RegressorBaseline(ParametricBaseline):
         out, begin = z.new_zeros(len(z), self.dof, len(free)), 0
         for axis in range(self.dof):
             own = free[free // self.library.count == axis] % self.library.count
-            out[:, axis, begin : begin + len(own)] = phi[:, own]
+            # all terms need not be picked
+            part = phi if len(own) == self.library.count else phi[:, own]
+            out[:, axis, begin : begin + len(own)] = part
             begin += len(own)
         return out
 

@@ -132,19 +132,26 @@ def _said(fitted: FittedModel) -> str:
 
 
 def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> None:
-    """Fit the heads whose baseline is there, long trainings in processes of their own."""
+    """Fit the heads whose baseline is there, long trainings but one in processes of their own."""
     settings, threads = fitter.settings, torch.get_num_threads()
     heads = [name for name in settings.heads if settings.baseline_name_of(name) in models]
     places = side_by_side(fitter)
+    long = [
+        name
+        for name in heads
+        if places > 1 and is_long(fitter, name) and fitter.store.finished(name) is None
+    ]
+    # this process trains the first itself, where each of the others has one
+    apart = long[1:] if len(long) <= places else long
     given = (dict(logs), settings, fitter.store.training_folder, threads)
-    with _heard() if places > 1 else nullcontext() as wire:
-        pooled = processes(places, _begin, (*given, wire)) if places > 1 else nullcontext()
+    with _heard() if apart else nullcontext() as wire:
+        workers = min(places, len(apart))
+        pooled = processes(workers, _begin, (*given, wire)) if apart else nullcontext()
         with pooled as pool:
             there: dict[str, Any] = {}
-            for name in heads:
+            for name in apart if pool else ():
                 base = models[settings.baseline_name_of(name)]
-                if pool and is_long(fitter, name) and fitter.store.finished(name) is None:
-                    there[name] = pool.submit(_fit_there, name, _sent(base))
+                there[name] = pool.submit(_fit_there, name, _sent(base))
             for name in heads:
                 begin(f"fitting {name}")
                 with _optional(settings, name):
