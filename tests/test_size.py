@@ -17,7 +17,7 @@ import residnet
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
     "api": (726, 84),
-    "baselines": (882, 128),
+    "baselines": (883, 128),
     "control": (3259, 351),
     "core": (1576, 243),
     "data": (9774, 874),
@@ -25,7 +25,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "dynamics": (2193, 276),
     "export": (1496, 169),
     "heads": (1284, 189),
-    "identification": (2242, 228),
+    "identification": (2244, 228),
     "judge": (2070, 226),
     "manoeuvres": (1009, 148),
     "physics": (2195, 265),
