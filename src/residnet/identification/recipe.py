@@ -429,7 +429,7 @@ class Preparation:
         rolls = [_memory(log, ("phi",)) for log in logs] if live.rolls else []
         quick = min(memory, float(np.median([m for m in rolls if np.isfinite(m)] or [memory])))
         step = float(f"{interval * max(1, int(quick / 40.0 / interval)):.4g}")
-        samples = min(max(7, 2 * round(0.5 * quick / 5.0 / step) + 1), 41)
+        samples = min(max(5, 2 * round(0.5 * quick / 5.0 / step) + 1), 41)
         held = tuple(name for name in inputs if _rests(logs, name))
         # a true wind acts from where the vessel points, and one from the bow tells it by itself
         wind = not live.dead and all(
