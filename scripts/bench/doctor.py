@@ -138,13 +138,13 @@ def long_logs(rows: int, seed: int, faults: Sequence[Fault]) -> None:
     """Print of each fault in a long log what either look alone finds."""
     usual, alike, count = statistics._LONG, 0, 0
     ship = next(one for one in SHIPS if one.name == "wam_v")
-    host = simulate(1, rows, seed)[0]
+    hosts = simulate(2, rows, seed)
     for number, fault in enumerate([None, *faults]):
         if fault is not None and ship.name not in fault.ships and "twin" not in fault.hosts:
             continue
         random = np.random.default_rng([seed, number])
         try:
-            log = host if fault is None else fault.plant(ship, [host], random)[0]
+            log = hosts[0] if fault is None else fault.plant(ship, hosts, random)[0]
         except (Undecidable, KeyError):
             # the boat has no such channel
             continue

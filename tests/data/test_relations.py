@@ -242,3 +242,24 @@ def test_a_long_log_tells_by_stretches_what_it_tells_whole(
         assert size == pytest.approx(
             {name: other.figures[name] for name in size}, rel=0.1, abs=0.02
         )
+
+
+def test_what_a_repair_of_a_long_log_does_is_measured_within_its_stretches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from residnet.data.doctor import Finding, statistics
+    from residnet.data.doctor.effects import Effects
+
+    log, off = sailed(24_000, 0.0), 0.3
+    log = log.replace(channels={**log.channels, "psi": log["psi"] + off})
+
+    def repair(log: Log) -> Log:
+        return log.replace(channels={**log.channels, "psi": log["psi"] - off})
+
+    finding, found = Finding("will mislead", "heading", "", repair=repair), []
+    for longest in (12_000, 30_000):
+        monkeypatch.setattr(statistics, "_LONG", longest)
+        effects = Effects(statistics.Record(log, ["delta"]))
+        found.append(effects.measured(finding).effect)
+    assert found[0] == pytest.approx(found[1], rel=0.2)
+    assert found[1] == pytest.approx(2.0 * np.sin(off / 2.0), rel=0.5)

@@ -175,7 +175,7 @@ class Effects:
 
     def of_repair(self, repaired: Log, finding: Finding) -> float | None:
         """Return what changes where the log is corrected; None if unknown."""
-        after = Record(repaired, self._log.inputs)
+        after = self._log.on(repaired)
         place = _counted(_beyond(self._astray, reckoning_error(after)))
         rows = OneStep(after, self._rows)
         fitted, moved = self._fit, 0.0
