@@ -149,9 +149,10 @@ def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> No
         pooled = processes(workers, _begin, (*given, wire)) if apart else nullcontext()
         with pooled as pool:
             there: dict[str, Any] = {}
-            for name in apart if pool else ():
+            for name in apart:
                 base = models[settings.baseline_name_of(name)]
-                there[name] = pool.submit(_fit_there, name, _sent(base))
+                if pool is not None:
+                    there[name] = pool.submit(_fit_there, name, _sent(base))
             for name in heads:
                 begin(f"fitting {name}")
                 with _optional(settings, name):
