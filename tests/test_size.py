@@ -25,7 +25,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "dynamics": (2193, 276),
     "export": (1496, 169),
     "heads": (1284, 189),
-    "identification": (2244, 228),
+    "identification": (2245, 228),
     "judge": (2070, 226),
     "manoeuvres": (1009, 148),
     "physics": (2195, 265),
