@@ -42,7 +42,7 @@ from residnet.testing import (
     check_vessel,
     example_samples,
 )
-from residnet.testing.examples import ROLLING, SIGNALS, example_model, example_spec
+from residnet.testing.examples import ROLLING, SIGNALS, SUBMERGED, example_model, example_spec
 
 RUDDER = SignalsConfig(inputs=("n", "delta"))
 # what a baseline cannot do without, and whose trials it is identified from
@@ -291,11 +291,11 @@ def test_what_logs_tell(velocities: tuple[str, ...]) -> None:
     assert np.flatnonzero(live.mask()).tolist() == live.axes
 
 
-LAYOUTS = ("drawn", "roll")
+LAYOUTS = {"drawn": None, "roll": ROLLING, "six": SUBMERGED}
 
 
 def _exported(name: str, layout: str, folder: Path) -> None:
-    signals = ROLLING if layout == "roll" else _drawn(name)
+    signals = LAYOUTS[layout] or _drawn(name)
     spec, file = example_spec(RidgeConfig(), signals), folder / f"model{exporter(name).suffix}"
     exported = ExportedVessel(spec, example_model(spec))
     if name in ("feed_forward", "parameters"):

@@ -32,11 +32,12 @@ from residnet.identification.monitoring import MonitorConfig, Piece, Watch, Watc
 from residnet.judge.freerun import integrate
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.open_loop import ConstantInput
+from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
 from residnet.simulators.vehicle import vehicle
 from residnet.testing import example_samples
-from residnet.testing.examples import ROLLING, example_model, example_spec
+from residnet.testing.examples import ROLLING, SUBMERGED, example_model, example_spec
 
 PHI, P = ROLL.names.index("phi"), ROLL.names.index("p")
 
@@ -120,18 +121,29 @@ def test_what_logs_tell() -> None:
     assert Live.shared([Live(("u",)), Live(("r",))]).planar
 
 
-def test_a_monitor_tells_stiffness_from_damping_in_roll() -> None:
-    spec = example_spec(None, ROLLING)
+@pytest.mark.parametrize(
+    ("signals", "names"),
+    [
+        (ROLLING, ("restoring", "damping roll")),
+        pytest.param(SUBMERGED, ("restoring pitch", "damping pitch"), marks=pytest.mark.long),
+    ],
+    ids=["roll", "six"],
+)
+def test_a_monitor_tells_stiffness_from_damping(
+    signals: SignalsConfig, names: tuple[str, ...]
+) -> None:
+    spec, live = example_spec(None, signals), signals.live
     model = example_model(spec).double()
-    noise = np.array([0.0, 0.0, 0.002, 0.02, 0.02, 0.003, 0.003, 0.003])
-    low, high = np.array(spec.low[5:]), np.array(spec.high[5:])
+    noise = np.full(len(live.states), 0.003)
+    noise[:5] = 0.0, 0.0, 0.002, 0.02, 0.02
+    low, high = (np.array(ends[live.size :]) for ends in (spec.low, spec.high))
 
     def logs(change: Change, count: int, seed: int) -> list[list[Piece]]:
         random = np.random.default_rng(seed)
-        w = random.uniform(low, high, size=(count, 6, 2)).repeat(50, axis=1)
-        x = torch.zeros(count, 8).double()
+        w = random.uniform(low, high, size=(count, 6, low.size)).repeat(50, axis=1)
+        x = torch.zeros(count, noise.size).double()
         x[:, 3] = 0.7 * spec.high[0]
-        changed = ChangedDynamics(model, [change], count, 2)
+        changed = ChangedDynamics(model, [change], count, low.size)
         with torch.no_grad():
             states = Rollout(changed)(x, torch.from_numpy(w), x[:, :0])[0].numpy()
         y = states + noise * random.normal(size=states.shape)
@@ -141,8 +153,8 @@ def test_a_monitor_tells_stiffness_from_damping_in_roll() -> None:
         ]
 
     watch = Watch(spec, model, logs(Change("none", "", "", 1.0), 30, 0), MonitorConfig())
-    assert list(watch.seen) == ["u", "v", "r", "p", "phi", "heading"]
-    for cause in ("restoring", "damping roll"):
+    assert list(watch.seen) == [*live.channels, "heading"]
+    for cause in names:
         watcher = Watcher(watch, 0)
         (known,) = (one for one in watch.causes if one.name == cause)
         for log in logs(known.of_size(-0.3), 5, 1):

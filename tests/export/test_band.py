@@ -14,7 +14,7 @@ from residnet.export import exporter, vessel
 from residnet.export.c_code import compile_shared
 from residnet.export.vessel import ExportedModel, ExportedVessel
 from residnet.physics.signals import SignalsConfig
-from residnet.testing.examples import ROLLING, SIGNALS, example_model, example_spec
+from residnet.testing.examples import ROLLING, SIGNALS, SUBMERGED, example_model, example_spec
 
 TABLE = BandTable(
     level=0.9,
@@ -28,10 +28,20 @@ TABLE = BandTable(
     cautions=("It is a test.",),
 )
 ROLLS = TABLE.model_copy(update={"p": (0.01, 0.03, 0.03), "phi": (0.001, 0.02, 0.05)})
+SIX = ROLLS.model_copy(
+    update={"w": (0.1, 0.2, 0.3), "q": (0.01, 0.02, 0.03), "z": (0.1, 0.3, 0.9), "theta": ROLLS.phi}
+)
 CASES = pytest.mark.parametrize(
     ("table", "signals"),
-    [(TABLE, SIGNALS), (None, SIGNALS), (ROLLS, ROLLING), (None, ROLLING)],
-    ids=["band", "none", "roll", "none of roll"],
+    [
+        (TABLE, SIGNALS),
+        (None, SIGNALS),
+        (ROLLS, ROLLING),
+        (None, ROLLING),
+        (SIX, SUBMERGED),
+        (None, SUBMERGED),
+    ],
+    ids=["band", "none", "roll", "none of roll", "six", "none of six"],
 )
 
 

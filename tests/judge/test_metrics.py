@@ -46,8 +46,8 @@ def test_by_hand() -> None:
         errors.rmse, [[np.sqrt(0.25 / 3), np.sqrt(0.02 / 3), np.sqrt(0.03 / 4)]]
     )
     np.testing.assert_allclose(errors.mae, [[0.7 / 3, 0.2 / 3, 0.3 / 4]])
-    assert errors.position_end.tolist() == [5.0]
-    assert errors.heading_end.tolist() == pytest.approx([0.5])
+    assert errors.ends()["position"].tolist() == [5.0]
+    assert errors.ends()["heading"].tolist() == pytest.approx([0.5])
     assert errors.samples.tolist() == [3]
     (row,) = [
         r

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 
 DEG = 180.0 / math.pi
 """Degrees in a radian."""
@@ -100,6 +101,11 @@ def interval(bounds: list[float] | None, factor: float = 1.0, digits: int = 3) -
     if not bounds:
         return DASH
     return f"{number(factor * bounds[0], digits)} to {number(factor * bounds[1], digits)}"
+
+
+def listed(parts: Sequence[str]) -> str:
+    """Return texts as `a, b and c`."""
+    return " and ".join(filter(None, (", ".join(parts[:-1]), *parts[-1:])))
 
 
 def plural(count: int, noun: str) -> str:

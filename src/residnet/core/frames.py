@@ -65,6 +65,20 @@ def upright(u: Tensor, v: Tensor, w: Tensor, phi: Tensor, theta: Tensor) -> list
     return [ahead, across, down]
 
 
+def along_axes(north: Tensor, east: Tensor, angles: Tensor) -> list[Tensor]:
+    """Return a horizontal vector along the body's x, y and z.
+
+    Args:
+        north: component along north [...].
+        east: component along east.
+        angles: roll, pitch and heading [..., 3] in rad.
+    """
+    phi, theta, psi = angles.unbind(-1)
+    along, across = to_body(north, east, psi)
+    side, normal = to_body(across, along * torch.sin(theta), phi)
+    return [along * torch.cos(theta), side, normal]
+
+
 def rotated(angles: Tensor, turn: Tensor) -> Tensor:
     """Return the attitude [..., 3] after a further rotation, by way of unit quaternions.
 

@@ -270,6 +270,13 @@ class Live:
         return "r" in self.velocities
 
     @property
+    def ends(self) -> tuple[str, ...]:
+        """Names of the errors of the pose that the velocities lead to, in `names.END_UNITS`."""
+        if self.spatial:
+            return ("position", "depth", "attitude")
+        return (*["position"] * self.moves, *["heading"] * self.turns)
+
+    @property
     def text(self) -> str:
         """What follows from the velocities not being u, v and r, for a reader; empty for these."""
         if self.spatial:
@@ -308,6 +315,17 @@ class Live:
                 f"{who} knows no roll, but the model moves {', '.join(self.velocities)}; fit one"
                 " without p (signals.velocities: [u, v, r])"
             )
+
+    def largest(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Return the size [n] of what moves at the ends of its ranges, [n] or more each.
+
+        Infinite for a depth, and for the angles of rotations that are composed: a vessel that loops
+        or dives deeper has not run away.
+        """
+        size = np.maximum(np.abs(low), np.abs(high))[: self.size]
+        if self.spatial:
+            size[[self.moving.index(name) for name in self.layout.attitude]] = np.inf
+        return size
 
     def mask(self) -> Tensor:
         """Return 1 for each that has an equation of its own and 0 for the others, [n] float64."""

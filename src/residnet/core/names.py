@@ -16,6 +16,7 @@ __all__ = [
     "ACCELERATION",
     "BOW_WIND",
     "CHANNEL_UNITS",
+    "END_UNITS",
     "POSE",
     "STATE",
     "VELOCITY",
@@ -32,6 +33,9 @@ STATE = POSE + VELOCITY
 """State of a 3-DOF model, in the order of the tensors: north [m], east [m], heading [rad], surge
 [m/s], sway [m/s], yaw rate [rad/s].
 """
+
+END_UNITS = {"position": "m", "heading": "rad", "depth": "m", "attitude": "rad"}
+"""Errors of the pose at the end of a free run: a distance, the angle of one rotation and so on."""
 
 ACCELERATION = tuple(f"{name}_dot" for name in VELOCITY)
 

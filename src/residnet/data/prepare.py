@@ -44,6 +44,11 @@ class PrepareConfig(Config):
             sample itself, exact for a command that changes on the grid. `mean`: the mean of the
             samples at both ends of the step, for a measured quantity that moves on during the step,
             such as shaft revolutions; held from the start it would lag by half a step.
+        beside: what states and inputs stand beside a rate that is learned. `samples`: those of its
+            sample, the states smoothed. `means`: their means over the samples that the rate is
+            taken from, weighed as it weighs these. A smoothed rate is such a mean of rates; beside
+            means it lags no step of an input, and a swing as short as the smoothing is no softer
+            in it than in them.
         dead_commands: what is done with stretches in which all inputs rest while the vessel moves
             as a model of the other logs does not explain: somebody took over by hand, or the record
             stopped. `mask` splits the log there, `keep` takes them as they are.
@@ -55,6 +60,7 @@ class PrepareConfig(Config):
     motion: MotionConfig = MotionConfig()
     trim: Seconds = Field(default=0.0, ge=0)
     hold: Literal["start", "mean"] = "start"
+    beside: Literal["samples", "means"] = "samples"
     dead_commands: Literal["mask", "keep"] = "mask"
 
 
@@ -71,7 +77,7 @@ class Prepared:
         smooth: states with smoothed velocities [T, 3 + n].
         nu_dot: rates of what moves [T, n].
         w: inputs held over the step that follows each sample [T, m].
-        recorded: inputs at the samples themselves [T, m].
+        recorded: inputs that go with the rates [T, m]: those at the samples, or means beside them.
         piece: number of the stretch that nothing crosses, [T]; -1 where there is none.
         usable: samples that may be scored [T].
         good: samples whose smoothed state and derivative may be learned from [T].
@@ -151,6 +157,17 @@ def prepare(
     clean = stretch_numbers(np.where(log.usable & usable, piece, -1))
     nu = y[:, live.columns]
     smooth_nu, nu_dot, valid = config.derivative.derive(nu, config.grid.step, clean)
+    held = _means(w, piece) if config.hold == "mean" else w
+    recorded = w
+    if config.beside == "means":
+        # the rate of an integral, by the same rule, is the mean that the rule takes
+        steps = np.concatenate((0.5 * (nu[:-1] + nu[1:]), held[:-1]), axis=1)
+        whole = np.concatenate((0.0 * steps[:1], np.nan_to_num(steps).cumsum(axis=0)))
+        means = config.derivative.derive(config.grid.step * whole, config.grid.step, clean)[1]
+        smooth_nu, recorded = (
+            means[:, : live.size],
+            np.where(valid[:, None], means[:, live.size :], w),
+        )
     smooth = np.concatenate((y[:, POSE], np.where(valid[:, None], smooth_nu, nu)), axis=1)
     if live.rolls:
         # the rate of an angle is what its velocity says
@@ -160,9 +177,8 @@ def prepare(
             known = sinking(torch.from_numpy(known), torch.from_numpy(nu)).numpy()
         nu_dot = np.where(live.mask().numpy() > 0.0, nu_dot, known)
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
-    held = _means(w, piece) if config.hold == "mean" else w
     good = usable & valid & trimmed
-    prepared = Prepared(log, split, y, smooth, nu_dot, held, w, piece, usable, good, live)
+    prepared = Prepared(log, split, y, smooth, nu_dot, held, recorded, piece, usable, good, live)
     return prepared.on_disk() if large else prepared
 
 

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from residnet.core.columns import turning
-from residnet.core.layout import HEADING, MOVING, SURGE, SWAY, YAW_RATE
+from residnet.core.frames import along_axes, to_body
+from residnet.core.layout import ATTITUDE, HEADING, MOVING, SIX, SURGE, SWAY, YAW_RATE
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import live_of
 
-_AXES = {"u": "surge", "v": "sway", "r": "yaw", "p": "roll"}
+_AXES = {"u": "surge", "v": "sway", "r": "yaw", "p": "roll", "w": "heave", "q": "pitch"}
 _TAKEN = {"u": 0.1}
 """Share of a velocity whose absence shows what damps it; all of others."""
 
@@ -70,7 +71,6 @@ class Change:
 
 def causes(signals: SignalsConfig) -> list[Change]:
     """Return the changes that a monitor looks for, given the inputs of a model."""
-    signals.live.require_on_surface("the monitor")
     units = signals.units()
     out = [Change("mass", "the vessel has become heavier", "share", 0.02, heavier=0.02)]
     live = signals.live
@@ -82,6 +82,9 @@ def causes(signals: SignalsConfig) -> list[Change]:
     if live.rolls:
         stiff = Change("restoring", "the vessel has become stiffer in roll", "share", 0.02)
         out.append(replace(stiff, damping="p", by="phi", damped=0.02))
+    if live.spatial:
+        stiff = Change("restoring pitch", "the vessel has become stiffer in pitch", "share", 0.02)
+        out.append(replace(stiff, damping="q", by="theta", damped=0.02))
     for place, name in enumerate(signals.inputs):
         words = f"{name} has grown stronger than it was"
         out.append(Change(f"gain {name}", words, "share", 0.02, gain={place: 0.02}))
@@ -121,10 +124,21 @@ def shown(sensor: str, x: Tensor, rate: Tensor, size: float) -> Tensor:
     elif sensor == "lag":
         out[..., MOVING] = -size * rate
     elif sensor in ("current_north", "current_east"):
-        cos, sin = torch.cos(x[..., HEADING]), torch.sin(x[..., HEADING])
-        north = sensor == "current_north"
-        out[..., SURGE] = size * (cos if north else sin)
-        out[..., SWAY] = size * (-sin if north else cos)
+        north = x.new_tensor(size if sensor == "current_north" else 0.0)
+        out = out + along_body(x, north, size - north)
+    return out
+
+
+def along_body(x: Tensor, north: Tensor, east: Tensor) -> Tensor:
+    """Return a horizontal vector as velocities in states x [..., 3 + n], zero elsewhere."""
+    out = torch.zeros_like(x)
+    if x.shape[-1] == len(SIX.names):
+        parts = along_axes(north, east, x[..., list(ATTITUDE)])
+        places = [SURGE, SWAY, SIX.names.index("w")]
+    else:
+        parts, places = [*to_body(north, east, x[..., HEADING])], [SURGE, SWAY]
+    for place, part in zip(places, parts, strict=True):
+        out[..., place] = part
     return out
 
 
@@ -179,12 +193,16 @@ class ChangedDynamics(Dynamics):
         gained = after[:, MOVING] - nu
         if self.damps:
             gained = gained - self._slowed(x, w, s, gained)
-        cos, sin = torch.cos(x[:, HEADING]), torch.sin(x[:, HEADING])
-        north, east = self.push[:, 0], self.push[:, 1]
-        push = torch.stack((cos * north + sin * east, cos * east - sin * north), dim=1)
-        push = torch.cat((push, torch.zeros_like(nu[:, 2:])), dim=1)
+        push = along_body(x, *self.push.unbind(1))[:, MOVING]
         moved = nu + gained / self.inertia + self.dt * push
         changed = after.clone()
+        if self.model.spatial:
+            moved = torch.where(self.model.live > 0.0, moved, after[:, MOVING])
+            changed[:, MOVING] = moved
+            turn = torch.zeros_like(after)
+            rates = [SIX.names.index(name) for name in "pqr"]
+            turn[:, ATTITUDE] = 0.5 * self.dt * (changed - after)[:, rates]
+            return self.model.moved_on(changed, turn), memory
         # angles follow what their rates have gained over the step
         known = (moved - after[:, MOVING]) @ self.model.known_rates
         angles = after[:, MOVING] + 0.5 * self.dt * known

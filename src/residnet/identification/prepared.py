@@ -154,7 +154,7 @@ def velocity_limit(low: np.ndarray, high: np.ndarray, divergence: float, live: L
         high: largest ones, [n + m].
         divergence: the multiple of the largest training value.
     """
-    return np.asarray(divergence * np.maximum(np.abs(low), np.abs(high))[: live.size])
+    return divergence * live.largest(low, high)
 
 
 def through_currents(

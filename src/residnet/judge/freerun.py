@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from residnet.core.frames import turn_between, wrap_array
+from residnet.core.columns import tilted
+from residnet.core.frames import rotated, turn_between, wrap_array
 from residnet.core.layout import ALIVE, ATTITUDE, HEADING, POSE, POSITION, Live, levelled
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
@@ -99,15 +100,14 @@ class Errors:
         usable: which samples are [N].
         counts: samples of each window [W].
         live: velocities that the logs tell; others are zero, and no error counts.
-        attitude_end: angle of the rotation between the attitudes at the end of each window [W];
-            None on the surface.
+        attitude: angle of the rotation between the attitudes [N]; None on the surface.
     """
 
     error: np.ndarray
     usable: np.ndarray
     counts: np.ndarray
     live: Live = ALIVE
-    attitude_end: np.ndarray | None = None
+    attitude: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -115,26 +115,22 @@ class Errors:
     ) -> Errors:
         """Return the errors of predictions over windows of logs."""
         rows = [(logs[window.log], slice(window.start, window.stop)) for window in windows]
-        pairs = zip(predictions, rows, strict=True)
-        error = np.concatenate([one.states - log.y[part] for one, (log, part) in pairs])
+        found = np.concatenate([one.states for one in predictions])
+        wanted = np.concatenate([log.y[part] for log, part in rows])
+        error = found - wanted
         # a turn too many is no error of where the vessel points
         error[:, HEADING] = wrap_array(error[:, HEADING])
-        live, ends = logs[windows[0].log].live, None
+        live, attitude = logs[windows[0].log].live, None
         if live.spatial:
             roll = live.states.index("phi")
             error[:, roll] = wrap_array(error[:, roll])
-            last = [
-                (one.states[-1], log.y[part][-1])
-                for one, (log, part) in zip(predictions, rows, strict=True)
-            ]
-            found, wanted = (np.stack(side)[:, ATTITUDE] for side in zip(*last, strict=True))
-            ends = turn_between(found, wanted)
+            attitude = turn_between(found[:, ATTITUDE], wanted[:, ATTITUDE])
         return cls(
             error,
             np.concatenate([log.usable[part] for log, part in rows]),
             np.array([window.stop - window.start for window in windows]),
             live,
-            ends,
+            attitude,
         )
 
     def nrmse(self, scales: np.ndarray) -> np.ndarray:
@@ -178,21 +174,15 @@ class Errors:
         """Mean absolute errors of what moves of each window [W, n]."""
         return self.mean(np.abs(self.velocities))
 
-    @property
-    def position_end(self) -> np.ndarray:
-        """Distance from the measured position at the end of each window [W]."""
-        return np.asarray(np.hypot(*self.error[self.begins + self.counts - 1][:, POSITION].T))
+    def ends(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Return the sizes [W] of the errors of the pose by name, see `Live.ends`.
 
-    @property
-    def heading_end(self) -> np.ndarray:
-        """Absolute error of the heading at the end of each window [W]."""
-        return np.asarray(np.abs(self.error[self.begins + self.counts - 1, HEADING]))
-
-    @property
-    def depth_end(self) -> np.ndarray:
-        """Absolute error of the depth at the end of each window [W]."""
-        last = self.begins + self.counts - 1
-        return np.asarray(np.abs(self.error[last, self.live.states.index("z")]))
+        Args:
+            rows: samples [W]; None for the last of each window.
+        """
+        last = self.begins + self.counts - 1 if rows is None else rows
+        at, turned = self.error[last], None if self.attitude is None else self.attitude[last]
+        return sizes_of(at, self.live, turned)
 
     @property
     def samples(self) -> np.ndarray:
@@ -382,6 +372,47 @@ def _initial(candidate: Candidate, window: Window, log: Prepared) -> np.ndarray:
     known = dict(zip(states, (*log.y[window.start, POSE], *window.nu), strict=True))
     names = candidate.state or states
     return np.array([known[n] if n in known else log.log[n][window.start] for n in names])
+
+
+def sizes_of(error: np.ndarray, live: Live, turned: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Return the sizes [W] of errors of the pose by name, see `Live.ends`.
+
+    Args:
+        error: of states [W, 3 + n], psi within half a turn.
+        live: what moves.
+        turned: angles between attitudes [W]; None on the surface.
+    """
+    out = {"position": np.hypot(*error[:, POSITION].T), "heading": np.abs(error[:, HEADING])}
+    if turned is not None:
+        out |= {"depth": np.abs(error[:, live.states.index("z")]), "attitude": turned}
+    return {name: out[name] for name in live.ends}
+
+
+def drift(y: np.ndarray, live: Live, step: float) -> dict[str, np.ndarray]:
+    """Return how far integrated measured velocities end from the measured pose, by name [W].
+
+    See `Live.ends`.
+
+    Args:
+        y: measured states [W, L, 3 + n].
+        live: what moves.
+        step: between samples in s.
+    """
+    error = np.zeros_like(y[:, -1])
+    for row, one in zip(error, y, strict=True):
+        row[POSE] = integrate(one[0, POSE], one[:, live.columns], step)[-1] - one[-1, POSE]
+    error[:, HEADING] = wrap_array(error[:, HEADING])
+    if not live.spatial:
+        return sizes_of(error, live, None)
+    down = tilted(torch.from_numpy(y[:, :, live.columns]))[2].numpy()
+    way = np.trapezoid(down, dx=step, axis=1)
+    depth = live.states.index("z")
+    error[:, depth] = way - (y[:, -1, depth] - y[:, 0, depth])
+    rate = torch.from_numpy(y[:, :, [live.states.index(name) for name in "pqr"]])
+    angles = torch.from_numpy(y[:, 0, ATTITUDE])
+    for turn in (0.5 * step * (rate[:, 1:] + rate[:, :-1])).unbind(1):
+        angles = rotated(angles, turn)
+    return sizes_of(error, live, turn_between(angles.numpy(), y[:, -1, ATTITUDE]))
 
 
 def integrate(pose: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:

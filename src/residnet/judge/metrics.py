@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from residnet.core.frames import wrap_array
-from residnet.core.layout import POSE, VELOCITIES
+from residnet.core.layout import VELOCITIES
+from residnet.core.names import END_UNITS
 from residnet.data.prepare import Prepared
 from residnet.judge.bands import count_bands
-from residnet.judge.freerun import Candidate, Errors, FreeRun, integrate
+from residnet.judge.freerun import Candidate, Errors, FreeRun, drift
 from residnet.judge.verdict import FEW_LOGS, diverged_note
 
 if TYPE_CHECKING:
@@ -101,11 +101,6 @@ def intervals(values: np.ndarray, blocks: Blocks | None) -> list[list[float] | N
         [float(lower), float(upper)]
         for lower, upper in np.quantile(means, [low, 1 - low], axis=0).T
     ]
-
-
-def _sizes(error: np.ndarray) -> np.ndarray:
-    """Return position and heading errors [W, 2] of errors of the pose [W, 3]."""
-    return np.column_stack((np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])))
 
 
 def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]:
@@ -274,10 +269,8 @@ class Judged:
 
     def _summary(self, name: str, chosen: np.ndarray) -> dict[str, Any]:
         found, drawn = self.found[name], blocks(self.numbers[chosen])
-        ends = [found.position_end, found.heading_end]
-        ends += [] if found.attitude_end is None else [found.attitude_end, found.depth_end]
-        by_window = np.column_stack((found.rmse, self.nrmse[name], *ends))[chosen]
-        live = self.live
+        live, ends = self.live, found.ends()
+        by_window = np.column_stack((found.rmse, self.nrmse[name], *ends.values()))[chosen]
         rmse, mae = by_window[:, : live.size].mean(0), found.mae[chosen].mean(0)
         nrmse = rmse / self.scale
         spread = intervals(by_window, drawn)
@@ -301,20 +294,11 @@ class Judged:
             "nrmse_mean_ci95": spread[live.size],
             "ci95_blocks": drawn.row() if drawn is not None else None,
         }
-        for column, name in self._ends:
+        # they stand behind the errors of what moves and their mean
+        for column, name in enumerate(ends, live.size + 1):
             out[f"{name}_error_end"] = float(by_window[:, column].mean())
             out[f"{name}_error_end_ci95"] = spread[column]
         return out
-
-    @property
-    def _ends(self) -> list[tuple[int, str]]:
-        """Columns and names of the errors at the end of a window that the velocities lead to.
-
-        They stand behind the errors of what moves and their mean.
-        """
-        live, first = self.live, self.live.size + 1
-        plane = [(first, "position")] * live.moves + [(first + 1, "heading")] * live.turns
-        return plane + [(first + 2, "attitude"), (first + 3, "depth")] * live.spatial
 
     def limits(self, step: float) -> dict[str, Any]:
         """Return the part of limits.json for one protocol and split; `step` of the grid in s."""
@@ -333,10 +317,9 @@ class Judged:
         Returns:
             One entry for 10, 30 and 100 s, as far as the windows go, and for the end of the longest
             window: `seconds`; `windows` and `logs` that last so long, `slowest` and `fastest` of
-            them (mean speeds, m/s) and the mean way `sailed` in m; `floor` (position and heading):
-            what integrated measured velocities are off; and by model `position` and `heading`: the
-            mean over the windows, with `intervals` for as many new logs, see `new_trials`. Of
-            position and heading only what the live velocities move is told.
+            them (mean speeds, m/s) and the mean way `sailed` in m; `floor`: what integrated
+            measured velocities are off in each of `Live.ends`; and by model the mean of each over
+            the windows, with `intervals` for as many new logs, see `new_trials`.
         """
         counts, speeds = (
             np.array([part.stop - part.start for _, part in self.parts]),
@@ -354,30 +337,21 @@ class Judged:
                 continue
             numbers = self.numbers[there]
 
-            names = [
-                (column - self.live.size - 1, name)
-                for column, name in self._ends
-                if name in ("position", "heading")
-            ]
-
             def off(
-                errors: Mapping[str, np.ndarray],
-                numbers: np.ndarray = numbers,
-                names: Sequence[tuple[int, str]] = names,
+                errors: Mapping[str, Mapping[str, np.ndarray]], numbers: np.ndarray = numbers
             ) -> dict[str, dict[str, Any]]:
-                """Return means and intervals of errors of the pose [W, 3], by name."""
-                values = np.hstack(
-                    [_sizes(error)[:, [k for k, _ in names]] for error in errors.values()]
-                )
+                """Return means and intervals of sizes [W] of errors of the pose, by name."""
+                values = np.column_stack([one for of in errors.values() for one in of.values()])
                 means = iter(values.mean(0).tolist())
                 told = iter(new_trials(values, numbers))
                 out: dict[str, dict[str, Any]] = {}
-                for model in errors:
-                    ends = {name: next(told) for _, name in names}
-                    if (heading := ends.get("heading")) is not None:
-                        # it is off by half a turn at most
-                        heading[1] = min(heading[1], math.pi)
-                    out[model] = {name: next(means) for _, name in names} | {"intervals": ends}
+                for model, of in errors.items():
+                    ends = {name: next(told) for name in of}
+                    for angle in ("heading", "attitude"):
+                        if (found := ends.get(angle)) is not None:
+                            # it is off by half a turn at most
+                            found[1] = min(found[1], math.pi)
+                    out[model] = {name: next(means) for name in of} | {"intervals": ends}
                 return out
 
             measured = [
@@ -385,12 +359,7 @@ class Judged:
                 for (log, part), taken in zip(self.parts, there, strict=True)
                 if taken
             ]
-            drift = [
-                integrate(y[0, POSE], y[:, self.live.columns], step)[-1] - y[-1, POSE]
-                for y in measured
-            ]
-            floor = np.array(drift)
-            floor[:, 2] = wrap_array(floor[:, 2])
+            floor = drift(np.stack(measured), self.live, step)
             sailed = [float(np.hypot(*y[:, VELOCITIES][:, :2].T).sum()) * step for y in measured]
             out.append(
                 {
@@ -403,7 +372,7 @@ class Judged:
                     "floor": off({"floor": floor})["floor"],
                     "models": off(
                         {
-                            name: found.error[(found.begins + k)[there]][:, POSE]
+                            name: found.ends((found.begins + k)[there])
                             for name, found in self.found.items()
                         }
                     ),
@@ -417,20 +386,19 @@ class Judged:
         They are integrated over each window from its measured pose, as predictions are.
 
         Returns:
-            windows; position_mean, position_rms in m and heading_mean, heading_rms in rad at the
-            ends of windows. A model that predicted the measured velocities exactly would have
-            these errors. Empty where only some velocities were recorded.
+            windows; mean and root mean square of each of `Live.ends` at the ends of windows, as
+            position_mean and position_rms. A model that predicted the measured velocities exactly
+            would have these errors. Empty where only some velocities were recorded.
         """
         if self.live.dead:
             return {}
-        measured = [log.y[part] for log, part in self.parts]
-        ends = [
-            integrate(y[0, POSE], y[:, self.live.columns], step)[-1] - y[-1, POSE] for y in measured
-        ]
-        error = np.array(ends)
-        position, heading = np.hypot(error[:, 0], error[:, 1]), np.abs(wrap_array(error[:, 2]))
-        out: dict[str, float] = {"windows": len(error)}
-        for name, values in (("position", position), ("heading", heading)):
+        of_length: dict[int, list[np.ndarray]] = {}
+        for log, part in self.parts:
+            of_length.setdefault(part.stop - part.start, []).append(log.y[part])
+        found = [drift(np.stack(alike), self.live, step) for alike in of_length.values()]
+        out: dict[str, float] = {"windows": len(self.parts)}
+        for name in self.live.ends:
+            values = np.concatenate([one[name] for one in found])
             out[f"{name}_mean"] = float(values.mean())
             out[f"{name}_rms"] = float(np.sqrt(np.mean(values**2)))
         return out
@@ -481,7 +449,8 @@ class Judged:
         Each with log, manoeuvre, t (start, the log's clock, s), nrmse, rmse, position_error_end
         (heading_error_end where no velocity moves the position).
         """
-        found, nrmse, end = self.found[name], self.nrmse[name], self._ends[0][1]
+        found, nrmse, end = self.found[name], self.nrmse[name], self.live.ends[0]
+        ends = found.ends()[end]
         return [
             {
                 "log": self.parts[i][0].log.name,
@@ -491,7 +460,7 @@ class Judged:
                 "rmse": {
                     self.live.moving[axis]: float(found.rmse[i, axis]) for axis in self.live.axes
                 },
-                f"{end}_error_end": float(getattr(found, f"{end}_end")[i]),
+                f"{end}_error_end": float(ends[i]),
             }
             for i in np.argsort(-nrmse, kind="stable")[:_WORST].tolist()
         ]
@@ -554,7 +523,7 @@ def find(table: Sequence[Mapping[str, Any]], **wanted: str) -> Mapping[str, Any]
 _LABELS = ("model", "kind", "split", "protocol", "manoeuvre", "selected")
 _COUNTS = ("windows", "diverged", "n")
 _BY_CHANNEL = ("rmse", "mae", "nrmse")
-_ENDS = ("position_error_end", "heading_error_end")
+_ENDS = tuple(f"{end}_error_end" for end in END_UNITS)
 
 
 def metrics_content(
@@ -600,7 +569,8 @@ def metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         Columns model, kind, split, protocol, manoeuvre (and selected where the rows have it),
         windows, diverged, n, then rmse_u, rmse_v, rmse_r (m/s, m/s, rad/s), the same for mae and
         nrmse with nrmse_mean, note (such as "2/12 diverged", where such windows count with the
-        error of `zero`), and position_error_end (m), heading_error_end (rad).
+        error of `zero`), and position_error_end (m), heading_error_end (rad), or depth_error_end
+        (m) and attitude_error_end (rad) where the vessel dives.
     """
     import pandas as pd
 

@@ -507,8 +507,8 @@ def check_bounded(
     It starts from the recorded points with their inputs, and from rest with inputs at the edges of
     their ranges; each is held for 300 s, or as long as the longest log where that is longer.
     """
-    limit = torch.maximum(_ranges(spec.low).abs(), _ranges(spec.high).abs())[: model.dof]
-    limit = limit.clamp(min=1e-9)
+    largest = spec.signals.live.largest(np.array(spec.low), np.array(spec.high))
+    limit = torch.from_numpy(largest).clamp(min=1e-9)
     corners = _corners(spec)
     known = len(recorded.x)
     x = torch.cat((recorded.x, recorded.x.new_zeros(len(corners), recorded.x.shape[1])))

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from residnet.core.format import interval, number, plural
+from residnet.core.format import interval, listed, number, plural, shown_unit
+from residnet.core.names import END_UNITS
 
 Content = Mapping[str, Any]
 """What a JSON object holds."""
@@ -74,12 +75,8 @@ _SHARE, _TURN = 0.10, math.radians(10.0)
 """What a good model is off at most: this share of the way sailed and so many radians of heading,
 at the upper end of the interval, or twice the noise floor. It is residnet's choice, and stands in
 the verdict, so that a reader with other needs can choose another."""
-_ENDS = (("position", 1.0, "m"), ("heading", math.degrees(1.0), "deg"))
-"""Errors at the end of a free run, as far as the velocities of the model move them."""
-_GOOD = {
-    "position": f"{100.0 * _SHARE:.0f} % of the way",
-    "heading": f"{math.degrees(_TURN):.0f} deg",
-}
+_WORDS = {"depth": " of depth", "attitude": " of attitude"}
+"""What stands behind an error of the pose that is no distance over ground and no heading."""
 _OF_BEST = 1.5
 """A good model errs at most so many times as much as the best one of the run, floor aside."""
 
@@ -163,7 +160,7 @@ def good_until(evidence: Evidence) -> float:
         floors = [entry["floor"], *(models[name] for name in plants & set(models))]
         rivals = set(models) - {evidence.selected} - plants
         for of in ends:
-            least = _SHARE * entry["sailed"] if of == "position" else _TURN
+            least = _TURN if END_UNITS[of] == "rad" else _SHARE * entry["sailed"]
             others = [models[name][of] for name in rivals]
             twice = 2.0 * max(floor[of] for floor in floors)
             near = own[of] <= max(twice, _OF_BEST * min(others, default=own[of]))
@@ -179,6 +176,7 @@ def ahead(evidence: Evidence) -> list[str]:
     entries = horizons(evidence)
     if not entries:
         return [compared(evidence)]
+    ends = [of for of in END_UNITS if of in entries[0]["floor"]]
     enough = [entry for entry in entries if _enough(evidence, entry)]
     until = good_until(evidence) if enough else 0.0
     chosen = next((e for e in entries if e["seconds"] == until), (enough or entries)[-1])
@@ -194,7 +192,11 @@ def ahead(evidence: Evidence) -> list[str]:
         start = f"Up to {after}: there {evidence.selected} is off by {off}."
     else:
         start = f"{after[0].upper()}{after[1:]} {evidence.selected} is off by {off}."
-        good = " and ".join(_GOOD[of] for of, _, _ in _ENDS if of in chosen["floor"])
+        limits = {
+            "m": f"{100.0 * _SHARE:.0f} % of the way",
+            "rad": f"{math.degrees(_TURN):.0f} deg",
+        }
+        good = listed(list(dict.fromkeys(limits[END_UNITS[of]] for of in ends)))
         wanted = [
             f"Good would be within {good}, or twice the noise floor, without a diverged window"
             " and near the best model of the run."
@@ -206,14 +208,14 @@ def ahead(evidence: Evidence) -> list[str]:
         if name in chosen["models"] and name != evidence.selected
     ]
     # a pose that was integrated from the velocities has no floor but rounding
-    known = any(chosen["floor"].get(of, 0.0) > 1e-9 for of, _, _ in _ENDS)
+    known = any(chosen["floor"][of] > 1e-9 for of in ends)
     floor = f"the noise floor (measured velocities, integrated) {_pair(chosen['floor'])}"
     rest = [
         f"{_pair(entry['models'][evidence.selected])} after {entry['seconds']:.4g} s"
         for entry in entries
         if entry is not chosen
     ]
-    moves = "position" in chosen["floor"]
+    moves = "position" in ends
     holds = (
         f"It holds for {plural(chosen['windows'], 'free run')} ({chosen['protocol']}) of"
         f" {plural(chosen['logs'], 'log')}"
@@ -230,25 +232,29 @@ def ahead(evidence: Evidence) -> list[str]:
     ]
 
 
+def sized(of: str, error: float) -> str:
+    """Return an error of the pose (`END_UNITS`) with its unit."""
+    unit, factor = shown_unit(END_UNITS[of])
+    return f"{number(factor * error, 2)} {unit}{_WORDS.get(of, '')}"
+
+
 def _pair(errors: Content) -> str:
-    found = [f"{number(f * errors[of], 2)} {unit}" for of, f, unit in _ENDS if of in errors]
-    return " and ".join(found)
+    return listed([sized(of, errors[of]) for of in END_UNITS if of in errors])
 
 
 def _off(entry: Content, name: str, sailed: float = 0.0) -> str:
     """Return errors of position and heading with their intervals as text."""
     own, out = entry["models"][name], []
-    for of, factor, unit in (end for end in _ENDS if end[0] in own):
-        ends = own["intervals"][of]
-        text = f"{number(factor * own[of], 2)} {unit}"
-        details = [interval(ends, factor, 2)] if ends else []
+    for of in (of for of in END_UNITS if of in own):
+        ends, text = own["intervals"][of], sized(of, own[of])
+        details = [interval(ends, shown_unit(END_UNITS[of])[1], 2)] if ends else []
         if of == "position" and sailed > 0.0:
             details.append(
                 f"{number(100.0 * own[of] / sailed, 2)} % of the {number(sailed, 2)} m sailed"
             )
         out.append(text + (f" ({', '.join(details)})" if details else ""))
     known = all(own["intervals"].values()) or sailed == 0.0
-    return " and ".join(out) + ("" if known else ", from too few logs for an interval")
+    return listed(out) + ("" if known else ", from too few logs for an interval")
 
 
 def objections(evidence: Evidence) -> list[str]:

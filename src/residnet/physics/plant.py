@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError
-from residnet.core.frames import cross, to_body, to_earth, upright
+from residnet.core.frames import along_axes, cross, to_body, to_earth, upright
 from residnet.core.layout import PLANAR, StateLayout
 from residnet.physics.actuators import Actuators
 from residnet.physics.environment import WIND_INPUTS, WindLoadConfig
@@ -303,13 +303,10 @@ class HullPlant(Plant):
 
     def _body(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
         """Return an earth-fixed horizontal vector along the (rolled) body axes, [B, n]."""
-        along, across = to_body(north, east, pose[..., -1])
-        zero = torch.zeros_like(along)
+        zero = torch.zeros_like(pose[..., -1])
         if self.dives:
-            phi, theta = pose[..., 3], pose[..., 4]
-            side, normal = to_body(across, along * torch.sin(theta), phi)
-            ahead = along * torch.cos(theta)
-            return torch.stack((ahead, side, normal, zero, zero, zero), dim=-1)
+            return torch.stack((*along_axes(north, east, pose[..., 3:]), zero, zero, zero), dim=-1)
+        along, across = to_body(north, east, pose[..., -1])
         if self.rolls:
             return torch.stack((along, across * torch.cos(pose[..., 2]), zero, zero), dim=-1)
         return torch.stack((along, across, zero), dim=-1)

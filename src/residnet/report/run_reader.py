@@ -17,10 +17,10 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_table
 from residnet.core.format import SHOWN_UNITS, shown_unit
 from residnet.core.layout import ALIVE, SIX, Live
-from residnet.core.names import CHANNEL_UNITS, to_si
+from residnet.core.names import CHANNEL_UNITS, END_UNITS, to_si
 from residnet.core.units import known_unit
 from residnet.judge.rollout_files import INPUT, columns_of
-from residnet.judge.verdict import by_windows
+from residnet.judge.verdict import by_windows, sized
 
 Content = Mapping[str, Any]
 """What a JSON object holds."""
@@ -279,8 +279,18 @@ class RunFiles:
 
     @cached_property
     def ends(self) -> list[str]:
-        """What of `position` and `heading` is scored at the end of free runs."""
-        return [end for end in ("position", "heading") if f"{end}_error_end" in self.rows[0]]
+        """What of `END_UNITS` is scored at the end of free runs."""
+        return [end for end in END_UNITS if f"{end}_error_end" in self.rows[0]]
+
+    def end(self, end: str) -> tuple[str, str, float]:
+        """Return name, unit and the factor to it from SI of an error at the end of free runs."""
+        return self.place if end == "position" else end, *shown_unit(END_UNITS[end])
+
+    def sized(self, errors: Content, key: str) -> list[str]:
+        """Return errors of the pose with their units, from their keys, such as `{}_mean`."""
+        return [
+            sized(end, errors[key.format(end)]) for end in self.ends if key.format(end) in errors
+        ]
 
     def row(
         self, model: str | None, split: str, protocol: str, manoeuvre: str = "all"

@@ -13,7 +13,7 @@ import numpy as np
 from residnet.core.config import dump_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, nearest, si_unit
+from residnet.core.names import CHANNEL_UNITS, END_UNITS, nearest, si_unit
 from residnet.core.progress import begin, say
 from residnet.data.doctor import inspect, inspect_together, inspection, summary
 from residnet.data.drafting.reading import log_files
@@ -59,7 +59,6 @@ if TYPE_CHECKING:
 
 _CHOSEN = ("predictor", "selected")
 """What stands for a model's name: the one reported first, and the single one chosen."""
-_END_UNITS = {"position": "m", "heading": "rad"}
 SPLIT = "external"
 """Name of the split of logs that no fit has seen."""
 
@@ -223,7 +222,7 @@ def fit_outcome(
                 for name in files.channels
             },
             **{
-                f"{end}_error_end": MainFigure(row[f"{end}_error_end"], _END_UNITS[end])
+                f"{end}_error_end": MainFigure(row[f"{end}_error_end"], END_UNITS[end])
                 for end in files.ends
             },
         }

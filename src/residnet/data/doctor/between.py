@@ -267,7 +267,7 @@ def extrapolation(logs: Together, found: Check) -> Iterator[Finding]:
     train = [log for log in logs.logs if logs.splits.get(log.name) == "train"]
     others = [log for log in logs.logs if logs.splits.get(log.name) in ("validation", "test")]
     for name in logs.channels if train and others else ():
-        if name in ("x", "y", "psi"):
+        if name in ("x", "y", "z", "psi"):
             continue
         unit = train[0].units[name]
         low = min(float(np.nanmin(log[name])) for log in train)

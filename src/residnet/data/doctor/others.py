@@ -20,6 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from residnet.core.arrays.paged import LARGE
+from residnet.core.layout import SIX
 from residnet.core.names import VELOCITY
 from residnet.core.stretches import stretches
 from residnet.data.channels import SIGMA_OF_MAD
@@ -87,6 +88,14 @@ def _wind(log: Sampled, names: Sequence[str]) -> list[np.ndarray]:
     return [pressure * np.cos(side), pressure * np.sin(side), pressure * np.sin(2.0 * side)]
 
 
+def _weight(log: Sampled, moving: Sequence[str]) -> list[np.ndarray]:
+    """Return the vertical along the axes of a vessel that dives; nothing on the surface."""
+    if "q" not in moving:
+        return []
+    level = np.cos(log["theta"])
+    return [np.sin(log["theta"]), level * np.sin(log["phi"]), level * np.cos(log["phi"])]
+
+
 def _quadratic(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> list[np.ndarray]:
     """Return forces of second degree in velocities and revolutions, as a hull in water has.
 
@@ -96,7 +105,7 @@ def _quadratic(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> l
     ahead = states[0]
     out = [state * np.abs(state) for state in states]
     out += [a * b for i, a in enumerate(states) for b in states[i + 1 :]]
-    out += [np.abs(ahead) * state for state in states[1:]]
+    out += [np.abs(ahead) * state for state in states[1:]] + _weight(log, moving)
     angles = [log[name] for name in driving if log.units[name] == "rad"]
     turns = [log[name] for name in driving if log.units[name] != "rad"]
     for turn in turns:
@@ -114,7 +123,7 @@ def _polynomial(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> 
     states, given = [log[name] for name in moving], [log[name] for name in driving]
     ahead = states[0]
     out = [np.ones_like(ahead), *states, *(state * np.abs(state) for state in states)]
-    out += [a * b for i, a in enumerate(states) for b in states[i + 1 :]]
+    out += [a * b for i, a in enumerate(states) for b in states[i + 1 :]] + _weight(log, moving)
     out += given
     # beyond four inputs each enters linearly only
     for i, a in enumerate(given if len(given) <= 4 else ()):
@@ -233,6 +242,8 @@ class Fleet:
     def __init__(self, logs: Sequence[Record], inputs: Sequence[str]) -> None:
         self.logs, self.inputs = list(logs), tuple(inputs)
         self.moving = [name for name in VELOCITY if all(name in log for log in logs)]
+        if all(name in log for log in logs for name in SIX.moving):
+            self.moving = list(SIX.velocities)
         self.driving = [name for name in inputs if not name.startswith(("wind", "current"))]
         seconds = [
             blocks_of(log, *self.moving).size * log.step for log in logs if len(log) >= FEWEST

@@ -8,9 +8,9 @@ from typing import Any
 
 from residnet.core.format import (
     DASH,
-    DEG,
     change,
     fixed,
+    listed,
     number,
     percent,
     plural,
@@ -82,11 +82,10 @@ def errors(run: RunFiles) -> Section:
 
 def _quantities(run: RunFiles, nrmse: str = "NRMSE [-]") -> dict[str, str]:
     """Return the titles of what tables of errors show."""
-    ends = {"position": f"{run.place}, end [m]", "heading": "heading, end [deg]"}
     return {
         **{channel: f"{title_of(channel)} [{run.unit(channel)[0]}]" for channel in run.channels},
         "nrmse": nrmse,
-        **{end: ends[end] for end in run.ends},
+        **{end: "{}, end [{}]".format(*run.end(end)) for end in run.ends},
         "diverged": "diverged",
     }
 
@@ -182,10 +181,8 @@ def _quantity(run: RunFiles, key: str, row: Content | None, base: Content | None
         return Cell(DASH)
     if key == "diverged":
         return Cell(f"{row['diverged']}/{row['windows']}", mark="bad" if row["diverged"] else "")
-    if key == "position":
-        return Cell(number(row.get("position_error_end"), 2))
-    if key == "heading":
-        return Cell(number(DEG * row.get("heading_error_end", math.nan), 2))
+    if key in run.ends:
+        return Cell(number(run.end(key)[2] * row.get(f"{key}_error_end", math.nan), 2))
     lost = diverged_note(row)
     if key == "nrmse":
         interval = row.get("nrmse_mean_ci95")
@@ -314,13 +311,9 @@ def _worst(run: RunFiles, lead: str, known: Content) -> Table | None:
 
 
 def _worst_end(run: RunFiles) -> Column:
-    if run.ends[0] == "heading":
-        return (
-            "heading, end [deg]",
-            lambda entry: number(DEG * entry["heading_error_end"], 2),
-            str,
-        )
-    return f"{run.place}, end [m]", lambda entry: number(entry["position_error_end"], 2), str
+    first = run.ends[0]
+    factor = run.end(first)[2]
+    return _quantities(run)[first], lambda e: number(factor * e[f"{first}_error_end"], 2), str
 
 
 def _what_limits(
@@ -330,13 +323,10 @@ def _what_limits(
     if found := known.get("kinematics"):
         out.append(
             "Consistency of the measured channels: the measured velocities, integrated over each"
-            f" window from its measured pose, end {number(found['position_mean'], 2)} m and"
-            f" {number(DEG * found['heading_mean'], 2)} deg from the measured pose on average (root"
-            f" mean square {number(found['position_rms'], 2)} m,"
-            f" {number(DEG * found['heading_rms'], 2)} deg). A model that predicted the measured"
-            f" velocities exactly would be off by as much; {lead} is off by"
-            f" {number(row['position_error_end'], 2)} m and"
-            f" {number(DEG * row['heading_error_end'], 2)} deg."
+            f" window from its measured pose, end {listed(run.sized(found, '{}_mean'))} from the"
+            f" measured pose on average (root mean square {', '.join(run.sized(found, '{}_rms'))})."
+            " A model that predicted the measured velocities exactly would be off by as much;"
+            f" {lead} is off by {listed(run.sized(row, '{}_error_end'))}."
         )
     if repeats := (run.limits.get("repeatability") or {}).get(protocol):
         out.append(_repeatability(run, repeats))
@@ -367,13 +357,7 @@ def _repeatability(run: RunFiles, found: Content) -> str:
     kinds = ", ".join(
         f"{name.replace('_', ' ')} {part['pairs']}" for name, part in found["manoeuvres"].items()
     )
-    ends = " and ".join(
-        {
-            "position": f"{number(found['position'], 2)} m",
-            "heading": f"{number(DEG * found['heading'], 2)} deg",
-        }[end]
-        for end in run.ends
-    )
+    ends = listed(run.sized(found, "{}"))
     place = f" and {number(share * found['position'], 2)} m" if "position" in run.ends else ""
     exogenous = (run.resolved.get("signals") or {}).get("exogenous")
     wind = " A model that knows the wind, as these do, can do better." if exogenous else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from residnet.core.format import DASH, DEG, minus, number, percent, plural, title_of
+from residnet.core.format import DASH, minus, number, percent, plural, title_of
 from residnet.data.doctor import summary
 from residnet.judge.soundness import CHECKS, Finding
 from residnet.judge.verdict import UNSEEN, Evidence, diverged_note
@@ -124,12 +124,8 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
                 lambda row: _MEASURED if row["model"] == _MEASURED else run.label(row["model"]),
             ),
             *(
-                (title, lambda row, of=of, f=f: error(row, f"{of}_error_end", f))
-                for of, title, f in (
-                    ("position", f"{run.place} [m]", 1.0),
-                    ("heading", "heading [deg]", DEG),
-                )
-                if of in run.ends
+                (f"{name} [{unit}]", lambda row, of=of, f=f: error(row, f"{of}_error_end", f))
+                for of, (name, unit, f) in ((of, run.end(of)) for of in run.ends)
             ),
             ("sound", sound),
         ],
