@@ -29,6 +29,7 @@ from residnet.heads import HeadConfig
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
 from residnet.identification.changes import causes
+from residnet.judge.freerun import drift
 from residnet.physics.hull import SubmergedConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
@@ -204,6 +205,24 @@ def test_what_logs_tell_and_lack() -> None:
 def flown() -> list[Log]:
     config = trials(4, 40.0)
     return [flight.log for flight in fly_trials(config.draw(), config)]
+
+
+def test_measured_velocities_lead_to_the_measured_pose() -> None:
+    y = np.stack([log.stack(SIX.names) for log in flown()])
+    off = drift(y, SUBMERGED.live, STEP)
+    assert list(off) == list(SUBMERGED.live.ends) == ["position", "depth", "attitude"]
+    way = np.hypot(*np.diff(y[:, :, :2], axis=1).T).sum(axis=0)
+    assert (off["position"] < 0.01 * way).all()
+    assert (off["depth"] < 0.01 * way).all()
+    assert (off["attitude"] < 0.01).all()
+
+
+def test_a_depth_and_a_loop_are_no_runaway() -> None:
+    low, high = -np.ones(12), 2.0 * np.ones(12)
+    size = SUBMERGED.live.largest(low, high)
+    assert size[:6].tolist() == [2.0] * 6
+    assert np.isinf(size[6:]).all()
+    assert Live().largest(low, high).tolist() == [2.0] * 3
 
 
 @pytest.mark.parametrize("beside", ["samples", "means"])

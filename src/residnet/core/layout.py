@@ -322,7 +322,7 @@ class Live:
         Infinite for a depth, and for the angles of rotations that are composed: a vessel that loops
         or dives deeper has not run away.
         """
-        size = np.maximum(np.abs(low), np.abs(high))[: self.size]
+        size = np.asarray(np.maximum(np.abs(low), np.abs(high))[: self.size])
         if self.spatial:
             size[[self.moving.index(name) for name in self.layout.attitude]] = np.inf
         return size
