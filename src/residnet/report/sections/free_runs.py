@@ -336,7 +336,7 @@ def _what_limits(
 def _repeatability(run: RunFiles, found: Content) -> str:
     tolerance = found["tolerance"]
 
-    def listed(values: Mapping[str, float], *digits: int) -> str:
+    def told(values: Mapping[str, float], *digits: int) -> str:
         return ", ".join(
             f"{name} {number(run.unit(name)[1] * values[name], *digits)} {run.unit(name)[0]}"
             for name in tolerance["start"]
@@ -345,7 +345,7 @@ def _repeatability(run: RunFiles, found: Content) -> str:
     rule = (
         f"commands within {100 * tolerance['command_share_of_range']:.0f} % of their range (root"
         " mean square over the window) and initial velocities within"
-        f" {listed(tolerance['start'], 2)}"
+        f" {told(tolerance['start'], 2)}"
     )
     where = "the logs evaluated here" if run.focus == "external" else "the logs of all splits"
     if not found["pairs"]:
@@ -364,7 +364,7 @@ def _repeatability(run: RunFiles, found: Content) -> str:
     return (
         f"Repeatability: {plural(found['pairs'], 'pair')} of stretches ({kinds}) in"
         f" {found['logs']} of {where} have {rule}. Their measured motions differ by"
-        f" {listed(found)} (root"
+        f" {told(found)} (root"
         f" mean square), and by {ends} at the end. Each motion is off their mean by"
         f" 1/√2 of that: an NRMSE of {number(share * found['nrmse'])}{place}."
         " The remaining differences of commands and"
