@@ -226,7 +226,8 @@ def test_casadi_has_exact_derivatives(variant: str, tmp_path: Path) -> None:
 
 def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
     made = exported("lstm")
-    exporter("c").export(made, tmp_path / "boat.c")
+    size = exporter("c").export(made, tmp_path / "boat.c")["size"]
+    assert 0 < size["stack_bytes"]["mine_step"] < size["code_bytes"]
     text = (tmp_path / "boat.c").read_text()
     assert "malloc" not in text
     kept = [line for line in text.splitlines() if line.startswith("static") and "(" not in line]

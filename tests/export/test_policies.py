@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from s_functions import SFunction
 from torch import Tensor
 
 from residnet.control.courses.course_plan import Course
@@ -185,6 +186,25 @@ def test_a_heading_policy_is_written_as_c(tmp_path: Path) -> None:
         header = (tmp_path / "pilot.h").read_text()
         assert "int pilot_step(const pilot_real *y" in header
         assert "PILOT_SIZE_S" in header
+
+
+def test_an_s_function_answers_as_the_policy(tmp_path: Path) -> None:
+    exported = heading()
+    made = SFunction(exported, tmp_path)
+    random = np.random.default_rng(0)
+    y = np.stack((0.2 * random.normal(size=200), np.full(200, 3.2), 0.02 * random.normal(size=200)))
+    rows = np.concatenate((y, np.full((1, 200), 0.3))).T
+    rows[100, 0] = np.nan
+    dt, out = made.fly(rows, 2)
+    assert dt == DT
+    policy: Any = exported.controller(torch.float64)
+    given = torch.from_numpy(rows)
+    s = policy.initial_state(given[:1, :3])
+    for k in range(200):
+        with torch.no_grad():
+            command, s, fault = policy.step(given[k : k + 1, :3], given[k : k + 1, 3:], s)
+        assert out[k, 0] == pytest.approx(float(command), abs=1e-9)
+        assert bool(out[k, 1]) == bool(fault) == (k == 100)
 
 
 @pytest.mark.exporters

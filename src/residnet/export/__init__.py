@@ -21,6 +21,7 @@ FORMATS = Kinds(
         "casadi": "residnet.export.casadi_function:CasadiExporter",
         "fmu": "residnet.export.fmu:Fmu3Exporter",
         "fmu2": "residnet.export.fmu:Fmu2Exporter",
+        "simulink": "residnet.export.simulink:SimulinkExporter",
         "aoti": "residnet.export.aoti:AotiExporter",
         "parameters": "residnet.export.parameters:ParametersExporter",
         "feed_forward": "residnet.export.feed_forward:FeedForwardExporter",

@@ -25,7 +25,13 @@ from residnet.export.base import (
     name_of,
     write_card,
 )
-from residnet.export.c_code import CFunction, c_files, compile_shared, identifier
+from residnet.export.c_code import (
+    CFunction,
+    c_files,
+    compile_shared,
+    footprint,
+    identifier,
+)
 from residnet.export.policy import ExportedController
 from residnet.export.vessel import ExportedVessel
 
@@ -283,7 +289,7 @@ class CExporter(Exporter):
             dtype, (written, parity) = in_precision(exported, attempt)
             if dtype == torch.float64:
                 card |= {"dtype": name_of(dtype)}
-            card |= {"parity": parity}
+            card |= {"size": footprint(partial), "parity": parity}
             file.parent.mkdir(parents=True, exist_ok=True)
             file.with_suffix(".h").write_text(written.header)
             write_card(file, card)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import platform
 import re
+import shutil
 import subprocess
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import casadi as ca
 
@@ -201,3 +204,27 @@ def compile_shared(sources: Sequence[Path], out: Path, flags: Sequence[str] = ()
         said = next((line for line in lines if "error" in line), "no message")
         raise ExportError(f"{sources[0].name}: does not compile ({said})")
     return out
+
+
+def footprint(source: Path, flags: Sequence[str] = ()) -> dict[str, Any]:
+    """Return what a C file takes on this machine, built for size, by the compiler's own account.
+
+    That is the bytes of each function's stack, without those of the C library that it calls, and of
+    code and constants. What the tools here do not tell is left out: a compiler without
+    `-fstack-usage`, or no `size`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "made.o"
+        call = [compiler(), "-std=c99", "-Os", "-fstack-usage", "-c", *flags, str(source)]
+        if subprocess.run([*call, "-o", str(made)], capture_output=True).returncode:
+            return {}
+        out: dict[str, Any] = {"machine": f"{platform.machine()}, -Os"}
+        usage = made.with_suffix(".su")
+        if usage.is_file():
+            rows = (line.split("\t") for line in usage.read_text().splitlines())
+            out["stack_bytes"] = {name.rsplit(":", 1)[-1]: int(size) for name, size, *_ in rows}
+        if (tool := shutil.which("size")) is not None:
+            told = subprocess.run([tool, str(made)], capture_output=True, text=True).stdout
+            # the first column of Berkeley's format holds code and constants
+            out["code_bytes"] = int(told.splitlines()[1].split()[0])
+        return out
