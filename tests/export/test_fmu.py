@@ -4,6 +4,8 @@ multiple, and refused at other steps.
 
 from __future__ import annotations
 
+import os
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,8 +16,9 @@ import torch
 from exported_models import built
 from fmpy.validation import validate_fmu
 
+from residnet.dynamics.c_code import compiler
 from residnet.dynamics.rollout import Rollout
-from residnet.export import exporter, vessel
+from residnet.export import exporter, fmu, vessel
 from residnet.export.vessel import ExportedVessel
 
 pytestmark = pytest.mark.exporters
@@ -66,3 +69,24 @@ def test_a_unit_is_imported_and_stepped(name: str, tmp_path: Path) -> None:
         assert not table["outside"].any()
     with pytest.raises(fmpy.fmi1.FMICallException, match="DoStep failed"):
         flown(0.25)
+
+
+def test_compilers_for_other_machines_are_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("x86_64-w64-mingw32-gcc", "aarch64-linux-gnu-gcc"):
+        tool = tmp_path / name
+        tool.write_text(f'#!/bin/sh\nexec {compiler()} "$@"\n')
+        tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(fmu.platform, "machine", lambda: "x86_64")
+    spec, model = built("plsr")
+    for name, wanted in (
+        ("fmu", {"x86_64-linux/model.so", "x86_64-windows/model.dll", "aarch64-linux/model.so"}),
+        ("fmu2", {"linux64/model.so", "win64/model.dll"}),
+    ):
+        file = tmp_path / f"{name}.fmu"
+        card = exporter(name).export(ExportedVessel(spec, model), file)
+        found = {one for one in zipfile.ZipFile(file).namelist() if one.startswith("binaries/")}
+        assert found == {f"binaries/{one}" for one in wanted}
+        assert set(card["binaries"]) == {one.split("/")[0] for one in wanted}

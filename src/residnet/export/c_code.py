@@ -191,13 +191,23 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 """Flags under which every exported file compiles without a warning."""
 
 
-def compile_shared(sources: Sequence[Path], out: Path, flags: Sequence[str] = ()) -> Path:
+def compile_shared(
+    sources: Sequence[Path], out: Path, flags: Sequence[str] = (), tool: str = ""
+) -> Path:
     """Compile C files to a shared library, without a single warning.
+
+    Args:
+        sources: of the library.
+        out: the library.
+        flags: of the compiler, beside its usual ones.
+        tool: the compiler; empty for that of this machine.
 
     Raises:
         ExportError: with the compiler's first complaint.
     """
-    call = [compiler(), "-O2", *STRICT, "-shared", "-fPIC", *flags, *map(str, sources)]
+    # all code for Windows is independent of its position, and the flag a warning there
+    own = () if out.suffix == ".dll" else ("-fPIC",)
+    call = [tool or compiler(), "-O2", *STRICT, "-shared", *own, *flags, *map(str, sources)]
     done = subprocess.run([*call, "-o", str(out), "-lm"], capture_output=True, text=True)
     if done.returncode:
         lines = done.stderr.strip().splitlines()

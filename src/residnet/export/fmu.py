@@ -1,6 +1,7 @@
 """The formats `fmu` and `fmu2`: co-simulation units of FMI 3.0 and 2.0 around the exported C.
 
-The archive holds the sources, and the unit compiled for this machine.
+The archive holds the sources, and the unit compiled for this machine and for others whose compilers
+are at hand.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import shutil
 import sys
 import tempfile
 import xml.etree.ElementTree as Xml
@@ -165,11 +167,14 @@ class FmuExporter(Exporter):
             for part, text in sources.items():
                 (folder / part).write_text(text)
             library = compile_shared(
-                [folder / part for part in sources if part.endswith(".c")],
-                folder / f"{NAME}{_library_suffix()}",
+                _compiled(folder, sources), folder / f"{NAME}{_library_suffix()}"
             )
             loaded = CompiledModel(library, exported, torch.float64)
-            card |= {"parity": exported.check(loaded, "the FMU's code", torch.float64)}
+            binaries = {self.platform(): library} | self._others(folder, sources)
+            card |= {
+                "parity": exported.check(loaded, "the FMU's code", torch.float64),
+                "binaries": list(binaries),
+            }
             with (
                 whole(file) as partial,
                 zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -180,8 +185,19 @@ class FmuExporter(Exporter):
                     archive.writestr(f"sources/{part}", text)
                 if self.version == "3.0":
                     archive.writestr("sources/buildDescription.xml", _BUILD)
-                archive.write(library, f"binaries/{self.platform()}/{library.name}")
+                for where, binary in binaries.items():
+                    archive.write(binary, f"binaries/{where}/{NAME}{binary.suffix}")
         return card
+
+    def _others(self, folder: Path, sources: Mapping[str, str]) -> dict[str, Path]:
+        """Return the units of other machines whose compilers are at hand, by platform."""
+        out = {}
+        for tool, platforms, suffix in _CROSS:
+            where = platforms[self.version]
+            if where not in ("", self.platform()) and shutil.which(tool) is not None:
+                made = folder / f"{where}{suffix}"
+                out[where] = compile_shared(_compiled(folder, sources), made, tool=tool)
+        return out
 
     def _sources(self, written: CSource, token: str, dt: float) -> dict[str, str]:
         """Return the source files by name."""
@@ -207,6 +223,18 @@ class FmuExporter(Exporter):
     @abstractmethod
     def platform(self) -> str:
         """Return this machine as the standard names it."""
+
+
+_CROSS = (
+    ("x86_64-w64-mingw32-gcc", {"3.0": "x86_64-windows", "2.0": "win64"}, ".dll"),
+    # version 2.0 has no name for it
+    ("aarch64-linux-gnu-gcc", {"3.0": "aarch64-linux", "2.0": ""}, ".so"),
+)
+"""Compilers for other machines as Linux distributions name them, the platform, and its suffix."""
+
+
+def _compiled(folder: Path, sources: Mapping[str, str]) -> list[Path]:
+    return [folder / part for part in sources if part.endswith(".c")]
 
 
 def _packaged(name: str) -> str:
