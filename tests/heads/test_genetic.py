@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import sympy
 import torch
+from made_equations import CHANNELS, draw_ship
 from made_odin import FORCE_TRUTH, MSD_TRUTH, force_logs, msd_log
 from made_samples import NAMES, made
 
@@ -25,7 +26,7 @@ from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.heads import HeadConfig
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.physics.terms import TermLibrary
+from residnet.physics.terms import TermLibrary, parse_term
 from residnet.regression.expressions import Algebra, ExpressionLibrary, Limits, Sum, tables
 from residnet.regression.genetic import breed, limits_of
 from residnet.regression.writing import equation, symbolic_sum, term
@@ -69,6 +70,27 @@ def test_force_equations_of_odin() -> None:
     parts = head.contributions(data.z, 0)
     assert list(parts) == [name for name in head.names() if name in FORCE_TRUTH["u_dot"]]
     np.testing.assert_allclose(sum(parts.values()), data.target[:, 0], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("final", [True, False])
+def test_noise_hides_no_equation_that_a_sparse_search_finds(final: bool) -> None:
+    design = draw_ship(3, noise=0.1)
+    config = GeneticConfig.model_validate(
+        {"evolution": {"population": 20, "generations": 1}} | ({} if final else {"final": None})
+    )
+    head = config.build(CHANNELS)
+    head.calibrate(design.samples)
+    notes = head.solve(design.samples)
+    for axis, truth in zip(ACCELERATION, design.truth, strict=True):
+        assert bool(notes["equations"][axis]["by_sparse_search"]) == final
+        if final:
+            found = {
+                tuple(sorted(parse_term(c["term"], CHANNELS))): c["value"]
+                for c in notes["coefficients"]
+                if c["axis"] == axis
+            }
+            wanted = {tuple(sorted(parse_term(term, CHANNELS))): truth[term] for term in truth}
+            assert found == pytest.approx(wanted, rel=0.1)
 
 
 @pytest.mark.parametrize("final", [True, False])

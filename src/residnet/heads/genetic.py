@@ -9,13 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.physics.symmetry import live_of
+from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term
 from residnet.regression.estimator import Solution
 from residnet.regression.expressions import ExpressionLibrary, Weights
 from residnet.regression.genetic import EquationSearchConfig, GeneticEquations
-from residnet.regression.writing import term
+from residnet.regression.sparse import SparseRegression
+from residnet.regression.writing import Term, term
 
 
 class GeneticConfig(FeatureConfig, EquationSearchConfig):
@@ -81,14 +84,49 @@ class GeneticHead(EquationHead):
     def solutions(self, samples: Samples) -> list[Solution]:
         """Return the equations of the best individuals of the three searches.
 
+        Where their terms are chosen from once more, those of a sparse search are among them: with
+        noise it finds more equations than breeding does, and in a hundredth of the time.
+
         Raises:
             FitError: where the data do not determine an equation.
             UsageError: where DEAP is not installed.
         """
-        return GeneticEquations(self.config).fit(
+        return GeneticEquations(self.config, self._known(samples)).fit(
             self.features.guarded(samples.z),
             samples.target,
             samples.group,
             names=self.features.names,
             outputs=self.outputs,
         )
+
+    def _known(self, samples: Samples) -> list[list[Term]]:
+        """Return the factors of the terms that a sparse search finds for each output."""
+        search, names = self.config.final, self.features.names
+        if search is None:
+            return []
+        candidates = CandidatesConfig().candidates(names)
+        library = TermLibrary([candidate.term for candidate in candidates], names)
+        estimator = SparseRegression(
+            search,
+            degrees=[candidate.degree for candidate in candidates],
+            efforts=[candidate.effort for candidate in candidates],
+        )
+        terms = library(self.features.guarded(samples.z))
+        try:
+            found = estimator.fit(terms, samples.target, names=library.terms, outputs=self.outputs)[
+                0
+            ].table
+        except FitError:
+            # too few samples for all candidates say nothing against a bred equation
+            return []
+        return [
+            [
+                [
+                    ("abs" if factor.magnitude else factor.function, factor.name, factor.power)
+                    for factor in parse_term(one.term, names)
+                ]
+                for one in found
+                if one.axis == output
+            ]
+            for output in self.outputs
+        ]

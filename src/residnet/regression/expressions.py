@@ -9,8 +9,8 @@ of numbers of atoms, so that trees that mean the same share their columns and th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -131,6 +131,21 @@ class Algebra:
         return {
             self._function("sum", {product: weight / lead for product, weight in a.items()}): lead
         }
+
+    def product(self, factors: Iterable[tuple[str, str, int]]) -> Product:
+        """Return a product of (function, channel, power); a function may be empty.
+
+        Raises:
+            TooLargeError: beyond the limits.
+        """
+        out: Sum = {ONE: 1.0}
+        for function, name, power in factors:
+            part = self.channel(name)
+            for one in (function, "inv" if power < 0 else ""):
+                part = self.apply(cast("Function", one), part) if one else part
+            for _ in range(abs(power)):
+                out = self.multiply(out, part)
+        return next(iter(out))
 
     def atom(self, function: Function, a: Sum) -> int:
         """Return the number of a function of a sum in normal form."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple, final
@@ -40,7 +41,7 @@ from residnet.regression.expressions import (
     tables,
 )
 from residnet.regression.sparse import SearchConfig, coefficient_row, everything, find, reduce
-from residnet.regression.writing import equation, symbolic_sum, term, total
+from residnet.regression.writing import Term, equation, symbolic_sum, term, total
 
 Operator = Literal["+", "-", "*", "/", "abs", "sin", "cos", "sqrt"]
 BINARY = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide"}
@@ -158,8 +159,9 @@ class EquationSearchConfig(Config):
     Attributes:
         evolution: how equations are bred.
         final: how the terms of the individual that wins are chosen from once more, by the extended
-            BIC on all samples; terms that genetic programming carries along without need go. None
-            keeps all.
+            BIC on all samples, together with those of a sparse search of the usual candidates:
+            terms that genetic programming carries along without need go, and what it missed comes
+            in. None keeps the individual's, all of them and no others.
         validate_every: number n of which every n-th manoeuvre validates during the search; with
             fewer manoeuvres every n-th eighth of the samples.
         seed: seed of the random choices; each axis has its own.
@@ -559,10 +561,16 @@ class GeneticEquations(Estimator):
 
     Args:
         config: how to search.
+        known: factors (function, channel, power) of terms that the final choice has beside those
+            that are bred, by output; none where empty.
     """
 
-    def __init__(self, config: EquationSearchConfig) -> None:
-        self.config = config
+    def __init__(
+        self,
+        config: EquationSearchConfig,
+        known: Sequence[Sequence[Term]] = (),
+    ) -> None:
+        self.config, self.known = config, known
 
     def solve(self, data: Data) -> list[Solution]:
         x, (_, y, groups, names, outputs) = whole(data.x), data
@@ -572,8 +580,9 @@ class GeneticEquations(Estimator):
         columns = {name: values[:, j] for j, name in enumerate(names)}
         groups = torch.zeros(len(x)) if groups is None else groups
         train = ~validating(groups.numpy(), config.validate_every)
+        known = [_within(algebra, row) for row in self.known] or [()] * n
         bred = [
-            breed(algebra, columns, target[:, k], train, config, n * config.seed + k)
+            breed(algebra, columns, target[:, k], train, config, n * config.seed + k, known[k])
             for k in range(n)
         ]
         products = sorted({product for found in bred for product in found.products})
@@ -606,6 +615,15 @@ class GeneticEquations(Estimator):
         ]
 
 
+def _within(algebra: Algebra, terms: Sequence[Term]) -> tuple[Product, ...]:
+    """Return the terms of these factors that are within the limits of the algebra."""
+    out = []
+    for factors in terms:
+        with suppress(TooLargeError):
+            out.append(algebra.product(factors))
+    return tuple(out)
+
+
 class Bred(NamedTuple):
     """The equation of one output.
 
@@ -631,6 +649,7 @@ def breed(
     train: np.ndarray,
     config: EquationSearchConfig,
     seed: int,
+    known: Sequence[Product] = (),
 ) -> Bred:
     """Search an equation and fit it to all samples.
 
@@ -641,27 +660,31 @@ def breed(
         train: which samples train the search; the others validate.
         config: how to search.
         seed: of the random choices.
+        known: terms that the final choice has beside those that are bred.
 
     Raises:
         FitError: where the data do not determine an equation.
         UsageError: where DEAP is not installed.
     """
     found = evolve(algebra, data, target, train, config.evolution, seed)
-    values = algebra.values(found.terms, data).T
-    names = [term(algebra, product) for product in found.terms]
+    pool = found.terms
+    if config.final is not None:
+        pool = tuple(sorted({*pool, *known}))
+    values = algebra.values(pool, data).T
+    names = [term(algebra, product) for product in pool]
     reduced = reduce(
         values,
         target[:, None],
         names,
-        [algebra.degree(p) for p in found.terms],
-        [algebra.effort(p) for p in found.terms],
+        [algebra.degree(p) for p in pool],
+        [algebra.effort(p) for p in pool],
     )
     kept, within = (
         (everything(reduced, 0), reduced)
         if config.final is None
         else find(reduced, 0, config.final)
     )
-    products = tuple(found.terms[names.index(name)] for name in kept.terms)
+    products = tuple(pool[names.index(name)] for name in kept.terms)
     numbers, errors = tuple(kept.values.tolist()), tuple(kept.errors.tolist())
     return Bred(found, products, numbers, errors, kept.summary(within))
 
@@ -685,6 +708,9 @@ def _written(algebra: Algebra, name: str, bred: Bred) -> dict[str, Any]:
         **equation(name, text, value, algebra.channels),
         **bred.summary,
         "bred_terms": len(bred.found.terms),
+        "by_sparse_search": [
+            term(algebra, product) for product in bred.products if product not in bred.found.terms
+        ],
         "generation": bred.found.generation,
         "reached_goal": bred.found.reached,
         "sets_fitted": bred.found.fitted,
