@@ -1,9 +1,13 @@
-"""Controllers of an identified model: predictive control by IPOPT, and PID with feed-forward."""
+"""Controllers of an identified model: predictive control, and PID with feed-forward."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
 
 import casadi
 import numpy as np
@@ -20,16 +24,23 @@ _CHANGE = 0.5
 """Change of an input within an interval, as a share of its range, that costs as much."""
 _LEAVING = 1e3
 """Cost of leaving the training range by its own width: dear, but never without a solution."""
+_LITTLE = 1e-6
+"""Curvature of that cost, so that the programme has one solution."""
+_ROUNDS, _FIRST = 2, 10
+"""Gauss-Newton steps of a move and of the first one, at most."""
+_SETTLED = 1e-3
+"""Change of all inputs, as a share of their range, that ends them."""
 
 
 class Predictive:
     """Model predictive control along a course, the model's training range as constraints.
 
-    Multiple shooting over 20 intervals; each holds its inputs over several steps of the model.
-    Inputs never leave the training range, and change no faster than the actuators. Velocities leave
-    it where nothing else is possible, for example at the start. The difference between the last
-    prediction and what was measured is taken to persist, so that a model that is a little wrong
-    leaves no lasting error.
+    The inputs of 20 intervals, each held over several steps of the model, are found by Gauss-Newton
+    steps: the model is run ahead with its exact derivatives by these inputs, as generated C, and a
+    quadratic programme gives better ones. Inputs never leave the training range, and change no
+    faster than the actuators. Velocities leave it where nothing else is possible, for example at
+    the start. The difference between the last prediction and what was measured is taken to persist,
+    so that a model that is a little wrong leaves no lasting error.
 
     Args:
         model: identified.
@@ -45,72 +56,47 @@ class Predictive:
         self.model, self.track, self.speed = model, track, speed
         self.every = max(1, round(interval / model.dt))
         self.interval = self.every * model.dt
-        self.size = 6 + model.memory
         self.bias = np.zeros(3)
         self.memory = np.zeros(model.memory)
         self.expected: np.ndarray | None = None
         self.plan: np.ndarray | None = None
-        self.duals: tuple[Any, Any] | None = None
-        self._build(rates)
-
-    def _build(self, rates: np.ndarray) -> None:
-        """Set up the problem once; each solution has other parameters only."""
-        sym = casadi.MX.sym
-        x, w, bias = sym("x", self.size), sym("w", 2), sym("bias", 3)
-        after = x
-        for _ in range(self.every):
-            state, memory, _ = self.model.step(after[:6], w, after[6:])
-            after = casadi.vertcat(state[:3], state[3:] + self.model.dt * bias, memory)
-        advance = casadi.Function("advance", [x, w, bias], [after])
-        self.advance = advance
+        self.ahead = self._ahead()
         n, span = INTERVALS, self.model.high - self.model.low
-        states, inputs = sym("states", self.size, n), sym("inputs", 2, n)
-        leaving = sym("leaving", n)
-        start, last, shift = sym("start", self.size), sym("last", 2), sym("shift", 3)
-        wanted = sym("wanted", 3, n)
-        cost, equal, within = 0, [], []
-        before, held = start, last
+        self.low, self.span = self.model.low, span
+        # of what is asked: the change within each interval [2 n, 2 n]
+        self.changes = np.eye(2 * n) - np.eye(2 * n, k=-2)
+        self.fastest = np.tile(rates * self.interval, n)
+        rows, columns = 6 * n + 2 * n, 3 * n
+        dense = casadi.Sparsity.dense
+        shape = {"h": dense(columns, columns), "a": dense(rows, columns)}
+        self.solver = casadi.conic("moves", "daqp", shape, {"error_on_fail": False})
+
+    def _ahead(self) -> casadi.Function:
+        """Return the model run ahead: of start, inputs [2, n] and bias, states and slopes.
+
+        States [6, n] stand at the ends of intervals, slopes [6 n, 2 n] are theirs by the inputs.
+        """
+        n, step, dt = INTERVALS, self.model.step, self.model.dt
+        x, s = casadi.MX.sym("x", 6), casadi.MX.sym("s", self.model.memory)
+        inputs, bias = casadi.MX.sym("inputs", 2, n), casadi.MX.sym("bias", 3)
+        slope, states, slopes = step.forward(1), [], []
+        start = [x, s]
+        by_x, by_s = casadi.MX(6, 0), casadi.MX(self.model.memory, 0)
         for k in range(n):
-            now, w = states[:, k], inputs[:, k]
-            equal.append(advance(before, w, shift) - now)
-            way = wanted[2, k]
-            north, east = now[0] - wanted[0, k], now[1] - wanted[1, k]
-            across = casadi.cos(way) * east - casadi.sin(way) * north
-            along = casadi.cos(way) * north + casadi.sin(way) * east
-            slow = (now[3] - self.speed) / (_SPEED * self.speed)
-            change = (w - held) / (_CHANGE * span[3:])
-            cost += (across / _ACROSS) ** 2 + (along / _ALONG) ** 2 + slow**2
-            cost += casadi.sumsqr(change) + _LEAVING * leaving[k]
-            within.append((now[3:6] - self.model.low[:3]) / span[:3] + leaving[k])
-            within.append((self.model.high[:3] - now[3:6]) / span[:3] + leaving[k])
-            within.append(1.0 - (w - held) / (rates * self.interval))
-            within.append(1.0 + (w - held) / (rates * self.interval))
-            before, held = now, w
-        unknown = casadi.vertcat(casadi.vec(states), casadi.vec(inputs), leaving)
-        given = casadi.vertcat(start, last, shift, casadi.vec(wanted))
-        constraints = casadi.vertcat(*equal, *within)
-        rows = n * self.size
-        self.lower = np.zeros(constraints.shape[0])
-        self.upper = np.r_[np.zeros(rows), np.full(constraints.shape[0] - rows, np.inf)]
-        free = np.full(rows, np.inf)
-        self.least = np.r_[-free, np.tile(self.model.low[3:], n), np.zeros(n)]
-        self.most = np.r_[free, np.tile(self.model.high[3:], n), np.full(n, np.inf)]
-        problem = {"x": unknown, "p": given, "f": cost, "g": constraints}
-        settings = {
-            "expand": True,
-            "print_time": False,
-            "ipopt.print_level": 0,
-            "ipopt.sb": "yes",
-            "ipopt.max_iter": 25,
-            "ipopt.tol": 1e-3,
-            "ipopt.acceptable_tol": 1e-2,
-            "ipopt.acceptable_iter": 3,
-            "ipopt.mu_strategy": "monotone",
-            "ipopt.mu_init": 1e-2,
-            "ipopt.mu_target": 1e-4,
-            "ipopt.warm_start_init_point": "yes",
-        }
-        self.solver = casadi.nlpsol("predictive", "ipopt", problem, settings)
+            w = inputs[:, k]
+            by_x = casadi.horzcat(by_x, casadi.MX(6, 2))
+            by_s = casadi.horzcat(by_s, casadi.MX(self.model.memory, 2))
+            by_w = casadi.horzcat(casadi.MX(2, 2 * k), casadi.MX.eye(2))
+            # one column of slopes after the other, about the same step
+            each = slope.map(f"slope_{k}", "serial", 2 * k + 2, [0, 1, 2, 3, 4, 5], [])
+            for _ in range(self.every):
+                found = step(x, w, s)
+                by_x, by_s, _ = each(x, w, s, *found, by_x, by_w, by_s)
+                x, s = casadi.vertcat(found[0][:3], found[0][3:] + dt * bias), found[1]
+            states.append(x)
+            slopes.append(casadi.horzcat(by_x, casadi.MX(6, 2 * (n - k - 1))))
+        found = [casadi.horzcat(*states), casadi.densify(casadi.vertcat(*slopes))]
+        return compiled(casadi.Function("ahead", [*start, inputs, bias], found))
 
     def observe(self, measured: np.ndarray, used: np.ndarray) -> None:
         """Take a step's measurement [6] and the inputs [2] that were in force before it."""
@@ -130,32 +116,111 @@ class Predictive:
             used: inputs as they are measured now [2].
         """
         n = INTERVALS
-        ahead = place + self.speed * self.interval * np.arange(1, n + 1)
-        wanted = self.track.at(ahead)[:, :3]
-        start = np.r_[measured, self.memory]
+        # where a vessel starts with its actuators outside of the range, the first move is into it
+        used = np.clip(used, self.low[3:], self.model.high[3:])
+        on = place + self.speed * self.interval * np.arange(1, n + 1)
+        wanted = self.track.at(on)[:, :3]
+        rounds = _FIRST if self.plan is None else _ROUNDS
         if self.plan is None:
-            states = np.tile(start, (n, 1))
-            states[:, :3], states[:, 3] = wanted, max(measured[3], 0.3 * self.speed)
-            self.plan = np.r_[states.ravel(), np.tile(used, n), np.zeros(n)]
-        given = np.r_[start, used, self.bias, wanted.ravel()]
-        extra: dict[str, Any] = {}
-        if self.duals is not None:
-            extra = {"lam_x0": self.duals[0], "lam_g0": self.duals[1]}
+            # thrusters at rest answer to no small change, and so show no way to go
+            plan = np.tile(self.model.steady(self.speed, 0.0)[1], n)
+        else:
+            # the next solution begins where the last one has arrived by now
+            plan = np.r_[self.plan[2:], self.plan[-2:]]
+        for _ in range(rounds):
+            ahead = self.ahead(measured, self.memory, plan.reshape(n, 2).T, self.bias)
+            states, slopes = (np.asarray(part) for part in ahead)
+            moves = self._moves(plan, states.T, slopes, wanted, used)
+            if not np.isfinite(moves).all():
+                self.plan = None
+                return used
+            plan = plan + moves
+            if np.abs(moves / np.tile(self.span[3:], n)).max() < _SETTLED:
+                break
+        self.plan = plan
+        return np.clip(plan[:2], self.low[3:], self.model.high[3:])
+
+    def _moves(
+        self,
+        plan: np.ndarray,
+        states: np.ndarray,
+        slopes: np.ndarray,
+        wanted: np.ndarray,
+        used: np.ndarray,
+    ) -> np.ndarray:
+        """Return by how much the inputs [2 n] of a plan are to change.
+
+        Args:
+            plan: inputs [2 n].
+            states: that they lead to [n, 6].
+            slopes: of these by the inputs [6 n, 2 n].
+            wanted: place and direction of the course [n, 3].
+            used: inputs now [2].
+        """
+        n, span, high = INTERVALS, self.span, self.model.high
+        by = slopes.reshape(n, 6, 2 * n)
+        north, east = (states[:, :2] - wanted[:, :2]).T
+        sin, cos = np.sin(wanted[:, 2]), np.cos(wanted[:, 2])
+        scale = np.tile(_CHANGE * span[3:], n)
+        change = self.changes @ plan - np.r_[used, np.zeros(2 * n - 2)]
+        misses = np.r_[
+            (cos * east - sin * north) / _ACROSS,
+            (cos * north + sin * east) / _ALONG,
+            (states[:, 3] - self.speed) / (_SPEED * self.speed),
+            change / scale,
+        ]
+        slope = np.concatenate(
+            (
+                (cos[:, None] * by[:, 1] - sin[:, None] * by[:, 0]) / _ACROSS,
+                (cos[:, None] * by[:, 0] + sin[:, None] * by[:, 1]) / _ALONG,
+                by[:, 3] / (_SPEED * self.speed),
+                self.changes / scale[:, None],
+            )
+        )
+        cost = np.zeros((3 * n, 3 * n))
+        cost[: 2 * n, : 2 * n] = 2.0 * slope.T @ slope
+        cost[2 * n :, 2 * n :] = _LITTLE * np.eye(n)
+        steep = np.r_[2.0 * slope.T @ misses, np.full(n, _LEAVING)]
+        inside = (states[:, 3:] / span[:3]).ravel()
+        moving = (by[:, 3:] / span[:3, None]).reshape(3 * n, 2 * n)
+        leaving = np.repeat(np.eye(n), 3, axis=0)
+        within = np.block(
+            [
+                [moving, leaving],
+                [moving, -leaving],
+                [self.changes, np.zeros((2 * n, n))],
+            ]
+        )
+        free = np.full(3 * n, np.inf)
+        least = np.tile(self.low[:3] / span[:3], n) - inside
+        most = np.tile(high[:3] / span[:3], n) - inside
         found = self.solver(
-            x0=self.plan, p=given, lbx=self.least, ubx=self.most, lbg=self.lower, ubg=self.upper,
-            **extra,
-        )  # fmt: skip
-        plan = np.asarray(found["x"]).ravel()
-        if not np.isfinite(plan).all():
-            self.plan = self.duals = None
-            return used
-        self.duals = (found["lam_x"], found["lam_g"])
-        cut = n * self.size
-        states, inputs = plan[:cut].reshape(n, -1), plan[cut : cut + 2 * n].reshape(n, 2)
-        # the next solution begins where this one has arrived by then
-        later = np.r_[states[1:], states[-1:]]
-        self.plan = np.r_[later.ravel(), np.r_[inputs[1:], inputs[-1:]].ravel(), plan[-n:]]
-        return np.clip(inputs[0], self.model.low[3:], self.model.high[3:])
+            h=cost,
+            g=steep,
+            a=within,
+            lba=np.r_[least, -free, -self.fastest - change],
+            uba=np.r_[free, most, self.fastest - change],
+            lbx=np.r_[np.tile(self.low[3:], n) - plan, np.zeros(n)],
+            ubx=np.r_[np.tile(high[3:], n) - plan, np.full(n, np.inf)],
+        )
+        return np.asarray(found["x"]).ravel()[: 2 * n]
+
+
+def compiled(function: casadi.Function) -> casadi.Function:
+    """Return a function as compiled C; as it is where there is no C compiler."""
+    tool = shutil.which("cc")
+    if tool is None:
+        return function
+    # what is loaded stays, though its file goes
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        writer = casadi.CodeGenerator("ahead.c")
+        writer.add(function)
+        writer.generate(f"{folder}/")
+        library = folder / "ahead.so"
+        call = [tool, "-O1", "-w", "-fPIC", "-shared", str(folder / "ahead.c"), "-o", str(library)]
+        subprocess.run([*call, "-lm"], check=True)
+        return casadi.external(function.name(), str(library))
 
 
 class Gains(NamedTuple):
