@@ -6,6 +6,12 @@ Each run may have another seed; the last line holds the means.
       residnet run autopilot_conditions -s seed=$seed --out runs/conditions_$seed
     done
     python scripts/bench/autopilot_margins.py runs/conditions_0 runs/conditions_1 runs/conditions_2
+
+With `--draw`, vessels are drawn and trained first, as `residnet autopilot` does: K, T, rate of the
+rudder and largest delay at random. `--logs` draws further ones that are known by simulated zigzags
+in noise alone.
+
+    python scripts/bench/autopilot_margins.py --draw 10 --logs 3 --seed 43 --out runs/drawn
 """
 
 from __future__ import annotations
@@ -13,8 +19,16 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
+import time
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import pandas as pd
+import yaml
 
 DEG = 180.0 / math.pi
 COLUMNS = (
@@ -32,6 +46,8 @@ COLUMNS = (
     "nominal overshoot [deg]",
     "worst beyond [%]",
     "diverged",
+    "training [s]",
+    "whole run, CPU [s]",
 )
 
 
@@ -56,6 +72,8 @@ def margins(run: Path, name: str) -> list[float]:
         least = min(find[(row["model"], protocol)]["cost"]["mean"] for row in classical)
         beyond.append(100 * (find[(name, protocol)]["cost"]["mean"] / least - 1))
     constants = [row["model"] for row in judged if row["kind"] == "constants"]
+    told = json.loads((run / "controllers.json").read_text())["controllers"]
+    cpu = run / "cpu.txt"
     quiet, nominal = find[(name, "quiet")], find[(name, "nominal")]
     pd = find.get(("pd", "conditions"))
     return [
@@ -73,15 +91,99 @@ def margins(run: Path, name: str) -> list[float]:
         DEG * nominal["overshoot"]["max"],
         max(beyond, default=math.nan),
         float(sum(row["diverged"] for row in rows if row["model"] == name and "diverged" in row)),
+        told[name]["seconds"],
+        float(cpu.read_text()) if cpu.is_file() else math.nan,
     ]
+
+
+class Drawn:
+    """A vessel: K [1/s], T [s], rate of the rudder [deg/s] and largest delay [s].
+
+    T lies within 2.5 and 40 s, and K T within 0.8 and 3. The rudder needs a tenth to 0.6 of T for
+    20 deg, and commands come up to 0.02 to 0.12 of T late.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.time = float(np.exp(rng.uniform(math.log(2.5), math.log(40.0))))
+        self.gain = float(rng.uniform(0.8, 3.0)) / self.time
+        self.rate = 20.0 / (self.time * float(rng.uniform(0.1, 0.6)))
+        self.delay = self.time * float(rng.uniform(0.02, 0.12))
+
+    def __str__(self) -> str:
+        return (
+            f"K {self.gain:.4g} 1/s, T {self.time:.4g} s, rudder {self.rate:.3g} deg/s, delay"
+            f" {self.delay:.2g} s"
+        )
+
+    def zigzag(self, file: Path, angle: float, rng: np.random.Generator) -> Path:
+        """Write a zigzag in noise at 10 Hz, with half of the delay, by Euler's rule."""
+        dt, fine = 0.1, 10
+        late = round(0.5 * self.delay / (dt / fine))
+        r = psi = rudder = 0.0
+        side, held, rows = 1.0, [0.0] * (late + 1), []
+        for k in range(round(60.0 * self.time / dt)):
+            side = -side if side * psi > angle else side
+            noise = rng.normal(size=2) * (0.2, 0.15)
+            rows.append((k * dt, psi + noise[0], r + noise[1], side * angle))
+            for _ in range(fine):
+                held.append(side * angle)
+                step = self.rate * dt / fine
+                rudder += min(max(held[-1 - late] - rudder, -step), step)
+                r += dt / fine * (self.gain * rudder - r) / self.time
+                psi += dt / fine * r
+        names = ("time [s]", "heading [deg]", "yaw rate [deg/s]", "rudder command [deg]")
+        pd.DataFrame(rows, columns=list(names)).to_csv(file, index=False)
+        return file
+
+
+def trained(name: str, vessel: Drawn, out: Path, rng: np.random.Generator, *, logs: bool) -> Path:
+    """Draft, train and compare for a vessel; returns the folder of the run."""
+    from residnet.tasks.own_autopilot import draft_autopilot
+    from residnet.tasks.registry import load_task
+
+    out.mkdir(parents=True, exist_ok=True)
+    file, run = out / f"{name}.yaml", out / name
+    if not (run / "metrics.json").is_file():
+        if logs:
+            source = [str(vessel.zigzag(out / f"{name}_{a}.csv", a, rng)) for a in (10, 20)]
+            draft_autopilot(source, file, overwrite=True)
+        else:
+            source = [f"{vessel.gain:.6g},{vessel.time:.6g}"]
+            draft_autopilot(source, file, rate=f"{vessel.rate:.4g} deg/s", overwrite=True)
+            config = yaml.safe_load(file.read_text())
+            conditions = config["conditions"]
+            for one in (conditions["stated"], *conditions["beyond"].values()):
+                one["delay"] = ["0 s", f"{vessel.delay:.4g} s"]
+            for peer in ("lqr", "ptos"):
+                config["peers"][peer]["lag"] = f"{0.75 * vessel.delay:.4g} s"
+            file.write_text(yaml.safe_dump(config, sort_keys=False))
+        begun = time.process_time()
+        load_task(file, []).run(source=file, out=run, overwrite=True)
+        (run / "cpu.txt").write_text(f"{time.process_time() - begun:.1f}")
+    return run
 
 
 def main() -> None:
     """Print a line for each figure, a column for each run, and the mean."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("runs", type=Path, nargs="*")
     parser.add_argument("--policy", default="learned")
+    parser.add_argument("--draw", type=int, default=0, help="vessels to draw and train")
+    parser.add_argument("--logs", type=int, default=0, help="the same, known by logs alone")
+    parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
+    parser.add_argument("--out", type=Path, default=Path("runs/drawn"))
     given = parser.parse_args()
+    rng = np.random.default_rng(given.seed)
+    for k in range(given.draw + given.logs):
+        vessel, logs = Drawn(rng), k >= given.draw
+        name = f"{'logs' if logs else 'vessel'}_{k + 1}"
+        print(f"{name}: {vessel}", flush=True)
+        run = trained(name, vessel, given.out, np.random.default_rng((given.seed, k)), logs=logs)
+        given.runs.append(run)
+        values = margins(run, given.policy)
+        print("  " + ", ".join(f"{t} {v:.3g}" for t, v in zip(COLUMNS, values, strict=True)))
+    if not given.runs:
+        parser.error("name the folders of finished runs, or give --draw")
     found = [margins(run, given.policy) for run in given.runs]
     print(f"{'':24s}" + "".join(f"{run.name:>16s}" for run in given.runs) + f"{'mean':>16s}")
     for place, title in enumerate(COLUMNS):

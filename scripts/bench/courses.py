@@ -2,9 +2,10 @@
 
     python scripts/bench/courses.py [--courses 100] [--protocol sides|enter] [--vessel NAME] ...
 
-Each plan is judged by `course_checks.faults`, which uses nothing of the planner. With `--sampled`
-its length stands beside that of the shortest of so many random Dubins paths; with `--fly` the
-nominal vessel flies it in calm water and in a current from a random direction.
+Each plan is judged by `course_checks.faults`, which uses nothing of the planner. For a refused
+course random Dubins paths are tried: one that passes the check shows that the refusal is wrong.
+With `--sampled` all lengths stand beside that of the shortest of so many such paths; with `--fly`
+the nominal vessel flies a plan in calm water and in a current from a random direction.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ def arguments() -> argparse.Namespace:
     add("--seed", type=int, default=0)
     add("--first", type=int, default=0, help="number of the first course")
     add("--sampled", type=int, default=0, help="random paths to compare with")
+    add("--search", type=int, default=20000, help="random paths tried for a refused course")
     add("--fly", action="store_true")
     add("--pictures", type=Path, help="folder for a picture of each course")
     add("--worst", type=int, default=0, help="only the pictures of so many worst")
@@ -183,6 +185,8 @@ def judge(args: argparse.Namespace, ship: Ship, steady: Any, number: int) -> dic
         out["ratio"] = planned.course.length / best if math.isfinite(best) else math.nan
         tracks["plan"] = track
     out |= {"seconds": time.time() - started, "cpu": time.process_time() - cpu}
+    if "refused" in out and not args.sampled:
+        out["sampled"] = sampled(rng, course, args.protocol, steady.radius, args.search)
     if args.fly and "length" in out:
         towards = rng.uniform(-math.pi, math.pi)
         stream = 0.3 * np.array([[0.0, 0.0], [math.cos(towards), math.sin(towards)]])
@@ -228,6 +232,14 @@ def main() -> None:
     cpu, wall = ([row[name] for row in rows] for name in ("cpu", "seconds"))
     print(f"time: median {np.median(cpu):.2f} s, worst {max(cpu):.2f} s of one core", end="")
     print(f" ({max(wall):.2f} s by the clock)")
+    refused = [row for row in rows if "refused" in row]
+    overlap = sum("circles overlap" in row["refused"] for row in refused)
+    named = sum("exclude each other" in row["refused"] for row in refused)
+    wrong = sum(math.isfinite(row["sampled"]) for row in refused)
+    print(
+        f"{len(refused)} refused: {overlap} whose circles overlap, {named} whose buoys exclude each"
+        f" other, {len(refused) - overlap - named} others; sampling finds a path for {wrong}"
+    )
     if args.sampled:
         got = sum("length" in row for row in feasible)
         print(f"sampling finds {len(feasible)}; of these {got} are planned", end="")
