@@ -165,6 +165,8 @@ def _write(exported: Exported, file: Path, dtype: torch.dtype) -> None:
                 _Sized(exported, dtype).eval(),
                 tuple(torch.zeros(2, count, dtype=dtype) for _, count in given),
                 dynamo=True,
+                # torch's own folding changes what a step in six degrees of freedom answers
+                optimize=False,
                 verbose=False,
                 input_names=[name for name, _ in given],
                 output_names=_results(exported),

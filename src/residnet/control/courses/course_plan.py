@@ -322,7 +322,9 @@ def _right(
     course = _sampled(fit.route, fitted.z, step, step)
     # to the end, between samples
     track = course.track[: math.ceil(course.length / step) + 1]
-    wrong = first_fault(track, request.buoys, request.protocol, 0.5 * step)
+    # between two samples a turn bends by no more
+    between = 0.5 * step**2 / request.turns.radius
+    wrong = first_fault(track, request.buoys, request.protocol, between)
     if wrong is not None:
         reasons.append((0.0, *wrong))
     return wrong is None
