@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -394,3 +395,38 @@ def test_a_model_basin_names_its_columns_by_groups_and_its_time_not_at_all(
     np.testing.assert_allclose(read.t, log.t, atol=1e-6)
     for name in ("x", "y", "psi", "delta"):
         np.testing.assert_allclose(read[name], log[name], atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", ["wind_dir", "wind_angle", "apparent_wind_angle"])
+def test_a_wind_is_told_by_what_makes_the_true_wind_steady(
+    kind: str, seed: int, tmp_path: Path
+) -> None:
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, random.uniform(100.0, 400.0), 0.5)
+
+    def wandering(size: float, time: float) -> np.ndarray:
+        steps = random.normal(size=t.size) * size * np.sqrt(1.0 / time)
+        kept = np.exp(-0.5 / time)
+        return np.array([*accumulate(steps, lambda last, step: kept * last + step)])
+
+    own = random.uniform(1.0, 8.0)
+    r = np.radians(wandering(random.uniform(2.0, 6.0), 15.0))
+    psi, u, v = np.cumsum(r) * 0.5, own + wandering(0.1 * own, 20.0), wandering(0.03 * own, 5.0)
+    ground = np.exp(1j * psi) * (u + 1j * v)
+    place = np.cumsum(ground) * 0.5
+    mean = random.uniform(2.0, 12.0)
+    true = np.maximum(mean + wandering(0.15 * mean, 15.0), 0.1)
+    true = true * np.exp(1j * (random.uniform(-3.0, 3.0) + wandering(0.15, 30.0)))
+    wind = {
+        "wind_dir": true,
+        "wind_angle": true * np.exp(-1j * psi),
+        "apparent_wind_angle": (true + ground) * np.exp(-1j * psi),
+    }[kind]
+    columns = {"time [s]": t, "x [m]": place.real, "y [m]": place.imag}
+    columns |= {"heading [deg]": np.degrees(psi) % 360.0, "rudder [deg]": np.degrees(r)}
+    columns |= {"wind speed [m/s]": np.abs(wind)}
+    columns |= {"wind direction [deg]": np.degrees(np.angle(wind)) % 360.0}
+    file = tmp_path / "wind.csv"
+    pd.DataFrame(columns).to_csv(file, index=False)
+    assert kind in draft_tables([file], Marks())[0]["channels"]

@@ -162,7 +162,9 @@ def drafted(
         preparation |= {"masks": [{"kind": "frozen", **where}]}
     usable = read.usable((*inputs, *chosen.exogenous), preparation)
     split, splits = _split(usable, folder, marks)
-    _judge_long_ones(split, splits, chosen.memory, marks)
+    if not called_splits(list(usable.values())):
+        # a split that the folders tell stays as it is
+        _judge_long_ones(split, splits, chosen.memory, marks)
     judged = judging(splits, chosen.memory, live)
     marks.note(("prepare", "grid"), chosen.reason)
     marks.note(

@@ -229,18 +229,3 @@ def turns_to(
     variance = 4.0 * float(left @ left) / max(b.size - 3, 1)
     spread = float(np.sqrt(variance * np.linalg.pinv((a / scale).T @ (a / scale))[0, 0]))
     return float(solution[0]), spread
-
-
-def explained_turn(direction: np.ndarray, psi: np.ndarray) -> float:
-    """Return how far a wind's direction turns against the heading, from 0 (not) to 1 (all).
-
-    Args:
-        direction: [T] in rad.
-        psi: [T] in rad.
-    """
-    known = np.isfinite(direction) & np.isfinite(psi)
-    if known.sum() < 50 or np.ptp(psi[known]) < 0.5:
-        return 0.0
-    apart = abs(np.exp(1j * direction[known]).mean())
-    together = abs(np.exp(1j * (direction[known] + psi[known])).mean())
-    return float(together - apart)
