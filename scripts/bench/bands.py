@@ -66,7 +66,7 @@ def alone(config: FitConfig, model: str) -> list[str]:
     if model not in ("baseline", *config.baselines, *config.heads):
         raise ValueError(f"{model} is no baseline or head of the config")
     needed = {model, config.baseline_name_of(model) if model in config.heads else model}
-    out = [f"~{key}" for key in ("ensembles", "gates", "forces") if getattr(config, key)]
+    out = ["~ensembles"] if config.ensembles else []
     for key in ("heads", "base_of", "training", "baselines", "refit"):
         given = getattr(config, key)
         unused = [name for name in given if name not in needed]

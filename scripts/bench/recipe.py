@@ -2,7 +2,7 @@
 
     python scripts/bench/recipe.py [--logs boats|shipped|measured] [--count N] [--seed S]
         [--minutes M ...] [--vessels NAME ...] [--effort E] [--without PART ...] [--peer]
-        [--records FILE]
+        [--records FILE] [--keep FOLDER]
 
 Nothing is said to `residnet.fit` but the logs: M minutes for training and validation (three to
 one), as long for the test, which takes part in no choice.
@@ -18,6 +18,10 @@ more for each part of the training that is named, with the same seeds: `mirror` 
 windows), `average` (the last weights in place of their average), `members` (one
 network in place of several).
 
+`--keep` writes a file for each draw with what every member missed in the free runs of the test logs
+and of the validation logs, the latter by a fit that did not see them too. Any weights of a mean can
+be judged by it.
+
 `--peer` adds what an hour of PyTorch gives: a GRU that reads two seconds of the past, and another
 that runs freely from what the first one leaves, the best of its validations kept; it is judged over
 the same windows. A line for each fit; at the end geometric means over the draws.
@@ -32,6 +36,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -51,9 +56,10 @@ from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
 from residnet.data.prepare import Prepared
 from residnet.data.simulated import SimulatedTrials, simulate
-from residnet.identification import settings
-from residnet.judge.freerun import Errors, Prediction
-from residnet.judge.protocol import Window
+from residnet.identification import fit, settings
+from residnet.identification.identified import candidates
+from residnet.judge.freerun import Errors, Prediction, free_run
+from residnet.judge.protocol import Window, all_windows, overlapping
 
 CHANNELS = {
     "esso_osaka": {
@@ -291,11 +297,50 @@ def subsets(models: Any) -> dict[str, float]:
     return out
 
 
-def judged(splits: Splits, effort: float, peer: bool, without: Sequence[str]) -> dict[str, Any]:
+def missed(models: Any, split: str, *, dense: bool) -> dict[str, np.ndarray]:
+    """Return the errors of models [N, n] in the free runs over a split, one window after another.
+
+    Errors are shares of the scales, NaN where they do not count. `window` numbers the windows,
+    which overlap where they are `dense`.
+    """
+    data, found = models.data, models.identified
+    config, step, logs = data.evaluation, data.prepare.grid.step, data.logs(split)
+    protocol = config.protocols[config.selection]
+    windows = all_windows(overlapping(protocol) if dense else protocol, logs, step, split)
+    judged = [replace(one, members=()) for one in candidates(found.values()) if one.name != "mean"]
+    out = {}
+    for name, predictions in free_run(judged, windows, logs, step, found.limit).items():
+        errors = Errors.of(windows, predictions, logs)
+        counted = np.where(errors.scored, errors.velocities, np.nan)
+        out[name] = (counted / config.scales.array())[:, errors.live.axes].astype(np.float32)
+    out["window"] = np.repeat(np.arange(len(windows)), errors.counts)
+    return out
+
+
+def keep(models: Any, splits: Splits, effort: float, file: Path) -> None:
+    """Write what the members of a fit missed, and what they miss of logs that they did not see."""
+    whole = {"test": missed(models, "test", dense=False)}
+    whole["validation"] = missed(models, "validation", dense=True)
+    if models.identified.chosen is not None:
+        with mock.patch.object(fit, "final_fit", return_value=False):
+            first = fitted(splits, effort, "")
+        whole["seen"] = whole["validation"]
+        whole["validation"] = missed(first, "validation", dense=True)
+        whole["first"] = missed(first, "test", dense=False)
+    arrays = {f"{part}.{name}": one for part, found in whole.items() for name, one in found.items()}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(file, **arrays)
+
+
+def judged(
+    splits: Splits, effort: float, peer: bool, without: Sequence[str], kept: Path | None
+) -> dict[str, Any]:
     """Fit, and return the test errors by the protocol that chooses."""
     began = time.process_time()
     models = fitted(splits, effort, "")
     seconds = time.process_time() - began
+    if kept is not None:
+        keep(models, splits, effort, kept)
     rows = residnet.metrics(models, split="test")
     rows = rows[rows.protocol == models.data.evaluation.selection].set_index("model")
     errors = {name: float(row.nrmse_mean) for name, row in rows.iterrows()}
@@ -354,6 +399,7 @@ def main() -> None:
     parser.add_argument("--without", nargs="+", default=[], choices=list(PARTS))
     parser.add_argument("--peer", action="store_true", help="train a plain GRU beside")
     parser.add_argument("--records", type=Path, help="file for one line of JSON for each fit")
+    parser.add_argument("--keep", type=Path, help="folder for the members' errors of each fit")
     given = parser.parse_args()
     torch.set_num_threads(1)
     source, names = SOURCES[given.logs]
@@ -364,7 +410,8 @@ def main() -> None:
         minutes = given.minutes[number // len(names) % len(given.minutes)]
         random = np.random.default_rng([given.seed, number])
         logs = source(name, 60.0 * minutes / STRETCHES, given.seed + number // 2, random)
-        records.append(judged(split(logs), given.effort, given.peer, given.without))
+        kept = given.keep and given.keep / f"{name}_{minutes:g}_{given.seed}_{number}.npz"
+        records.append(judged(split(logs), given.effort, given.peer, given.without, kept))
         print(f"{name}, {minutes:g} min, draw {number}, {line(records[-1])}", flush=True)
         if given.records is not None:
             with given.records.open("a", encoding="utf-8") as file:

@@ -11,7 +11,7 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.layout import HEADING, MOTION, POSITION
 from residnet.core.samples import Samples
 from residnet.dynamics.base import Integrator
-from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
+from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads.base import FeatureConfig
 from residnet.heads.lstm import LstmConfig
@@ -26,9 +26,9 @@ TERMS = {"linear": ["u", "v", "r", "a", "b"], "nonlinear": ["u", "v|v|", "r", "a
 @pytest.mark.parametrize("integrator", get_args(Integrator))
 @pytest.mark.parametrize("wind", [False, True])
 @pytest.mark.parametrize("terms", TERMS)
-@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("told", [False, True])
 def test_heading_and_velocities_do_not_hang_on_positions(
-    integrator: Integrator, wind: bool, terms: str, force: bool
+    integrator: Integrator, wind: bool, terms: str, told: bool
 ) -> None:
     torch.manual_seed(3)
     exogenous = ("wind_speed", "wind_dir") if wind else ()
@@ -36,11 +36,10 @@ def test_heading_and_velocities_do_not_hang_on_positions(
     names = [*TERMS[terms], "wind_u", "wind_v"] if wind else TERMS[terms]
     baseline = RegressorBaseline([names] * 3, signals.names)
     baseline.theta.data.copy_(0.3 * torch.randn(3, len(names)) - 0.6 * torch.eye(3, len(names)))
-    head = LstmConfig(hidden_size=6).build(signals.names)
-    model = HybridDynamics(
-        signals, baseline, head, DT, integrator, DisturbanceConfig().build(DT) if force else None
-    )
-    model = model.double().eval()
+    kind = RecurrentConfig(members=1, hidden_size=6, step=DT) if told else LstmConfig(hidden_size=6)
+    head = kind.build(signals.names)
+    model = HybridDynamics(signals, baseline, head, DT, integrator).double().eval()
+    assert (model.missed is not None) == told
     x0 = torch.randn(5, 6, dtype=torch.float64)
     w = torch.randn(5, 40, 4 if wind else 2, dtype=torch.float64)
     slopes, states = [], []

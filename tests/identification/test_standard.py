@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -14,12 +15,11 @@ from random_vessels import small_boat_logs
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.frames import to_body
+from residnet.core.layout import ALIVE
 from residnet.core.log import Log
 from residnet.data.prepare import samples
-from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
+from residnet.dynamics.hybrid import Missed
 from residnet.heads.lstm import LstmConfig
-from residnet.heads.zero import ZeroHead
 from residnet.identification.fit import Identified, fit
 from residnet.identification.fitter import Fitter, burden
 from residnet.identification.models import NoStore
@@ -288,35 +288,18 @@ def test_a_mirror_symmetric_model_has_no_asymmetry(logs: PreparedSplits) -> None
     assert float(theta.flatten() @ pull @ theta.flatten()) > 0.0
 
 
-def test_an_unknown_force_is_told_from_the_past_and_held() -> None:
-    """A constant force over ground, which the model does not know, on a vessel that turns."""
-    signals = SignalsConfig(inputs=("n",)).build()
-    baseline = RegressorsConfig(terms=("u", "v", "r")).build(signals.names)
-    with torch.no_grad():
-        baseline.theta.copy_(torch.diag(torch.tensor([-0.1, -0.3, -0.5], dtype=torch.float64)))
-    known = HybridDynamics(signals, baseline, ZeroHead(), 0.1, "semi_implicit_euler")
-    observer = DisturbanceConfig(settle=5.0).build(0.1)
-    model = HybridDynamics(signals, baseline, ZeroHead(), 0.1, "semi_implicit_euler", observer)
-    w = torch.zeros(1, 1, dtype=torch.float64)
-
-    def blown(x: torch.Tensor) -> torch.Tensor:
-        ahead, across = to_body(torch.tensor([0.05]), torch.tensor([-0.02]), x[:, 2])
-        force = torch.stack((ahead, across, torch.tensor([0.02])), dim=-1)
-        return known.integrate(x, signals.prepare(w), force)
-
-    x, past = torch.tensor([[0.0, 0.0, 0.7, 0.3, 0.0, 0.05]], dtype=torch.float64), []
-    for _ in range(400):
-        past.append(x)
-        x = blown(x)
-    s = model.warmup(torch.stack(past, 1), w[:, None].expand(1, 400, 1))
-    np.testing.assert_allclose(s[0, 4:], [0.05, -0.02, 0.02], atol=3e-4)
-    truth = free = without = x
-    for _ in range(300):
-        truth, without = blown(truth), known.step(without, w, s[:, :0])[0]
-        free, s = model.step(free, w, s)
-    assert float((free - truth)[:, 3:].abs().max()) < 0.01
-    assert float((without - truth)[:, 3:].abs().max()) > 0.1
-    torch.jit.script(model)
+def test_what_was_predicted_wrong_of_the_past_is_told_and_fades() -> None:
+    """A constant acceleration that no prediction knows; then a free run, where none is missed."""
+    force = torch.tensor([[0.05, -0.02, 0.02]], dtype=torch.float64)
+    missed = Missed(5.0, 0.1, ALIVE)
+    x, s = torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 7, dtype=torch.float64)
+    told = force
+    for k in range(2000):
+        told = missed(x, s)
+        s = missed.remembered(x, told)
+        x = x + 0.1 * torch.cat((torch.zeros(1, 3), force), dim=-1) * (k < 1950)
+    torch.testing.assert_close(told / force, torch.full_like(force, math.exp(-4.9 / 5.0)))
+    torch.jit.script(missed)
 
 
 def test_an_encoder_starts_the_memory_with_weights_of_its_own() -> None:

@@ -1,10 +1,9 @@
-"""The hybrid model, nu_dot = baseline + residual (document 003 eq. (19)), and its disturbance.
+"""The hybrid model, nu_dot = baseline + residual (document 003 eq. (19)), and what it missed.
 
-A residual in force space acts through the head's mass. An unknown slowly varying force, such as
-unmeasured wind, is estimated from a measured past: each step's velocities are compared with those
-that the step before predicted, and what is left over moves the estimate, as an observer does. In a
-free run nothing is left over, and the estimate is held or decays. So one and the same step serves
-both, and nothing has to tell it which is which.
+A residual in force space acts through the head's mass. A head may be shown what was predicted wrong
+of the measured past, where unmeasured wind leaves its trace: each step's velocities are compared
+with those that the step before predicted. In a free run nothing is left over. So one and the same
+step serves both, and nothing has to tell it which is which.
 """
 
 from __future__ import annotations
@@ -13,14 +12,11 @@ import math
 from typing import final
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
-from residnet.core.columns import heading, pose, sinking, turning, velocities
-from residnet.core.config import Config, Seconds
-from residnet.core.frames import to_body, to_earth
-from residnet.core.layout import ALIVE, ATTITUDE, Live
+from residnet.core.columns import pose, sinking, turning, velocities
+from residnet.core.layout import ATTITUDE, Live
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals
@@ -32,50 +28,32 @@ FARTHEST = 100.0
 """Largest velocity or acceleration that a memory may hold, SI."""
 
 
-class DisturbanceConfig(Config):
-    """Settings of an unknown force that a model estimates from the measured past.
-
-    Attributes:
-        settle: time constant at which the estimate follows what the model does not explain.
-        decay: time constant at which it is forgotten; null holds it over the whole prediction.
-    """
-
-    settle: Seconds = Field(default=20.0, gt=0)
-    decay: Seconds | None = Field(default=None, gt=0)
-
-    def build(self, dt: float, live: Live = ALIVE) -> Disturbance:
-        """Return the observer for a step of dt."""
-        return Disturbance(self, dt, live=live)
-
-
 @final
-class Disturbance(nn.Module):
-    """The observer: an acceleration north and east and one in yaw, kept in the memory.
+class Missed(nn.Module):
+    """An acceleration by which steps were predicted wrong, low-passed and kept in the memory.
+
+    It stays in body axes: what settles is forgotten as quickly, before the vessel has turned.
 
     Args:
-        config: time constants.
+        settle: time constant in s.
         dt: step in s.
-        body: keep it in body axes, where it is forgotten before the vessel has turned.
-        live: what moves; n numbers. An angle whose rate is known has no disturbance.
+        live: what moves; n numbers. An angle whose rate is known is never predicted wrong.
 
     Attributes:
-        size: entries of the memory: whether there is a prediction, what it is, the estimate.
+        size: entries of the memory: whether there is a prediction, what it is, what was missed.
     """
 
-    def __init__(
-        self, config: DisturbanceConfig, dt: float, *, body: bool = False, live: Live = ALIVE
-    ) -> None:
+    def __init__(self, settle: float, dt: float, live: Live) -> None:
         super().__init__()
-        self.body = body
         self.dof, self.size = live.size, 1 + 2 * live.size
         self.free = len(live.learned) == live.size
         self.register_buffer("mask", live.mask(), persistent=False)
         self.mask: Tensor
-        self.gain = (1.0 - math.exp(-dt / config.settle)) / dt
-        self.keep = 1.0 if config.decay is None else math.exp(-dt / config.decay)
+        self.keep = math.exp(-dt / settle)
+        self.gain = (1.0 - self.keep) / dt
 
-    def forward(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the acceleration in body axes [B, n] and the new estimate [B, n].
+    def forward(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the acceleration in body axes [B, n].
 
         Args:
             x: states at the step's start, measured or predicted [B, nx].
@@ -85,19 +63,12 @@ class Disturbance(nn.Module):
         left = (velocities(x, self.dof) - predicted) * known
         if not self.free:
             left = left * self.mask.to(left.dtype)
-        if self.body:
-            estimate = self.keep * before + self.gain * left
-            return estimate, estimate
-        north, east = to_earth(left[:, 0], left[:, 1], heading(x))
-        seen = torch.cat((torch.stack((north, east), dim=-1), left[:, 2:]), dim=-1)
-        estimate = self.keep * before + self.gain * seen
-        ahead, across = to_body(estimate[:, 0], estimate[:, 1], heading(x))
-        return torch.cat((torch.stack((ahead, across), dim=-1), estimate[:, 2:]), dim=-1), estimate
+        return self.keep * before + self.gain * left
 
-    def remembered(self, after: Tensor, estimate: Tensor) -> Tensor:
-        """Return the memory [B, 1 + 2 n] from the predicted states [B, nx] and estimate [B, n]."""
+    def remembered(self, after: Tensor, missed: Tensor) -> Tensor:
+        """Return the memory [B, 1 + 2 n] from the predicted states [B, nx] and what was missed."""
         predicted = velocities(after, self.dof)
-        return torch.cat((torch.ones_like(after[:, :1]), predicted, estimate), dim=-1)
+        return torch.cat((torch.ones_like(after[:, :1]), predicted, missed), dim=-1)
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [1 + 2 n]."""
@@ -112,7 +83,7 @@ class HybridDynamics(Dynamics):
     """A hybrid model with the state x [B, 3 + n]: x, y, psi, then what moves, u, v, r and so on.
 
     The head is evaluated once per step and held over the integrator's stages. A head with a
-    `settle` time is shown the estimate of what was predicted wrong, in place of adding it.
+    `settle` time is shown what was predicted wrong.
     """
 
     def __init__(
@@ -122,7 +93,6 @@ class HybridDynamics(Dynamics):
         head: ResidualHead,
         dt: float,
         integrator: Integrator = "rk4",
-        disturbance: Disturbance | None = None,
     ) -> None:
         super().__init__(dt, integrator)
         self.signals = signals
@@ -143,14 +113,9 @@ class HybridDynamics(Dynamics):
         self.living: Tensor
         self.known_rates: Tensor
         head.set_step(dt)
-        self.shown = head.settle > 0.0
-        if self.shown:
-            # a low-pass: what settles is forgotten as quickly
-            low_pass = DisturbanceConfig(settle=head.settle, decay=head.settle)
-            disturbance = Disturbance(low_pass, dt, body=True, live=live)
-        self.disturbance = disturbance
+        self.missed = Missed(head.settle, dt, live) if head.settle > 0.0 else None
         self.width = head.n_state
-        self.n_state = head.n_state + (0 if disturbance is None else disturbance.size)
+        self.n_state = head.n_state + (0 if self.missed is None else self.missed.size)
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return x_dot [B, 3 + n] from what the step holds fixed.
@@ -219,14 +184,13 @@ class HybridDynamics(Dynamics):
         """Return the state and the memory one step later, from p = signals.prepare(w) [B, k]."""
         x = self.alive(x)
         z: Tensor = self.signals(x, p)
-        if self.disturbance is None:
+        if self.missed is None:
             rho, s = self.head(z, s)
             return self.advanced(x, z, p, rho), s
-        unknown, estimate = self.disturbance(x, s[:, self.width :])
-        seen = torch.cat((z, unknown), dim=-1) if self.shown else z
-        rho, own = self.head(seen, s[:, : self.width])
-        after = self.advanced(x, z, p, rho if self.shown else rho + unknown)
-        return after, torch.cat((own, self.disturbance.remembered(after, estimate)), dim=-1)
+        missed = self.missed(x, s[:, self.width :])
+        rho, own = self.head(torch.cat((z, missed), dim=-1), s[:, : self.width])
+        after = self.advanced(x, z, p, rho)
+        return after, torch.cat((own, self.missed.remembered(after, missed)), dim=-1)
 
     def advanced(self, x: Tensor, z: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the state [B, 3 + n] one step later.
@@ -298,21 +262,20 @@ class HybridDynamics(Dynamics):
             return self.stepped(x, row[0], s)
         x = self.alive(x)
         nu = velocities(x, self.dof)
-        estimate = nu
-        if self.disturbance is None:
+        missed = nu
+        if self.missed is None:
             rho, own = self.head.at(nu, row[1], s, shared[1])
         else:
-            unknown, estimate = self.disturbance(x, s[:, self.width :])
-            seen = torch.cat((nu, unknown), dim=-1) if self.shown else nu
+            missed = self.missed(x, s[:, self.width :])
+            seen = torch.cat((nu, missed), dim=-1)
             rho, own = self.head.at(seen, row[1], s[:, : self.width], shared[1])
-            rho = rho if self.shown else rho + unknown
         if self.baseline.linear and self.level:
             after = torch.cat((x, row[0], rho), dim=-1) @ shared[2][0]
         else:
             after = self.moved(x, row[0], shared[0], rho)
-        if self.disturbance is None:
+        if self.missed is None:
             return after, own
-        return after, torch.cat((own, self.disturbance.remembered(after, estimate)), dim=-1)
+        return after, torch.cat((own, self.missed.remembered(after, missed)), dim=-1)
 
     def known(self, z: Tensor) -> Tensor:
         """Return what the baseline says at channels z [..., nz], accelerations [..., n]."""
@@ -325,7 +288,7 @@ class HybridDynamics(Dynamics):
         The head's memory is empty at first.
         """
         known = self.baseline(z)
-        if self.shown:
+        if self.missed is not None:
             return self._observed(z, known)
         rho = self.head.sequence(z)
         return self.found(known, rho, z[..., : self.dof])
@@ -347,13 +310,13 @@ class HybridDynamics(Dynamics):
         n = self.dof
         x = torch.cat((z.new_zeros(z.shape[:-1] + (3,)), z[..., :n]), dim=-1)  # noqa: RUF005
         s, out = z.new_zeros((len(z), self.n_state)), []
-        assert self.disturbance is not None
+        assert self.missed is not None
         for k in range(2 * piece):
-            unknown, estimate = self.disturbance(x[:, k], s[:, self.width :])
-            rho, own = self.head(torch.cat((z[:, k], unknown), dim=-1), s[:, : self.width])
+            missed = self.missed(x[:, k], s[:, self.width :])
+            rho, own = self.head(torch.cat((z[:, k], missed), dim=-1), s[:, : self.width])
             nu_dot = self.found(known[:, k], rho, z[:, k, :n])
             after = torch.cat((x[:, k, :3], x[:, k, 3:] + self.dt * nu_dot), dim=-1)
-            s = torch.cat((own, self.disturbance.remembered(after, estimate)), dim=-1)
+            s = torch.cat((own, self.missed.remembered(after, missed)), dim=-1)
             s = s * inside[:, k, None]
             out.append(nu_dot)
         each = torch.stack(out[piece:], dim=1).reshape(copies, rows, -1, n)
@@ -362,12 +325,11 @@ class HybridDynamics(Dynamics):
     def acceleration(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
         """Return nu_dot [B, n] of baseline and head at states x [B, 3 + n], inputs w and memory."""
         z = self.channels(x, w)
-        if self.shown:
-            assert self.disturbance is not None
-            unknown, _ = self.disturbance(x, s[:, self.width :])
-            rho, _ = self.head(torch.cat((z, unknown), dim=-1), s[:, : self.width])
+        if self.missed is None:
+            rho, _ = self.head(z, s)
         else:
-            rho, _ = self.head(z, s[:, : self.width])
+            missed = self.missed(x, s[:, self.width :])
+            rho, _ = self.head(torch.cat((z, missed), dim=-1), s[:, : self.width])
         return self.found(self.baseline(z), rho, velocities(x, self.dof))
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
@@ -377,7 +339,7 @@ class HybridDynamics(Dynamics):
             y_history: measured states [B, T, 3 + n], oldest first; T may be 0.
             w_history: inputs held over the step that follows each of them [B, T, m].
         """
-        if self.disturbance is None:
+        if self.missed is None:
             s: Tensor = self.head.warmup(self.channels(y_history, w_history))
             return s
         s = y_history.new_zeros((y_history.shape[0], self.n_state))
@@ -386,9 +348,9 @@ class HybridDynamics(Dynamics):
         return s
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [n_state], of the head and of the observer."""
+        """Return the least and largest memory [n_state], of the head and of what was missed."""
         low, high = self.head.memory_range()
-        if self.disturbance is None:
+        if self.missed is None:
             return low, high
-        least, most = self.disturbance.memory_range()
+        least, most = self.missed.memory_range()
         return torch.cat((low.double(), least)), torch.cat((high.double(), most))

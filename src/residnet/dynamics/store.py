@@ -25,7 +25,7 @@ from residnet.core.names import nearest
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
-from residnet.dynamics.hybrid import DisturbanceConfig, HybridDynamics
+from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import HeadConfig
 from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
@@ -125,7 +125,6 @@ class ModelSpec(Stored):
         low: smallest of what moves and of the inputs in the training data, SI, [n + m].
         high: their largest.
         band: how far free runs may be off; None where none was calibrated.
-        disturbance: unknown force that is estimated from the measured past; None for none.
         members: of an ensemble; its own baseline and head are then empty.
         of: what an ensemble averages: accelerations within one free run, or the trajectories of
             members that run by themselves.
@@ -144,7 +143,6 @@ class ModelSpec(Stored):
     low: tuple[float, ...]
     high: tuple[float, ...]
     band: BandTable | None = None
-    disturbance: DisturbanceConfig | None = None
     members: tuple[ModelSpec, ...] = ()
     of: Literal["accelerations", "trajectories"] = "accelerations"
 
@@ -176,8 +174,7 @@ class ModelSpec(Stored):
             )
         known = self.baseline.build(signals.names)
         head.set_mass(known.mass())
-        unknown = None if self.disturbance is None else self.disturbance.build(self.dt, live)
-        model = HybridDynamics(signals, known, head, self.dt, self.integrator, unknown)
+        model = HybridDynamics(signals, known, head, self.dt, self.integrator)
         if self.role == "zero":
             # all is held, angles too
             model.known_rates.zero_()

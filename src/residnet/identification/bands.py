@@ -90,8 +90,6 @@ class FoldModels:
         role = fitted.spec.role
         if role == "zero":
             return [copy.deepcopy(fitted.model) for _ in range(self.count)]
-        if fitted.spec.disturbance is not None:
-            return []
         if role == "baseline":
             return self._baseline(fitted)
         head = fitted.model.head

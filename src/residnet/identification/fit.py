@@ -86,10 +86,6 @@ def _fitted(fitter: Fitter, logs: Logs) -> Identified:
             models[name] = fitter.baseline(name)
             say(f"  {name}: {_said(models[name])}")
     _fit_heads(fitter, logs, models)
-    for name, force in settings.forces.items():
-        if force.of in models:
-            models[name] = fitter.with_force(name, models[force.of], force)
-            say(f"  {name}: {_said(models[name])}")
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
         say(f"  {name}: {_said(models[name])}")

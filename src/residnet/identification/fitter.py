@@ -28,7 +28,7 @@ from residnet.heads.base import ClosedFormHead
 from residnet.identification.models import FitStore, FittedModel, NoStore
 from residnet.identification.prepared import PreparedSplits, velocity_limit
 from residnet.identification.recipe import Facts
-from residnet.identification.settings import FitSettings, ForceConfig
+from residnet.identification.settings import FitSettings
 from residnet.judge.freerun import Candidate, Errors, free_run
 from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
 from residnet.regression.estimator import Coefficient, Solution
@@ -341,29 +341,6 @@ class Fitter:
             **self._validated(spec.as_one(model)),
         }
         return self._kept(FittedModel(spec, spec.as_one(model), notes))
-
-    def with_force(self, name: str, base: FittedModel, config: ForceConfig) -> FittedModel:
-        """Return a model with an unknown force, by the observer that validates best.
-
-        Args:
-            name: of the model.
-            base: fitted model that the force is added to.
-            config: time constants to choose from.
-        """
-        tried = []
-        for observer in config.candidates():
-            spec = base.spec.model_copy(update={"name": name, "disturbance": observer})
-            model = spec.build()
-            model.load_state_dict(base.model.state_dict())
-            tried.append((self.validate(model), spec, model))
-        _, spec, model = min(tried, key=lambda one: one[0])
-        notes: dict[str, Any] = {
-            **{key: base.notes[key] for key in ("refit", "baseline") if key in base.notes},
-            "of": base.name,
-            "force": spec.model_dump()["disturbance"],
-            **self._validated(model),
-        }
-        return self._kept(FittedModel(spec, model, notes))
 
     def ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         """Return the mean acceleration of fitted models as one model."""

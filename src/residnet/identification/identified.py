@@ -275,9 +275,7 @@ def parameter_count(model: HybridDynamics) -> int:
         if isinstance(model.head, ClosedFormHead)
         else sum(parameter.numel() for parameter in model.head.parameters())
     )
-    # two time constants of an observer of the unknown force
-    of_force = 0 if model.disturbance is None else 2
-    return round(sum(model.baseline.parameter_count()) + of_head + of_force)
+    return round(sum(model.baseline.parameter_count()) + of_head)
 
 
 @dataclass(frozen=True)

@@ -344,8 +344,7 @@ def members(facts: Facts) -> int:
 
 
 PARTS = (
-    "baseline", "baselines", "refit", "heads", "base_of", "forces", "ensembles", "means",
-    "training",
+    "baseline", "baselines", "refit", "heads", "base_of", "ensembles", "means", "training",
 )  # fmt: skip
 """Keys of a fit that the recipe stands in place of."""
 MEAN = "mean"
@@ -379,7 +378,6 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
         "refit": dict.fromkeys(("baseline", "hull"), refit_settings(facts)),
         "heads": heads,
         "base_of": {"hull_network": "hull", "network": "zero"},
-        "forces": {},
         "ensembles": {},
         "means": {MEAN: ("hull", *heads)},
         "training": dict.fromkeys(heads, training_settings(facts, effort)),

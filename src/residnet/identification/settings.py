@@ -16,12 +16,11 @@ from residnet.baselines import BaselineConfig
 from residnet.baselines.base import ParametricBaseline
 from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.core.config import Config, Seconds, validate
+from residnet.core.config import Config, validate
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
-from residnet.dynamics.hybrid import DisturbanceConfig
 from residnet.heads import HeadConfig
 from residnet.identification.recipe import PARTS, Facts, portfolio
 from residnet.judge.band import BandsConfig
@@ -32,32 +31,6 @@ from residnet.training.current import CurrentConfig
 from residnet.training.refit import RefitConfig
 
 _RESERVED = ("zero", "baseline", "truth")
-
-
-class ForceConfig(Config):
-    """A model that adds an unknown slowly varying force to another one.
-
-    The force is fixed to the earth, as wind and current are, and is estimated from the measured
-    past of each free run. Of several time constants those are taken whose free runs are best on the
-    validation data.
-
-    Attributes:
-        of: baseline or head that it is added to.
-        settle: time constants at which the estimate follows what the model does not explain.
-        decay: time constants at which it is forgotten during the prediction, beside holding it.
-    """
-
-    of: str
-    settle: tuple[Annotated[Seconds, Field(gt=0)], ...] = (5.0, 15.0, 45.0, 120.0)
-    decay: tuple[Annotated[Seconds, Field(gt=0)], ...] = (60.0,)
-
-    def candidates(self) -> list[DisturbanceConfig]:
-        """Return the observers to choose from."""
-        return [
-            DisturbanceConfig(settle=settle, decay=decay)
-            for settle in self.settle
-            for decay in (None, *self.decay)
-        ]
 
 
 class Parts(Config):
@@ -72,8 +45,6 @@ class Parts(Config):
         heads: residual heads by name.
         base_of: the baseline that a head stands on, by the head's name; `baseline` where absent,
             `zero` for a head that is the whole model.
-        forces: models by name that add an unknown force, estimated from the measured past, to
-            another one.
         ensembles: models whose mean acceleration makes another model, by its name.
         means: models by name that are the mean of what several others predict, each running by
             itself; members that diverge on a validation window are left out.
@@ -85,7 +56,6 @@ class Parts(Config):
     refit: dict[str, RefitConfig] = Field(default_factory=dict)
     heads: dict[str, HeadConfig] = Field(default_factory=dict)
     base_of: dict[str, str] = Field(default_factory=dict)
-    forces: dict[str, ForceConfig] = Field(default_factory=dict)
     ensembles: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = Field(
         default_factory=dict
     )
@@ -156,11 +126,6 @@ class FitSettings(Parts):
                 "current: currents are told by u, v and r beside a position; leave `current` out of"
                 f" a model of {', '.join(self.signals.velocities)}"
             )
-        if self.signals.live.spatial and self.forces:
-            raise ValueError(
-                "forces: an unknown force is estimated in the horizontal plane; leave it out"
-                " of a model of six degrees of freedom"
-            )
         given, wanted = tuple(self.evaluation.scales.named()), self.signals.live.channels
         if given != wanted:
             raise ValueError(
@@ -170,7 +135,7 @@ class FitSettings(Parts):
             )
         baselines = self.all_baselines
         single = (*baselines, *self.heads)
-        further = (*self.forces, *self.ensembles, *self.means)
+        further = (*self.ensembles, *self.means)
         models = (*single, *further)
         for name in (*self.baselines, *self.heads, *further):
             if (
@@ -186,11 +151,10 @@ class FitSettings(Parts):
         require_known("base_of", self.base_of, self.heads, "head")
         require_known("base_of", self.base_of.values(), ("zero", *baselines), "baseline")
         require_known("refit", self.refit, baselines, "baseline")
-        require_known("forces", (force.of for force in self.forces.values()), single, "model")
         members = (name for names in self.ensembles.values() for name in names)
         require_known("ensembles", members, single, "model")
         members = (name for names in self.means.values() for name in names)
-        require_known("means", members, (*single, *self.forces), "model")
+        require_known("means", members, single, "model")
         self._parts_fit_together()
         return self
 
@@ -239,8 +203,7 @@ class FitSettings(Parts):
     @property
     def model_names(self) -> tuple[str, ...]:
         """Names of all models but `zero`: baselines, heads, ensembles."""
-        further = (*self.forces, *self.ensembles, *self.means)
-        return (*self.all_baselines, *self.heads, *further)
+        return (*self.all_baselines, *self.heads, *self.ensembles, *self.means)
 
     def baseline_name_of(self, head: str) -> str:
         """Return the name of the baseline that a head stands on."""
