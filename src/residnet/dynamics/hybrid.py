@@ -63,7 +63,8 @@ class Missed(nn.Module):
         left = (velocities(x, self.dof) - predicted) * known
         if not self.free:
             left = left * self.mask.to(left.dtype)
-        return self.keep * before + self.gain * left
+        missed: Tensor = self.keep * before + self.gain * left
+        return missed
 
     def remembered(self, after: Tensor, missed: Tensor) -> Tensor:
         """Return the memory [B, 1 + 2 n] from the predicted states [B, nx] and what was missed."""
