@@ -19,6 +19,7 @@ from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.drafting.words import state_channel, words_of
+from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers import ReaderConfig
 
 
@@ -430,3 +431,65 @@ def test_a_wind_is_told_by_what_makes_the_true_wind_steady(
     file = tmp_path / "wind.csv"
     pd.DataFrame(columns).to_csv(file, index=False)
     assert kind in draft_tables([file], Marks())[0]["channels"]
+
+
+def test_the_wind_that_is_felt_is_made_true_by_velocities_that_a_smoother_finds(
+    log: Log, breeze: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    speed, direction = breeze
+    felt = speed * np.exp(1j * (direction - log["psi"])) + log["u"] + 1j * log["v"]
+    columns = {name: log[name] for name in ("x", "y", "psi", "r")}
+    wind = {"AWS [m/s]": np.abs(felt), "AWA [deg]": np.degrees(np.angle(felt))}
+    read, _ = _drafted(_frame(log, **columns, **wind), tmp_path / "ship.csv")
+    assert "wind_dir" not in read.channels
+    inputs = ("delta", "n", "wind_speed", "wind_dir")
+    named = residnet.inspect([read], inputs=inputs)
+    assert named.text.str.contains("apparent_wind_angle").any()
+    made = complete_motion(read, MotionConfig())
+    off = np.exp(1j * made["wind_dir"]) - np.exp(1j * direction)
+    assert float(np.abs(off).mean()) < 0.05
+
+
+def test_a_channels_own_name_goes_before_others(log: Log, tmp_path: Path) -> None:
+    psi, ground = log["psi"], np.exp(1j * log["psi"]) * (log["u"] + 1j * log["v"])
+    fixed = dict.fromkeys(("lat (rad)", "lon (rad)"), np.full(len(log), 0.7))
+    along = {"vx (m/s)": ground.real, "vy (m/s)": ground.imag}
+    own = {"u (m/s)": log["u"], "v (m/s)": log["v"]}
+    azimuth = {"Thruster_Azimuth_deg": np.degrees(log["delta"])}
+    place = {"x (m)": log["x"], "y (m)": log["y"], "psi (rad)": psi}
+    frame = _frame(log, **fixed, **place, **along, **own, **azimuth)
+    read, marks = _drafted(frame, tmp_path / "log.csv")
+    for name in ("u", "v", "x", "y"):
+        np.testing.assert_allclose(read[name], log[name], atol=1e-9)
+    assert "latitude" not in read.channels
+    np.testing.assert_allclose(read["azimuth"], log["delta"], atol=1e-9)
+    assert not _guessed(marks, "azimuth")
+
+
+def test_a_folder_of_messages_whose_values_come_in_turns(log: Log, tmp_path: Path) -> None:
+    clock = "timestamp (seconds since 01/01/1970)"
+    for number in range(2):
+        folder, t = tmp_path / f"20250614_10{number}005_auv", 1_750_000_000.0 + 900.0 * number
+        folder.mkdir()
+        motion = {f" {name} ({unit})": log[name] for name, unit in (("x", "m"), ("y", "m"))}
+        motion[" psi (rad)"] = (log["psi"] + np.pi) % (2.0 * np.pi) - np.pi
+        about = {clock: t + log.t, " system": "auv", " entity": "Navigation"}
+        state = pd.DataFrame(about | motion)
+        state.to_csv(folder / "EstimatedState.csv", index=False)
+        fins = [
+            pd.DataFrame({clock: t + log.t + 0.01 * k, " id": k, " value (rad)": value})
+            for k, value in enumerate((-log["delta"], 0.3 * np.sin(0.2 * log.t)))
+        ]
+        together = pd.concat(fins).sort_values(clock)
+        together.to_csv(folder / "SetServoPosition.csv", index=False)
+        motor = pd.DataFrame({clock: t + log.t, " value (rpm)": np.round(60.0 * log["n"])})
+        motor.to_csv(folder / "Rpm.csv", index=False)
+        pd.DataFrame({clock: t + log.t, " value (V)": 25.0}).to_csv(folder / "Voltage.csv")
+    logs = residnet.read_logs(tmp_path)
+    assert len(logs) == 2
+    read = logs[0]
+    assert read.units["servo_1"] == read.units["servo_2"] == "rad"
+    inner = slice(20, -20)
+    at = np.interp(read.t - read.t[0], log.t, log["delta"])[inner]
+    assert np.corrcoef(read["servo_1"][inner], -at)[0, 1] > 0.99
+    np.testing.assert_allclose(np.nanmax(read["n"]), np.round(60 * log["n"].max()) / 60, rtol=1e-6)

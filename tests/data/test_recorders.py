@@ -151,6 +151,34 @@ def test_ardupilot(tmp_path: Path) -> None:
         np.testing.assert_allclose(got[name], log[name], atol=2e-6, err_msg=name)
 
 
+def test_ardupilot_as_text(tmp_path: Path) -> None:
+    log = trial(20.0)
+    lines = [
+        "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns",
+        "FMT, 130, 30, XKF1, QBffff, TimeUS,C,PN,PE,VN,VE",
+        "FMT, 131, 20, ATT, Qff, TimeUS,Roll,Yaw",
+        "FMT, 132, 20, RCOU, QHHH, TimeUS,C1,C2,C3",
+    ]
+    for i, t in enumerate(log.t.tolist()):
+        at, psi = round(5e6 + 1e6 * t), log["psi"][i]
+        ground = np.exp(1j * psi) * (log["u"][i] + 1j * log["v"][i])
+        place = f"{log['x'][i]:.6f}, {log['y'][i]:.6f}, {ground.real:.6f}, {ground.imag:.6f}"
+        lines.append(f"XKF1, {at}, 0, {place}")
+        lines.append(f"ATT, {at}, 0.0, {np.degrees(psi) % 360.0:.6f}")
+        pulses = [1500 + round(300.0 * np.sin(0.1 * k * t)) for k in (1, 2)]
+        lines.append(f"RCOU, {at}, {pulses[0]}, 0, {pulses[1]}")
+    path = tmp_path / "00000042.log"
+    path.write_text("\n".join(lines) + "\n")
+    found = format_of(path)
+    assert found is not None
+    assert found.name == "ArduPilot log"
+    (read,) = residnet.read_logs(path)
+    assert {"servo_1", "servo_3"} <= set(read.channels)
+    for name in ("x", "y", "u", "v"):
+        at_ours = np.interp(read.t - 5.0, log.t, log[name])
+        np.testing.assert_allclose(read[name], at_ours, atol=0.02, err_msg=name)
+
+
 @pytest.mark.parametrize(
     ("write", "name"),
     [

@@ -16,10 +16,11 @@ from residnet.core.config import Config, Metres, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, POSE, STATE
+from residnet.core.names import BOW_WIND, CHANNEL_UNITS, POSE, STATE
 from residnet.data.channels import noise_of, spikes, without_held
 from residnet.data.readers.base import unwrap
 from residnet.data.readers.recording import remark
+from residnet.physics.environment import WIND_INPUTS
 
 _DENSE = 0.9
 """Share of the samples that hold a value in a channel that is measured at every sample."""
@@ -158,6 +159,16 @@ def with_true_wind(log: Log) -> Log:
         channels={**log.channels, **told},
         units={**log.units, **{name: CHANNEL_UNITS[name] for name in told}},
     )
+
+
+def as_recorded(log: Log, inputs: Sequence[str]) -> list[str]:
+    """Return inputs by the channels that tell them before the motion is complete.
+
+    Without u and v of its own a log holds the wind that the moving vessel feels, not the true one.
+    """
+    missing = {*WIND_INPUTS} & {*inputs} - {*log.channels}
+    bow = [name for name in (*BOW_WIND, *WIND_INPUTS) if missing and name in log.channels]
+    return [*(name for name in inputs if not bow or name not in WIND_INPUTS), *bow]
 
 
 def _still(log: Log, live: Live) -> Log:

@@ -151,7 +151,7 @@ def drafted(
     deep = [name for name in SIX.moving if name in measured and name not in ROLL.moving]
     if deep and not live.spatial:
         text = f"{', '.join(deep)}: left out: six degrees of freedom need depth, pitch and roll"
-        marks.note(CHANNELS, f"{text} angles, and u and v or a position, in all logs")
+        marks.note(CHANNELS, f"{text} angles, and u and v or a position, that move in all logs")
     if not chosen.exogenous and all(
         {*WIND_INPUTS} <= {*log.channels} for log in read.logs.values()
     ):

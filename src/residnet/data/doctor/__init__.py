@@ -34,6 +34,7 @@ from residnet.data.doctor.findings import (
 )
 from residnet.data.doctor.statistics import MEASURED, Record
 from residnet.data.masks import Mask, apply_masks
+from residnet.data.motion import as_recorded
 
 __all__ = [
     "CHECKS",
@@ -93,7 +94,7 @@ def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask]
                 f"log {log.name}: channel {name} holds no number; take it out of the channel map"
             )
     driving = [name for name in log.channels if name not in MEASURED]
-    driving = driving if inputs is None else list(inputs)
+    driving = driving if inputs is None else as_recorded(log, inputs)
     log.stack(driving)
     raw = Record(log, driving)
     found = [*imported(log.meta.get("findings", ())), *run("header", raw)]
@@ -151,5 +152,7 @@ def inspect_together(
         splits: log's name -> train, validation or test, where a config says.
     """
     sound = [log for log in logs if len(log) > 1 and not [*run("order", Record(log))]]
+    if inputs is not None:
+        inputs = [*dict.fromkeys(name for log in sound for name in as_recorded(log, inputs))]
     found = run("between", Together(sound, inputs, splits or {})) if sound else ()
     return Report("together", tuple(found))

@@ -46,11 +46,11 @@ def absent(log: Record, found: Check) -> Iterator[Finding]:
             else:
                 yield found(f"no {', '.join(names)}: {live.text}")
     if "p" in log and not live.rolls:
-        text = "p of the roll is measured and not modelled: a model that rolls needs the angle phi"
-        yield found(text, code="roll")
+        text = "p of the roll is measured and not modelled: a model that rolls needs an angle phi"
+        yield found(f"{text} that moves", code="roll")
     if {"z", "theta"} & {*log} and not live.spatial and {"x", "u"} & {*log}:
         text = "depth or pitch is measured and not modelled: six degrees of freedom need both, phi,"
-        yield found(f"{text} psi, and u and v or a position", code="depth")
+        yield found(f"{text} psi, and u and v or a position, that move", code="depth")
 
 
 # one full circle in rad, and in degrees that were taken for rad

@@ -24,7 +24,7 @@ from residnet.data.drafting.physics import (
     motion_of,
 )
 from residnet.data.drafting.questions import Marks
-from residnet.data.drafting.units import thrown, unit_by_size, written_unit
+from residnet.data.drafting.units import si_of, thrown, unit_by_size, written_unit
 from residnet.data.drafting.words import axis_velocity, words_of
 from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
 from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
@@ -36,8 +36,8 @@ _SURE = 0.9
 _STEADIER = 0.8
 """Spread of the true wind, in that of what its name says, from which it is told another way.
 
-Of 120 winds of boats that turn, drawn at random, all are told right, and none from north is misread;
-of boats that turn by less than a radian a third is taken as its name says.
+Of 120 winds of boats that turn, drawn at random, all are told right, and none from north is
+misread; of boats that turn by less than a radian a third is taken as its name says.
 """
 _SAMPLES = 50
 """Samples of a wind that tell nothing yet."""
@@ -264,9 +264,13 @@ def _from_fixes(
     fix of each.
     """
     fixes = set(_FIXES.values())
+    rest = {name: column for name, column in names.items() if name not in fixes}
+    if set(_FIXES) <= set(names) and len(rest) < len(names):
+        columns = ", ".join(names[name] for name in sorted(fixes & set(names)))
+        marks.note(CHANNELS, f"x and y stand beside it; left out: {columns}")
+        return rest, list(logs), 0.0
     if not fixes <= set(names) or set(_FIXES) & set(names):
         return dict(names), list(logs), 0.0
-    rest = {name: column for name, column in names.items() if name not in fixes}
     whole = [raw for raw in logs if fixes <= set(raw.columns)]
     cells = {f: np.concatenate([raw.columns[f] for raw in whole] or [np.zeros(0)]) for f in fixes}
     known = {name: values[np.isfinite(values)] for name, values in cells.items()}
@@ -540,7 +544,7 @@ class Channels:
     def _unit(self, name: str, *, mark: bool = True) -> str:
         """Return the unit of a channel from its header or its size."""
         column = self._names[name]
-        written = written_unit(column, CHANNEL_UNITS.get(name))
+        written = written_unit(column, si_of(name))
         if written is not None:
             return written
         unit, reason = unit_by_size(name, self._values(name))

@@ -17,7 +17,7 @@ from residnet.data.drafting.channels import CHANNELS, READER, drafted_channels
 from residnet.data.drafting.physics import FRAMES, Fit, Motion, Raw, along, follows, motion_of
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import mark_folders, named
-from residnet.data.drafting.units import thrown, unit_by_size
+from residnet.data.drafting.units import si_of, thrown, unit_by_size, written_unit
 from residnet.data.drafting.words import MOTION, input_channel, state_channel, words_of
 from residnet.data.readers.compose import heading_part, position_part
 from residnet.data.readers.detect import AutoConfig
@@ -426,6 +426,9 @@ def _entry(
     if throw := thrown(channel, field, values):
         marks.guess((*CHANNELS, channel), throw.reason)
         return {**entry, **throw.settings, "hold": True}
+    if unit := written_unit(field, si_of(channel)):
+        marks.guess((*CHANNELS, channel), "taken by its name")
+        return {**entry, "unit": unit, "hold": True}
     unit, reason = unit_by_size(channel, values)
     marks.guess((*CHANNELS, channel), f"taken by its name; {reason}")
     return {**entry, "unit": unit, "hold": True}

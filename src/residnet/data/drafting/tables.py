@@ -29,7 +29,7 @@ from residnet.data.drafting.channels import (
 from residnet.data.drafting.physics import Raw
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.units import other_dimension, written_unit
-from residnet.data.drafting.words import input_channel, plain, state_channel, words_of
+from residnet.data.drafting.words import MOTION, input_channel, plain, state_channel, words_of
 from residnet.data.readers.base import require_file
 from residnet.data.readers.clocks import first_of_copies, steady_clock
 from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
@@ -280,11 +280,12 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
     }
     sided = sided if len({*sided.values()}) == 2 else {}
 
-    def order(column: str) -> tuple[bool, int]:
+    def order(column: str) -> tuple[bool, bool, int]:
         magnetic = MAGNETIC.search(column) and state_channel(about[column]) == "psi"
-        return bool(magnetic), len(about[column].about)
+        return bool(magnetic), about[column].text not in MOTION, len(about[column].about)
 
-    # true headings first, then shorter names: `heading` before `heading of the second compass`
+    # true headings first, then a channel's own name, `u` before `vx`, then shorter names: `heading`
+    # before `heading of the second compass`
     for column in sorted(columns, key=order):
         channel = sided.get(column) or state_channel(about[column]) or input_channel(about[column])
         si = CHANNEL_UNITS.get(channel or "")

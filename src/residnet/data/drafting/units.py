@@ -67,7 +67,7 @@ def unit_by_size(channel: str, values: np.ndarray) -> tuple[str, str]:
     """
     known = np.abs(values[np.isfinite(values)])
     largest = float(np.quantile(known, 0.99)) if known.size else 0.0
-    expected = CHANNEL_UNITS.get(channel) or _by_name(channel)
+    expected = si_of(channel) or "-"
     if expected == "rad":
         limit = 7.0 if channel in ("psi", "wind_dir") or "azimuth" in channel else 1.6
         unit = "deg" if largest > limit else "rad"
@@ -137,8 +137,10 @@ def is_pulse(channel: str, values: np.ndarray) -> bool:
     return bool(low >= 800.0 and high <= 2300.0 and high > 1200.0)
 
 
-def _by_name(channel: str) -> str:
-    """Return the SI unit of a channel that residnet does not know, by its name."""
+def si_of(channel: str) -> str | None:
+    """Return the SI unit of a channel, by its name where residnet does not know it, or None."""
+    if channel in CHANNEL_UNITS:
+        return CHANNEL_UNITS[channel]
     first = channel.removeprefix("cmd_")
     if re.match(r"n(_|$)", first):
         return "1/s"
@@ -146,4 +148,4 @@ def _by_name(channel: str) -> str:
         return "rad"
     if first.startswith(("tau_x", "tau_y", "thrust")):
         return "N"
-    return "N m" if first.startswith("tau_n") else "-"
+    return "N m" if first.startswith("tau_n") else None

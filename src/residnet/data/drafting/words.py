@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from functools import lru_cache
 from typing import NamedTuple
 
 from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS
@@ -154,6 +155,7 @@ def plain(name: str) -> str:
     return " ".join(re.split(r"[\W_]+", joined)).strip()
 
 
+@lru_cache(maxsize=4096)
 def words_of(name: str) -> Words:
     """Return what a column's name is about."""
     tokens = [part for token in plain(name).split() for part in _sided(token)]

@@ -206,11 +206,15 @@ class Wanted:
         return self._named is None or any(self._same(name, topic) for name, _ in self._named)
 
     def field(self, topic: str, path: str) -> bool:
-        """Return whether a field or a part of it is wanted (`orientation.w` of `orientation`)."""
+        """Return whether a field, a part of it or what it is a part of is wanted.
+
+        `orientation.w` is a part of `orientation`, and `value[0]` of `value`.
+        """
         key = key_of(path)
         fields = [key_of(field) for name, field in self._named or () if self._same(name, topic)]
         return self._named is None or any(
-            not field or key == field or key.startswith(field + "_") for field in fields
+            not field or f"{key}_".startswith(f"{field}_") or field.startswith(f"{key}_")
+            for field in fields
         )
 
     @staticmethod

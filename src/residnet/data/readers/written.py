@@ -377,6 +377,8 @@ def _fractions(column: pd.Series, whole: np.ndarray) -> tuple[np.ndarray, tuple[
         return padded, ()
     unit = {3: "ms", 6: "us", 9: "ns"}[longest]
     changed = int((padded != unpadded).sum())
+    if not changed:
+        return padded, ()
     text = (
         f"fractions of seconds are whole {unit} without their leading zeros: {changed} of"
         f" {whole.size} times are repaired, taken as printed time runs backwards {back[0]} times"

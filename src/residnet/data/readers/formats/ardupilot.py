@@ -1,4 +1,4 @@
-"""ArduPilot's onboard logs (.bin), through the package pymavlink."""
+"""ArduPilot's onboard logs (.bin, or the same as text), through the package pymavlink."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from residnet.data.readers.base import (
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.recording import EVERYTHING, Recording, Series, Wanted
 
+_BINARY, _TEXT = b"\xa3\x95\x80", b"FMT,"
+"""How the two kinds of logs begin: with the message that describes messages."""
 _TICKS = {"TimeUS": 1_000, "TimeMS": 1_000_000, "T": 1_000_000}
 """Field of the time since boot -> its unit in ns."""
 _DATED = 100_000_000.0
@@ -40,7 +42,9 @@ class ArduPilotConfig(RecordingConfig):
 
     kind: Literal["ardupilot"] = "ardupilot"
     endings: ClassVar = (".bin",)
-    formats: ClassVar = {"ArduPilot log": lambda path, head: head.startswith(b"\xa3\x95\x80")}
+    formats: ClassVar = {
+        "ArduPilot log": lambda path, head: head.lstrip().startswith((_BINARY, _TEXT))
+    }
 
     def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
         """Read the wanted messages of a dataflash log, on the boot clock (TimeUS).
@@ -54,14 +58,16 @@ class ArduPilotConfig(RecordingConfig):
         """
         require_file(path)
         try:
-            from pymavlink.DFReader import DFReader_binary
+            from pymavlink.DFReader import DFReader_binary, DFReader_text
         except ImportError as error:
             raise missing_package("ardupilot", "pymavlink", "an ArduPilot log") from error
         columns: dict[str, _Columns] = {}
         listed: set[str] = set()
         try:
             with _silence():
-                reader = DFReader_binary(str(path))
+                with path.open("rb") as stream:
+                    text = stream.read(100).lstrip().startswith(_TEXT)
+                reader = (DFReader_text if text else DFReader_binary)(str(path))
             with progress(path.name, path.stat().st_size, 100.0) as advance:
                 _collect(reader, columns, listed, wanted, advance)
             base = float(reader.clock.timebase or 0.0)
@@ -76,7 +82,7 @@ class ArduPilotConfig(RecordingConfig):
                 raise UsageError(
                     f"{path}: none of its messages is wanted (it holds {', '.join(sorted(listed))})"
                 )
-            raise DataError(f"{path}: holds no message with a time; is it an ArduPilot .bin log?")
+            raise DataError(f"{path}: holds no message with a time; is it an ArduPilot log?")
         start = min(one.time[0] for one in columns.values())
         boot = round(base * 1e6) * 1000 if base > _DATED else None
         epoch = None if boot is None else (boot + start) // 10**9 * 10**9

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, final
@@ -41,6 +42,10 @@ if TYPE_CHECKING:
 
 _ENDINGS = (".csv", ".tsv", ".txt")
 _ARRIVAL = ("time", "Time", "t", "timestamp", "rosbagTimestamp", "%time", "stamp", "date")
+_CLOCK = re.compile(r"(?:time|timestamp)s?\s*[\[(]", re.IGNORECASE)
+"""A time whose unit stands behind it."""
+_MOST = 16
+"""Most actuators whose values stand in one column, told apart by another one."""
 # last parts of the names of a header stamp's two columns, in ROS 1 and ROS 2
 _SECONDS, _NANOSECONDS = ("secs", "sec"), ("nsecs", "nanosec")
 
@@ -56,14 +61,11 @@ def is_topic_folder(path: Path) -> bool:
     heads: dict[Path, list[str]] = {}
     begins: list[float] = []
     for file in _files(path)[:200]:
-        with file.open("rb") as stream:
-            head = stream.read(10_000)
-        lines = head.decode(encoding_of_head(head), errors="replace").splitlines()[:2]
-        names, *row = [line.removeprefix("\ufeff").strip().split(",") for line in lines] or [[""]]
+        names, *row = _cells(file)[:2]
         if names != [""]:
             heads[file] = names
         for name, cell in zip(names, *row, strict=False) if row else ():
-            if name in _ARRIVAL:
+            if name == _clock_of(names, _ARRIVAL):
                 with contextlib.suppress(ValueError):
                     begins.append(float(cell))
     if any(_stamp_columns(head) is not None for head in heads.values()):
@@ -72,7 +74,7 @@ def is_topic_folder(path: Path) -> bool:
     units = {unix_unit(np.array([begin])) for begin in begins}
     if any(len(files) > 1 for files in trips.values()) or len(units) > 1:
         return False
-    timed = [head for head in heads.values() if set(head) & set(_ARRIVAL)]
+    timed = [head for head in heads.values() if _clock_of(head, _ARRIVAL) is not None]
     apart = len(timed) > 1 and 2 * len(timed) > len(heads) and len(set(map(tuple, timed))) > 1
     return apart and sum(_is_whole_log(head) for head in timed) < 2
 
@@ -162,7 +164,7 @@ class TopicFolderConfig(RecordingConfig):
         try:
             with file.open(newline="", encoding="utf-8-sig") as stream:
                 header = [cell.strip() for cell in next(csv.reader(stream, delimiter=sep), [])]
-            clock = next((column for column in self.time if column in header), None)
+            clock = _clock_of(header, self.time)
             stamp = _stamp_columns(header)
             if clock is None and stamp is None:
                 text = (
@@ -174,7 +176,10 @@ class TopicFolderConfig(RecordingConfig):
             kept = [
                 i
                 for i, column in enumerate(header)
-                if column in always or _names_sender(column) or wanted.field(name, column)
+                if column in always
+                or _names_sender(column)
+                or words_of(column).has("index")
+                or wanted.field(name, column)
             ]
             table = pd.read_csv(
                 file,
@@ -204,13 +209,27 @@ class TopicFolderConfig(RecordingConfig):
             return remark("will mislead", "no_time", text)
 
 
-def _step_of(file: Path, clocks: Sequence[str]) -> float:
-    """Return the usual step of the first times of a topic, in its own unit; 0 for none."""
+def _cells(file: Path) -> list[list[str]]:
+    """Return the cells of a topic's first lines, the last of which may be cut short."""
     with file.open("rb") as stream:
         head = stream.read(10_000)
-    lines = head.decode(encoding_of_head(head), errors="replace").splitlines()[:-1]
-    names, *rows = [line.removeprefix("\ufeff").strip().split(",") for line in lines] or [[""]]
-    clock = next((names.index(name) for name in clocks if name in names), len(names))
+    lines = (
+        head.decode(encoding_of_head(head), errors="replace").removeprefix("\ufeff").splitlines()
+    )
+    return [[cell.strip() for cell in line.split(",")] for line in lines] or [[""]]
+
+
+def _clock_of(header: Sequence[str], clocks: Sequence[str]) -> str | None:
+    """Return the column of the arrival time: the first of the names given, else called a time."""
+    called = (name for name in header if _CLOCK.match(name))
+    return next((name for name in clocks if name in header), next(called, None))
+
+
+def _step_of(file: Path, clocks: Sequence[str]) -> float:
+    """Return the usual step of the first times of a topic, in its own unit; 0 for none."""
+    names, *rows = _cells(file)[:-1] or [[""]]
+    name = _clock_of(names, clocks)
+    clock = len(names) if name is None else names.index(name)
     try:
         steps = np.diff([float(row[clock]) for row in rows if len(row) > clock])
     except ValueError:
@@ -254,11 +273,13 @@ class _Topic:
             if column != clock and (values := self._numbers(name, column, cells)) is not None:
                 whole[column] = values
         self._stamp = None if stamp is None else _header_stamps(whole, stamp)
-        self._fields = {
-            column: values.astype(np.float64, copy=False)
-            for column, values in whole.items()
-            if column not in (stamp or ())
-        }
+        self._fields = _told_apart(
+            {
+                column: values.astype(np.float64, copy=False)
+                for column, values in whole.items()
+                if column not in (stamp or ())
+            }
+        )
 
     @property
     def stamps(self) -> list[Stamps]:
@@ -329,6 +350,26 @@ class _Topic:
         )
         self._remarks.append(remark("note", "not_numbers", text, rows=float(len(cells))))
         return None
+
+
+def _told_apart(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return `value[0]` and `value[1]` of values [T] in turns, where a column numbers them.
+
+    Each holds in the rows of the others, and is NaN before its first.
+    """
+    for name, number in fields.items():
+        known = np.unique(number)
+        turns = number.size > 1 and float((np.diff(number) != 0.0).mean()) > 0.5
+        if words_of(name).has("index") and 1 < known.size <= _MOST and turns:
+            rows = np.arange(number.size)
+            last = {one: np.maximum.accumulate(np.where(number == one, rows, -1)) for one in known}
+            return {
+                f"{other}[{one:g}]": np.where(at < 0, np.nan, values[at])
+                for other, values in fields.items()
+                if other != name
+                for one, at in last.items()
+            }
+    return fields
 
 
 def _header_stamps(numbers: dict[str, np.ndarray], columns: tuple[str, str]) -> Stamps | None:
