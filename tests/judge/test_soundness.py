@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,8 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.prepare import PrepareConfig, Prepared, prepare
-from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.ensemble import MeanOfTrajectories
+from residnet.dynamics.hybrid import Disturbance, DisturbanceConfig, HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.heads.lstm import LstmHead
 from residnet.judge.soundness import (
@@ -272,6 +274,23 @@ def test_a_network_on_top_is_checked_with_its_memory_settled() -> None:
     of_kind(model.head, LstmHead).scale.spread.fill_(0.5)
     assert findings(spec, model)[SYMMETRY].ok is False
     assert next(model.head.parameters()).dtype == torch.float32, "the model stays as it is"
+
+
+def test_what_looks_for_an_unknown_force_is_asked_without_a_past() -> None:
+    spec, plain = made(RUDDER)
+    low_pass = DisturbanceConfig(settle=2.0, decay=2.0)
+    seen = Disturbance(low_pass, STEP, body=True, live=spec.signals.live)
+    model = HybridDynamics(plain.signals, plain.baseline, plain.head, STEP, "rk4", seen)
+    low, high = spec.low[:3], spec.high[:3]
+    for one in (model, MeanOfTrajectories([plain, model], low, high)):
+        assert one.observes
+        found = findings(spec, one)
+        assert found[DAMPING].ok, found[DAMPING].text
+        slopes = [
+            float(number) for number in re.findall(r"d[uvr] ([-+][.0-9]+)", found[DAMPING].text)
+        ]
+        # the mean's are those of a step, by its length
+        np.testing.assert_allclose(slopes, [-0.1, -0.3, -0.5], rtol=0.15)
 
 
 def log(seconds: float = 200.0, *, settles: bool = True) -> Prepared:

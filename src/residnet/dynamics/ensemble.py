@@ -255,6 +255,10 @@ class MeanOfTrajectories(HybridDynamics):
                 s = self.step(y_history[:, k], w_history[:, k], s)[1]
         return s
 
+    @property
+    def observes(self) -> bool:
+        return any(member.observes for member in self.members)
+
     def known(self, z: Tensor) -> Tensor:
         total = zero_acceleration(z, self.dof)
         for member in self.members:

@@ -348,6 +348,11 @@ class HybridDynamics(Dynamics):
             s = self.step(y_history[:, k], w_history[:, k], s)[1]
         return s
 
+    @property
+    def observes(self) -> bool:
+        """Whether the measured past tells the memory how wrong it was predicted."""
+        return self.disturbance is not None
+
     def memory_range(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [n_state], of the head and of what was missed."""
         low, high = self.head.memory_range()

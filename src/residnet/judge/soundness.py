@@ -244,8 +244,13 @@ def settled_memory(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
 
 
 def acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
-    """Return nu_dot [B, n] of baseline and head together, the head's memory settled."""
-    return model.acceleration(x, w, settled_memory(model, x, w))
+    """Return nu_dot [B, n] of baseline and head together, the head's memory settled.
+
+    To a model that looks for what was predicted wrong, states that are held would tell of a force
+    that holds them: it has no past.
+    """
+    s = model.initial_state(len(x)).to(x) if model.observes else settled_memory(model, x, w)
+    return model.acceleration(x, w, s)
 
 
 def check_damping(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) -> Finding:
