@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
+import residnet
 from residnet.core.config import validate
 from residnet.core.errors import DataError
+from residnet.core.layout import SIX, Live
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
@@ -272,3 +275,35 @@ def test_a_name_that_stands_twice(tmp_path: Path) -> None:
     entry["column"] = "heading [deg].1"
     other = validate(content, ReaderConfig, "here").build().read(path)
     np.testing.assert_allclose(other["psi"] - log["psi"], np.radians(2.0), atol=1e-9)
+
+
+def test_odometry_of_ros_under_water(tmp_path: Path) -> None:
+    helix = {"kind": "helix", "drive": 0.6, "steer": 0.4, "dive": 0.4}
+    log = next(iter(residnet.simulate("remus_100", [helix], duration=60.0, step=0.1, seed=2).logs))
+    down = Rotation.from_euler("ZYX", np.stack([log[n] for n in ("psi", "theta", "phi")], axis=1))
+    east = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    up = Rotation.from_matrix(east @ down.as_matrix() @ np.diag([1.0, -1.0, -1.0])).as_quat()
+    columns = {"time": log.t}
+    columns |= dict(zip((f"pose.pose.orientation.{axis}" for axis in "xyzw"), up.T, strict=True))
+    for axis, values in zip("xyz", (log["y"], log["x"], -log["z"]), strict=True):
+        columns[f"pose.pose.position.{axis}"] = values
+    for name, sign in (("u", 1), ("v", -1), ("w", -1), ("p", 1), ("q", -1), ("r", -1)):
+        kind, axis = ("linear", "xyz"["uvw".find(name)]) if name in "uvw" else (None, None)
+        kind, axis = (kind, axis) if kind else ("angular", "xyz"["pqr".find(name)])
+        columns[f"twist.twist.{kind}.{axis}"] = sign * log[name]
+    (tmp_path / "dive").mkdir()
+    pd.DataFrame(columns).to_csv(tmp_path / "dive" / "odom.csv", index=False)
+    inputs = {name: log[name] for name in log.channels if name not in (*SIX.names, "t")}
+    for name, values in inputs.items():
+        table = pd.DataFrame({"time": log.t, "data": values})
+        table.to_csv(tmp_path / "dive" / f"{name}.csv", index=False)
+    (read,) = residnet.read_logs(tmp_path / "dive")
+    assert Live.told(read.channels).spatial
+    for name in ("z", "phi", "theta", "u", "v", "w", "p", "q", "r"):
+        at = np.interp(read.t, log.t - log.t[0], log[name])
+        np.testing.assert_allclose(read[name], at, atol=1e-3, err_msg=name)
+    # of a vessel on the surface nobody asks for its pitch
+    columns["pose.pose.position.z"] = 0.01 * np.sin(log.t)
+    pd.DataFrame(columns).to_csv(tmp_path / "dive" / "odom.csv", index=False)
+    (read,) = residnet.read_logs(tmp_path / "dive")
+    assert not {"z", "theta", "w", "q"} & {*read.channels}

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError, UsageError
+from residnet.core.layout import ROLL, SIX, Live
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, to_si
 from residnet.data.channels import without_fills
@@ -162,6 +163,17 @@ class RecordingReader(LogReader):
             plan = standard_plan(recording, plan)
         log = compose(recording, plan, config.clock, config.longest_gap)
         require_samples(path, log.t)
+        rest: set[str] = set()
+        if not Live.told(log.channels).spatial:
+            # of a vessel that does not dive nobody asked for these
+            rest = {*SIX.names} - {*ROLL.names}
+        elif isinstance(plan.velocity, EarthFixed | CourseSpeed):
+            # turned by the heading alone they are not along the axes of one that pitches
+            rest = {"u", "v"}
+        kept = {
+            n: values for n, values in log.channels.items() if n not in rest - {*config.channels}
+        }
+        log = log.replace(channels=kept, units={name: log.units[name] for name in kept})
         manoeuvre = path.resolve().parent.name if config.manoeuvre == "folder" else config.manoeuvre
         meta = {**log.meta, "source": str(path), "sha256": digest(recording.files or (path,))}
         name = path.name if path.is_dir() else path.stem
@@ -400,7 +412,7 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
 
 
 def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float) -> Part:
-    """Return psi, unwrapped from its first value in [0, 2 pi); phi where wanted.
+    """Return psi, unwrapped from its first value in [0, 2 pi); phi and theta where wanted.
 
     Raises:
         UsageError: where topic or field is missing.
@@ -428,7 +440,7 @@ def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float
 def _attitude(
     recording: Recording, series: Series, config: Quaternion
 ) -> tuple[np.ndarray, dict[str, np.ndarray], list[Remark]]:
-    """Return yaw, roll where it is wanted, and remarks from the quaternions of a topic."""
+    """Return yaw, roll and pitch where wanted, and remarks from the quaternions of a topic."""
     parts = unit_quaternion(
         *(_numbers(recording, series, f"{config.field}.{axis}") for axis in "xyzw")
     )
@@ -451,9 +463,11 @@ def _attitude(
         empty = int((~known).sum())
         text = f"topic {series.name}: {empty} quaternions are empty; no heading there"
         remarks.append(remark("note", "empty_quaternions", text, rows=empty))
-    # roll about the forward axis has one sign in both frames
+    # roll about the forward axis has one sign in both frames, pitch about the sideways one has not
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    return yaw_of(*parts), {"phi": roll} if config.roll else {}, remarks
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    pitch = -pitch if config.frame == "enu" else pitch
+    return yaw_of(*parts), {"phi": roll, "theta": pitch} if config.roll else {}, remarks
 
 
 def _velocity_part(

@@ -36,6 +36,9 @@ _INTEGERS = tuple(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 3
 _NUMBERS = ("Float64", "Float32", *_INTEGERS, "Float64Stamped", "Float32Stamped")
 
 
+_TILT = {"phi": "Roll", "theta": "Pitch"}
+
+
 @dataclass(frozen=True)
 class Message:
     """A kind of message.
@@ -75,10 +78,17 @@ def _body(s: Series, prefix: str) -> dict[str, FieldMap]:
     """Velocities of a twist that are not zero throughout: a planar source leaves others empty."""
     out: dict[str, FieldMap] = {}
     paths = {"u": "linear.x", "v": "linear.y", "r": "angular.z", "p": "angular.x"}
+    paths |= {"w": "linear.z", "q": "angular.y"}
     for name, path in paths.items():
         if s.has(prefix + path) and s[prefix + path].any():
             out |= _maps(s, CHANNEL_UNITS[name], {name: prefix + path}, frame="body_fpu")
     return out
+
+
+def _depth(s: Series, field: str, **settings: Any) -> dict[str, FieldMap]:
+    """The depth, where it moves: a planar source leaves it at zero."""
+    moves = s.has(field) and float(np.nanstd(s[field])) > 0.0
+    return _maps(s, "m", {"z": field}, **settings) if moves else {}
 
 
 def _orientation(s: Series, path: str) -> Quaternion | None:
@@ -91,7 +101,9 @@ def _orientation(s: Series, path: str) -> Quaternion | None:
 def _pose(s: Series) -> Plan:
     at = _prefix(s, ("pose.pose.", "pose.", ""), "position.x")
     place = Local(topic=s.name, north=f"{at}position.y", east=f"{at}position.x")
-    return Plan({}, place, _orientation(s, f"{at}orientation"))
+    return Plan(
+        _depth(s, f"{at}position.z", frame="enu"), place, _orientation(s, f"{at}orientation")
+    )
 
 
 def _twist(s: Series) -> Plan:
@@ -183,7 +195,8 @@ def _revolutions(s: Series) -> Plan:
 def _odometry(s: Series) -> Plan:
     at = "pose.pose.position"
     place = Local(topic=s.name, north=f"{at}.y", east=f"{at}.x")
-    return Plan(_body(s, "twist.twist."), place, _orientation(s, "pose.pose.orientation"))
+    channels = _body(s, "twist.twist.") | _depth(s, f"{at}.z", frame="enu")
+    return Plan(channels, place, _orientation(s, "pose.pose.orientation"))
 
 
 def _earth_fixed(s: Series, north: str, east: str) -> EarthFixed | None:
@@ -206,9 +219,12 @@ def _angle(s: Series, field: str) -> HeadingConfig:
     return Angle(topic=s.name, field=field, unit="deg")
 
 
-def _local(north: str, east: str, v_north: str, v_east: str) -> Callable[[Series], Plan]:
+def _local(north: str, east: str, down: str, v_north: str, v_east: str) -> Callable[[Series], Plan]:
     return lambda s: Plan(
-        {}, Local(topic=s.name, north=north, east=east), None, _earth_fixed(s, v_north, v_east)
+        _depth(s, down),
+        Local(topic=s.name, north=north, east=east),
+        None,
+        _earth_fixed(s, v_north, v_east),
     )
 
 
@@ -252,7 +268,7 @@ MESSAGES = (
     Message(
         "Wrench", ("WrenchStamped", "Wrench"), _wrench, _ROS, ("wrench.force.x", "wrench.torque.z")
     ),
-    Message("Px4LocalPosition", ("vehicle_local_position",), _local("x", "y", "vx", "vy")),
+    Message("Px4LocalPosition", ("vehicle_local_position",), _local("x", "y", "z", "vx", "vy")),
     Message(
         "Px4Attitude",
         ("vehicle_attitude",),
@@ -264,11 +280,13 @@ MESSAGES = (
         lambda s: Plan(_maps(s, "rad/s", {"r": "xyz[2]", "p": "xyz[0]"})),
     ),
     Message("Px4Gps", ("vehicle_gps_position", "sensor_gps"), _px4_gps),
-    Message("ArduPilotFilter", ("XKF1", "NKF1"), _local("PN", "PE", "VN", "VE")),
+    Message("ArduPilotFilter", ("XKF1", "NKF1"), _local("PN", "PE", "PD", "VN", "VE")),
     Message(
         "ArduPilotAttitude",
         ("ATT",),
-        lambda s: Plan(_maps(s, "deg", {"phi": "Roll"}), None, _angle(s, "Yaw")),
+        lambda s: Plan(
+            _maps(s, "deg", {n: f for n, f in _TILT.items() if s.has(f)}), None, _angle(s, "Yaw")
+        ),
     ),
     Message(
         "ArduPilotImu", ("IMU",), lambda s: Plan(_maps(s, "rad/s", {"r": "GyrZ", "p": "GyrX"}))

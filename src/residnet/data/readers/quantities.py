@@ -353,7 +353,7 @@ class Quaternion(Source):
     Attributes:
         field: path whose x, y, z, w are meant, for example `pose.pose.orientation`.
         frame: `ned` (yaw clockwise from north) or `enu` (REP-103: counter-clockwise from east).
-        roll: writes the roll angle as channel phi too.
+        roll: writes the angles of roll and pitch as channels phi and theta too.
     """
 
     kind: Literal["quaternion"] = "quaternion"
