@@ -117,17 +117,25 @@ class TorchScriptExporter(Exporter):
             scripted = torch.jit.freeze(torch.jit.script(module), preserved_attrs=methods)
             for method in methods:
                 _compute_once(scripted, method)
-            parity = exported.check(ScriptedModel(scripted, dtype), "the exported module", dtype)
+            # what is checked was saved and read: the file differs from it by the card alone
+            stored = ScriptedModel(torch.jit.load(io.BytesIO(_saved(scripted))), dtype)
+            parity = exported.check(stored, "the exported module", dtype)
             card = exported.card() | _SETTINGS | {"dtype": name_of(dtype), "parity": parity}
-            # through memory: a disk that is full is then the system's error, not one of PyTorch
-            written = io.BytesIO()
-            extra = {"card.json": json.dumps(card, indent=1)}
-            torch.jit.save(scripted, written, _extra_files=extra)
             with whole(file) as partial:
-                partial.write_bytes(written.getvalue())
-                stored = ScriptedModel(torch.jit.load(str(partial)), dtype)
-                exported.check(stored, "the exported module", dtype)
+                partial.write_bytes(_saved(scripted, card))
+                torch.jit.load(str(partial))
         return card
+
+
+def _saved(scripted: Any, card: Mapping[str, Any] | None = None) -> bytes:
+    """Return a module as its file holds it.
+
+    Through memory, so that a disk that is full is the system's error and not one of PyTorch.
+    """
+    written = io.BytesIO()
+    extra = {} if card is None else {"card.json": json.dumps(card, indent=1)}
+    torch.jit.save(scripted, written, _extra_files=extra)
+    return written.getvalue()
 
 
 def _compute_once(scripted: Any, method: str) -> None:
