@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 import torch
 from kinds import of_kind
+from torch import Tensor
 
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.ensemble import MeanOfTrajectories
-from residnet.dynamics.hybrid import Disturbance, DisturbanceConfig, HybridDynamics
+from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
+from residnet.heads.base import ResidualHead
 from residnet.heads.lstm import LstmHead
 from residnet.judge.soundness import (
     BOUNDED,
@@ -276,21 +278,28 @@ def test_a_network_on_top_is_checked_with_its_memory_settled() -> None:
     assert next(model.head.parameters()).dtype == torch.float32, "the model stays as it is"
 
 
+class Carried(ResidualHead):
+    """Adds twice the acceleration by which the past was predicted wrong."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.settle = 2.0
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        return 2.0 * z[:, -self.dof :], s
+
+
 def test_what_looks_for_an_unknown_force_is_asked_without_a_past() -> None:
     spec, plain = made(RUDDER)
-    low_pass = DisturbanceConfig(settle=2.0, decay=2.0)
-    seen = Disturbance(low_pass, STEP, body=True, live=spec.signals.live)
-    model = HybridDynamics(plain.signals, plain.baseline, plain.head, STEP, "rk4", seen)
+    model = HybridDynamics(plain.signals, plain.baseline, Carried(), STEP, "rk4")
     low, high = spec.low[:3], spec.high[:3]
     for one in (model, MeanOfTrajectories([plain, model], low, high)):
         assert one.observes
         found = findings(spec, one)
         assert found[DAMPING].ok, found[DAMPING].text
-        slopes = [
-            float(number) for number in re.findall(r"d[uvr] ([-+][.0-9]+)", found[DAMPING].text)
-        ]
+        slopes = re.findall(r"d[uvr] ([-+][.0-9]+)", found[DAMPING].text)
         # the mean's are those of a step, by its length
-        np.testing.assert_allclose(slopes, [-0.1, -0.3, -0.5], rtol=0.15)
+        np.testing.assert_allclose([*map(float, slopes)], [-0.1, -0.3, -0.5], rtol=0.15)
 
 
 def log(seconds: float = 200.0, *, settles: bool = True) -> Prepared:

@@ -351,7 +351,7 @@ class HybridDynamics(Dynamics):
     @property
     def observes(self) -> bool:
         """Whether the measured past tells the memory how wrong it was predicted."""
-        return self.disturbance is not None
+        return self.missed is not None
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [n_state], of the head and of what was missed."""
