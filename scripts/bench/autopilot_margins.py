@@ -1,11 +1,14 @@
 """Print what learning brings under stated conditions, from finished runs of the task `autopilot`.
 
-Each run may have another seed; the last line holds the means.
+Each run may have another seed; the last columns hold mean, standard deviation and the range.
 
-    for seed in 0 1 2; do
-      residnet run autopilot_conditions -s seed=$seed --out runs/conditions_$seed
-    done
-    python scripts/bench/autopilot_margins.py runs/conditions_0 runs/conditions_1 runs/conditions_2
+    residnet run autopilot_conditions -s seed=7 --out runs/conditions_7
+    python scripts/bench/autopilot_margins.py runs/conditions_7
+
+With `--seeds`, a config is run first, with so many seeds from `--seed` on. The constants of its
+peers are tuned by the first seed and kept; of its policies `--policy` is trained and compared.
+
+    python scripts/bench/autopilot_margins.py --config autopilot_conditions --seeds 10 --seed 43
 
 With `--draw`, vessels are drawn and trained first, as `residnet autopilot` does: K, T, rate of the
 rudder and largest delay at random. `--logs` draws further ones that are known by simulated zigzags
@@ -163,14 +166,41 @@ def trained(name: str, vessel: Drawn, out: Path, rng: np.random.Generator, *, lo
     return run
 
 
+def seeded(config: str, policy: str, seeds: range, out: Path) -> list[Path]:
+    """Train a config's policy with each seed, its peers tuned by the first; returns the runs."""
+    from residnet.tasks.registry import config_file, load_task
+
+    out.mkdir(parents=True, exist_ok=True)
+    base = yaml.safe_load(config_file(Path(config)).read_text())
+    base["policies"] = {policy: base["policies"][policy]}
+    base.pop("predictive", None)
+    tuned, runs = out / "peers.json", []
+    for seed in seeds:
+        file, run = out / f"seed_{seed}.yaml", out / f"seed_{seed}"
+        runs.append(run)
+        if (run / "metrics.json").is_file():
+            continue
+        peers = json.loads(tuned.read_text()) if tuned.is_file() else base["peers"]
+        content = base | {"name": run.name, "seed": seed, "peers": peers}
+        file.write_text(yaml.safe_dump(content, sort_keys=False))
+        begun = time.process_time()
+        load_task(file, []).run(source=file, out=run, overwrite=True)
+        (run / "cpu.txt").write_text(f"{time.process_time() - begun:.1f}")
+        told = json.loads((run / "controllers.json").read_text())["controllers"]
+        tuned.write_text(json.dumps({name: told[name]["config"] for name in peers}))
+    return runs
+
+
 def main() -> None:
-    """Print a line for each figure, a column for each run, and the mean."""
+    """Print a line for each figure, a column for each run, and their spread."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path, nargs="*")
     parser.add_argument("--policy", default="learned")
     parser.add_argument("--draw", type=int, default=0, help="vessels to draw and train")
     parser.add_argument("--logs", type=int, default=0, help="the same, known by logs alone")
-    parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
+    parser.add_argument("--config", default="autopilot_conditions", help="that --seeds runs")
+    parser.add_argument("--seeds", type=int, default=0, help="seeds to run the config with")
+    parser.add_argument("--seed", type=int, default=0, help="of what is drawn, or the first one")
     parser.add_argument("--out", type=Path, default=Path("runs/drawn"))
     given = parser.parse_args()
     rng = np.random.default_rng(given.seed)
@@ -182,14 +212,17 @@ def main() -> None:
         given.runs.append(run)
         values = margins(run, given.policy)
         print("  " + ", ".join(f"{t} {v:.3g}" for t, v in zip(COLUMNS, values, strict=True)))
+    seeds = range(given.seed, given.seed + given.seeds)
+    given.runs += seeded(given.config, given.policy, seeds, given.out)
     if not given.runs:
-        parser.error("name the folders of finished runs, or give --draw")
-    found = [margins(run, given.policy) for run in given.runs]
-    print(f"{'':24s}" + "".join(f"{run.name:>16s}" for run in given.runs) + f"{'mean':>16s}")
-    for place, title in enumerate(COLUMNS):
-        values = [row[place] for row in found]
-        shown = [*values, sum(values) / len(values)]
-        print(f"{title:24s}" + "".join(f"{value:16.3f}" for value in shown))
+        parser.error("name the folders of finished runs, or give --draw or --seeds")
+    found = np.array([margins(run, given.policy) for run in given.runs])
+    names = [*(run.name for run in given.runs), "mean", "deviation", "least", "most"]
+    print(f"{'':24s}" + "".join(f"{name:>12s}" for name in names))
+    for title, values in zip(COLUMNS, found.T, strict=True):
+        deviation = values.std(ddof=1) if len(values) > 1 else math.nan
+        shown = [*values, values.mean(), deviation, values.min(), values.max()]
+        print(f"{title:24s}" + "".join(f"{value:12.3f}" for value in shown))
 
 
 if __name__ == "__main__":
