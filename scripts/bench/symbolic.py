@@ -1,6 +1,6 @@
 """Equations recovered from simulated logs: how often, how exactly, and how fast, on one thread.
 
-    python scripts/bench/symbolic.py [--parts exact,random,late,ships,bred,delay] [--designs N]
+    python scripts/bench/symbolic.py [--parts ships,ratios,bred] [--designs N] [--seed S]
 
     exact       all six equations of Odin (document 000, (6.6)-(6.8), (6.21)-(6.23)) from random
                 multi-sine designs with accelerations given; a coefficient counts within 1 %
@@ -8,6 +8,7 @@
                 standard deviations of noise: how often the structure is exactly the true one
     late        the same with inputs that act 0.3 s late
     ships       random ships with propeller and rudder, no settings at all, without and with noise
+    ratios      the same of ships that divide by their revolutions, which stay away from zero
     bred        the noisy ships by genetic programming, no settings at all (extra gp)
     delay       a delay of 0.5 s, 10 % noise on all channels: one profile, and a regression for
                 every shift as the document does
@@ -221,6 +222,12 @@ def ships(count: int, first: int) -> None:
         drawn(f"ships {noise_level:g}", designs, {})
 
 
+def ratios(count: int, first: int) -> None:
+    for noise_level in (0.0, 0.1):
+        designs = [draw_ship(first + k, noise=noise_level, ratios=True) for k in range(count)]
+        drawn(f"ratios {noise_level:g}", designs, {})
+
+
 def bred(count: int, first: int) -> None:
     """Breed the equations of noisy ships, with the defaults of genetic programming."""
     designs = [draw_ship(seed, noise=0.1) for seed in range(first, first + count)]
@@ -241,6 +248,7 @@ PARTS: dict[str, Callable[[int, int], None]] = {
     "random": random_equations,
     "late": late,
     "ships": ships,
+    "ratios": ratios,
     "bred": bred,
     "delay": delay,
 }

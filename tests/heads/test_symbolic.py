@@ -109,8 +109,9 @@ def test_structure_of_random_equations_with_products_magnitudes_and_ratios(delay
     assert right == 6
 
 
-def test_ships_are_known_without_settings() -> None:
-    drawn = draw_ship(1)
+@pytest.mark.parametrize("ratios", [False, True])
+def test_ships_are_known_without_settings(ratios: bool) -> None:
+    drawn = draw_ship(1, ratios=ratios)
     _, notes = fitted({}, drawn.samples)
     for axis, terms in zip(ACCELERATION, drawn.truth, strict=True):
         assert found(notes, axis) == pytest.approx(terms, rel=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from residnet.core.errors import ConfigError
 from residnet.physics.terms import CandidatesConfig, rated
@@ -82,6 +83,24 @@ def test_candidates_know_propellers_and_rudders_unless_told_otherwise() -> None:
     assert {"|r|", "r |r|", "delta |delta|"} <= {
         c.term for c in CandidatesConfig().candidates(("r", "delta"))
     }
+
+
+def test_nothing_divides_by_what_comes_near_zero() -> None:
+    names = ("u", "n", "delta")
+    config = CandidatesConfig(extra=("u inv(delta)",))
+    terms = [c.term for c in config.candidates(names)]
+    z = torch.tensor([[1.0, 4.0, 0.3], [-1.0, 20.0, -0.3], [0.5, 9.0, 0.1]]).double()
+
+    def kept(z: torch.Tensor) -> set[str]:
+        clear = config.clear(terms, names, z)
+        return {t for t, good in zip(terms, clear.tolist(), strict=True) if good and "inv" in t}
+
+    # what is named by hand stays
+    over = {"inv(n)", "u inv(n)", "u^2 inv(n)", "delta inv(n)", "u inv(delta)"}
+    assert kept(z) == over
+    assert kept(-z) == over
+    z[0, 1] = 1.9
+    assert kept(z) == {"u inv(delta)"}
 
 
 def test_unknown_channels_are_named() -> None:

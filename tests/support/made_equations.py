@@ -100,17 +100,30 @@ SHIP: tuple[tuple[tuple[str, ...], ...], ...] = (
     ),
 )
 """Terms of ships' equations by axis: one of each group."""
+OVER = (
+    ("u inv(n)", "u^2 inv(n)", "inv(n)"),
+    ("v inv(n)", "u v inv(n)", "delta inv(n)"),
+    ("r inv(n)", "u r inv(n)", "delta inv(n)"),
+)
+"""Terms of a ship that divides by its revolutions, which stay away from zero."""
 
 
-def draw_ship(seed: int, *, count: int = 3000, step: float = 0.1, noise: float = 0.0) -> Drawn:
+def draw_ship(
+    seed: int, *, count: int = 3000, step: float = 0.1, noise: float = 0.0, ratios: bool = False
+) -> Drawn:
     """Return the equations of a random ship with propeller and rudder, and a record of it.
 
-    Each term makes up between 0.3 and 1 standard deviation of its target.
+    Each term makes up between 0.3 and 1 standard deviation of its target. With `ratios` each
+    equation has one of `OVER`, and revolutions stay ahead: terms with |n| are then those with n.
     """
     random = np.random.default_rng(seed)
     z = record(random, count, step, astern=True)
+    z[:, 3] += 7.0 * ratios
     targets, truth = [], []
-    for groups in SHIP:
+    for groups, over in zip(SHIP, OVER, strict=True):
+        if ratios:
+            told = [tuple(term for term in group if "|n|" not in term) for group in groups]
+            groups = (*told, over)
         chosen = [str(random.choice(group)) for group in groups]
         columns = TermLibrary(chosen, CHANNELS)(torch.from_numpy(z)).numpy()
         share = random.uniform(0.3, 1.0, len(chosen)) * random.choice([-1.0, 1.0], len(chosen))

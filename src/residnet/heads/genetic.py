@@ -104,14 +104,17 @@ class GeneticHead(EquationHead):
         search, names = self.config.final, self.features.names
         if search is None:
             return []
-        candidates = CandidatesConfig().candidates(names)
+        space, z = CandidatesConfig(), self.features.guarded(samples.z)
+        candidates = space.candidates(names)
         library = TermLibrary([candidate.term for candidate in candidates], names)
+        clear = space.clear(library.terms, names, z)
         estimator = SparseRegression(
             search,
             degrees=[candidate.degree for candidate in candidates],
             efforts=[candidate.effort for candidate in candidates],
+            allowed=clear[:, None].expand(-1, len(self.outputs)),
         )
-        terms = library(self.features.guarded(samples.z))
+        terms = library(z)
         try:
             found = estimator.fit(terms, samples.target, names=library.terms, outputs=self.outputs)[
                 0

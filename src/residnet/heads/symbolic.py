@@ -335,21 +335,29 @@ class SymbolicHead(EquationHead):
         """Return the solutions of a sparse regression of all axes."""
         with torch.no_grad():
             terms = self.basis(torch.from_numpy(past.chosen)).numpy()
-        channels = self.features.names
         rows = self.config.estimator.rows(Rows(terms, past.target, past.stretch), past.step)
-        odd = [
-            [parity not in (None, own) for own in self.parities]
-            for parity in (term_parity(term, channels) for term in self.library.terms)
-        ]
         estimator = SparseRegression(
             self.config.search,
             degrees=[candidate.degree for candidate in self.candidates],
             efforts=[candidate.effort for candidate in self.candidates],
-            allowed=~torch.tensor(odd) if self.config.symmetric else None,
+            allowed=self._allowed(past),
             gammas=gammas,
         )
         x, y = torch.from_numpy(rows.x), torch.from_numpy(rows.y)
         return estimator.fit(x, y, names=self.library.terms, outputs=self.outputs)
+
+    def _allowed(self, past: Past) -> Tensor:
+        """Return which candidates each axis may have, [J, n] bool."""
+        channels = self.features.names
+        allowed = torch.ones(self.library.count, self.dof, dtype=torch.bool)
+        if not self.config.terms:
+            z = torch.from_numpy(past.chosen)
+            allowed &= self.config.candidates.clear(self.library.terms, channels, z)[:, None]
+        if self.config.symmetric:
+            parities = [term_parity(term, channels) for term in self.library.terms]
+            even = [[parity in (None, own) for own in self.parities] for parity in parities]
+            allowed &= torch.tensor(even)
+        return allowed
 
     def _delay(self, past: Past) -> tuple[int, dict[str, Any]]:
         """Return the delay in steps, and the notes about it.
@@ -359,7 +367,12 @@ class SymbolicHead(EquationHead):
         """
         if self.line.count == 0:
             return 0, {}
-        simple = [c.term for c in self.candidates if c.degree <= 1]
+        possible = self._allowed(past).any(1).tolist()
+        simple = [
+            c.term
+            for c, some in zip(self.candidates, possible, strict=True)
+            if some and c.degree <= 1
+        ]
         terms: list[list[str]] = [simple] * self.dof
         tried: list[int] = []
         profile = np.zeros(0)

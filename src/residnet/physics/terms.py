@@ -339,7 +339,9 @@ class CandidatesConfig(Config):
         input_degree: highest degree of their products, all factors plain; None: 1 where `coupling`
             is given, otherwise what propellers and rudders need: the first and second degree with
             magnitudes as in `n|n|`, times u and |u|, those of one input also times u^2 and `u|u|`
-            as in `u^2 delta`, and squares of one times another as in `n|n| delta`.
+            as in `u^2 delta`, and squares of one times another as in `n|n| delta`. There are ratios
+            too, products of motions over an input and one input over another; a head takes those
+            whose divisor stays `clear` of zero in its data.
         angles: inputs that enter as sine and cosine.
         coupling: motions that products of inputs are multiplied by.
         coupling_degree: highest degree of these factors.
@@ -382,17 +384,41 @@ class CandidatesConfig(Config):
     def _driven(self, motions: Sequence[str], inputs: Sequence[str]) -> list[str]:
         """Return the products of inputs and coupled motions."""
         if self.input_degree is None and not self.coupling:
-            return _of_ships("u" if "u" in motions else "", inputs, magnitudes=self.magnitudes)
+            return _of_ships(motions, inputs, magnitudes=self.magnitudes)
         degree = 1 if self.input_degree is None else self.input_degree
         coupled = _products(self.coupling, self.coupling_degree if self.coupling else 0)
         return _joined(coupled, _products(inputs, degree))
 
+    def clear(self, terms: Sequence[str], names: Sequence[str], z: Tensor) -> Tensor:
+        """Return which terms [J] divide by nothing near zero, or are named under `extra`.
 
-def _of_ships(speed: str, inputs: Sequence[str], *, magnitudes: bool) -> list[str]:
-    """Return what propellers and rudders add to an equation: thrust, and lift in their flow."""
-    first, second = (
-        _products([speed] if speed else [], degree, magnitudes=magnitudes) for degree in (1, 2)
-    )
+        Args:
+            terms: names of the terms.
+            names: of the channels.
+            z: channels in the data [N, nz].
+        """
+        far = z.amin(0) * z.amax(0) > 0
+        far &= z.abs().amin(0) >= _CLEAR * z.abs().amax(0)
+        near = {name for name, good in zip(names, far.tolist(), strict=True) if not good}
+        return torch.tensor(
+            [
+                term in self.extra
+                or not any(f.function == "inv" and f.name in near for f in parse_term(term, names))
+                for term in terms
+            ]
+        )
+
+
+_CLEAR = 0.1
+"""Least share of a channel's largest value that a divisor keeps: noise of a hundredth of that value
+then changes the quotient by a tenth at most.
+"""
+
+
+def _of_ships(motions: Sequence[str], inputs: Sequence[str], *, magnitudes: bool) -> list[str]:
+    """Return what propellers and rudders add to an equation: thrust, lift in their flow, ratios."""
+    speed = [name for name in motions if name == "u"]
+    first, second = (_products(speed, degree, magnitudes=magnitudes) for degree in (1, 2))
     one = [t for name in inputs for t in _products([name], 2, magnitudes=magnitudes)[1:]]
     pairs = [
         t
@@ -409,7 +435,12 @@ def _of_ships(speed: str, inputs: Sequence[str], *, magnitudes: bool) -> list[st
         for other in inputs
         if other != name
     ]
-    return ["", *_joined(second, one), *_joined(first, pairs), *squares]
+    ratios = [
+        f"{above} inv({name})".strip()
+        for name in inputs
+        for above in (*_products(motions, 2), *(other for other in inputs if other != name))
+    ]
+    return ["", *_joined(second, one), *_joined(first, pairs), *squares, *ratios]
 
 
 def _joined(*choices: Sequence[str]) -> list[str]:

@@ -581,14 +581,16 @@ class SparseRegression(Estimator):
     def _reduced(self, x: np.ndarray, y: np.ndarray, names: Sequence[str]) -> list[Reduced]:
         """Return the regression of each output, reduced to its QR factor; one for all if it can."""
         degrees = self.degrees or (1,) * len(names)
-        if self.allowed is None:
-            return [reduce(x, y, names, degrees, self.efforts)] * y.shape[1]
+        every = torch.ones(len(names), y.shape[1], dtype=torch.bool)
+        found: dict[tuple[int, ...], Reduced] = {}
         out = []
-        for output in range(y.shape[1]):
-            columns = self.allowed[:, output].nonzero()[:, 0].tolist()
-            efforts = [self.efforts[j] for j in columns] if self.efforts else ()
-            chosen = [names[j] for j in columns], [degrees[j] for j in columns], efforts
-            out.append(reduce(x[:, columns], y, *chosen))
+        for mask in (every if self.allowed is None else self.allowed).T:
+            columns = tuple(mask.nonzero()[:, 0].tolist())
+            if columns not in found:
+                efforts = [self.efforts[j] for j in columns] if self.efforts else ()
+                chosen = [names[j] for j in columns], [degrees[j] for j in columns], efforts
+                found[columns] = reduce(x[:, columns], y, *chosen)
+            out.append(found[columns])
         return out
 
     def _solution(
