@@ -23,6 +23,7 @@ import argparse
 import json
 import math
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -142,7 +143,6 @@ class Drawn:
 def trained(name: str, vessel: Drawn, out: Path, rng: np.random.Generator, *, logs: bool) -> Path:
     """Draft, train and compare for a vessel; returns the folder of the run."""
     from residnet.tasks.own_autopilot import draft_autopilot
-    from residnet.tasks.registry import load_task
 
     out.mkdir(parents=True, exist_ok=True)
     file, run = out / f"{name}.yaml", out / name
@@ -160,15 +160,28 @@ def trained(name: str, vessel: Drawn, out: Path, rng: np.random.Generator, *, lo
             for peer in ("lqr", "ptos"):
                 config["peers"][peer]["lag"] = f"{0.75 * vessel.delay:.4g} s"
             file.write_text(yaml.safe_dump(config, sort_keys=False))
-        begun = time.process_time()
-        load_task(file, []).run(source=file, out=run, overwrite=True)
-        (run / "cpu.txt").write_text(f"{time.process_time() - begun:.1f}")
+        timed(file, run)
     return run
+
+
+def timed(file: Path, run: Path) -> None:
+    """Carry out a config, tell what it says, and note its processor time beside it."""
+    from residnet.core.progress import Progress, listen
+    from residnet.tasks.registry import load_task
+
+    def told(progress: Progress) -> None:
+        if progress.message:
+            print(progress.message, file=sys.stderr, flush=True)
+
+    begun = time.process_time()
+    with listen(told):
+        load_task(file, []).run(source=file, out=run, overwrite=True)
+    (run / "cpu.txt").write_text(f"{time.process_time() - begun:.1f}")
 
 
 def seeded(config: str, policy: str, seeds: range, out: Path) -> list[Path]:
     """Train a config's policy with each seed, its peers tuned by the first; returns the runs."""
-    from residnet.tasks.registry import config_file, load_task
+    from residnet.tasks.registry import config_file
 
     out.mkdir(parents=True, exist_ok=True)
     base = yaml.safe_load(config_file(Path(config)).read_text())
@@ -183,9 +196,7 @@ def seeded(config: str, policy: str, seeds: range, out: Path) -> list[Path]:
         peers = json.loads(tuned.read_text()) if tuned.is_file() else base["peers"]
         content = base | {"name": run.name, "seed": seed, "peers": peers}
         file.write_text(yaml.safe_dump(content, sort_keys=False))
-        begun = time.process_time()
-        load_task(file, []).run(source=file, out=run, overwrite=True)
-        (run / "cpu.txt").write_text(f"{time.process_time() - begun:.1f}")
+        timed(file, run)
         told = json.loads((run / "controllers.json").read_text())["controllers"]
         tuned.write_text(json.dumps({name: told[name]["config"] for name in peers}))
     return runs

@@ -35,34 +35,40 @@ class Boat(Dynamics):
 class Helm(Source):
     """A controller with weights, whose command arrives as many steps late as each row says."""
 
-    def __init__(self) -> None:
+    def __init__(self, longest: int = 3) -> None:
         super().__init__()
+        self.longest = longest
         self.mix = nn.Linear(3, 2)
         self.gain = nn.Parameter(torch.tensor(0.7))
 
     def initial(self, x: Tensor) -> Tensor:
-        return torch.zeros(x.shape[0], 4, dtype=x.dtype)
+        return torch.zeros(x.shape[0], self.longest + 1, dtype=x.dtype)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         error = torch.remainder(w[:, :1] - x[:, 1:2] + torch.pi, 2 * torch.pi) - torch.pi
         both = torch.tanh(self.mix(torch.cat((error, x), dim=1)))
         command = (torch.exp(self.gain) * both.sum(1, keepdim=True)).clamp(-1.0, 1.0)
-        queue = torch.cat((command, memory[:, :3]), dim=1)
+        queue = torch.cat((command, memory[:, : self.longest]), dim=1)
         late = queue.gather(1, w[:, 1:2].to(torch.int64))
-        return torch.cat((late, both[:, :1]), dim=1), torch.cat((queue[:, :3], both[:, 1:]), dim=1)
+        kept = torch.cat((queue[:, : self.longest], both[:, 1:]), dim=1)
+        return torch.cat((late, both[:, :1]), dim=1), kept
 
 
-def loop() -> tuple[Rollout, tuple[Tensor, Tensor, Tensor]]:
+def loop(longest: int = 3) -> tuple[Rollout, tuple[Tensor, Tensor, Tensor]]:
     torch.manual_seed(2)
     rows, steps = 21, 30
-    wanted, late = 2.0 * torch.randn(rows, 1), (torch.arange(rows) % 4.0)[:, None]
+    wanted, late = 2.0 * torch.randn(rows, 1), (torch.arange(rows) % (longest + 1.0))[:, None]
     w = torch.stack((wanted.expand(-1, steps), late.expand(-1, steps)), dim=2)
-    return Rollout(Boat(DT, "rk4"), Helm()), (torch.randn(rows, 2), w, torch.zeros(rows, 1))
+    return Rollout(Boat(DT, "rk4"), Helm(longest)), (torch.randn(rows, 2), w, torch.zeros(rows, 1))
 
 
-def test_flights_and_gradient_are_those_of_torch() -> None:
-    rollout, given = loop()
-    fast = CompiledRollout(rollout, *given)
+@pytest.mark.parametrize(
+    ("longest", "most"), [(3, torch.inf), (3, 1e9), (40, torch.inf)], ids=["sum", "rows", "late"]
+)
+def test_flights_and_gradient_are_those_of_torch(longest: int, most: float) -> None:
+    """Gradients are summed, or each row's is looked at before; commands may be 40 steps late."""
+    rollout, given = loop(longest)
+    fast = CompiledRollout(rollout, *given, most=most)
     flown = [run(*given)[:2] for run in (fast, rollout)]
     (states, inputs), (wanted, acted) = flown
     assert torch.allclose(states, wanted, atol=2e-5)

@@ -75,7 +75,7 @@ def _horner(x: str, *parts: float) -> str:
     return f"(ALL({first!r}) + {x} * {_horner(x, *rest)})" if rest else f"ALL({first!r})"
 
 
-def _at_once(terms: int, bits: int, bias: int, least: int, most: int) -> dict[str, str]:
+def _at_once(terms: int, bits: int, bias: int, least: int, most: int, odd: int) -> dict[str, str]:
     """Return functions of many numbers at once, right but for the last digits, by name.
 
     They are those that networks call most. With C's library a step of a recurrent network takes six
@@ -86,7 +86,9 @@ def _at_once(terms: int, bits: int, bias: int, least: int, most: int) -> dict[st
         bits: of a number behind its exponent.
         bias: of the exponent.
         least, most: beyond which the exponential is zero and infinite.
+        odd: terms of the logarithm's series for what is at most 0.172, by odd powers.
     """
+    log = [2.0 / (2 * k + 1) for k in range(odd)]
     series = [2.0 / math.factorial(k) for k in range(terms + 1)]
     return {
         # 2^n e^r, whose rest r is at most half of log 2. Twice e^r, and half of 2^n from two
@@ -114,12 +116,28 @@ def _at_once(terms: int, bits: int, bias: int, least: int, most: int) -> dict[st
             "    V e = pick(x < ALL(.5), low, v_exp(x) - ONE), t = e / (e + ALL(2));\n"
             "    return pick(a < ZERO, -t, t);\n}\n"
         ),
+        # the logarithm of u = 1 + a = 2^n m with m around one, by that of (1 + t) / (1 - t), and
+        # what rounding took from u. A zero, less than that and infinity follow from u itself
+        "log1p": (
+            '__attribute__((noinline, optimize("no-associative-math"))) static V v_log1p(V a) {\n'
+            "    V u = a + ONE, lost = (a - (u - ONE)) / u;\n"
+            f"    I n = ((I)u >> {bits}) - {bias};\n"
+            f"    V m = (V)((I)u - (n << {bits}));\n"
+            "    I high = m > ALL(1.4142135623730951);\n"
+            "    m = pick(high, m * ALL(.5), m);\n"
+            "    n = n - high;\n"
+            "    V t = (m - ONE) / (m + ONE), s = t * t, whole = __builtin_convertvector(n, V);\n"
+            f"    V low = t * {_horner('s', *log)} + lost + whole * ALL(-2.12194440054690583e-4);\n"
+            "    V o = low + whole * ALL(0.693359375);\n"
+            "    o = pick(u < ALL(INFINITY), o, u);\n"
+            "    return pick(u > ZERO, o, pick(u < ZERO, ALL(NAN), u - ALL(INFINITY)));\n}\n"
+        ),
     }
 
 
 _AT_ONCE = {
-    torch.float32: _at_once(8, 23, 127, -104, 89),
-    torch.float64: _at_once(14, 52, 1023, -746, 710),
+    torch.float32: _at_once(8, 23, 127, -104, 89, 6),
+    torch.float64: _at_once(14, 52, 1023, -746, 710, 12),
 }
 _SIDE_BY_SIDE = 8
 """Sums of a product that are in registers at once, each an entry of its result."""
@@ -149,6 +167,16 @@ _PRODUCT = "".join(
     )
 )
 """Numbers [count] of a row times a matrix [count, to_count], and times the transposed of one."""
+_OUTER = """static __attribute__((noinline)) void outer(const REAL *restrict from, long count,
+    const REAL *restrict slope, long to_count, long room, REAL *restrict sum) {
+    for (long i = 0; i < count; i++) {
+        V v = *(const U *)(from + i * room);
+        for (long j = 0; j < to_count; j++)
+            *(U *)(sum + (i * to_count + j) * LANES) += v * *(const U *)(slope + j * room);
+    }
+}
+"""
+"""Adds what numbers and slopes of a step give to the gradient of a matrix, each row for itself."""
 
 
 def _prelude(dtype: torch.dtype) -> str:
@@ -257,7 +285,12 @@ def _function(
 
 
 def _source(
-    parts: Parts, sizes: Mapping[str, int], trained: Sequence[int] | None, dtype: torch.dtype
+    parts: Parts,
+    sizes: Mapping[str, int],
+    trained: Sequence[int] | None,
+    dtype: torch.dtype,
+    *,
+    apart: bool,
 ) -> str:
     """Return the source file with the functions `fly` and, where there is a gradient, `back`.
 
@@ -266,6 +299,7 @@ def _source(
         sizes: number of entries of each of its arguments, and `a` of what acts.
         trained: places in `theta` that have a gradient; None where nothing has one.
         dtype: precision of the file.
+        apart: whether each row has a gradient of matrices for itself.
     """
     step = in_numbers(parts.function)
     if not step.is_a("SXFunction") or step.n_instructions() > _LONGEST:
@@ -326,11 +360,21 @@ def _source(
                 ("x_before", "total"),
             )
         )
+    plain = len(trained or ())
+    outer = "".join(
+        f"outer(AT(held, N_HELD, k) + {held[len(products) + k] + r * one.taken} * width,"
+        f" {one.taken}, AT(pulled, N_PULLED, k) + {held[k] + r * one.given} * width, {one.given},"
+        f" width, total + at * N_TOTAL + {plain + tables[k]} * LANES);\n"
+        for k, one in numbers.items()
+        for r in range(one.rows)
+        if apart
+    )
     counts = dict(sizes) | {
-        "held": held[-1], "pulled": held[len(products)], "total": len(trained or ())
+        "held": held[-1], "pulled": held[len(products)], "total": plain + apart * tables[-1]
     }  # fmt: skip
     text = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in counts.items())
-    return "".join((_prelude(dtype), text, _AT, *functions, FLY, "" if trained is None else BACK))
+    back = "" if trained is None else _OUTER + BACK.replace("OUTER\n", outer)
+    return "".join((_prelude(dtype), text, _AT, *functions, FLY, back))
 
 
 _WAYS = ("taken", "given")
@@ -427,11 +471,13 @@ void back(const REAL *theta, const REAL *tables, const REAL *own, const REAL *x,
         memset(slope_q, 0, sizeof slope_q);
         for (long i = 0; i < N_S; i++) EACH
             slope_s[(steps - 1) & 1][i * LANES + l] = AT(gs, N_S, 0)[i * width + l];
-        for (long k = steps - 1; k >= 0; k--)
+        for (long k = steps - 1; k >= 0; k--) {
             slope(AT(x, N_X, k), AT(w, N_W, k), AT(s, N_S, k), AT(q, N_Q, k), AT(own, N_OWN, 0),
                   theta, AT(gx, N_X, k + 1), slope_s[k & 1], slope_q[k & 1], AT(ga, N_A, k),
                   AT(gx, N_X, k), slope_s[~k & 1], slope_q[~k & 1], total + at * N_TOTAL,
                   tables, AT(held, N_HELD, k), AT(pulled, N_PULLED, k), width, width);
+OUTER
+        }
         for (long i = 0; i < N_S; i++) EACH
             AT(gs, N_S, 0)[i * width + l] = slope_s[1][i * LANES + l];
     }
@@ -492,6 +538,7 @@ class CompiledRollout:
     ) -> None:
         self.rollout, self.dtype, self.own = rollout, x.dtype, tuple(own)
         self.most, self.threads = math.inf, max(torch.get_num_threads(), 1)
+        self.apart = not math.isinf(most)
         alone = copy.deepcopy(rollout).double()
         held = _numbers(alone)
         self.shared = [
@@ -533,7 +580,7 @@ class CompiledRollout:
         self.most = most
 
     def _made(self, dtype: torch.dtype, *, quick: bool = False) -> None:
-        source = _source(self.parts, self.sizes, self.trained, dtype)
+        source = _source(self.parts, self.sizes, self.trained, dtype, apart=self.apart)
         self.dtype, self.library = dtype, compiled_library(source, quick=quick)
         self.lanes = ctypes.c_long.in_dll(self.library, "lanes").value
 
@@ -771,32 +818,28 @@ class _Flight(torch.autograd.Function):
         sizes = [one.rows * one.given for one in products]
         pulled = torch.empty(steps, sum(sizes), width, dtype=loop.dtype)
         # each row adds up for itself, so that the sum does not depend on the number of threads
-        blocks = width // loop.lanes
-        total = torch.zeros(blocks, len(loop.trained), loop.lanes, dtype=loop.dtype)
+        blocks, plain = width // loop.lanes, len(loop.trained)
+        shared = sum(one.taken * one.given for one in products) if loop.apart else 0
+        total = torch.zeros(blocks, plain + shared, loop.lanes, dtype=loop.dtype)
         loop.run("back", blocks, *known, *given, pulled, total, steps, width)
-        plain = total.transpose(1, 2).reshape(width, -1)[:count]
-        held = known[-1].split([*sizes, *(one.rows * one.taken for one in products)], dim=1)
-        pairs = [
-            (factor.unflatten(1, (one.rows, -1)), slope.unflatten(1, (one.rows, -1)))
-            for one, factor, slope in zip(
-                products, held[len(products) :], pulled.split(sizes, dim=1), strict=True
-            )
-        ]
-        if math.isinf(loop.most):
+        rows = total.transpose(1, 2).reshape(width, -1)[:count]
+        if not math.isinf(loop.most):
+            asked = sum(grad.flatten(1).square().sum(1) for grad in grads)
+            rows = _held(rows, torch.as_tensor(asked).sqrt(), loop.most)
+        found, tables = rows.sum(0).split([plain, shared])
+        if not loop.apart:
+            held = known[-1].split([*sizes, *(one.rows * one.taken for one in products)], dim=1)
+            pairs = [
+                (factor.unflatten(1, (one.rows, -1)), slope.unflatten(1, (one.rows, -1)))
+                for one, factor, slope in zip(
+                    products, held[len(products) :], pulled.split(sizes, dim=1), strict=True
+                )
+            ]
             by_table = [
                 a.permute(2, 0, 1, 3).flatten(1) @ b.permute(2, 0, 1, 3).flatten(1).T
                 for a, b in pairs
             ]
-            found, tables = plain.sum(0), _flat(by_table)
-        else:
-            each = [
-                (a.permute(3, 2, 0, 1).flatten(2) @ b.permute(3, 0, 1, 2).flatten(1, 2)).flatten(1)
-                for a, b in pairs
-            ]
-            asked = sum(grad.flatten(1).square().sum(1) for grad in grads)
-            rows = torch.cat([plain, *(part[:count] for part in each)], dim=1)
-            whole = _held(rows, torch.as_tensor(asked).sqrt(), loop.most).sum(0)
-            found, tables = whole[: plain.shape[1]], whole[plain.shape[1] :]
+            tables = _flat(by_table)
         theta = torch.zeros(len(known[0]), dtype=loop.dtype)
         theta[loop.trained] = found
         x, s = given[0][0].T[:count], given[2][0].T[:count]

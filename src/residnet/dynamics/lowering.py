@@ -43,8 +43,10 @@ _LIKE: Final = frozenset(
     )
 )  # fmt: skip
 """Operations whose result depends on the shape of their argument alone."""
-_SHORT: Final = 16
-"""Rows up to which a look-up is a chain of choices, which has derivatives and can be expanded."""
+_SHORT: Final = 64
+"""Rows up to which a look-up is a chain of choices, which has derivatives and can be expanded: the
+commands of a second under way at 50 Hz are so many.
+"""
 
 
 def _chosen(condition: Any, a: Any, b: Any) -> Any:

@@ -257,7 +257,7 @@ def _config(vessel: OwnVessel, out: Path, vessel_file: Path) -> dict[str, Any]:
         "pace": pace,
         "test": {"heading": "30 deg", "dt": "0.02 s", "duration": "14 s", "plants": 100},
         "conditions": {"stated": stated, "flights": 1000, "beyond": beyond},
-        "policies": {"learned": {"start": "ptos"}},
+        "policies": {"learned": {"start": "ptos", "training": {"epochs": 9, "batch": 192}}},
         "peers": {
             "pd": {"kind": "pd"},
             "pid": {"kind": "pid"},
