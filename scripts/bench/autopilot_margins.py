@@ -50,7 +50,7 @@ COLUMNS = (
     "nominal overshoot [deg]",
     "worst beyond [%]",
     "diverged",
-    "training [s]",
+    "training, CPU [s]",
     "whole run, CPU [s]",
 )
 
@@ -95,7 +95,7 @@ def margins(run: Path, name: str) -> list[float]:
         DEG * nominal["overshoot"]["max"],
         max(beyond, default=math.nan),
         float(sum(row["diverged"] for row in rows if row["model"] == name and "diverged" in row)),
-        told[name]["seconds"],
+        told[name].get("cpu_seconds", math.nan),
         float(cpu.read_text()) if cpu.is_file() else math.nan,
     ]
 

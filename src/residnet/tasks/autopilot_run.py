@@ -207,7 +207,7 @@ def _policy(
         }
     )
     policy, store = spec.build(), FolderStore(folder)
-    notes, started = store.finished_module(name, policy), time.time()
+    notes, started = store.finished_module(name, policy), (time.time(), time.process_time())
     if notes is None:
         begin(f"training {name}")
         compiler = partial(CompiledRollout, most=wanted.training.outlying)
@@ -221,7 +221,9 @@ def _policy(
             folder.path,
             compiler if wanted.training.compiled else None,
         )
-        notes |= {"seconds": round(time.time() - started, 1), "constants": policy.values()}
+        seconds, cpu = time.time() - started[0], time.process_time() - started[1]
+        notes |= {"seconds": round(seconds, 1), "cpu_seconds": round(cpu, 1)}
+        notes |= {"constants": policy.values()}
         store.keep_module(name, spec, policy, notes)
         # as a resumed run reads it
         policy = rebuilt(spec, policy)

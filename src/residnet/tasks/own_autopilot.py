@@ -43,6 +43,10 @@ _NOISE = 0.1
 """Noise in deg and deg/s of a magnetic compass and a MEMS gyro, where no log shows it."""
 _BIAS, _PUSH = 1.0, 0.5
 """Rudder offset and slow push in deg that are usual, where logs show no more."""
+_TRAINING = {"epochs": 6, "batch": 192}
+"""A third of the epochs and half of the batch of the configs that come with residnet: one vessel's
+policy cost 7 % less than the best law after two such epochs, and 9.5 % less after nine.
+"""
 _STEP = 0.02
 """Step in s of the vessel of document 004, which `pace` multiplies."""
 
@@ -257,7 +261,7 @@ def _config(vessel: OwnVessel, out: Path, vessel_file: Path) -> dict[str, Any]:
         "pace": pace,
         "test": {"heading": "30 deg", "dt": "0.02 s", "duration": "14 s", "plants": 100},
         "conditions": {"stated": stated, "flights": 1000, "beyond": beyond},
-        "policies": {"learned": {"start": "ptos", "training": {"epochs": 9, "batch": 192}}},
+        "policies": {"learned": {"start": "ptos", "training": _TRAINING}},
         "peers": {
             "pd": {"kind": "pd"},
             "pid": {"kind": "pid"},
