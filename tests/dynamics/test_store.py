@@ -184,3 +184,18 @@ def test_another_kind_is_named(tmp_path: Path) -> None:
     card.write_text(json.dumps(content))
     with pytest.raises(UsageError, match=r"holds 'residnet.heading_policy/1', expected"):
         load_model(tmp_path / "m")
+
+
+def test_a_run_of_before_names_an_unknown_force_that_its_model_has_not(tmp_path: Path) -> None:
+    saved = spec()
+    save_model(tmp_path / "baseline", saved, saved.build())
+    file = tmp_path / "baseline" / "model.json"
+    content = json.loads(file.read_text())
+    content["disturbance"] = None
+    # one without a sum of its own is older still
+    del content["description_sha256"]
+    file.write_text(json.dumps(content))
+    assert load_model(tmp_path / "baseline")[0] == saved
+    file.write_text(json.dumps(content | {"disturbance": {"settle": 20.0}}))
+    with pytest.raises(ConfigError, match="disturbance"):
+        load_model(tmp_path / "baseline")
