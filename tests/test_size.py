@@ -22,7 +22,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "core": (1594, 247),
     "data": (9842, 879),
     "documents": (2505, 230),
-    "dynamics": (2179, 277),
+    "dynamics": (2182, 277),
     "export": (1599, 175),
     "heads": (1311, 191),
     "identification": (2230, 227),
