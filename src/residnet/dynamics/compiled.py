@@ -560,7 +560,7 @@ class CompiledRollout:
             # a source whose rows have numbers of their own flies as many rows
             q = alone.source.initial(x.double())
             acting = alone.source(x.double(), w[:, 0].double(), 0, q)[0]
-        rows += [("q", q[:1]), ("own", self._own(alone, 1).double())]
+        rows += [("q", q[:1]), ("own", self._own(held, 1).double())]
         shared = [held[name].detach() for name in self.shared]
         names = [f"{name}_after" for name in _HANDED_ON]
         self.parts = in_parts(step, rows, shared, [*names, "a"], _WHAT)
@@ -590,9 +590,8 @@ class CompiledRollout:
         other.rollout = rollout
         return other
 
-    def _own(self, rollout: Rollout, count: int) -> Tensor:
+    def _own(self, held: Mapping[str, Tensor], count: int) -> Tensor:
         """Return the numbers [count, n] that every row has for itself."""
-        held = _numbers(rollout)
         parts = [held[name].detach()[:count].reshape(count, -1) for name in self.own]
         return torch.cat([torch.zeros(count, 0), *parts], dim=1)
 
@@ -608,10 +607,11 @@ class CompiledRollout:
 
     def __call__(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return states, inputs that acted and the last memory, as the rollout does."""
-        rows = self._own(self.rollout, len(x) if self.own else 1).expand(len(x), -1)
+        held = _numbers(self.rollout)
+        rows = self._own(held, len(x) if self.own else 1).expand(len(x), -1)
         q = self.rollout.source.initial(x)
         with torch.set_grad_enabled(self.trained is not None and torch.is_grad_enabled()):
-            theta, tables = self.prepared(_numbers(self.rollout))
+            theta, tables = self.prepared(held)
             states, acted, after = self.flown(theta, tables, x, s, rows, w, q)
         return states, w if self.rollout.source.given else acted, after
 
