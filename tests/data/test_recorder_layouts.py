@@ -288,8 +288,8 @@ def test_odometry_of_ros_under_water(tmp_path: Path) -> None:
     for axis, values in zip("xyz", (log["y"], log["x"], -log["z"]), strict=True):
         columns[f"pose.pose.position.{axis}"] = values
     for name, sign in (("u", 1), ("v", -1), ("w", -1), ("p", 1), ("q", -1), ("r", -1)):
-        kind, axis = ("linear", "xyz"["uvw".find(name)]) if name in "uvw" else (None, None)
-        kind, axis = (kind, axis) if kind else ("angular", "xyz"["pqr".find(name)])
+        kind, names = ("linear", "uvw") if name in "uvw" else ("angular", "pqr")
+        axis = "xyz"[names.index(name)]
         columns[f"twist.twist.{kind}.{axis}"] = sign * log[name]
     (tmp_path / "dive").mkdir()
     pd.DataFrame(columns).to_csv(tmp_path / "dive" / "odom.csv", index=False)
