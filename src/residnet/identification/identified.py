@@ -15,7 +15,7 @@ from residnet.core.arrays import paged
 from residnet.core.errors import UsageError
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared, channels
-from residnet.data.simulated import SimulatedTrials
+from residnet.data.simulated import SimulatedTrials, surrounded
 from residnet.data.sources import MeasuredLogs
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
@@ -38,7 +38,6 @@ from residnet.judge.selection import (
     shares,
 )
 from residnet.judge.soundness import Finding, Recorded, check_model
-from residnet.physics.vessel import load_vessel
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -177,7 +176,7 @@ def members_of(entry: FittedModel) -> tuple[str, ...]:
 
 def _truth(data: SimulatedTrials) -> Candidate | None:
     """The plant that made the logs; None where a log does not show all of its state."""
-    plant = load_vessel(data.vessel).build()
+    plant = surrounded(data.vessel, data.disturbance)
     if any(name.startswith("_") for name in plant.state):
         # no log shows what is under way in a delay line, so that the plant could not start from one
         return None

@@ -30,6 +30,7 @@ from residnet.data.simulated import (
     log_names,
     source_of,
     stand_ins,
+    surrounded,
     trials_craft,
 )
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
@@ -201,7 +202,7 @@ class Programme(Config):
                 manoeuvre.begin(craft.start[0], craft.helm.state)
 
     def _vessel_craft(self, vessel: str, step: float) -> tuple[Craft, Sea]:
-        plant = load_vessel(vessel).build()
+        plant = surrounded(vessel, self.disturbance)
         # actuators with dead time move by a step of their own
         inputs = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
         plant.end_step(plant.approach(1), inputs, step / self.substeps)
