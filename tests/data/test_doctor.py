@@ -370,6 +370,17 @@ def test_noise_of_velocities_is_no_scale_of_theirs() -> None:
         assert np.abs(np.concatenate([[0.0], *gains])).max() < 0.3, seed
 
 
+def test_noise_of_v_on_a_slow_straight_course_is_no_drift() -> None:
+    random, t = np.random.default_rng(1), 0.1 * np.arange(400)
+    noise = {"u": 0.005, "v": 0.005, "r": 0.002, "psi": 0.003}
+    moving = {"x": 0.05 * t, "y": 0.0 * t, "u": 0.05 + 0.0 * t, "delta": np.sin(t)}
+    told = {name: moving.get(name, 0.0 * t) for name in ("x", "y", "psi", "u", "v", "r", "delta")}
+    log = Log(
+        "slow", t, {n: c + noise.get(n, 0.0) * random.normal(size=400) for n, c in told.items()}
+    )
+    assert not inspect(log, ["delta"]).find("course_as_heading")
+
+
 def test_spikes_are_bridged_and_fill_values_told_from_measurements() -> None:
     assert spike_cells(LOG) == {}
     assert without_spikes(LOG) is LOG

@@ -60,6 +60,7 @@ class Rates:
         yaw: rate of psi [T] in rad/s.
         measured: u, v, r as far as the log has them, [T].
         noise: the larger of those in `yaw` and in the averaged r, rad/s.
+        sway: noise in the averaged v, m/s.
     """
 
     ground: np.ndarray
@@ -67,6 +68,7 @@ class Rates:
     yaw: np.ndarray
     measured: dict[str, np.ndarray]
     noise: float
+    sway: float
 
 
 def rates(log: Record) -> Rates:
@@ -113,6 +115,7 @@ def rates(log: Record) -> Rates:
         rate(log["psi"], turn),
         {name: mean(log[name], turn if name == "r" else place) for name in known},
         max(noise, log.noise("r") / np.sqrt(2.0 * turn) if "r" in known else 0.0),
+        log.noise("v") / np.sqrt(2.0 * place) if "v" in known else 0.0,
     )
 
 
@@ -273,8 +276,9 @@ def course_as_heading(log: Record, found: Check) -> Iterator[Finding]:
     if good.any():
         good &= (speed > 0.3 * np.quantile(speed[good], 0.9)) & (np.abs(drift) < 1.2)
     spread = float(np.std(drift[good])) if good.sum() >= 100 else 0.0
-    # the drift angle must vary by so much before it tells heading from course
-    if spread < math.radians(1.0):
+    # the drift angle must vary by so much, beyond its noise, before it tells heading from course
+    noise = float(np.sqrt(np.mean((motion.sway / speed[good]) ** 2))) if spread else 0.0
+    if spread < math.hypot(math.radians(1.0), noise):
         return
     as_heading, as_course = (
         float(np.sqrt(np.mean(np.angle(np.exp(1j * angle)) ** 2)))
