@@ -351,6 +351,7 @@ class Scatter:
         known: variance of the mean size of all clean logs [Q].
         correlation: of the scores of different causes [Q, Q].
         count: of the groups that told all this.
+        wider: how many times as far scores of clean stretches lie as all this says.
     """
 
     noise: np.ndarray
@@ -359,6 +360,7 @@ class Scatter:
     known: np.ndarray
     correlation: np.ndarray
     count: int = 10**9
+    wider: float = 1.0
 
     def variance(self, own: np.ndarray) -> np.ndarray:
         """Return the variance of scores [..., Q] whose information is `own` [..., Q]."""
@@ -401,8 +403,9 @@ class Scatter:
             told.append(part / again)
             weight.append(sure / again + _NOTHING)
         size, agreed = _agreed(np.stack(told), np.stack(weight))
-        explained = np.sum(told, axis=0) ** 2 / np.sum(weight, axis=0) / self.inflation
-        return size, np.sqrt((1.0 / agreed + self.known) * self.inflation), explained
+        inflation = self.inflation * self.wider**2
+        explained = np.sum(told, axis=0) ** 2 / np.sum(weight, axis=0) / inflation
+        return size, np.sqrt((1.0 / agreed + self.known) * inflation), explained
 
 
 def _agreed(told: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -445,6 +448,27 @@ def scattered(groups: Sequence[Group]) -> Scatter:
     shared = _shared(groups, alone)
     whole = Scatter(noise, apart, shared, 0.0 * apart, correlation)
     return Scatter(noise, apart, shared, 1.0 / _told(groups, whole)[1], correlation, count)
+
+
+def wider(held: Sequence[Sequence[Group]], size: int) -> float:
+    """Return how many times as far scores of clean stretches lie as other clean logs say.
+
+    Wind, waves and what a model does not know differ from log to log and last for minutes, so what
+    groups say of a whole stretch is put to the test on logs that were left out.
+
+    Args:
+        held: groups of clean windows in the order of time, those that are left out together by
+            themselves.
+        size: number of groups in a stretch.
+    """
+    found = []
+    for fold, own in enumerate(held):
+        others = [group for k, some in enumerate(held) if k != fold for group in some]
+        scatter = scattered(others)
+        for first in range(0, len(own), size):
+            mean, error, _ = scatter.together(own[first : first + size])
+            found.append(mean / error)
+    return max(1.0, float(np.sqrt(np.mean(np.square(found)))))
 
 
 def _told(groups: Sequence[Group], scatter: Scatter) -> tuple[np.ndarray, np.ndarray]:
@@ -632,7 +656,7 @@ class Watch:
         # groups of one log are alike
         fold = (of if len(set(of)) >= _FOLDS else np.arange(len(found))) % _FOLDS
         self.bias = self._bias([self._sums(group) for group in found])
-        apart: list[Group] = []
+        held: list[list[Group]] = []
         self.by_fold: list[tuple[list[np.ndarray], np.ndarray]] = []
         # scores scatter more where others say what is always wrong, as they do in service
         for k in range(_FOLDS):
@@ -642,10 +666,12 @@ class Watch:
             others = [self._sums(one) for one in found]
             bias = self._bias([one for one, own in zip(others, fold, strict=True) if own != k])
             self.by_fold.append((self.always, bias))
-            for i in np.flatnonzero(fold == k):
-                apart.append(self._group(int(of[i]), others[i], bias))
+            own = np.flatnonzero(fold == k)
+            held.append([self._group(int(of[i]), others[i], bias) for i in own])
         self.always = known
-        self.scatter = scattered(apart)
+        apart = [group for some in held for group in some]
+        size = max(round(config.stretch / config.group), 1)
+        self.scatter = replace(scattered(apart), wider=wider(held, size))
         looks = config.false_alarm / config.stretch * _OVERLAP * len(self.causes)
         self.threshold = float(scipy.stats.t.isf(0.5 / looks, len(apart) - 1))
 

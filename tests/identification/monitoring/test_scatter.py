@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from residnet.identification.monitoring import Group, scattered
+from residnet.identification.monitoring import Group, scattered, wider
 
 CAUSES = 3
 ALIKE = np.array([[1.0, 0.8, 0.0], [0.8, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -59,6 +59,30 @@ def test_groups_of_one_log_share_what_is_their_own() -> None:
     # where no clean log tells, a single log counts once
     alone = scattered(groups(random, 40, 1, np.zeros(CAUSES), 0.5))
     np.testing.assert_array_equal(alone.shared, alone.apart)
+
+
+def test_what_lasts_for_a_stretch_makes_its_scores_lie_wider() -> None:
+    """Logs left out tell it: pairs of groups of a long log share less than those of a stretch."""
+    random = np.random.default_rng(3)
+
+    def sailed(logs: int, legs: int) -> list[Group]:
+        out = []
+        for log in range(logs):
+            for _ in range(legs):
+                leg = groups(random, 1, 5, np.zeros(CAUSES), 0.05, shared=0.5)
+                out += [Group(log, one.score, one.information) for one in leg]
+        return out
+
+    held = [sailed(2, 4) for _ in range(5)]
+    scatter = scattered([group for some in held for group in some])
+    scores = []
+    for _ in range(300):
+        size, error, _ = scatter.together(sailed(1, 1))
+        scores.append(size / error)
+    factor = wider(held, 5)
+    assert np.std(scores) > 1.3
+    assert 0.75 < np.std(scores) / factor < 1.25
+    assert wider([groups(random, 8, 1, np.zeros(CAUSES), 0.5) for _ in range(5)], 5) < 1.2
 
 
 def test_all_scores_together_name_the_cause() -> None:
