@@ -300,7 +300,7 @@ def prepare(
         like: data whose settings are taken over; all logs then form the split `external`.
         progress: is told how far the work is.
         settings: further keys of the sections `signals` (exogenous, forces, velocities),
-            `prepare` (masks, derivative, motion, trim, hold) and `evaluation` (protocols,
+            `prepare` (masks, derivative, motion, trim, hold, beside) and `evaluation` (protocols,
             selection, scales, groups, divergence) of a config, as YAML has them; without
             `selection` the first of `protocols` chooses between models.
 

@@ -455,12 +455,15 @@ class Preparation:
         )
 
     def content(self) -> dict[str, Any]:
-        """Return `prepare` as a config has it."""
+        """Return `prepare` as a config has it.
+
+        A smoothed rate stands beside means: it is one itself.
+        """
         grid: dict[str, Any] = {"step": f"{self.step:g} s"}
         grid |= {"held": list(self.held)} if self.held else {}
         window = f"{self.window:g} s"
         derivative = {"kind": "savitzky_golay", "window": window, "order": 2}
-        return {"grid": grid, "derivative": derivative, "hold": self.hold}
+        return {"grid": grid, "derivative": derivative, "hold": self.hold, "beside": "means"}
 
 
 def _rests(logs: Sequence[Log], name: str) -> bool:
