@@ -242,7 +242,7 @@ def ornstein_uhlenbeck(
     They run along T and are discretised exactly.
     """
     keep = np.exp(-step / correlation)
-    out = random.standard_normal(shape) * np.sqrt(1 - keep**2)
+    out: np.ndarray = random.standard_normal(shape) * np.sqrt(1 - keep**2)
     out[:, 0] /= np.sqrt(1 - keep**2)
     for k in range(1, shape[1]):
         out[:, k] += keep * out[:, k - 1]

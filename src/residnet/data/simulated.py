@@ -327,8 +327,9 @@ def surrounded(vessel: str, disturbance: Disturbance) -> Plant:
     The numbers are the same there: a vessel under water is flown in half the time.
     """
     plant = load_vessel(vessel).build()
-    calm = isinstance(plant, HullPlant) and not disturbance.needs()
-    return plant.in_calm_water() if calm else plant
+    if isinstance(plant, HullPlant) and not disturbance.needs():
+        return plant.in_calm_water()
+    return plant
 
 
 def trials_craft(config: SimulatedTrials) -> Craft:
