@@ -406,6 +406,7 @@ class Preparation:
         hold: whether an input over a step is the sample at its `start` or the `mean` of its ends.
         exogenous: channels of the true wind, where every log holds them.
         rate: what the memory is that of: the yaw rate, or the speed where no log tells that.
+        swings: whether the vessel rolls.
     """
 
     interval: float
@@ -416,6 +417,7 @@ class Preparation:
     hold: str
     exogenous: tuple[str, ...]
     rate: str = "yaw rate"
+    swings: bool = False
 
     @classmethod
     def of(cls, logs: Sequence[Log], inputs: Sequence[str], live: Live = ALIVE) -> Preparation:
@@ -444,6 +446,7 @@ class Preparation:
             "start" if len(held) == len(inputs) else "mean",
             WIND_INPUTS if wind else (),
             "yaw rate" if live.turns else "speed",
+            live.rolls,
         )
 
     @property
@@ -457,13 +460,14 @@ class Preparation:
     def content(self) -> dict[str, Any]:
         """Return `prepare` as a config has it.
 
-        A smoothed rate stands beside means: it is one itself.
+        Angles that swing are set against means, as a smoothed rate is one itself.
         """
         grid: dict[str, Any] = {"step": f"{self.step:g} s"}
         grid |= {"held": list(self.held)} if self.held else {}
         window = f"{self.window:g} s"
         derivative = {"kind": "savitzky_golay", "window": window, "order": 2}
-        return {"grid": grid, "derivative": derivative, "hold": self.hold, "beside": "means"}
+        beside = {"beside": "means"} if self.swings else {}
+        return {"grid": grid, "derivative": derivative, "hold": self.hold, **beside}
 
 
 def _rests(logs: Sequence[Log], name: str) -> bool:
