@@ -29,6 +29,7 @@ from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
 from residnet.identification.changes import Change, ChangedDynamics
 from residnet.identification.monitoring import MonitorConfig, Piece, Watch, Watcher
+from residnet.identification.recipe import Preparation
 from residnet.judge.freerun import integrate
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.open_loop import ConstantInput
@@ -119,6 +120,14 @@ def test_what_logs_tell() -> None:
     assert rolls.channels == ("u", "r", "p", "phi")
     assert Live.shared([rolls, planar]).velocities == ("u", "r")
     assert Live.shared([Live(("u",)), Live(("r",))]).planar
+
+
+def test_a_draft_sets_the_rates_of_a_roll_beside_means() -> None:
+    t = np.arange(0.0, 60.0, 0.1)
+    log = Log("swing", t, dict.fromkeys(("u", "v", "r", "p", "phi", "delta"), np.sin(t)))
+    for live, beside in ((Live(("u", "v", "r", "p")), "means"), (Live(), None)):
+        drafted = Preparation.of([log], ["delta"], live).content()
+        assert drafted.get("beside") == beside
 
 
 @pytest.mark.parametrize(
