@@ -270,7 +270,7 @@ def test_logs_alone_are_fitted_by_the_recipe(logs: list[residnet.Log]) -> None:
     models = residnet.fit([_coarse(log) for log in logs[:6]], effort=0.01)
     assert models.settings.recipe == "standard"
     assert models.settings.signals.inputs == ("n_port", "n_stbd")
-    assert {"zero", "baseline", "hull", "hull_network", "network"} <= set(models)
+    assert {"zero", "baseline", "hull", "hull_network", "mean"} <= set(models)
     assert models.selected in models
 
 

@@ -1,8 +1,8 @@
 """The mean of the standard recipe beside its members, the selected model, and a plain network.
 
     python scripts/bench/recipe.py [--logs boats|shipped|measured] [--count N] [--seed S]
-        [--minutes M ...] [--vessels NAME ...] [--effort E] [--without PART ...] [--peer]
-        [--records FILE] [--keep FOLDER]
+        [--minutes M ...] [--vessels NAME ...] [--effort E] [--without PART ...] [--network]
+        [--peer] [--records FILE] [--keep FOLDER]
 
 Nothing is said to `residnet.fit` but the logs: M minutes for training and validation (three to
 one), as long for the test, which takes part in no choice.
@@ -17,6 +17,8 @@ Means of fewer members need no fit of their own and stand beside the recipe's. `
 more for each part of the training that is named, with the same seeds: `mirror` (no mirrored
 windows), `average` (the last weights in place of their average), `members` (one
 network in place of several).
+
+`--network` lets networks alone take part where logs are short, as they do of long ones.
 
 `--keep` writes a file for each draw with what every member missed in the free runs of the test logs
 and of the validation logs, the latter by a fit that did not see them too. Any weights of a mean can
@@ -258,7 +260,15 @@ PARTS: dict[str, Callable[[dict[str, Any]], None]] = {
     "mirror": lambda plan: _each(plan["training"], mirror=False),
     "average": lambda plan: _each(plan["training"], average=0.0),
     "members": lambda plan: _each(plan["heads"], members=1),
+    "network": lambda plan: _alone(plan),
 }
+
+
+def _alone(plan: dict[str, Any]) -> None:
+    for key in ("heads", "training"):
+        plan[key].setdefault("network", plan[key]["hull_network"])
+    plan["base_of"]["network"] = "zero"
+    plan["means"] = {"mean": ("hull", *plan["heads"])}
 
 
 def _each(parts: dict[str, dict[str, Any]], **changes: Any) -> None:
@@ -266,14 +276,14 @@ def _each(parts: dict[str, dict[str, Any]], **changes: Any) -> None:
         parts[name] = {**parts[name], **changes}
 
 
-def fitted(splits: Splits, effort: float, without: str) -> Any:
-    """Fit the recipe, without a part of it where one is named."""
+def fitted(splits: Splits, effort: float, parts: Sequence[str]) -> Any:
+    """Fit the recipe with some parts of it changed."""
     whole = settings.portfolio
 
     def changed(facts: Any, effort: float) -> dict[str, Any]:
         plan = whole(facts, effort)
-        if without:
-            PARTS[without](plan)
+        for part in parts:
+            PARTS[part](plan)
         return plan
 
     with mock.patch.object(settings, "portfolio", changed):
@@ -317,13 +327,13 @@ def missed(models: Any, split: str, *, dense: bool) -> dict[str, np.ndarray]:
     return out
 
 
-def keep(models: Any, splits: Splits, effort: float, file: Path) -> None:
+def keep(models: Any, splits: Splits, effort: float, parts: Sequence[str], file: Path) -> None:
     """Write what the members of a fit missed, and what they miss of logs that they did not see."""
     whole = {"test": missed(models, "test", dense=False)}
     whole["validation"] = missed(models, "validation", dense=True)
     if models.identified.chosen is not None:
         with mock.patch.object(fit, "final_fit", return_value=False):
-            first = fitted(splits, effort, "")
+            first = fitted(splits, effort, parts)
         whole["seen"] = whole["validation"]
         whole["validation"] = missed(first, "validation", dense=True)
         whole["first"] = missed(first, "test", dense=False)
@@ -333,20 +343,26 @@ def keep(models: Any, splits: Splits, effort: float, file: Path) -> None:
 
 
 def judged(
-    splits: Splits, effort: float, peer: bool, without: Sequence[str], kept: Path | None
+    splits: Splits,
+    effort: float,
+    peer: bool,
+    without: Sequence[str],
+    network: bool,
+    kept: Path | None,
 ) -> dict[str, Any]:
     """Fit, and return the test errors by the protocol that chooses."""
     began = time.process_time()
-    models = fitted(splits, effort, "")
+    parts = ["network"] if network else []
+    models = fitted(splits, effort, parts)
     seconds = time.process_time() - began
     if kept is not None:
-        keep(models, splits, effort, kept)
+        keep(models, splits, effort, parts, kept)
     rows = residnet.metrics(models, split="test")
     rows = rows[rows.protocol == models.data.evaluation.selection].set_index("model")
     errors = {name: float(row.nrmse_mean) for name, row in rows.iterrows()}
     errors["selected"] = errors[models.selected]
     for part in without:
-        other = residnet.metrics(fitted(splits, effort, part), split="test")
+        other = residnet.metrics(fitted(splits, effort, [*parts, part]), split="test")
         other = other[other.protocol == models.data.evaluation.selection].set_index("model")
         errors[f"mean without {part}"] = float(other.nrmse_mean["mean"])
     return {
@@ -396,7 +412,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, nargs="+", default=[5.0])
     parser.add_argument("--vessels", nargs="+", help="of the source; all of it otherwise")
     parser.add_argument("--effort", type=float, default=1.0, help="of the recipe's networks")
-    parser.add_argument("--without", nargs="+", default=[], choices=list(PARTS))
+    parser.add_argument("--without", nargs="+", default=[], choices=list(PARTS)[:-1])
+    parser.add_argument("--network", action="store_true", help="networks alone take part")
     parser.add_argument("--peer", action="store_true", help="train a plain GRU beside")
     parser.add_argument("--records", type=Path, help="file for one line of JSON for each fit")
     parser.add_argument("--keep", type=Path, help="folder for the members' errors of each fit")
@@ -411,7 +428,9 @@ def main() -> None:
         random = np.random.default_rng([given.seed, number])
         logs = source(name, 60.0 * minutes / STRETCHES, given.seed + number // 2, random)
         kept = given.keep and given.keep / f"{name}_{minutes:g}_{given.seed}_{number}.npz"
-        records.append(judged(split(logs), given.effort, given.peer, given.without, kept))
+        records.append(
+            judged(split(logs), given.effort, given.peer, given.without, given.network, kept)
+        )
         print(f"{name}, {minutes:g} min, draw {number}, {line(records[-1])}", flush=True)
         if given.records is not None:
             with given.records.open("a", encoding="utf-8") as file:

@@ -31,7 +31,7 @@ from residnet.judge.protocol import all_windows
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import dissipates
 
-NAMES = ("hull", "hull_network", "network", "mean")
+NAMES = ("hull", "hull_network", "mean")
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -95,9 +95,8 @@ def test_the_mean_is_reported_first_and_a_single_model_is_chosen_beside_it(
     families = {entry.name: entry.family for entry in chosen.contenders}
     assert chosen.predictor == chosen.selected_ensemble == "mean"
     assert families[chosen.selected] != "ensemble"
-    assert families["network"] == families["hull_network"] == families["mean"] == "ensemble"
-    # networks that were hardly trained may be left out of it
-    assert {"hull", "hull_network"} <= set(identified["mean"].notes["members"])
+    assert families["hull_network"] == families["mean"] == "ensemble"
+    assert identified["mean"].notes["members"] == ["hull", "hull_network"]
 
 
 @pytest.mark.long
@@ -122,7 +121,7 @@ def test_members_that_run_away_are_left_out_of_the_mean(
     identified: Identified, logs: PreparedSplits
 ) -> None:
     fitter = Fitter(logs, settings(), NoStore())
-    lost = replace(identified["network"], notes={"validation_diverged": 1})
+    lost = replace(identified["baseline"], notes={"validation_diverged": 1})
     members = [identified["hull"], identified["hull_network"], lost]
     assert fitter.mean("mean", members).notes["members"] == ["hull", "hull_network"]
     with pytest.raises(FitError, match="no mean errs less"):
@@ -140,6 +139,8 @@ def test_members_that_harm_the_mean_are_left_out(
     assert (found.notes["members"], found.notes["left_out"]) == (["hull", "hull_network"], ["zero"])
     with pytest.raises(FitError, match="no mean errs less"):
         fitter.mean("mean", [hull, zero])
+    fitter.seen = True
+    assert fitter.mean("mean", [hull, zero]).notes["left_out"] == []
 
 
 def test_what_harms_a_mean_of_independent_errors() -> None:
@@ -161,7 +162,7 @@ def test_settings_say_the_recipe_and_nothing_of_its_parts() -> None:
     assert written["recipe"] == "standard"
     assert not set(PARTS) & set(written)
     assert validate(written, FitSettings, "again") == own
-    assert own.model_names == ("baseline", *NAMES)
+    assert own.model_names == ("baseline", "hull", "hull_network", "network", "mean")
 
 
 @pytest.mark.parametrize(
@@ -181,7 +182,7 @@ def test_what_does_not_go_with_the_recipe(changes: dict[str, Any], said: str) ->
 
 def test_terms_follow_from_what_moves() -> None:
     names = ("u", "v", "r", "n", "delta", "wind_u", "wind_v", "wind_mag")
-    whole = replace(Facts.supposed(names), samples=20_000)
+    whole = Facts.supposed(names)
     hull = portfolio(whole)["baselines"]["hull"]["terms"]
     assert {"u|u|", "n|n|", "|n| u", "n|n| delta", "wind_u wind_mag"} <= set(hull)
     assert {"u^2 v", "n r", "wind_mag r", "n|n| delta|delta|"} <= set(hull)
@@ -194,17 +195,30 @@ def test_terms_follow_from_what_moves() -> None:
     assert not [t for t in portfolio(still)["baselines"]["hull"]["terms"] if "n" in t.split()]
 
 
+def short(names: tuple[str, ...]) -> Facts:
+    """What is supposed of nine minutes of logs."""
+    return replace(Facts.supposed(names), samples=5_400)
+
+
+def test_networks_stand_alone_where_logs_are_long() -> None:
+    names = ("u", "v", "r", "n", "delta")
+    assert portfolio(short(names))["means"] == {"mean": ("hull", "hull_network")}
+    whole = portfolio(Facts.supposed(names))
+    assert whole["means"] == {"mean": ("hull", "hull_network", "network")}
+    assert whole["base_of"] == {"hull_network": "hull", "network": "zero"}
+
+
 def test_short_logs_give_each_axis_the_terms_that_a_symmetric_vessel_has() -> None:
     names = ("u", "v", "r", "n", "delta")
-    rows = portfolio(Facts.supposed(names))["baselines"]["hull"]["terms"]
+    rows = portfolio(short(names))["baselines"]["hull"]["terms"]
     assert {"1", "u", "u|u|", "v r", "n", "n|n|", "|n| u"} == set(rows["u"])
     assert {"u v", "v|r|", "u|u| delta", "n|n| delta", "n|n|", "1"} <= set(rows["v"])
     assert not {"u", "u|u|", "|n| u", "v r"} & set(rows["r"])
     paired = SignalsConfig(inputs=("left", "right"), pairs=(("left", "right"),)).build().names
-    rows = portfolio(Facts.supposed(paired))["baselines"]["hull"]["terms"]
+    rows = portfolio(short(paired))["baselines"]["hull"]["terms"]
     assert {"left", "right|right|", "|left| u"} <= set(rows["r"])
     assert "u|u|" not in rows["r"]
-    assert portfolio(Facts.supposed(paired))["training"]["network"]["mirror"]
+    assert portfolio(short(paired))["training"]["hull_network"]["mirror"]
 
 
 def test_the_models_of_the_recipe_cannot_run_away() -> None:

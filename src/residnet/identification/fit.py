@@ -59,7 +59,7 @@ def fit(logs: Logs, settings: FitSettings, *, store: FitStore | None = None) -> 
     say("  then with them: logs are short, and nothing is chosen any more")
     whole = {**logs, "train": [*logs["train"], *logs["validation"]]}
     without = found.model_copy(update={"bands": None})
-    last = _fitted(Fitter(whole, without, store, settle=False), whole)
+    last = _fitted(Fitter(whole, without, store, settle=False, seen=True), whole)
     if found.bands is not None:
         last.models.update(borrowed_bands(last, chosen, logs["validation"], found.bands))
         for model in last.values():

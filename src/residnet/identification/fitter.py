@@ -205,6 +205,7 @@ class Fitter:
         settings: of the fit.
         store: keeps every model as it is done.
         settle: whether the recipe's parts are yet to follow from the logs.
+        seen: the validation logs are among those of training, and judge nothing.
     """
 
     def __init__(
@@ -214,8 +215,9 @@ class Fitter:
         store: FitStore,
         *,
         settle: bool = True,
+        seen: bool = False,
     ) -> None:
-        self.store = store
+        self.store, self.seen = store, seen
         self.train = logs["train"]
         self.signals = settings.signals.build()
         self.low, self.high = envelope(self.train)
@@ -359,7 +361,7 @@ class Fitter:
 
         Members that diverge on a validation window are left out, and so is one that errs so much
         more than the others that it harms a mean even where their errors are independent, unless
-        the mean of the others errs more.
+        the mean of the others errs more. Logs that the members have seen tell nothing of that.
 
         Raises:
             FitError: where less than two are left.
@@ -369,7 +371,7 @@ class Fitter:
         if left:
             say(f"  {name}: {', '.join(left)} diverged on validation logs and is left out")
         found = self._mean_of(name, kept) if len(kept) > 1 else None
-        while found is not None and (worst := burden(kept)) is not None:
+        while found is not None and not self.seen and (worst := burden(kept)) is not None:
             others = [one for one in kept if one is not worst]
             alone = self._mean_of(name, others) if len(others) > 1 else others[0]
             if alone.notes["validation"] >= found.notes["validation"]:

@@ -61,8 +61,8 @@ class Facts:
 
     @classmethod
     def supposed(cls, names: tuple[str, ...]) -> Facts:
-        """Return facts before any log is read: every channel moves, ahead only."""
-        return cls(names, _acting(names), (), 0.1, _USUAL, 0.1 * _USUAL, math.inf, 10_000)
+        """Return facts before any log is read: every channel moves, ahead only, for long."""
+        return cls(names, _acting(names), (), 0.1, _USUAL, 0.1 * _USUAL, math.inf, 20_000)
 
     @classmethod
     def of(
@@ -347,6 +347,8 @@ PARTS = (
     "baseline", "baselines", "refit", "heads", "base_of", "ensembles", "means", "training",
 )  # fmt: skip
 """Keys of a fit that the recipe stands in place of."""
+_BASES = {"hull_network": "hull", "network": "zero"}
+"""What the networks stand on."""
 MEAN = "mean"
 """Name of the mean of unlike models, which is reported first."""
 
@@ -355,8 +357,8 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     """Return baselines, refits, heads and trainings by the names that the recipe gives them.
 
     `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted; long logs
-    determine a hull of more terms. Networks stand on the hull and alone, several of each, and the
-    mean of the trajectories of hull and networks is the predictor.
+    determine a hull of more terms. Several networks stand on the hull, and as many alone where logs
+    are long. The mean of the trajectories of hull and networks is the predictor.
 
     Args:
         facts: of the logs; `Facts.supposed` before they are read.
@@ -370,14 +372,14 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
         "restoring": True,
         "margin": 0.0,
     }
-    heads = {"hull_network": network, "network": network}
+    heads = {"hull_network": network} | ({"network": network} if long(facts) else {})
     terms = full_hull_terms(facts) if long(facts) else hull_terms(facts)
     return {
         "baseline": _regressors(1e-6, linear_terms(facts)),
         "baselines": {"hull": _regressors(1e-4, terms)},
         "refit": dict.fromkeys(("baseline", "hull"), refit_settings(facts)),
         "heads": heads,
-        "base_of": {"hull_network": "hull", "network": "zero"},
+        "base_of": {name: base for name, base in _BASES.items() if name in heads},
         "ensembles": {},
         "means": {MEAN: ("hull", *heads)},
         "training": dict.fromkeys(heads, training_settings(facts, effort)),
