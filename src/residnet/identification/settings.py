@@ -76,9 +76,9 @@ class FitSettings(Parts):
         evaluation: protocols and scales.
         bands: how far free runs may be off, calibrated over logs that were left out; null for none.
         recipe: `standard` stands in place of the parts: a line, a hull, networks on the hull,
-            of long logs networks alone, and the mean of hull and networks, named `mean`, reported first
-            and exported where no model is named. Terms, sizes and trainings follow from the logs.
-            Null for parts of your own.
+            of long logs networks alone, and the mean of hull and networks, named `mean`, which is
+            reported first and exported where no model is named. Terms, sizes and trainings follow
+            from the logs. Null for parts of your own.
         effort: how long the recipe trains its networks: 1 for usual, less for a quick look.
     """
 
