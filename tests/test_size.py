@@ -25,7 +25,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "dynamics": (2182, 277),
     "export": (1599, 175),
     "heads": (1311, 191),
-    "identification": (2244, 228),
+    "identification": (2245, 228),
     "judge": (2084, 225),
     "manoeuvres": (1009, 148),
     "physics": (2200, 266),
