@@ -493,3 +493,21 @@ def test_a_folder_of_messages_whose_values_come_in_turns(log: Log, tmp_path: Pat
     at = np.interp(read.t - read.t[0], log.t, log["delta"])[inner]
     assert np.corrcoef(read["servo_1"][inner], -at)[0, 1] > 0.99
     np.testing.assert_allclose(np.nanmax(read["n"]), np.round(60 * log["n"].max()) / 60, rtol=1e-6)
+
+
+def test_thrusters_that_no_number_tells_apart_are_one_each(log: Log, tmp_path: Path) -> None:
+    columns = {name: log[name] for name in ("x", "y", "psi")}
+    called = [f"cmd_thrust_{end}_{side}" for end in ("fore", "aft") for side in ("port", "stbd")]
+    called += [f"cmd_thrust_lift_{one.removeprefix('cmd_thrust_')}" for one in called]
+    forces = {one: np.sin((0.1 + 0.02 * k) * log.t) for k, one in enumerate(called)}
+    read, marks = _drafted(pd.DataFrame({"t": log.t, **columns, **forces}), tmp_path / "rov.csv")
+    inputs = [name for name in read.channels if name.startswith("thrust")]
+    assert len(inputs) == len(called)
+    for one in called:
+        assert any(np.array_equal(read[name], forces[one]) for name in inputs)
+    assert _guessed(marks, "thrust_port_cmd_1")
+    # two columns may be one quantity
+    two = {"engine rpm": 600.0 + log.t, "shaft rpm": 300.0 + log.t}
+    frame = pd.DataFrame({"t": log.t, **columns, **two})
+    read, marks = _drafted(frame, tmp_path / "boat.csv")
+    assert len([name for name in read.channels if name.startswith("n")]) == 1

@@ -69,6 +69,8 @@ _SIDES = {"latitude": {"N", "S"}, "longitude": {"E", "W", "O"}}
 _GERMANIC = re.compile(r"breite|l(?:ae|a)nge|breedte|lengte|zeit|tijd|kurs|koers|ruder|roer")
 Settings = Mapping[str, Mapping[str, Any]]
 """Column -> what its entry in a channel map says beside column and unit."""
+_SEVERAL = 3
+"""Columns of one channel from which each is an actuator: two may be one quantity, seen twice."""
 _LOOKED_AT = 24
 """Tables whose values are looked at; of the others only the header is."""
 
@@ -267,6 +269,7 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
             marks.guess((*CHANNELS, "x"), text)
             return {**pair, **others}
     names: dict[str, str] = {}
+    alike: dict[str, list[str]] = {}
     speeds: list[str] = []
     about = {column: words_of(column) for column in columns}
     copied = re.compile(r"\.\d+$")
@@ -309,7 +312,18 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
             text = f"the header names it more than once; '{names[channel]}' is the first of them"
             marks.guess((*CHANNELS, channel), text)
         elif channel is not None:
-            marks.note(CHANNELS, f"'{column}' may be {channel} as well as '{names[channel]}' is")
+            alike.setdefault(channel, [names[channel]]).append(column)
+    for channel, called in alike.items():
+        each = {f"{channel}_{k}": one for k, one in enumerate(sorted(called, key=columns.index), 1)}
+        moves = state_channel(about[called[0]]) is not None
+        if len(called) < _SEVERAL or moves or names.keys() & each.keys():
+            for column in called[1:]:
+                marks.note(CHANNELS, f"'{column}' may be {channel} as well as '{called[0]}' is")
+            continue
+        # thrusters that no number and no side tells apart
+        del names[channel]
+        names |= each
+        marks.guess((*CHANNELS, f"{channel}_1"), f"{', '.join(called)} are taken for one each")
     placed = bool({"x", "y", "latitude", "longitude"} & names.keys())
     theta = next((column for column in columns if "theta" in about[column].text.split()), None)
     if placed and theta is not None and not {"psi", "phi"} & names.keys():
