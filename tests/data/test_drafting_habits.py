@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -489,6 +490,9 @@ def test_a_folder_of_messages_whose_values_come_in_turns(log: Log, tmp_path: Pat
     assert len(logs) == 2
     read = logs[0]
     assert read.units["servo_1"] == read.units["servo_2"] == "rad"
+    # what the folder that holds them is called says nothing of its messages
+    (alone,) = residnet.read_logs(shutil.copytree(folder, tmp_path / "one" / folder.name).parent)
+    assert {*alone.channels} == {*read.channels}
     inner = slice(20, -20)
     at = np.interp(read.t - read.t[0], log.t, log["delta"])[inner]
     assert np.corrcoef(read["servo_1"][inner], -at)[0, 1] > 0.99
@@ -506,8 +510,18 @@ def test_thrusters_that_no_number_tells_apart_are_one_each(log: Log, tmp_path: P
     for one in called:
         assert any(np.array_equal(read[name], forces[one]) for name in inputs)
     assert _guessed(marks, "thrust_port_cmd_1")
-    # two columns may be one quantity
-    two = {"engine rpm": 600.0 + log.t, "shaft rpm": 300.0 + log.t}
-    frame = pd.DataFrame({"t": log.t, **columns, **two})
-    read, marks = _drafted(frame, tmp_path / "boat.csv")
-    assert len([name for name in read.channels if name.startswith("n")]) == 1
+    # of a rudder that is told several times one is read, by its own name
+    again = {f"rudder {one} [deg]": np.degrees(log["delta"]) + 1.0 for one in ("port tank", "two")}
+    read, _ = _drafted(_frame(log, **columns).assign(**again), tmp_path / "boat.csv")
+    assert [name for name in read.channels if name.startswith("delta")] == ["delta"]
+    np.testing.assert_allclose(read["delta"], log["delta"], atol=1e-9)
+
+
+def test_logs_with_other_columns_beside_each_other_are_no_messages(
+    log: Log, tmp_path: Path
+) -> None:
+    for k in range(4):
+        columns = {"Time [s]": log.t, "speed [m/s]": log["u"], "motor rps": log["n"]}
+        columns |= {"battery [V]": 24.0 - 0.01 * log.t} if k % 2 else {}
+        pd.DataFrame(columns).to_csv(tmp_path / f"run_{k}.csv", index=False)
+    assert len(residnet.read_logs(tmp_path)) == 4

@@ -300,6 +300,11 @@ def test_what_looks_for_an_unknown_force_is_asked_without_a_past() -> None:
         slopes = re.findall(r"d[uvr] ([-+][.0-9]+)", found[DAMPING].text)
         # the mean's are those of a step, by its length
         np.testing.assert_allclose([*map(float, slopes)], [-0.1, -0.3, -0.5], rtol=0.15)
+    # what runs away by itself is found all the same
+    spec, plain = made({**RUDDER, "u": (0.1, 0, 0)})
+    wrong = HybridDynamics(plain.signals, plain.baseline, Carried(), STEP, "rk4")
+    for one in (wrong, MeanOfTrajectories([plain, wrong], low, high)):
+        assert findings(spec, one)[DAMPING].fault
 
 
 def log(seconds: float = 200.0, *, settles: bool = True) -> Prepared:

@@ -241,11 +241,12 @@ def ornstein_uhlenbeck(
 
     They run along T and are discretised exactly.
     """
+    from scipy.signal import lfilter
+
     keep = np.exp(-step / correlation)
-    out: np.ndarray = random.standard_normal(shape) * np.sqrt(1 - keep**2)
-    out[:, 0] /= np.sqrt(1 - keep**2)
-    for k in range(1, shape[1]):
-        out[:, k] += keep * out[:, k - 1]
+    drive = random.standard_normal(shape) * np.sqrt(1 - keep**2)
+    drive[:, 0] /= np.sqrt(1 - keep**2)
+    out: np.ndarray = lfilter([1.0], [1.0, -keep], drive, axis=1)
     return out
 
 

@@ -478,10 +478,12 @@ class Channels:
             self._marks.guess((*CHANNELS, "wind_dir"), f"{text} north")
             return
         felt = best.startswith("felt")
+        side = " to port" if best.endswith("port") else ""
         new = BOW_WIND[1:] if felt else ("wind_speed", BOW_WIND[0])
         self._rename(dict(zip(old, new, strict=True)))
-        self._flipped |= {new[1]} if best.endswith("port") else set()
-        text = f"taken from the bow, where the {'apparent' if felt else 'true'} wind comes from:"
+        self._flipped |= {new[1]} if side else set()
+        wind = "apparent" if felt else "true"
+        text = f"taken from the bow{side}, where the {wind} wind comes from:"
         ratio = spread.get(best, 1.0) / max(spread.get("north", 1.0), 1e-9)
         text += f" so the true wind is steadiest ({ratio:.2f} of its spread if told from north)"
         self._marks.guess((*CHANNELS, new[1]), text)

@@ -69,8 +69,6 @@ _SIDES = {"latitude": {"N", "S"}, "longitude": {"E", "W", "O"}}
 _GERMANIC = re.compile(r"breite|l(?:ae|a)nge|breedte|lengte|zeit|tijd|kurs|koers|ruder|roer")
 Settings = Mapping[str, Mapping[str, Any]]
 """Column -> what its entry in a channel map says beside column and unit."""
-_SEVERAL = 3
-"""Columns of one channel from which each is an actuator: two may be one quantity, seen twice."""
 _LOOKED_AT = 24
 """Tables whose values are looked at; of the others only the header is."""
 
@@ -162,6 +160,8 @@ def draft_tables(
 
 def _wider(sheet: Sheet, clock: Clock, numeric: Sequence[str]) -> str:
     """Return what to do with a table whose columns name no channel."""
+    if not numeric:
+        return "the files have no column of numbers in common: give those of one kind"
     words = [name for name, cells in sheet.texts.items() if 1 < cells.nunique() <= len(cells) / 4]
     words = [name for name in words if name not in clock.columns]
     if len(numeric) == 1 and words:
@@ -315,12 +315,12 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
             alike.setdefault(channel, [names[channel]]).append(column)
     for channel, called in alike.items():
         each = {f"{channel}_{k}": one for k, one in enumerate(sorted(called, key=columns.index), 1)}
-        moves = state_channel(about[called[0]]) is not None
-        if len(called) < _SEVERAL or moves or names.keys() & each.keys():
+        if not channel.startswith("thrust") or names.keys() & each.keys():
+            # of a rudder or a shaft that is told twice, one is an indicator
             for column in called[1:]:
                 marks.note(CHANNELS, f"'{column}' may be {channel} as well as '{called[0]}' is")
             continue
-        # thrusters that no number and no side tells apart
+        # thrusters that no number tells apart
         del names[channel]
         names |= each
         marks.guess((*CHANNELS, f"{channel}_1"), f"{', '.join(called)} are taken for one each")
@@ -333,7 +333,9 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
         if (port in names) != (stbd in names):
             # one rudder: the side says where positive angles turn it
             one = port if port in names else stbd
-            names[one.rpartition("_")[0]] = names.pop(one)
+            alone, column = one.rpartition("_")[0], names.pop(one)
+            if names.setdefault(alone, column) != column:
+                marks.note(CHANNELS, f"'{column}' may be {alone} as well as '{names[alone]}' is")
     headed = headed or "psi" in names or any("course" in words.about for words in about.values())
     if "u" not in names and speeds and ("v" in names or not (placed and headed)):
         names["u"] = speeds[0]

@@ -53,7 +53,8 @@ _DATE = r"(?P<date>\d{1,4}\s*[-./年]\s*(?:\d{1,2}|[^\W\d_]{3,9}\.?)\s*[-./月]\
 _CLOCK = (
     # Italians and Finns write 08.30.00
     r"(?P<hour>\d{1,2})\s*(?:[:h時]|\.(?=\d\d\.\d\d))\s*(?P<minute>\d{1,2})\s*"
-    r"(?:(?:[:分']|(?<=\.\d\d)\.)\s*(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d+))?秒?)?\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+    r"(?:(?:[:分']|(?<=\.\d\d)\.)\s*(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d+))?秒?)?"
+    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
 )
 _FORM = (
     rf"^\s*(?:{_DATE}(?:[T ,_;]+|$))?(?:{_CLOCK})?\s*(?P<zone>Z|UTC|GMT|[+-]\d{{2}}:?\d{{2}})?\s*$"

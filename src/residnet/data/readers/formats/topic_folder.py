@@ -46,6 +46,8 @@ _CLOCK = re.compile(r"(?:time|timestamp)s?\s*[\[(]", re.IGNORECASE)
 """A time whose unit stands behind it."""
 _MOST = 16
 """Most actuators whose values stand in one column, told apart by another one."""
+_TOGETHER = 60.0
+"""Seconds within which the topics of a recording begin, those too that come once a minute."""
 # last parts of the names of a header stamp's two columns, in ROS 1 and ROS 2
 _SECONDS, _NANOSECONDS = ("secs", "sec"), ("nsecs", "nanosec")
 
@@ -59,22 +61,29 @@ def is_topic_folder(path: Path) -> bool:
     if not path.is_dir():
         return False
     heads: dict[Path, list[str]] = {}
-    begins: list[float] = []
+    begins: dict[Path, float] = {}
     for file in _files(path)[:200]:
         names, *row = _cells(file)[:2]
         if names != [""]:
             heads[file] = names
+        clock = _clock_of(names, _ARRIVAL)
         for name, cell in zip(names, *row, strict=False) if row else ():
-            if name == _clock_of(names, _ARRIVAL):
+            if name == clock:
                 with contextlib.suppress(ValueError):
-                    begins.append(float(cell))
+                    begins[file] = float(cell)
     if any(_stamp_columns(head) is not None for head in heads.values()):
         return True
     trips = partners({file: tuple(head) for file, head in heads.items()})
-    units = {unix_unit(np.array([begin])) for begin in begins}
+    units = {unix_unit(np.array([begin])) for begin in begins.values()}
     if any(len(files) > 1 for files in trips.values()) or len(units) > 1:
         return False
-    timed = [head for head in heads.values() if _clock_of(head, _ARRIVAL) is not None]
+    # a clock of any other name tells a log too: dates that begin together are of one recording
+    dated = units == {"s"} and np.ptp([*begins.values()]) < _TOGETHER
+    timed = [
+        head
+        for head in heads.values()
+        if (clock := _clock_of(head, _ARRIVAL)) in _ARRIVAL or (clock is not None and dated)
+    ]
     apart = len(timed) > 1 and 2 * len(timed) > len(heads) and len(set(map(tuple, timed))) > 1
     return apart and sum(_is_whole_log(head) for head in timed) < 2
 
@@ -128,6 +137,7 @@ class TopicFolderConfig(RecordingConfig):
         # what is wrong with other topics too is worth a look where that costs little
         take = EVERYTHING if size < LARGE else wanted
         called = [file.relative_to(root).with_suffix("").as_posix() for file in files]
+        called = _without_what_says_nothing(called)
         # ulog2csv begins each name with that of the recording
         own = f"{root.name}_"
         own = own if all(name.startswith(own) for name in called) else ""
@@ -207,6 +217,15 @@ class TopicFolderConfig(RecordingConfig):
         except DataError as error:
             text = f"topic {name}: {error}; the file is left out"
             return remark("will mislead", "no_time", text)
+
+
+def _without_what_says_nothing(called: list[str]) -> list[str]:
+    """Return topics without the folder that holds all of them, where its name tells of nothing."""
+    folders = {name.partition("/")[0] for name in called if "/" in name}
+    alone = len(folders) == 1 and all("/" in name for name in called)
+    if not alone or words_of(*folders).about:
+        return called
+    return _without_what_says_nothing([name.partition("/")[2] for name in called])
 
 
 def _cells(file: Path) -> list[list[str]]:
