@@ -332,10 +332,10 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
     for port, stbd in (("delta_port", "delta_stbd"), ("cmd_delta_port", "cmd_delta_stbd")):
         if (port in names) != (stbd in names):
             # one rudder: the side says where positive angles turn it
-            one = port if port in names else stbd
-            alone, column = one.rpartition("_")[0], names.pop(one)
-            if names.setdefault(alone, column) != column:
-                marks.note(CHANNELS, f"'{column}' may be {alone} as well as '{names[alone]}' is")
+            side = port if port in names else stbd
+            rudder, column = side.rpartition("_")[0], names.pop(side)
+            if names.setdefault(rudder, column) != column:
+                marks.note(CHANNELS, f"'{column}' may be {rudder} as well as '{names[rudder]}' is")
     headed = headed or "psi" in names or any("course" in words.about for words in about.values())
     if "u" not in names and speeds and ("v" in names or not (placed and headed)):
         names["u"] = speeds[0]
