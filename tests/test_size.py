@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (883, 128),
     "control": (3260, 351),
     "core": (1594, 247),
-    "data": (9861, 880),
+    "data": (9875, 881),
     "documents": (2505, 230),
     "dynamics": (2182, 277),
     "export": (1599, 175),
