@@ -50,7 +50,7 @@ COLUMNS = (
     "nominal overshoot [deg]",
     "worst beyond [%]",
     "diverged",
-    "training, CPU [s]",
+    "training [s]",
     "whole run, CPU [s]",
 )
 
@@ -95,7 +95,7 @@ def margins(run: Path, name: str) -> list[float]:
         DEG * nominal["overshoot"]["max"],
         max(beyond, default=math.nan),
         float(sum(row["diverged"] for row in rows if row["model"] == name and "diverged" in row)),
-        told[name].get("cpu_seconds", math.nan),
+        told[name].get("seconds", math.nan),
         float(cpu.read_text()) if cpu.is_file() else math.nan,
     ]
 
@@ -166,6 +166,7 @@ def trained(name: str, vessel: Drawn, out: Path, rng: np.random.Generator, *, lo
 
 def timed(file: Path, run: Path) -> None:
     """Carry out a config, tell what it says, and note its processor time beside it."""
+    from residnet.core.processes import spread
     from residnet.core.progress import Progress, listen
     from residnet.tasks.registry import load_task
 
@@ -174,7 +175,7 @@ def timed(file: Path, run: Path) -> None:
             print(progress.message, file=sys.stderr, flush=True)
 
     begun = time.process_time()
-    with listen(told):
+    with listen(told), spread():
         load_task(file, []).run(source=file, out=run, overwrite=True)
     (run / "cpu.txt").write_text(f"{time.process_time() - begun:.1f}")
 

@@ -189,10 +189,10 @@ def judge_ferry(number: int, random: torch.Generator, folder: Path) -> str:
     found = study(config)
     results, _ = written(config, found, RunFolder(folder / f"run_{number}"))
     against = objections("plsr", results)
-    model = found.models["plsr"]
+    model = found.whole.get("plsr", found.models["plsr"])
     file, base_force = folder / "feed_forward.pt", believed()
     force = RequiredForce(*model.force.parts(), mirrored=True)
-    ranges = [(low, high) for low, high in results["training_range"]]
+    ranges = [(low, high) for low, high in results["models"]["plsr"]["exported"]["range"]]
     TorchScriptExporter().export(ExportedForce("plsr", force, ranges, None), file)
     lag: Lag | None = model.lag
     ferry, told = config.ferry(str(true)), []

@@ -49,7 +49,7 @@ def config(name: str, *overrides: str) -> FerryStudyConfig:
 @pytest.fixture(scope="module")
 def short() -> Flown:
     torch.set_num_threads(1)
-    return study(config("operation", *SHORT, "~crossing"))
+    return study(config("operation", *SHORT, "~crossing", "models.plsr={fit: {kind: plsr}}"))
 
 
 def hull(name: str) -> Any:
@@ -148,6 +148,35 @@ def test_lag_and_no_residual_are_tried_with_every_order(short: Flown) -> None:
     nothing = identify(wanted, explained, believed)
     assert (nothing.lag, nothing.fit.notes["order"]) == (None, 0)
     torch.testing.assert_close(nothing.force(record.nu_dot, record.nu), force)
+
+
+def test_motions_to_port_tell_of_those_to_starboard(short: Flown) -> None:
+    believed, record = ForceModel(hull("milliampere")), short.record
+    fit = {"fit": {"kind": "plsr"}}
+    found = short.models["plsr"]
+    assert found.fit.notes["mirror"]
+    motion = torch.cat((record.nu_dot, record.nu), dim=-1)[~record.train].split(3, dim=-1)
+    sides = torch.tensor([1.0, -1.0, -1.0]).double()
+    there, back = (found.force(*(part * by for part in motion)) for by in (1.0, sides))
+    torch.testing.assert_close(there, back * sides, rtol=1e-6, atol=1e-3)
+    alone = identify(FerryModelConfig.model_validate({**fit, "mirror": False}), record, believed)
+    left, more = (sum(model.test_mse(record)) for model in (found, alone))
+    assert left < 0.7 * more
+    for k, (low, high) in enumerate(record.ranges(mirror=True)):
+        # nu_dot and nu: surge, sway and yaw
+        assert (low == -high) == (k % 3 > 0)
+    # a hull that leans to port is not taken for one that does not
+    pulled = record.command + torch.tensor([0.0, 200.0, 0.0]).double()
+    leaning = replace(record, command=pulled, averaged=pulled)
+    model = identify(FerryModelConfig.model_validate(fit), leaning, believed)
+    assert "mirror" not in model.fit.notes
+
+
+def test_what_searches_its_settings_leaves_with_the_whole_course(short: Flown) -> None:
+    assert set(short.whole) == {"plsr"}
+    # the model that is reported has not seen what judges it
+    half, whole = (of["plsr"].test_mse(short.record) for of in (short.models, short.whole))
+    assert all(more < less for more, less in zip(whole, half, strict=True))
 
 
 def test_a_feed_forward_worse_than_the_believed_one_is_objected_to() -> None:

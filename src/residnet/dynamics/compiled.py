@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
+from residnet.core.processes import free_cores
 from residnet.dynamics.c_code import (
     FUNCTIONS,
     Body,
@@ -537,7 +538,7 @@ class CompiledRollout:
         most: float = math.inf,
     ) -> None:
         self.rollout, self.dtype, self.own = rollout, x.dtype, tuple(own)
-        self.most, self.threads = math.inf, max(torch.get_num_threads(), 1)
+        self.most = math.inf
         self.apart = not math.isinf(most)
         alone = copy.deepcopy(rollout).double()
         held = _numbers(alone)
@@ -673,13 +674,13 @@ class CompiledRollout:
         return found, [*known, held]
 
     def run(self, name: str, blocks: int, *arguments: Tensor | int) -> None:
-        """Call a function of the library for all blocks of rows, in as many threads as torch."""
+        """Call a function of the library for all blocks of rows, spread over free cores."""
         function = getattr(self.library, name)
         given = [
             ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_long(a)
             for a in arguments
         ]
-        parts = min(self.threads, blocks)
+        parts = min(max(torch.get_num_threads(), free_cores()), blocks)
         ends = [ctypes.c_long(blocks * k // parts) for k in range(parts + 1)]
         if parts == 1:
             function(*given, *ends)

@@ -11,6 +11,7 @@ from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 _PARITY = dict.fromkeys(
     ("v", "r", "p", "phi", "delta", "tau_y", "tau_n", "wind_v"), -1
 ) | dict.fromkeys(("u", "w", "q", "z", "theta", "n", "delta_s", "tau_x", "wind_u", "wind_mag"), 1)
+_PARITY |= {f"{name}_dot": _PARITY[name] for name in ("u", "v", "w", "p", "q", "r")}
 _ANGLES = ("delta", "rudder", "azimuth")
 
 

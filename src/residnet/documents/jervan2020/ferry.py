@@ -6,7 +6,7 @@ residual models are identified from the course, and the course is flown again wi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -250,12 +250,12 @@ class FerryStudyConfig(Study, ComputingTask):
         chain = [name]
         while below := self.models[chain[0]].on:
             chain.insert(0, below)
-        rows = [results["models"][one] for one in chain]
+        rows = [results["models"][one]["exported"] for one in chain]
         force = ForceModel(force_hull(self.believed)[0].hull)
         for row in rows:
             numbers = (torch.tensor(row[key]).double() for key in ("coefficients", "intercept"))
             force = force.extended(Correction(row["terms"], *numbers))
-        ranges = [(low, high) for low, high in results["training_range"]]
+        ranges = [(low, high) for low, high in rows[-1]["range"]]
         made = RequiredForce(*force.parts(), mirrored=True)
         exported = ExportedForce(name, made, ranges, rows[-1]["notes"].get("lag"))
         return asked.write(exported, objections(name, results), f"{name}_feed_forward")
@@ -339,7 +339,8 @@ class Flown:
         record: its log, of which one half identifies the models and the other tests them.
         unmodelled: mean square of the believed model's residual on the test half, by axis in N^2,
             N^2, (N m)^2.
-        models: fitted models by name.
+        models: fitted models by name, each from one half of the course.
+        whole: those that search their settings, fitted to the whole course as they are exported.
         courses: the course by model, `believed` first.
         crossings: the crossing by model, `believed` first.
         alone: the course without feedback, by model.
@@ -351,6 +352,7 @@ class Flown:
     record: Record
     unmodelled: list[float]
     models: dict[str, FittedModel]
+    whole: dict[str, FittedModel]
     courses: dict[str, Flight]
     crossings: dict[str, Flight]
     alone: dict[str, Flight]
@@ -392,6 +394,13 @@ def study(config: FerryStudyConfig) -> Flown:
     models: dict[str, FittedModel] = {}
     for name, model in config.models.items():
         models[name] = identify(model, record, models[model.on].force if model.on else believed)
+    every_sample = replace(record, train=torch.ones_like(record.train))
+    # what the judged half could choose by itself leaves with all that is known
+    whole = {
+        name: identify(model, every_sample, believed)
+        for name, model in config.models.items()
+        if model.searched and not model.on and models[name].fit.notes["order"] > 0
+    }
     flying = {name: models[name] for name, model in config.models.items() if model.fly}
     every: dict[str, Feed] = {_BELIEVED: (believed, None)}
     every |= {name: (model.force, model.lag) for name, model in flying.items()}
@@ -431,6 +440,7 @@ def study(config: FerryStudyConfig) -> Flown:
         record,
         mse(residual[~record.train]),
         models,
+        whole,
         {_BELIEVED: first, **flown(ferry, config.course, flying)},
         flown(ferry, config.crossing, every) if config.crossing is not None else {},
         flown(ferry, config.course, every, feedback=False) if config.feed_forward_alone else {},
@@ -493,8 +503,6 @@ def written(
 
     The models' equations are written into the folder.
     """
-    # the range of what identified the models, not of the whole course
-    motion = torch.cat((found.record.nu_dot, found.record.nu), dim=-1)[found.record.train]
     figures: list[Figure] = []
     equations: dict[str, HullEquations] = {}
     refused = dict.fromkeys(found.models, "")
@@ -524,6 +532,7 @@ def written(
             "notes": model.fit.notes,
             "not_forward": refused[name],
             **fit_as_json(config.models[name].terms, model.fit),
+            "exported": _exported(config.models[name].terms, found, name),
         }
     flights = {
         "course": found.courses,
@@ -535,7 +544,6 @@ def written(
     content = {
         "schema": "residnet.ferry/1",
         "run": config.name,
-        "training_range": list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True)),
         "unmodelled_test_mse": found.unmodelled,
         "true_coefficients": missing_coefficients(config.true, config.believed),
         "models": models,
@@ -547,6 +555,15 @@ def written(
         "forward": forward,
     }
     return content, figures
+
+
+def _exported(terms: Sequence[str], found: Flown, name: str) -> dict[str, Any]:
+    """Return a model as it is exported, with the range of what it was fitted to."""
+    record, model = found.record, found.models[name]
+    if name in found.whole:
+        record, model = replace(record, train=torch.ones_like(record.train)), found.whole[name]
+    ranges = record.ranges(mirror=bool(model.fit.notes.get("mirror")))
+    return {**fit_as_json(terms, model.fit), "notes": model.fit.notes, "range": ranges}
 
 
 def _flights(flights: Mapping[str, Flight], kind: str) -> list[Figure]:

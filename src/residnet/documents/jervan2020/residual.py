@@ -7,6 +7,7 @@ regressed on basis functions of the motion (chapters 3 and 4); a model runs forw
 
 from __future__ import annotations
 
+import itertools
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -38,6 +39,7 @@ from residnet.physics.force_model import (
     column_scale,
 )
 from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.symmetry import term_parity
 from residnet.physics.terms import TermLibrary, parse_term
 from residnet.regression.estimator import Estimator, require_data
 from residnet.regression.least_squares import CentredLeastSquares, ElasticNet
@@ -68,6 +70,8 @@ _RANK_TOLERANCE = 1e-7
 """Regressors with singular values below this share of the largest count as dependent."""
 _LEAST_EARTH_FORCE_SPREAD = 0.02
 """Least root mean square that turning must leave of a unit force fixed in earth axes."""
+_SIDES = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+"""Signs of surge, sway and yaw in the mirror."""
 _COLOURS_SPAN = (6.3, 316.0)
 """Shares in % of the first and the last colour of a surface."""
 
@@ -313,17 +317,20 @@ class ResidualModelConfig(Config):
             follows the command through it. Null where an estimator searches its order: with lag,
             without, and no residual at all are then tried too, over the same left-out folds; for
             other estimators null is without.
+        mirror: what a motion to port shows is taken to hold to starboard too, as for a hull that is
+            alike on both sides. Null tries both ways where `lag` does.
         earth: also identify a force that is constant in earth axes, such as that of wind.
     """
 
     fit: RegressionConfig
     terms: tuple[str, ...] = FERRY_TERMS
     lag: bool | None = None
+    mirror: bool | None = None
     earth: bool = False
 
     @property
     def searched(self) -> bool:
-        """Whether lag and no residual at all are candidates beside the orders."""
+        """Whether lag, mirror and no residual at all are candidates beside the orders."""
         return self.lag is None and isinstance(self.fit, PlsrRegression) and self.fit.order is None
 
     def model_post_init(self, context: Any) -> None:
@@ -364,6 +371,16 @@ class Record:
     def dt(self) -> float:
         """Sampling interval in s."""
         return float(self.t[1] - self.t[0])
+
+    def ranges(self, *, mirror: bool) -> list[tuple[float, float]]:
+        """Return the least and most of nu_dot and nu of the training samples, six.
+
+        With `mirror` the mirror images of the samples count too.
+        """
+        motion = torch.cat((self.nu_dot, self.nu), dim=-1)[self.train]
+        if mirror:
+            motion = torch.cat((motion, motion * torch.cat((_SIDES, _SIDES))))
+        return list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True))
 
     def smoothed(self) -> Record:
         """Return the record with the most likely motion under the known noise of the sensors."""
@@ -443,12 +460,21 @@ def fit_model(config: ResidualModelConfig, record: Record, base: ForceModel) -> 
         earth_force = constant_force(x[train], y[train], -earth_axes[train])
         y = y + torch.einsum("nad,d->na", earth_axes, earth_force)
         notes["earth"] = dict(zip(("north", "east"), earth_force.tolist(), strict=True))
+    seen, shown, fold = x[train], y[train], record.fold[train]
+    if config.mirror:
+        signs = mirror_signs(config.terms)
+        if signs is None:
+            raise FitError("mirror: not all basis functions are known to mirror; leave it out")
+        seen, shown = (
+            torch.cat((part, part * by)) for part, by in ((seen, signs), (shown, _SIDES))
+        )
+        fold, notes["mirror"] = fold.repeat(2), True
     data = Regression(
         config.terms,
-        x[train],
-        y[train],
-        column_scale(config.terms, torch.nan_to_num(x[train])),
-        torch.unique(record.fold[train], return_inverse=True)[1],
+        seen,
+        shown,
+        column_scale(config.terms, torch.nan_to_num(seen)),
+        torch.unique(fold, return_inverse=True)[1],
         (x[~train], y[~train]),
     )
     fit = config.fit.fit(data)
@@ -458,16 +484,22 @@ def fit_model(config: ResidualModelConfig, record: Record, base: ForceModel) -> 
 
 
 def _searched(config: ResidualModelConfig, record: Record, base: ForceModel) -> FittedModel:
-    """Return the model with lag, without, or without a residual, by the error over left-out folds.
+    """Return the model of least error over left-out folds.
 
-    Errors are in units of what the base leaves, so that no residual has an error of one.
+    Tried are lag and mirror, each with and without, and no residual. Errors are in units of what
+    the base leaves, so that no residual has an error of one.
     """
     none = FittedModel(base, None, Fit(torch.zeros(0), torch.zeros(0), torch.zeros(0)))
     nothing = torch.tensor(mse(none.remaining(record)[record.train]))
     tried, faults = [], []
-    for lag in (False, True):
+    mirrors = [False, True] if config.mirror is None else [config.mirror]
+    if mirror_signs(config.terms) is None and config.mirror is None:
+        mirrors = [False]
+    for lag, mirror in itertools.product((False, True), mirrors):
         try:
-            found = fit_model(config.model_copy(update={"lag": lag}), record, base)
+            found = fit_model(
+                config.model_copy(update={"lag": lag, "mirror": mirror}), record, base
+            )
         except FitError as error:
             faults.append(error)
             continue
@@ -482,6 +514,12 @@ def _searched(config: ResidualModelConfig, record: Record, base: ForceModel) -> 
     zero = torch.zeros_like(best.fit.coefficients)
     fit = Fit(zero, zero[0], zero, {"order": 0, "left_out": 1.0})
     return FittedModel(base.extended(Correction(config.terms, zero, zero[0])), None, fit)
+
+
+def mirror_signs(terms: Sequence[str]) -> Tensor | None:
+    """Return the sign [J] that each basis function changes by in the mirror; None if unknown."""
+    signs = [parity for term in terms if (parity := term_parity(term, MOTION)) is not None]
+    return torch.tensor(signs, dtype=torch.float64) if len(signs) == len(terms) else None
 
 
 def constant_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
