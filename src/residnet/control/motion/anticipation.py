@@ -148,18 +148,19 @@ class Assisted(Policy):
         self.dt = dt
         self.leads = any(lag is not None for lag in lags)
         known = [lag or Lag(frequency=2.0, damping=1.0) for lag in lags]
-        self.led = torch.tensor([[lag is not None] for lag in lags])
-        self.frequency = torch.tensor([[lag.frequency] for lag in known], dtype=torch.float64)
-        self.damping = torch.tensor([[lag.damping] for lag in known], dtype=torch.float64)
-        self.gains = [
-            factor * (_MEND * self.frequency) ** power
-            for factor, power in ((4.0, 1), (6.0, 2), (4.0, 3), (1.0, 4))
+        told = [
+            [float(lag is not None), one.frequency, one.damping]
+            for lag, one in zip(lags, known, strict=True)
         ]
         rows = [
             [[0.0, 1.0, 0.0], [-(w**2), -2 * z * w, w**2], [0.0, 0.0, 0.0]]
             for w, z in ((lag.frequency, lag.damping) for lag in known)
         ]
-        self.step = torch.linalg.matrix_exp(torch.tensor(rows, dtype=torch.float64) * dt)
+        step = torch.linalg.matrix_exp(torch.tensor(rows, dtype=torch.float64) * dt)
+        self.register_buffer("lag", torch.tensor(told, dtype=torch.float64), persistent=False)
+        self.register_buffer("step", step, persistent=False)
+        self.lag: Tensor
+        self.step: Tensor
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         n = self.feedback.n_state
@@ -169,7 +170,11 @@ class Assisted(Policy):
             return needed + correction, torch.cat((integral, s[:, n:]), dim=-1)
         force, rate, missed, twice = s[:, n:].unflatten(-1, (4, 3)).unbind(1)
         error = needed - force
-        k1, k2, k3, k4 = self.gains
+        led, frequency, damping = self.lag.split(1, dim=1)
+        k1, k2, k3, k4 = (
+            factor * (_MEND * frequency) ** power
+            for factor, power in ((4.0, 1), (6.0, 2), (4.0, 3), (1.0, 4))
+        )
         drive = (
             reference[:, 15:18]
             + k1 * (reference[:, 12:15] - rate)
@@ -177,7 +182,7 @@ class Assisted(Policy):
             + k3 * missed
             + k4 * twice
         )
-        lead = force + (2 * self.damping / self.frequency) * rate + drive / self.frequency**2
+        lead = force + (2 * damping / frequency) * rate + drive / frequency**2
         state = self.step @ torch.stack((force, rate, lead), dim=1)
         memory = torch.cat(
             (
@@ -189,7 +194,7 @@ class Assisted(Policy):
             ),
             dim=-1,
         )
-        return torch.where(self.led, lead, needed) + correction, memory
+        return torch.where(led > 0.0, lead, needed) + correction, memory
 
 
 def reference_row(motion: Derivatives, needed: Tensor) -> Tensor:

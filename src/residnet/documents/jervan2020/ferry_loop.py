@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import final
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.control.base import ClosedLoop, GivenReference, Reference
+from residnet.control.base import ClosedLoop, Policy
 from residnet.control.guidance.crossing import Crossing, CrossingConfig
+from residnet.control.heading.conditions import quickly
 from residnet.control.motion.anticipation import Assisted, Lag, course, needed_force, reference_row
 from residnet.control.motion.pid import Allocated, Gain, MotionPID, MotionPIDConfig
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
@@ -30,8 +32,9 @@ from residnet.core.config import (
 )
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.layout import ACTUATORS, MOTION, POSE, VELOCITIES
-from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.compiled import CompiledRollout
+from residnet.dynamics.rollout import FreeRun, Rollout, Source
+from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
 from residnet.judge.courses import Tracking, tracking
 from residnet.physics.actuators import ForceActuators
 from residnet.physics.force_model import ForceModel
@@ -39,6 +42,8 @@ from residnet.physics.hull import HullConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
+_WORTH_COMPILING = 2500
+"""Steps of a flight that take about as long as compiling it does."""
 Feed = tuple[ForceModel, Lag | None]
 """A model as feed-forward, and the lag of the thrusters that it leads."""
 
@@ -122,6 +127,29 @@ class Disturbance(Config):
 def measured(x: Tensor, noise: Tensor) -> Tensor:
     """Return states [..., nx] with noise [..., 6] on pose and velocities."""
     return torch.cat((x[..., MOTION] + noise, x[..., ACTUATORS]), dim=-1)
+
+
+@final
+class Followed(Source):
+    """A controller whose reference stands behind the inputs of the plant, and behind it the noise.
+
+    Args:
+        policy: the controller.
+        given: number of the plant's inputs.
+        reference: number of columns of the reference.
+    """
+
+    def __init__(self, policy: Policy, given: int, reference: int) -> None:
+        super().__init__()
+        self.policy, self.sizes = policy, (given, reference)
+
+    def initial(self, x: Tensor) -> Tensor:
+        return self.policy.initial_state(x)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        given, reference, noise = w.split((*self.sizes, w.shape[1] - sum(self.sizes)), dim=1)
+        command, memory = self.policy(measured(x, noise), reference, memory)
+        return torch.cat((command, given[:, command.shape[1] :]), dim=1), memory
 
 
 @final
@@ -238,28 +266,39 @@ class Ferry:
             DataError: where the closed loop is unstable.
         """
         gains, step, lags = self.loop, self.loop.step, [lag for _, lag in feeds]
-        guidance: Reference
-        if isinstance(path, CrossingConfig):
-            guidance, steps = Crossing(path, step, feeds), round(path.duration / step)
-        else:
-            motion = course(path, step)
-            needed = [needed_force(model, motion, lag, step) for model, lag in feeds]
-            asked = torch.stack([reference_row(motion, force) for force in needed])
-            guidance, steps = GivenReference(asked), len(motion.pose)
         if not feedback:
             gains = gains.model_copy(update={"frequency": (0.0, 0.0, 0.0)})
         pid = gains.pid(self.believed.mass)
-        w = torch.zeros(len(feeds), steps, len(self.true.inputs), dtype=torch.float64)
+        policy = Allocated(Assisted(pid, lags, step), self.thrusters)
+        inputs = len(self.true.inputs)
+        asked = torch.zeros(len(feeds), 0, 0, dtype=torch.float64)
+        if isinstance(path, CrossingConfig):
+            steps = round(path.duration / step)
+        else:
+            motion = course(path, step)
+            steps = len(motion.pose)
+            needed = [needed_force(model, motion, lag, step) for model, lag in feeds]
+            asked = torch.stack([reference_row(motion, force) for force in needed])
+        w = torch.zeros(len(feeds), steps, inputs, dtype=torch.float64)
         if self.disturbance != Disturbance():
             for key, force in self.disturbance:
                 w[:, :, self.true.inputs.index(f"force_{key}")] = force
         noise = (self.noise or MotionNoise()).draw((len(feeds), steps), self.seed)
-        loop = ClosedLoop(Allocated(Assisted(pid, lags, step), self.thrusters), guidance)
-        source = loop if self.noise is None else Sensed(loop, noise[..., MOTION])
         x0 = torch.zeros(len(feeds), len(self.true.state), dtype=torch.float64)
         with torch.no_grad():
-            model = Rollout(TracedPlantDynamics(self.true, step), source)
-            states, inputs, _ = model(x0, w, x0[:, :0])
+            if isinstance(path, CrossingConfig):
+                guidance = Crossing(path, step, feeds)
+                source = Sensed(ClosedLoop(policy, guidance), noise[..., MOTION])
+                model: FreeRun = Rollout(TracedPlantDynamics(self.true, step), source)
+                given = (x0, w, x0[:, :0])
+            else:
+                followed = Followed(policy, inputs, asked.shape[2])
+                model = Rollout(PlantDynamics(self.true, step), followed)
+                given = (x0, torch.cat((w, asked, noise[..., MOTION]), dim=2), x0[:, :0])
+                if steps > _WORTH_COMPILING:
+                    own = ["source.policy.policy.lag", "source.policy.policy.step"]
+                    model = quickly(model, partial(CompiledRollout, own=own), given)
+            states, acted, _ = model(*given)
             states = states[:, :-1]
             if not bool(torch.isfinite(states).all()):
                 raise DataError(
@@ -267,16 +306,14 @@ class Ferry:
                     " is unstable"
                 )
             seen = measured(states, noise[..., MOTION])
-            if isinstance(guidance, GivenReference):
-                references = guidance.values
-            else:
-                memory, followed = guidance.initial_state(states[:, 0]), []
+            if isinstance(path, CrossingConfig):
+                memory, rows = guidance.initial_state(states[:, 0]), []
                 for k in range(steps):
                     reference, memory = guidance(seen[:, k], k, memory)
-                    followed.append(reference)
-                references = torch.stack(followed, dim=1)
+                    rows.append(reference)
+                asked = torch.stack(rows, dim=1)
             return [
-                self._flight(states[i], inputs[i], references[i], seen[i], noise[i], pid)
+                self._flight(states[i], acted[i], asked[i], seen[i], noise[i], pid)
                 for i in range(len(feeds))
             ]
 
