@@ -143,6 +143,7 @@ class Trials:
         self.config, self.steering, self.conditions = config, steering, conditions
         self.changes, self.compiler = changes, compiler
         self.loop: CompiledRollout | None = None
+        self.given: dict[int, tuple[HeadingChanges, tuple[Tensor, Tensor, Tensor]]] = {}
 
     def costs(self, candidates: dict[str, Tensor]) -> Tensor:
         """Return the mean cost [C] in s of candidates, parameters [C] by name.
@@ -157,18 +158,23 @@ class Trials:
             some = {name: values[first : first + at_once] for name, values in candidates.items()}
             size = len(next(iter(some.values())))
             rows = {name: values.repeat_interleave(flights) for name, values in some.items()}
-            flown = self._flown(rows, self.changes.repeated(size))
+            flown = self._flown(rows, size)
             cost = flown.measured(self.conditions)["cost"].reshape(size, flights)
             out.append(cost.double().nan_to_num(_LOST, _LOST).clamp(max=_LOST).mean(1))
         return torch.cat(out)
 
-    def _flown(self, rows: dict[str, Tensor], changes: HeadingChanges) -> ConditionedFlights:
+    def _flown(self, rows: dict[str, Tensor], size: int) -> ConditionedFlights:
         policy = self.config.rows(rows, self.steering).float().requires_grad_(False)
-        run = ConditionedRun(self.steering.vessel, policy, changes.dt, "heun", torch.float32)
+        run = ConditionedRun(self.steering.vessel, policy, self.changes.dt, "heun", torch.float32)
+        if size not in self.given:
+            again = self.changes.repeated(size)
+            x, w, s = run.given(again)
+            # rows next to each other in memory, as the compiled flights take them
+            self.given[size] = again, (x, w.permute(1, 2, 0).contiguous().permute(2, 0, 1), s)
+        changes, given = self.given[size]
         if self.compiler is None:
             return run.fly(changes)
         rollout = run.rollout(max(int(changes.delay.max()), 1))
-        given = run.given(changes)
         try:
             if self.loop is None:
                 own = [f"source.policy.{name}" for name in self.config.own]
