@@ -111,3 +111,28 @@ class ClosedLoop(Source):
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return the rows whose guidance has arrived."""
         return self.reference.finished(x, k, memory[:, : self.reference.n_state])
+
+
+@final
+class Followed(Source):
+    """A controller whose reference stands behind the inputs of a rollout, w [B, m + r].
+
+    What does not count steps can be compiled. Its commands take the first columns of the m.
+
+    Args:
+        policy: the controller.
+        inputs: number m of the vessel's inputs.
+    """
+
+    def __init__(self, policy: Policy, inputs: int) -> None:
+        super().__init__()
+        self.policy, self.inputs, self.counts = policy, inputs, False
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Return the controller's memory."""
+        return self.policy.initial_state(x)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the inputs [B, m]: the command, then what else was given."""
+        command, memory = self.policy(x, w[:, self.inputs :], memory)
+        return torch.cat((command, w[:, command.shape[-1] : self.inputs]), dim=-1), memory

@@ -79,7 +79,7 @@ def compiled(rollout: Rollout, steps: int) -> FreeRun:
 
 
 def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> FreeRun:
-    apart = x0.device.type != "cpu" or not rollout.source.given or not w.numel()
+    apart = x0.device.type != "cpu" or rollout.source.counts or not w.numel()
     if steps < WORTH_SCRIPTING or apart:
         return scripted(rollout, steps)
     out = io.BytesIO()

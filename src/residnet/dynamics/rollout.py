@@ -26,6 +26,9 @@ class Source(nn.Module, ABC):
 
     Args:
         given: whether they are those that the rollout is given, whatever the state.
+
+    Attributes:
+        counts: whether the number of the step matters.
     """
 
     __constants__: ClassVar = ["given"]
@@ -33,7 +36,7 @@ class Source(nn.Module, ABC):
     def __init__(self, *, given: bool = False) -> None:
         super().__init__()
         self.may_stop = False
-        self.given = given
+        self.given, self.counts = given, not given
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the source's memory [B, k] at the start, from the initial state x [B, nx]."""

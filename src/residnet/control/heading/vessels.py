@@ -11,13 +11,14 @@ from typing import final
 import torch
 from torch import Tensor
 
-from residnet.control.base import ClosedLoop, GivenReference, Policy
+from residnet.control.base import Followed, Policy
 from residnet.control.heading.turning import Steered, Turning, measure_turning
 from residnet.core.errors import ConfigError
 from residnet.core.frames import wrap
 from residnet.core.names import nearest
 from residnet.dynamics.actuated import commanded
 from residnet.dynamics.base import Dynamics
+from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.steering_variation import VariedModel, VariedPlant
@@ -260,10 +261,11 @@ def fly(
     for name, value in (weather or {}).items():
         w[:, vessel.inputs.index(name)] = value
     steps = round(duration / dt)
-    loop: Source = ClosedLoop(policy.double(), GivenReference(heading[:, None, None]))
+    loop: Source = Followed(policy.double(), w.shape[1])
+    given = torch.cat((w, heading[:, None]), dim=1).unsqueeze(1).expand(-1, steps, -1)
     with torch.no_grad():
         free = Rollout(vessel.model(dt), loop if surround is None else surround(loop))
-        states, inputs, _ = free(x, w.unsqueeze(1).expand(-1, steps, -1), vessel.memory(variation))
+        states, inputs, _ = compiled(free, steps)(x, given, vessel.memory(variation))
     return Flights(states, inputs, heading, dt, vessel.state)
 
 

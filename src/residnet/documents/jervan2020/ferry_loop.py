@@ -14,7 +14,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.control.base import ClosedLoop, Policy
+from residnet.control.base import ClosedLoop, Followed, Policy
 from residnet.control.guidance.crossing import Crossing, CrossingConfig
 from residnet.control.heading.conditions import quickly
 from residnet.control.motion.anticipation import Assisted, Lag, course, needed_force, reference_row
@@ -130,26 +130,19 @@ def measured(x: Tensor, noise: Tensor) -> Tensor:
 
 
 @final
-class Followed(Source):
-    """A controller whose reference stands behind the inputs of the plant, and behind it the noise.
+class Sensing(Policy):
+    """A controller that sees noise [B, 6] on pose and velocities, which is behind its reference."""
 
-    Args:
-        policy: the controller.
-        given: number of the plant's inputs.
-        reference: number of columns of the reference.
-    """
-
-    def __init__(self, policy: Policy, given: int, reference: int) -> None:
+    def __init__(self, policy: Policy) -> None:
         super().__init__()
-        self.policy, self.sizes = policy, (given, reference)
+        self.policy, self.n_state = policy, policy.n_state
 
-    def initial(self, x: Tensor) -> Tensor:
+    def initial_state(self, x: Tensor) -> Tensor:
         return self.policy.initial_state(x)
 
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        given, reference, noise = w.split((*self.sizes, w.shape[1] - sum(self.sizes)), dim=1)
-        command, memory = self.policy(measured(x, noise), reference, memory)
-        return torch.cat((command, given[:, command.shape[1] :]), dim=1), memory
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        command, s = self.policy(measured(x, reference[:, -6:]), reference[:, :-6], s)
+        return command, s
 
 
 @final
@@ -292,11 +285,11 @@ class Ferry:
                 model: FreeRun = Rollout(TracedPlantDynamics(self.true, step), source)
                 given = (x0, w, x0[:, :0])
             else:
-                followed = Followed(policy, inputs, asked.shape[2])
+                followed = Followed(Sensing(policy), inputs)
                 model = Rollout(PlantDynamics(self.true, step), followed)
                 given = (x0, torch.cat((w, asked, noise[..., MOTION]), dim=2), x0[:, :0])
                 if steps > _WORTH_COMPILING:
-                    own = ["source.policy.policy.lag", "source.policy.policy.step"]
+                    own = [f"source.policy.policy.policy.{name}" for name in ("lag", "step")]
                     model = quickly(model, partial(CompiledRollout, own=own), given)
             states, acted, _ = model(*given)
             states = states[:, :-1]
