@@ -20,6 +20,7 @@ __all__ = [
     "POSE",
     "STATE",
     "VELOCITY",
+    "WIND_INPUTS",
     "nearest",
     "shown",
     "si_unit",
@@ -39,6 +40,8 @@ END_UNITS = {"position": "m", "heading": "rad", "depth": "m", "attitude": "rad"}
 
 ACCELERATION = tuple(f"{name}_dot" for name in VELOCITY)
 
+WIND_INPUTS = ("wind_speed", "wind_dir")
+"""True wind as inputs of a plant: speed [m/s] and where it comes FROM [rad], earth-fixed."""
 BOW_WIND = ("wind_angle", "apparent_wind_speed", "apparent_wind_angle")
 """A wind that is told from the bow: where the true wind comes from, and the wind that is felt."""
 

@@ -89,49 +89,36 @@ def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarr
     reach = 2 * half
     if at.size <= 2 * reach:
         return out
-    known, last = values[at], at.size - 1
+    known = values[at]
     padded = np.pad(known, reach, mode="reflect", reflect_type="odd")
 
-    def straight(of: np.ndarray, i: int) -> np.ndarray:
-        """Return the middle [K] of the straight line between the i-th neighbours of samples [K]."""
-        return np.asarray(0.5 * (padded[of + i] + padded[of + 2 * reach - i]))
+    def neighbours(values: np.ndarray, i: int, k: slice) -> np.ndarray:
+        return values[k.start + i : k.stop + i]
 
-    def look(of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return how far the neighbours [K, samples] of samples [K] lie from the straight lines
-        between theirs, the medians [K] of that, and the distances [K] from these.
-        """
-        near = last - np.abs(last - np.abs(of[:, None] + np.arange(-half, half + 1)))
-        there, bent = np.zeros(known.size, dtype=bool), np.empty(known.size)
-        there[near] = True
-        some = np.flatnonzero(there)
-        pairs = _medians(lambda k: [straight(some[k], i) for i in range(reach)], some.size)
-        bent[some] = known[some] - pairs
-        windows = bent[near]
-        median = _medians(lambda k: [*windows[k].T], of.size)
-        return windows, median, np.abs(bent[of] - median)
-
-    of = spread_rows(known.size, _FEW, _SPREAD)
-    windows, median, distance = look(of)
+    # how far samples lie from the straight lines between their neighbours, and how usual that is
+    lines = _medians(
+        lambda k: [
+            0.5 * (neighbours(padded, i, k) + neighbours(padded, 2 * reach - i, k))
+            for i in range(reach)
+        ],
+        known.size,
+    )
+    bent = np.pad(known - lines, half, mode="reflect")
+    count = 2 * half + 1
+    median = _medians(lambda k: [neighbours(bent, i, k) for i in range(count)], known.size)
+    distance = np.abs(bent[half:-half] - median)
+    some = distance[spread_rows(known.size, _FEW, _SPREAD)]
     # a coarse channel flickers by single steps of its resolution, a spread at the level of rounding
     # is none
-    resolution = 2.0 * float(np.quantile(distance[distance > 0.0], 0.1)) if distance.any() else 0.0
+    resolution = 2.0 * float(np.quantile(some[some > 0.0], 0.1)) if some.any() else 0.0
     floor = max(
-        SIGMA_OF_MAD * float(np.median(distance)), resolution, 1e-9 * float(np.abs(known).max())
+        SIGMA_OF_MAD * float(np.median(some)), resolution, 1e-9 * float(np.abs(known).max())
     )
-    if of.size < known.size:
-        # what stands out leaves half of the straight lines by more than this
-        least, seen = (sigmas - 1.0) * floor, np.zeros(known.size, dtype=bool)
-        for start in range(0, known.size, _CACHED):
-            part, stop = known[start : start + _CACHED], min(start + _CACHED, known.size)
-            for i in range(half - 1, reach):
-                sums = padded[start + i : stop + i] + padded[start + 2 * reach - i :][: part.size]
-                seen[start:stop] |= np.abs(sums - 2.0 * part) > 2.0 * least
-        of = np.flatnonzero(seen)
-        windows, median, distance = look(of)
     # what a smooth channel bends by anyhow is no outlier where it stops bending
     far = np.flatnonzero(distance > sigmas * np.maximum(floor, np.abs(median)))
-    spread = SIGMA_OF_MAD * np.median(np.abs(windows[far] - median[far, None]), axis=1)
-    out[at[of[far]]] = distance[far] > sigmas * spread
+    windows = bent[far[:, None] + np.arange(count)]
+    spread = SIGMA_OF_MAD * np.median(np.abs(windows - median[far, None]), axis=1)
+    out[at[far]] = distance[far] > sigmas * spread
     return out
 
 

@@ -16,11 +16,10 @@ from residnet.core.config import Config, Metres, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.log import Log
-from residnet.core.names import BOW_WIND, CHANNEL_UNITS, POSE, STATE
+from residnet.core.names import BOW_WIND, CHANNEL_UNITS, POSE, STATE, WIND_INPUTS
 from residnet.data.channels import noise_of, spikes, without_held
 from residnet.data.readers.base import unwrap
 from residnet.data.readers.recording import remark
-from residnet.physics.environment import WIND_INPUTS
 
 _DENSE = 0.9
 """Share of the samples that hold a value in a channel that is measured at every sample."""

@@ -21,9 +21,9 @@ from residnet.core.config import (
     Seconds,
 )
 from residnet.core.errors import ConfigError
-from residnet.core.names import CHANNEL_UNITS, VELOCITY, nearest
+from residnet.core.names import CHANNEL_UNITS, VELOCITY, WIND_INPUTS, nearest
 from residnet.dynamics.rollout import Source
-from residnet.physics.environment import WIND_INPUTS, Waves, WavesConfig
+from residnet.physics.environment import Waves, WavesConfig
 from residnet.physics.plant import Plant
 
 

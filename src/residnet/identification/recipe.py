@@ -13,13 +13,12 @@ import torch
 from residnet.baselines.sets import Roles, submerged
 from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
-from residnet.core.names import BOW_WIND, CHANNEL_UNITS
+from residnet.core.names import BOW_WIND, CHANNEL_UNITS, WIND_INPUTS
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
 from residnet.data.motion import BRIDGED, without_pauses
 from residnet.data.prepare import Prepared
 from residnet.judge.protocol import EvaluationConfig, Windows
-from residnet.physics.environment import WIND_INPUTS
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
 from residnet.physics.symmetry import live_of, mirrored_channels, wrong_parity
 

@@ -29,6 +29,7 @@ from residnet.core.columns import velocities_on
 from residnet.core.errors import DataError
 from residnet.core.format import interval, number, shown_unit
 from residnet.core.layout import LATERAL, POSE, SURGE, SWAY
+from residnet.core.names import WIND_INPUTS
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
 from residnet.dynamics.ensemble import MeanOfTrajectories
@@ -36,7 +37,6 @@ from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
-from residnet.physics.environment import WIND_INPUTS
 from residnet.physics.symmetry import axis_parities, channel_parity, pair_parity, partners_of
 
 SCHEMA = "residnet.sanity/1"

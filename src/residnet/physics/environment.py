@@ -17,9 +17,6 @@ from torch import Tensor, nn
 from residnet.core.config import Config, Metres, Radians, Seconds
 from residnet.physics.parameters import Density, SquareMetres
 
-WIND_INPUTS = ("wind_speed", "wind_dir")
-"""True wind as inputs of a plant: speed [m/s] and where it comes FROM [rad], earth-fixed."""
-
 
 class WindLoadConfig(Config, ABC):
     """The part of a vessel file that describes the hull above water.

@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from residnet.core.errors import ConfigError
 from residnet.core.frames import along_axes, cross, to_body, to_earth, upright
 from residnet.core.layout import PLANAR, StateLayout
+from residnet.core.names import WIND_INPUTS
 from residnet.physics.actuators import Actuators
-from residnet.physics.environment import WIND_INPUTS, WindLoadConfig
+from residnet.physics.environment import WindLoadConfig
 from residnet.physics.terms import TermLibrary
 
 ROLLING = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))

@@ -18,10 +18,9 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
 from residnet.core.layout import PLANAR, ROLL, SIX, Live
-from residnet.core.names import CHANNEL_UNITS, nearest
+from residnet.core.names import CHANNEL_UNITS, WIND_INPUTS, nearest
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig
-from residnet.physics.environment import WIND_INPUTS
 from residnet.physics.hull import FossenConfig
 from residnet.physics.symmetry import ChannelNames
 from residnet.physics.vessel import load_vessel

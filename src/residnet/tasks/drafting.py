@@ -13,7 +13,7 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.layout import ROLL, SIX, Live
 from residnet.core.log import Log
-from residnet.core.names import BOW_WIND
+from residnet.core.names import BOW_WIND, WIND_INPUTS
 from residnet.core.progress import say
 from residnet.data.doctor import inspect
 from residnet.data.drafting.channels import CHANNELS
@@ -24,7 +24,6 @@ from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
 from residnet.data.split import SPLITS, called_splits, divided, without_copies
 from residnet.identification.recipe import Preparation, judging, protocols, window_length
-from residnet.physics.environment import WIND_INPUTS
 from residnet.tasks.driving import driving, lacks
 from residnet.tasks.fit import FitConfig
 

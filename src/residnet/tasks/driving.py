@@ -8,12 +8,11 @@ import numpy as np
 
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.log import Log
-from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS, STATE
+from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS, STATE, WIND_INPUTS
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.reading import INPUTS
 from residnet.data.drafting.words import input_channel, state_channel, words_of
 from residnet.data.readers.quantities import QUATERNION
-from residnet.physics.environment import WIND_INPUTS
 
 _PASSIVE = (
     *(*STATE, *ACCELERATION, *SIX.moving, "latitude", "longitude", *QUATERNION),

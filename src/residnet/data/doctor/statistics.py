@@ -183,16 +183,16 @@ class Record:
 
     def without(self, bad: np.ndarray) -> Record:
         """Return the record with NaN in the measured channels where bad [T]."""
-        channels = {
-            name: np.where(bad, np.nan, values) if name in MEASURED else values
-            for name, values in self.log.channels.items()
-        }
         if not bad.any():
             return self
         if len(self) > _LONG:
             # copies of all channels of a long log would be as large again
             few = self.few.without(bad[self.few_rows])
             return Record(self.log, self.inputs, self._seams, few, bad)
+        channels = {
+            name: np.where(bad, np.nan, values) if name in MEASURED else values
+            for name, values in self.log.channels.items()
+        }
         return Record(self.log.replace(channels=channels), self.inputs, self._seams)
 
 

@@ -416,13 +416,14 @@ def outliers(log: Record, found: Check) -> Iterator[Finding]:
     An input may jump: its outliers leave the range of all others too.
     """
     for name in (*log.measured, *log.inputs):
-        far, values = log.spikes(name), log[name]
+        values, beyond = log[name], np.ones(1, dtype=bool)
         if name not in log.measured:
             low, top = np.nanquantile(values, (0.01, 0.99))
+            beyond = np.maximum(low - values, values - top) > 0.25 * max(top - low, 1e-12)
             # a direction may go anywhere at once, as that of a light wind does
-            turns = log.units[name] == "rad" and name not in STEERING
-            beyond = np.maximum(low - values, values - top)
-            far = far & (beyond > 0.25 * max(top - low, 1e-12)) & (not turns)
+            if not beyond.any() or (log.units[name] == "rad" and name not in STEERING):
+                continue
+        far = log.spikes(name) & beyond
         count = int(far.sum())
         if not count:
             continue
