@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from residnet.core.stretches import stretches
 from residnet.data.channels import SIGMA_OF_MAD
 from residnet.data.doctor.findings import Check, Finding, check, correction
 from residnet.data.doctor.statistics import (
+    AT_ONCE,
     FEWEST,
     SECTIONS,
     STEERING,
@@ -455,63 +456,64 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     blocks = replace(blocks, first=first[inside & blocks.clear_of(log.torn(reach))])
     other = [name for name in log if name in ("n", "delta", "wind_speed") and name not in names]
     y = blocks.change(log[answer])
-    sums: dict[int, np.ndarray] = {}
+    # shift -> the squares [K] that a fit leaves with the inputs shifted, NaN where unknown, and sum
+    sums, total = dict[int, np.ndarray](), dict[int, float]()
     # the flow over a rudder falls as the vessel turns: without their product in the fit the answer
     # seems to come early
-    moving = {name: blocks.sampled(log[name]) for name in log.moving}
+    moving = {name: log[name][:, None] for name in log.moving}
     driving = [name for name in (*other, *names) if float(np.nanstd(log[name])) > 0.0]
     linear = len(driving) > 4
 
-    def given(part: Sequence[str], shift: int) -> list[np.ndarray]:
-        inputs = [blocks.sampled(log[name], shift) for name in driving if name in part]
+    def integrals(columns: Sequence[np.ndarray]) -> np.ndarray:
+        return blocks.integrals(np.stack(columns, axis=-1))(0)
+
+    def given(part: Sequence[str], shifts: Sequence[int]) -> list[np.ndarray]:
+        """Return terms [T, S] of inputs that are shifted by so many samples each."""
+        at = np.arange(len(log))[:, None] - np.array(shifts)
+        inputs = [np.take(log[name], at, mode="wrap") for name in driving if name in part]
         return of_inputs(inputs, moving.get("u"), linear=linear)
 
-    ones = np.ones((blocks.first.size, blocks.size + 1))
-    fixed = blocks.summed([ones, *of_motion(moving), *given(other, 0)])
+    ones = np.ones((len(log), 1))
+    fixed = integrals([ones, *of_motion(moving), *given(other, [0])])
 
-    def terms(shift: int) -> np.ndarray:
-        return np.column_stack((fixed, blocks.summed(given(names, shift))))
-
-    def left(shift: int) -> np.ndarray:
-        """Return the squares [K] that a fit leaves with the inputs shifted, NaN where unknown."""
-        if shift not in sums:
-            x = terms(shift)
-            good = np.isfinite(x).all(axis=1) & np.isfinite(y)
-            scale = np.maximum(np.linalg.norm(x[good], axis=0), 1e-300)
-            part = x[good] / scale
-            gram = part.T @ part + 1e-9 * np.eye(part.shape[1])
-            sums[shift] = np.full(y.size, np.nan)
-            sums[shift][good] = (y[good] - part @ np.linalg.solve(gram, part.T @ y[good])) ** 2
-        return sums[shift]
+    def look(shifts: Iterable[int]) -> None:
+        new = [k for k in dict.fromkeys(shifts) if k not in sums and abs(k) <= reach]
+        pieces = np.array_split(new, -(-len(new) * len(log) // AT_ONCE)) if new else ()
+        for some in pieces:
+            own = integrals(given(names, some))
+            x = np.concatenate((fixed.repeat(some.size, axis=1), own), axis=2).transpose(1, 0, 2)
+            good = np.isfinite(x).all(axis=2) & np.isfinite(y)
+            part, target = np.where(good[..., None], x, 0.0), np.where(good, y, 0.0)[..., None]
+            part /= np.maximum(np.linalg.norm(part, axis=1, keepdims=True), 1e-300)
+            turned = part.transpose(0, 2, 1)
+            gram = turned @ part + 1e-9 * np.eye(part.shape[2])
+            rest = (target - part @ np.linalg.solve(gram, turned @ target))[..., 0]
+            sums.update(zip(some.tolist(), np.where(good, rest**2, np.nan), strict=True))
+            total.update(zip(some.tolist(), (rest**2).sum(axis=1).tolist(), strict=True))
 
     def lowest() -> list[int]:
         """Return the shifts of the minima so far, the lowest first."""
-        shifts = sorted(sums)
-        total = np.array([np.nansum(sums[shift]) for shift in shifts])
-        fenced = np.concatenate(([np.inf], total, [np.inf]))
-        minima = np.flatnonzero((total <= fenced[:-2]) & (total <= fenced[2:]))
-        return [shifts[i] for i in minima[np.argsort(total[minima])]]
+        shifts = sorted(total)
+        left = np.array([total[shift] for shift in shifts])
+        fenced = np.concatenate(([np.inf], left, [np.inf]))
+        minima = np.flatnonzero((left <= fenced[:-2]) & (left <= fenced[2:]))
+        return [shifts[i] for i in minima[np.argsort(left[minima])]]
 
-    for k in range(-_SHIFTS, _SHIFTS + 1):
-        left(round(k * reach / _SHIFTS))
+    look(round(k * reach / _SHIFTS) for k in range(-_SHIFTS, _SHIFTS + 1))
     gap = max(round(reach / _SHIFTS), 1)
-    for least in lowest()[:_MINIMA]:
-        for k in range(-6, 7):
-            if abs(least + round(k * gap / 6)) <= reach:
-                left(least + round(k * gap / 6))
+    look(least + round(k * gap / 6) for least in lowest()[:_MINIMA] for k in range(-6, 7))
     # of several that fit alike the least that is no early answer: an input that repeats itself, as
     # that of a zigzag, fits as well half a period away
-    total = {shift: float(np.nansum(rest)) for shift, rest in sums.items()}
     floor = max(min(total.values()), 1e-300)
     alike = [shift for shift in lowest() if total[shift] <= _ALIKE * floor]
     best = min(alike, key=lambda shift: (-shift * step > EARLY, abs(shift)))
-    good = np.isfinite(sums[best]) & np.isfinite(left(0))
-    if abs(best) >= reach - gap or good.sum() < 5 * terms(0).shape[1]:
+    good = np.isfinite(sums[best]) & np.isfinite(sums[0])
+    if abs(best) >= reach - gap or good.sum() < 5 * (fixed.shape[2] + len(given(names, [0]))):
         return None
     # how well the least is determined: its scatter over sections of the log
-    tried = list(sums)
+    tried, table = np.array([*sums]) * step, np.array([*sums.values()])
     sections = np.array_split(np.flatnonzero(good), SECTIONS // 2)
-    each = [min(tried, key=lambda k: float(sums[k][part].sum())) * step for part in sections]
+    each = [tried[np.argmin(np.nan_to_num(table[:, p].sum(axis=1), nan=np.inf))] for p in sections]
     scatter = SIGMA_OF_MAD * float(np.median(np.abs(np.array(each) - np.median(each))))
     error = max(1.5 * scatter / np.sqrt(len(sections)), 0.25 * step)
     rest = max(float(sums[best][good].sum()), 1e-300)

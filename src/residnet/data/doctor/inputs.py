@@ -228,10 +228,10 @@ def idle(log: Record, found: Check) -> Iterator[Finding]:
     for name in driving:
         still &= np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * high(log[name], 1.0)
     starts, stops = stretches(still)
-    both = np.stack((starts, stops + 1), axis=1).ravel()
-    ends = [of.reduceat(np.append(psi, psi[-1]), both)[::2] for of in (np.maximum, np.minimum)]
-    wide = ends[0] - ends[1] >= _SWING if starts.size else np.zeros(0, dtype=bool)
-    for start, stop in zip(starts[wide], stops[wide], strict=True):
+    # a heading that turns round goes farther than it gets
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(psi))))
+    bent = way[stops] - way[starts] - np.abs(psi[stops] - psi[starts]) >= _SWING
+    for start, stop in zip(starts[bent], stops[bent], strict=True):
         run = psi[start : stop + 1]
         turns = reversals(run, _SWING)
         if turns >= 2:

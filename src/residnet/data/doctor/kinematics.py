@@ -67,11 +67,11 @@ def yaw_causes(log: Record) -> dict[str, Cause]:
     """
     psi, r, t = log["psi"], log["r"], log.t
     dt = np.diff(t)
-    smooth = _around(log, "r")
+    smooth = log.of(_around, "r")
     time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
     columns = {"bias": [-dt], "ramp": [-dt, -dt * time]}
     # where the heading does not move, a bias of r would be all gain
-    if _stands_out(log, "r") and float(np.nanstd(_around(log, "psi"))) > _TURNED * log.noise("psi"):
+    if _stands_out(log, "r") and float(np.nanstd(log.of(_around, "psi"))) > _TURNED * log.noise("psi"):
         columns = {"gain": [-_area(dt, smooth)], "lag": [np.diff(smooth)], **columns}
     rate = np.full(dt.size, log.noise("r"))
     return _explained(psi, _area(dt, r), dt, log.noise("psi"), rate, columns)
@@ -88,11 +88,11 @@ def position_causes(log: Record) -> dict[str, Cause]:
     """
     dt, psi = np.diff(log.t), log["psi"]
     turn, mid = np.exp(1j * psi), np.exp(0.5j * (psi[1:] + psi[:-1]))
-    u, v = _around(log, "u"), _around(log, "v")
+    u, v = log.of(_around, "u"), log.of(_around, "v")
     along, across = _area(dt, turn * u), _area(dt, 1j * turn * v)
     lag_u, lag_v = mid * np.diff(u), 1j * mid * np.diff(v)
     ground = turn * (u + 1j * v)
-    lag_psi = 0.5j * np.diff(_around(log, "psi")) * (ground[1:] + ground[:-1])
+    lag_psi = 0.5j * np.diff(log.of(_around, "psi")) * (ground[1:] + ground[:-1])
     columns = {
         "gain_u": [-along],
         "gain_v": [-across],
@@ -137,7 +137,7 @@ def _area(dt: np.ndarray, rate: np.ndarray) -> np.ndarray:
 
 def _stands_out(log: Record, name: str) -> bool:
     """Return whether a channel does more than its noise."""
-    return float(np.sqrt(np.nanmean(_around(log, name) ** 2))) > 1.2 * log.noise(name)
+    return float(np.sqrt(np.nanmean(log.of(_around, name) ** 2))) > 1.2 * log.noise(name)
 
 
 def _around(log: Record, name: str) -> np.ndarray:
@@ -182,6 +182,8 @@ def _explained(
 
     def between(steps: np.ndarray) -> np.ndarray:
         """Return the sums [K, ...] of steps [T - 1, ...] from one pose to the next, NaN as well."""
+        if at.size == pose.size:
+            return steps
         unknown, start = ~np.isfinite(steps), np.zeros((1, *steps.shape[1:]))
         total = np.concatenate((start, np.cumsum(np.where(unknown, 0.0, steps), axis=0)))[at]
         count = np.concatenate((start, np.cumsum(unknown, axis=0)))[at]
@@ -207,12 +209,9 @@ def _explained(
     # noise of the pose alone is singular in the limit: a little of the diagonal keeps the factor
     band = np.stack((1.0001 * (total + 2.0 * ends + floor**2), np.where(adjacent, -ends, 0.0)))
     factor = scipy.linalg.cholesky_banded(band, lower=True)
-    y, *x = (
-        scipy.linalg.solve_banded((1, 0), factor, part)
-        for part in (excess[keep], *np.moveaxis(table[keep], 1, 0))
-    )
     # real and imaginary parts of a sample side by side, so that sections hold both
-    rows = np.stack((y, *x), axis=-1)
+    rows = np.column_stack((excess[keep], table[keep]))
+    rows = scipy.linalg.solve_banded((1, 0), factor, rows, overwrite_b=True)
     if np.iscomplexobj(rows):
         rows = np.stack((rows.real, rows.imag), axis=1).reshape(-1, rows.shape[1])
     y, table = rows[:, 0], rows[:, 1:]
@@ -245,7 +244,8 @@ def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray) -> dict[str, Cause
         others = [name for name in every if name not in chosen]
         # of causes that explain the same, as lags of all channels but one and of that one do, the
         # first counts
-        gain = {n: left(chosen) - left([*chosen, n]) - price[n] for n in others}
+        before = left(chosen)
+        gain = {n: before - left([*chosen, n]) - price[n] for n in others}
         gain = {n: round(value / max(energy, 1e-300), 9) for n, value in gain.items()}
         best = max(others, key=lambda name: gain[name], default="")
         if not best or gain[best] <= 0.0:

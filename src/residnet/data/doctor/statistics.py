@@ -212,14 +212,18 @@ def smoothed(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def averaged(values: np.ndarray, samples: int) -> np.ndarray:
     """Return the moving average [T] over so many samples, NaN left out; NaN where none is known."""
-    kernel = np.ones(min(samples, values.size))
-    known = np.isfinite(values)
-    before, ahead = (kernel.size - 1) // 2, kernel.size // 2
-    at, lost = np.arange(values.size), np.append(0, np.cumsum(~known))
-    first, stop = np.maximum(at - ahead, 0), np.minimum(at + before + 1, values.size)
-    count = stop - first - (lost[stop] - lost[first])
-    total = np.convolve(np.where(known, values, 0.0), kernel, mode="same")
-    return np.where(count > 0.5, total / np.maximum(count, 1.0), np.nan)
+    size, known = min(samples, values.size), np.isfinite(values)
+    at = np.arange(values.size)
+    first = np.maximum(at - size // 2, 0)
+    stop = np.minimum(at + (size - 1) // 2 + 1, values.size)
+
+    def over(values: np.ndarray) -> np.ndarray:
+        """Return the sums [T] over the samples around each."""
+        total = np.append(0.0, np.cumsum(values))
+        return np.asarray(total[stop] - total[first])
+
+    count = over(known)
+    return np.where(count > 0.5, over(np.where(known, values, 0.0)) / np.maximum(count, 1.0), np.nan)
 
 
 def high(values: np.ndarray, share: float = 0.95) -> float:
@@ -305,6 +309,8 @@ _BLOCK_SAMPLES, _BLOCK_SECONDS = 16, 3.0
 _OVERLAP = 4
 # blocks and lags of a long log that are looked at, evenly spread: more tell the same
 _MOST_BLOCKS, _MOST_SAMPLES = 5_000, 20_000
+AT_ONCE = 40_000
+"""Samples that are shifted at a time: each of some ten columns stays in a core's cache."""
 # over a block each velocity changes by so many standard deviations of its noise, where it can
 _OVER_NOISE = 10.0
 
@@ -331,41 +337,27 @@ class Blocks:
         return np.asarray(values[first + self.size] - values[first])
 
     def clear_of(self, bad: np.ndarray, shift: int = 0) -> np.ndarray:
-        """Return the blocks [K] bool that touch none of the samples bad [T]."""
-        count, first = np.append(0, np.cumsum(bad)), self.first - shift
+        """Return the blocks [K, ...] bool that touch none of the samples bad [T, ...]."""
+        count, first = np.zeros((len(bad) + 1, *bad.shape[1:]), dtype=int), self.first - shift
+        np.cumsum(bad, axis=0, out=count[1:])
         return np.asarray(count[first + self.size + 1] == count[first])
 
     def integrals(self, table: np.ndarray) -> Callable[[int], np.ndarray]:
-        """Return the integrals [K, k] of columns [T, k] over the blocks, by shift in samples.
+        """Return the integrals [K, ...] of columns [T, ...] over the blocks, by shift in samples.
 
         They are NaN where a sample of the block is.
         """
-        bad = ~np.isfinite(table).all(axis=1)
-        total = np.zeros(table.shape)
-        filled = np.where(bad[:, None], 0.0, table)
-        np.cumsum(
-            0.5 * np.diff(self.t)[:, None] * (filled[1:] + filled[:-1]), axis=0, out=total[1:]
-        )
+        bad, total = ~np.isfinite(table), np.zeros(table.shape)
+        spoilt = bool(bad.any())
+        filled = np.where(bad, 0.0, table) if spoilt else table
+        half = 0.5 * np.diff(self.t).reshape(-1, *(1 for _ in table.shape[1:]))
+        np.cumsum(half * (filled[1:] + filled[:-1]), axis=0, out=total[1:])
 
         def at(shift: int) -> np.ndarray:
-            clear = self.clear_of(bad, shift)[:, None]
+            clear = self.clear_of(bad, shift) if spoilt else True
             return np.where(clear, self.change(total, shift), np.nan)
 
         return at
-
-    def sampled(self, values: np.ndarray, shift: int = 0) -> np.ndarray:
-        """Return values [T] at the samples of each block [K, size + 1], `shift` samples early."""
-        return np.asarray(values[self.first[:, None] + np.arange(-shift, self.size + 1 - shift)])
-
-    @cached_property
-    def half(self) -> np.ndarray:
-        """Half of each time between the samples of the blocks [K, size]."""
-        return np.asarray(0.5 * np.diff(self.sampled(self.t), axis=1))
-
-    def summed(self, columns: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the integrals [K, k] of columns that were sampled, each [K, size + 1]."""
-        parts = [((c[:, 1:] + c[:, :-1]) * self.half).sum(axis=1) for c in columns]
-        return np.stack(parts, axis=-1)
 
 
 def blocks_of(log: Record, *moving: str) -> Blocks:
@@ -451,11 +443,14 @@ def agreement(reference: np.ndarray, measured: np.ndarray, step: float) -> Agree
     if at.size < FEWEST:
         return None
     at = at[:: -(-at.size // _MOST_SAMPLES)]
-    a, lags = reference[at], range(-reach, reach + 1)
-    spread, std = float(a.std()), np.array([measured[at + k].std() for k in lags])
+    a, lags = reference[at], np.arange(-reach, reach + 1)
+    spread, std, values = float(a.std()), np.empty(lags.size), np.empty(lags.size)
+    for some in np.array_split(lags, -(-lags.size * at.size // AT_ONCE)):
+        there = measured[at + some[:, None]]
+        std[some + reach], values[some + reach] = there.std(axis=1), there @ (a - a.mean())
     if spread == 0.0 or std.min() <= 1e-12 * np.nanmax(np.abs(measured)):
         return None
-    values = np.array([(a - a.mean()) @ measured[at + k] for k in lags]) / (at.size * spread * std)
+    values /= at.size * spread * std
     best = int(np.argmax(np.abs(values)))
     shift = 0.0
     if 0 < best < 2 * reach:

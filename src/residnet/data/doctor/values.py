@@ -379,7 +379,7 @@ def _straight(log: Record, name: str) -> np.ndarray:
         return out
     slope = np.diff(log[name]) / np.diff(log.t)
     bend = np.abs(np.diff(slope))
-    flat = np.nan_to_num(bend, nan=np.inf) <= max(1e-5 * usual, rounding, 2.1 * resolution)
+    flat = bend <= max(1e-5 * usual, rounding, 2.1 * resolution)
     if float(flat.mean()) > _USUALLY_STRAIGHT:
         return out
     moving = np.abs(slope[:-1]) > 10.0 * rounding

@@ -583,23 +583,25 @@ def clock_of(sheet: Sheet) -> Clock:
     dated = {name: cells for name, cells in sheet.texts.items() if looks_dated(cells)}
     if dated:
         return _dated(sheet, dated)
-    rising = [
-        name
-        for name, values in sheet.numbers.items()
-        if values.size > 1
-        and bool((np.diff(_going_on(values[np.isfinite(values)])) > 0.0).all())
+
+    def rises(name: str) -> bool:
+        values = sheet.numbers[name]
         # pandas writes the number of each row under no name, or the time
-        and not (name.startswith("Unnamed: ") and bool((np.diff(values) == 1.0).all()))
-    ]
+        return (
+            values.size > 1
+            and bool((np.diff(_going_on(values[np.isfinite(values)])) > 0.0).all())
+            and not (name.startswith("Unnamed: ") and bool((np.diff(values) == 1.0).all()))
+        )
+
     called = [name for name in named if name in sheet.numbers]
     # one that is called time and does not increase is refused where it is read; a counter is none
     others = [
         name
-        for name in rising
-        if not called and words_of(name).lacks("index") and state_channel(words_of(name)) is None
+        for name in (sheet.numbers if not called else ())
+        if words_of(name).lacks("index") and state_channel(words_of(name)) is None and rises(name)
     ]
     others.sort(key=lambda name: _unsteady(sheet.numbers[name]))
-    chosen = next((name for name in rising if name in named), next(iter([*called, *others]), None))
+    chosen = next(filter(rises, called), next(iter([*called, *others]), None))
     if chosen is None:
         if not named:
             raise DataError(

@@ -49,7 +49,7 @@ def _unpacked(t: np.ndarray) -> np.ndarray | None:
 
     They tell themselves where a minute ends: the number goes on by 40 more than the clock.
     """
-    some = np.floor(t[:: max(t.size // _SOME, 1)])
+    some = np.floor(t[:: t.size // _SOME | 1])
     if some.min() < 0.0 or some.max() >= 240_000 or (some % 100).max() >= 60:
         return None
     whole = np.floor(t)

@@ -300,11 +300,13 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
                 "list(yaml.safe_load_all(open(file)))).to_csv('log.csv', index=False)"
             )
         delimiter, cells, (at, above) = _delimiter(path, lines)
+        # a comma between cells is none within numbers
+        told = [cell for row in cells[1:50] for cell in row] if delimiter != "," else []
         comma, point = (
-            sum(bool(re.fullmatch(_FRACTION.format(sign), c)) for row in cells[1:50] for c in row)
+            sum(bool(re.fullmatch(_FRACTION.format(sign), cell)) for cell in told)
             for sign in (",", r"\.")
         )
-        decimal = "," if delimiter != "," and comma > point else "."
+        decimal = "," if comma > point else "."
         names = numbered(cells[at])
         comments, held = [], 0
         for line, block, _ in _blocks(file):
@@ -336,9 +338,10 @@ def _delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]], tupl
         DataError: where there is none.
     """
     found: list[tuple[int, int, tuple[str, list[list[str]], tuple[int, int]]]] = []
+    text = "".join(lines[:_GUESSED])
     for sign in (",", ";", "\t", "|", BLANKS):
-        if sign == BLANKS and found:
-            break
+        if found if sign == BLANKS else sign not in text:
+            continue
         rows = [_cells(_COMMENTED.sub("", line, count=1), sign) for line in lines[:_GUESSED]]
         place = found_header(rows)
         if place is None:
@@ -584,15 +587,10 @@ def _counted(block: bytes, delimiter: str, wide: int) -> np.ndarray:
             return np.ones(1, dtype=np.int64)
     sign = delimiter.encode()
     if wide > 1 and len(sign) == 1:
-        values = np.frombuffer(block, dtype=np.uint8)
-        ends = values[(values == sign[0]) | (values == ord("\n"))] == ord("\n")
         # the usual block: every so many marks one is the end of a line, the others are delimiters
-        if (
-            ends.size % wide == 0
-            and ends[wide - 1 :: wide].all()
-            and ends.sum() * wide == ends.size
-        ):
-            return np.full(ends.size // wide, wide)
+        marks = block.translate(None, bytes({*range(256)} - {sign[0], ord("\n")}))
+        if marks == (sign * (wide - 1) + b"\n") * (len(marks) // wide):
+            return np.full(len(marks) // wide, wide)
     lines = _lines(block)
     cells = np.array([line.count(sign) for line in lines], dtype=np.int64) + 1
     for i in np.flatnonzero(cells == 1):
