@@ -71,7 +71,8 @@ def yaw_causes(log: Record) -> dict[str, Cause]:
     time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
     columns = {"bias": [-dt], "ramp": [-dt, -dt * time]}
     # where the heading does not move, a bias of r would be all gain
-    if _stands_out(log, "r") and float(np.nanstd(log.of(_around, "psi"))) > _TURNED * log.noise("psi"):
+    turned = float(np.nanstd(log.of(_around, "psi")))
+    if _stands_out(log, "r") and turned > _TURNED * log.noise("psi"):
         columns = {"gain": [-_area(dt, smooth)], "lag": [np.diff(smooth)], **columns}
     rate = np.full(dt.size, log.noise("r"))
     return _explained(psi, _area(dt, r), dt, log.noise("psi"), rate, columns)

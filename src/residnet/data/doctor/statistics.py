@@ -222,8 +222,8 @@ def averaged(values: np.ndarray, samples: int) -> np.ndarray:
         total = np.append(0.0, np.cumsum(values))
         return np.asarray(total[stop] - total[first])
 
-    count = over(known)
-    return np.where(count > 0.5, over(np.where(known, values, 0.0)) / np.maximum(count, 1.0), np.nan)
+    count, total = over(known), over(np.where(known, values, 0.0))
+    return np.where(count > 0.5, total / np.maximum(count, 1.0), np.nan)
 
 
 def high(values: np.ndarray, share: float = 0.95) -> float:
