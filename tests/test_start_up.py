@@ -45,3 +45,9 @@ def test_lists_and_errors_of_files_and_tasks_import_nothing_heavy(tmp_path: Path
 def test_a_check_and_errors_of_a_fit_import_torch_alone() -> None:
     """Its models are built as they are read, so that what does not fit together is refused."""
     assert loaded("check quickstart -s nme=3", "check quickstart") == ["torch"]
+
+
+def test_looking_at_a_table_imports_no_torch(tmp_path: Path) -> None:
+    rows = [f"{0.1 * k:.1f},{0.1 * k % 3:.3f},{0.01 * (k % 7):.3f}" for k in range(60)]
+    (tmp_path / "log.csv").write_text("\n".join(["t [s],u [m/s],delta [rad]", *rows]))
+    assert loaded(f"inspect {tmp_path / 'log.csv'}") == ["pandas"]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from residnet.core.stretches import stretches
-from residnet.data.channels import SIGMA_OF_MAD
+from residnet.data.channels import SIGMA_OF_MAD, quantiles
 from residnet.data.doctor.findings import Check, Finding, check, correction
 from residnet.data.doctor.statistics import (
     AT_ONCE,
@@ -364,7 +364,7 @@ def _answers(
         good: samples that are known [T].
     """
     r, size = log.smooth("r"), max(round(1.0 / log.step), WINDOW)
-    low, top = np.nanquantile(log["r"], (0.05, 0.95))
+    low, top = quantiles(log["r"], 0.05, 0.95)
     v = np.zeros(len(log))
     if "v" in log and np.isfinite(log["v"]).sum() > 2 * FEWEST:
         v = log.smooth("v")

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from residnet.core.stretches import stretches
+from residnet.data.channels import quantiles
 from residnet.data.doctor.findings import Check, Finding, Level, check, share_of, show
 from residnet.data.doctor.statistics import Record, averaged, bridged
 
@@ -49,7 +50,7 @@ def still(log: Record) -> np.ndarray:
     noise = np.hypot(log.noise("u"), log.noise("v")), log.noise("r")
     for values, level in zip((speed, turning), noise, strict=True):
         # what is left of the noise after averaging, but never a motion that is one for this vessel
-        usual, left = float(np.nanquantile(values, 0.95)), 4.0 * level / np.sqrt(samples)
+        usual, left = quantiles(values, 0.95)[0], 4.0 * level / np.sqrt(samples)
         at_rest &= values < min(max(0.03 * usual, left), max(0.2 * usual, left))
     return at_rest
 
@@ -81,7 +82,7 @@ def rest(log: Record, found: Check) -> Iterator[Finding]:
 def slow(log: Record, found: Check) -> Iterator[Finding]:
     """Report a vessel that hardly moves."""
     speed = np.hypot(log["u"], log["v"])
-    limit = 0.1 * float(np.nanpercentile(speed, 95))
+    limit = 0.1 * quantiles(speed, 0.95)[0]
     share = float(np.mean(speed[np.isfinite(speed)] <= limit))
     if share > 0.05:
         text = (

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.names import POSE, VELOCITY
-from residnet.data.channels import SIGMA_OF_MAD, STILL
+from residnet.data.channels import SIGMA_OF_MAD, STILL, quantiles
 from residnet.data.doctor.findings import (
     Check,
     Finding,
@@ -227,7 +227,7 @@ def position_jumps(log: Record, found: Check) -> Iterator[Finding]:
     explained = 0.5 * _bridged_steps(log) * (velocity[1:] + velocity[:-1])
     excess = np.abs(np.nan_to_num(np.diff(log["x"] + 1j * log["y"]) - explained))
     known = np.abs(explained[np.isfinite(explained)])
-    fast = 0.5 * float(np.quantile(known, 0.95)) if known.size else 0.0
+    fast = 0.5 * quantiles(known, 0.95)[0] if known.size else 0.0
     limit = max(15.0 * float(np.median(excess)), fast)
     what = (
         f"position jumps {{}} times by more than {limit:.2g} m beyond u, v, at most by {{:.2g}} m"
@@ -274,7 +274,7 @@ def course_as_heading(log: Record, found: Check) -> Iterator[Finding]:
     good = np.isfinite(course) & np.isfinite(drift)
     speed = np.abs(motion.ground)
     if good.any():
-        good &= (speed > 0.3 * np.quantile(speed[good], 0.9)) & (np.abs(drift) < 1.2)
+        good &= (speed > 0.3 * quantiles(speed[good], 0.9)[0]) & (np.abs(drift) < 1.2)
     spread = float(np.std(drift[good])) if good.sum() >= 100 else 0.0
     # the drift angle must vary by so much, beyond its noise, before it tells heading from course
     noise = float(np.sqrt(np.mean((motion.sway / speed[good]) ** 2))) if spread else 0.0

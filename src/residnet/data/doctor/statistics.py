@@ -15,7 +15,7 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.stretches import stretches as runs_of
-from residnet.data.channels import noise_of, spikes, spread_rows
+from residnet.data.channels import noise_of, quantiles, spikes, spread_rows
 from residnet.data.derivatives import local_polynomials
 
 MEASURED = (
@@ -229,7 +229,7 @@ def averaged(values: np.ndarray, samples: int) -> np.ndarray:
 def high(values: np.ndarray, share: float = 0.95) -> float:
     """Return the size that a channel reaches, by a quantile of its absolute values."""
     size = np.abs(values)
-    return float(np.nanmax(size) if share == 1.0 else np.nanquantile(size, share))
+    return float(np.nanmax(size)) if share == 1.0 else quantiles(size, share)[0]
 
 
 def reversals(heading: np.ndarray, swing: float) -> int:
@@ -256,7 +256,7 @@ def resolution_of(values: np.ndarray) -> float:
     change = change[np.isfinite(change) & (change > 0.0)]
     if change.size < FEWEST:
         return 0.0
-    least = float(np.quantile(change, 0.01))
+    least = quantiles(change, 0.01)[0]
     steps = change / least
     return least if float((np.abs(steps - np.round(steps)) < 0.02).mean()) > 0.95 else 0.0
 

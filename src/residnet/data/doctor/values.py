@@ -13,7 +13,14 @@ from residnet.core.layout import Live, levelled
 from residnet.core.log import Log
 from residnet.core.names import POSE, STATE
 from residnet.core.stretches import stretches
-from residnet.data.channels import beyond_belief, fills, noise_of, spike_cells, usual_interval
+from residnet.data.channels import (
+    beyond_belief,
+    fills,
+    noise_of,
+    quantiles,
+    spike_cells,
+    usual_interval,
+)
 from residnet.data.doctor.findings import Check, Finding, Level, check, share_of, show
 from residnet.data.doctor.statistics import MEASURED, STEERING, Record, resolution_of
 from residnet.data.motion import BRIDGED, MotionConfig, complete_motion
@@ -279,7 +286,7 @@ def _moves(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
     It goes on far from where it stood.
     """
     change = np.abs(np.diff(values))
-    resolution = float(np.quantile(change[change > 0.0], 0.1)) if (change > 0.0).any() else 0.0
+    resolution = quantiles(change[change > 0.0], 0.1)[0] if (change > 0.0).any() else 0.0
     # the steps from the run's end on, no longer than the log
     after = sliding_window_view(np.append(change, np.full(5, np.nan)), 6)[
         np.minimum(stops, change.size - 1)
@@ -418,7 +425,7 @@ def outliers(log: Record, found: Check) -> Iterator[Finding]:
     for name in (*log.measured, *log.inputs):
         values, beyond = log[name], np.ones(1, dtype=bool)
         if name not in log.measured:
-            low, top = np.nanquantile(values, (0.01, 0.99))
+            low, top = quantiles(values, 0.01, 0.99)
             beyond = np.maximum(low - values, values - top) > 0.25 * max(top - low, 1e-12)
             # a direction may go anywhere at once, as that of a light wind does
             if not beyond.any() or (log.units[name] == "rad" and name not in STEERING):
@@ -474,7 +481,7 @@ def resolution(log: Record, found: Check) -> Iterator[Finding]:
     """Report the step of a channel's values, too coarse where few lie between its ends."""
     for name in log.measured:
         known = log[name][np.isfinite(log[name])]
-        low, high = (float(value) for value in np.quantile(known, (0.05, 0.95)))
+        low, high = quantiles(known, 0.05, 0.95)
         levels = np.unique(known)
         if levels.size < 2 or levels.size > 0.5 * known.size:
             continue
@@ -522,9 +529,9 @@ def jumps(log: Record, found: Check) -> Iterator[Finding]:
         if np.isfinite(change).sum() < 50:
             continue
         change = np.nan_to_num(change)
-        low, high = np.nanquantile(values, (0.01, 0.99))
+        low, high = quantiles(values, 0.01, 0.99)
         # beyond noise, beyond what goes on beside it, and a good part of the whole range
-        least = 0.3 * float(high - low)
+        least = 0.3 * (high - low)
         least = max(8.0 * noise_of(values), least) if change.max() > least else np.inf
         over = change > least
         if over.any():
