@@ -228,18 +228,18 @@ def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray) -> dict[str, Cause
     """Select groups of columns one at a time, then drop those that others made superfluous."""
     scale = np.linalg.norm(x, axis=0)
     x, names = x[:, scale > 0.0] / scale[scale > 0.0], names[scale > 0.0]
-    scale = scale[scale > 0.0]
+    scale, told = scale[scale > 0.0], names.tolist()
     gram, product, energy = x.T @ x, x.T @ y, float(y @ y)
 
     def left(chosen: list[str]) -> float:
         """Return the sum of squares that some causes leave."""
-        part = np.isin(names, chosen)
-        values = np.linalg.lstsq(gram[np.ix_(part, part)], product[part], rcond=1e-9)[0]
+        part = [i for i, name in enumerate(told) if name in chosen]
+        values = np.linalg.lstsq(gram[part][:, part], product[part], rcond=1e-9)[0]
         return energy - float(product[part] @ values) if chosen else energy
 
-    every = list(dict.fromkeys(names.tolist()))
+    every = list(dict.fromkeys(told))
     variance = max(left(every) / y.size, 1e-12 * energy / y.size)
-    price = {name: _WORTH * variance * (1.0 + 0.2 * float((names == name).sum())) for name in every}
+    price = {name: _WORTH * variance * (1.0 + 0.2 * told.count(name)) for name in every}
     chosen: list[str] = []
     while len(chosen) < _MOST_CAUSES:
         others = [name for name in every if name not in chosen]

@@ -167,7 +167,7 @@ def read_csv(
                 " `delimiter` and `decimal`"
             ) from error
     whole = {
-        place: _plain(pd.concat(pieces.pop(place) or [pd.Series([])]), decimal)
+        place: _plain(pd.concat(pieces.pop(place) or [pd.Series([])], ignore_index=True), decimal)
         for place in [*pieces]
     }
     table = pd.DataFrame({i: whole[place][0] for i, place in enumerate(where)}, copy=False)
