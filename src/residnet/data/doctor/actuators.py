@@ -393,7 +393,7 @@ def _answers(
     side, sizes, _ = np.linalg.svd(known[told] / length, full_matrices=False)
     side = side[:, sizes > 1e-5 * sizes[0]]
     # what steers explains by the part of it that the other terms do not
-    tried = np.column_stack([given(shift)[told] for shift in shifts])
+    tried = given(shifts)[told][..., 0]
     rest, own = (part - side @ (side.T @ part) for part in (y[told], tried))
     gain = (rest @ own) ** 2 / np.maximum((own**2).sum(axis=0), 1e-300)
     surest = shifts[int(np.argmax(gain))]
@@ -473,12 +473,12 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
 
     def table(shifts: np.ndarray) -> np.ndarray:
         """Return the regressors [S, K, k] with the inputs shifted by so many samples each."""
-        parts = [np.stack([fixed] * shifts.size), np.stack([alone(k) for k in shifts])]
+        parts = [np.stack([fixed] * shifts.size, axis=1), alone(shifts)]
         if flow is not None:
             at = np.arange(len(log))[:, None] - shifts
             moved = [flow[:, None] * np.take(values, at, mode="wrap") for values in inputs]
-            parts.append(blocks.integrals(np.stack(moved, axis=-1))(0).transpose(1, 0, 2))
-        return np.concatenate(parts, axis=2)
+            parts.append(blocks.integrals(np.stack(moved, axis=-1))(0))
+        return np.concatenate(parts, axis=2).transpose(1, 0, 2)
 
     def look(shifts: Iterable[int]) -> None:
         new = [k for k in dict.fromkeys(shifts) if k not in sums and abs(k) <= reach]

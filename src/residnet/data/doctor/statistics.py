@@ -11,6 +11,7 @@ from functools import cache, cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
@@ -331,19 +332,23 @@ class Blocks:
     first: np.ndarray
     size: int
 
-    def change(self, values: np.ndarray, shift: int = 0) -> np.ndarray:
-        """Return the changes [K, ...] of values [T, ...] over the blocks, `shift` samples early."""
-        first = self.first - shift
+    def change(self, values: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
+        """Return the changes [K, ...] of values [T, ...] over the blocks, `shift` samples early.
+
+        Of several shifts [S] they are [K, S, ...].
+        """
+        first = np.subtract.outer(self.first, shift)
         return np.asarray(values[first + self.size] - values[first])
 
-    def clear_of(self, bad: np.ndarray, shift: int = 0) -> np.ndarray:
+    def clear_of(self, bad: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
         """Return the blocks [K, ...] bool that touch none of the samples bad [T, ...]."""
-        count, first = np.zeros((len(bad) + 1, *bad.shape[1:]), dtype=int), self.first - shift
+        count = np.zeros((len(bad) + 1, *bad.shape[1:]), dtype=int)
         np.cumsum(bad, axis=0, out=count[1:])
+        first = np.subtract.outer(self.first, shift)
         return np.asarray(count[first + self.size + 1] == count[first])
 
-    def integrals(self, table: np.ndarray) -> Callable[[int], np.ndarray]:
-        """Return the integrals [K, ...] of columns [T, ...] over the blocks, by shift in samples.
+    def integrals(self, table: np.ndarray) -> Callable[[ArrayLike], np.ndarray]:
+        """Return the integrals of columns [T, ...] over the blocks, by shift as of `change`.
 
         They are NaN where a sample of the block is.
         """
@@ -353,7 +358,7 @@ class Blocks:
         half = 0.5 * np.diff(self.t).reshape(-1, *(1 for _ in table.shape[1:]))
         np.cumsum(half * (filled[1:] + filled[:-1]), axis=0, out=total[1:])
 
-        def at(shift: int) -> np.ndarray:
+        def at(shift: ArrayLike) -> np.ndarray:
             clear = self.clear_of(bad, shift) if spoilt else True
             return np.where(clear, self.change(total, shift), np.nan)
 
