@@ -214,16 +214,10 @@ def smoothed(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def averaged(values: np.ndarray, samples: int) -> np.ndarray:
     """Return the moving average [T] over so many samples, NaN left out; NaN where none is known."""
     size, known = min(samples, values.size), np.isfinite(values)
-    at = np.arange(values.size)
-    first = np.maximum(at - size // 2, 0)
-    stop = np.minimum(at + (size - 1) // 2 + 1, values.size)
-
-    def over(values: np.ndarray) -> np.ndarray:
-        """Return the sums [T] over the samples around each."""
-        total = np.append(0.0, np.cumsum(values))
-        return np.asarray(total[stop] - total[first])
-
-    count, total = over(known), over(np.where(known, values, 0.0))
+    at, sums = np.arange(values.size), np.zeros((2, values.size + 1))
+    np.cumsum((known, np.where(known, values, 0.0)), axis=1, out=sums[:, 1:])
+    ends = np.minimum(at + (size - 1) // 2 + 1, values.size), np.maximum(at - size // 2, 0)
+    count, total = sums[:, ends[0]] - sums[:, ends[1]]
     return np.where(count > 0.5, total / np.maximum(count, 1.0), np.nan)
 
 
