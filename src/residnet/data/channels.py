@@ -56,7 +56,7 @@ def quantiles(values: np.ndarray, *shares: float) -> list[float]:
     at = np.multiply(shares, known.size - 1)
     low, high = np.floor(at).astype(int), np.ceil(at).astype(int)
     known = np.partition(known, np.concatenate((low, high)))
-    return np.asarray(known[low] + (at - low) * (known[high] - known[low])).tolist()
+    return [float(x) for x in known[low] + (at - low) * (known[high] - known[low])]
 
 
 def _medians(members: Callable[[slice], list[np.ndarray]], count: int) -> np.ndarray:
