@@ -460,31 +460,28 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     sums, total = dict[int, np.ndarray](), dict[int, float]()
     # the flow over a rudder falls as the vessel turns: without their product in the fit the answer
     # seems to come early
-    moving = {name: log[name] for name in log.moving}
+    moving = {name: log[name][:, None] for name in log.moving}
     driving = [name for name in (*other, *names) if float(np.nanstd(log[name])) > 0.0]
     linear = len(driving) > 4
-    u, inputs = moving.get("u"), [log[name] for name in driving if name in names]
-    ones, beside = np.ones(len(log)), [log[name] for name in driving if name in other]
-    columns = [ones, *of_motion(moving), *of_inputs(beside, u, linear=linear)]
-    fixed = blocks.integrals(np.stack(columns, axis=-1))(0)
-    alone = blocks.integrals(np.stack(of_inputs(inputs, None, linear=linear), axis=-1))
-    flow = None if u is None or linear else u * np.abs(u)
-    count = fixed.shape[1] + alone(0).shape[1] + (0 if flow is None else len(inputs))
 
-    def table(shifts: np.ndarray) -> np.ndarray:
-        """Return the regressors [S, K, k] with the inputs shifted by so many samples each."""
-        parts = [np.stack([fixed] * shifts.size, axis=1), alone(shifts)]
-        if flow is not None:
-            at = np.arange(len(log))[:, None] - shifts
-            moved = [flow[:, None] * np.take(values, at, mode="wrap") for values in inputs]
-            parts.append(blocks.integrals(np.stack(moved, axis=-1))(0))
-        return np.concatenate(parts, axis=2).transpose(1, 0, 2)
+    def integrals(columns: Sequence[np.ndarray]) -> np.ndarray:
+        return blocks.integrals(np.stack(columns, axis=-1))(0)
+
+    def given(part: Sequence[str], shifts: Sequence[int]) -> list[np.ndarray]:
+        """Return terms [T, S] of inputs that are shifted by so many samples each."""
+        at = np.arange(len(log))[:, None] - np.array(shifts)
+        inputs = [np.take(log[name], at, mode="wrap") for name in driving if name in part]
+        return of_inputs(inputs, moving.get("u"), linear=linear)
+
+    ones = np.ones((len(log), 1))
+    fixed = integrals([ones, *of_motion(moving), *given(other, [0])])
 
     def look(shifts: Iterable[int]) -> None:
         new = [k for k in dict.fromkeys(shifts) if k not in sums and abs(k) <= reach]
         pieces = np.array_split(new, -(-len(new) * len(log) // AT_ONCE)) if new else ()
         for some in pieces:
-            x = table(some)
+            own = integrals(given(names, some))
+            x = np.concatenate((fixed.repeat(some.size, axis=1), own), axis=2).transpose(1, 0, 2)
             good = np.isfinite(x).all(axis=2) & np.isfinite(y)
             part, target = np.where(good[..., None], x, 0.0), np.where(good, y, 0.0)[..., None]
             part /= np.maximum(np.linalg.norm(part, axis=1, keepdims=True), 1e-300)
@@ -511,12 +508,12 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     alike = [shift for shift in lowest() if total[shift] <= _ALIKE * floor]
     best = min(alike, key=lambda shift: (-shift * step > EARLY, abs(shift)))
     good = np.isfinite(sums[best]) & np.isfinite(sums[0])
-    if abs(best) >= reach - gap or good.sum() < 5 * count:
+    if abs(best) >= reach - gap or good.sum() < 5 * (fixed.shape[2] + len(given(names, [0]))):
         return None
     # how well the least is determined: its scatter over sections of the log
-    tried, rests = np.array([*sums]) * step, np.array([*sums.values()])
+    tried, table = np.array([*sums]) * step, np.array([*sums.values()])
     sections = np.array_split(np.flatnonzero(good), SECTIONS // 2)
-    each = [tried[np.argmin(np.nan_to_num(rests[:, p].sum(axis=1), nan=np.inf))] for p in sections]
+    each = [tried[np.argmin(np.nan_to_num(table[:, p].sum(axis=1), nan=np.inf))] for p in sections]
     scatter = SIGMA_OF_MAD * float(np.median(np.abs(np.array(each) - np.median(each))))
     error = max(1.5 * scatter / np.sqrt(len(sections)), 0.25 * step)
     rest = max(float(sums[best][good].sum()), 1e-300)
