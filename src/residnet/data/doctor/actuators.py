@@ -467,7 +467,7 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     def integrals(columns: Sequence[np.ndarray]) -> np.ndarray:
         return blocks.integrals(np.stack(columns, axis=-1))(0)
 
-    def given(part: Sequence[str], shifts: Sequence[int]) -> list[np.ndarray]:
+    def given(part: Sequence[str], shifts: Sequence[int] | np.ndarray) -> list[np.ndarray]:
         """Return terms [T, S] of inputs that are shifted by so many samples each."""
         at = np.arange(len(log))[:, None] - np.array(shifts)
         inputs = [np.take(log[name], at, mode="wrap") for name in driving if name in part]
