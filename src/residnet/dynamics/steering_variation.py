@@ -17,9 +17,40 @@ from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.plant import Plant
 
+
+class Axis(NamedTuple):
+    """What a controller steers, and by what.
+
+    Attributes:
+        name: of the axis.
+        command: input that steers, an angle in rad.
+        gear: state that follows the command, where the vessel has one.
+        slowed: velocities that the `time` of a variation slows down.
+        value: state that the reference is of; heading [rad] or depth [m].
+        angle, rate: states that the command turns, in rad and rad/s.
+        side: sign of the angle under a positive command.
+    """
+
+    name: str
+    command: str
+    gear: str
+    slowed: tuple[str, str]
+    value: str
+    angle: str
+    rate: str
+    side: float
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The states that noise is added to: value, angle and rate."""
+        return tuple(dict.fromkeys((self.value, self.angle, self.rate)))
+
+
+HEADING = Axis("heading", "cmd_delta", "delta", ("v", "r"), "psi", "psi", "r", 1.0)
+DEPTH = Axis("depth", "cmd_delta_s", "delta_s", ("w", "q"), "z", "theta", "q", -1.0)
 VARIATION = ("effect", "time", "bias")
-"""Of each row: rudder force as a multiple, time constants of sway and yaw as a multiple, and an
-angle [rad] that is added to the rudder's.
+"""Of each row: rudder force as a multiple, time constants of sway and yaw (heave and pitch) as a
+multiple, and an angle [rad] that is added to the rudder's.
 """
 
 
@@ -52,28 +83,37 @@ class VariedPlant(Dynamics):
     K and `time` multiplies T; with other hulls `effect` multiplies the rudder angle that the water
     feels, and `time` divides the accelerations in sway and yaw.
 
+    On another axis than the heading the rudder is what steers there: for the depth the stern
+    planes. Its command is the first of the inputs, and those of the plant follow in their order.
+
     Raises:
         ConfigError: where the vessel has no rudder.
     """
 
-    def __init__(self, plant: Plant, dt: float, integrator: str = "rk4") -> None:
+    def __init__(
+        self, plant: Plant, dt: float, integrator: str = "rk4", axis: Axis = HEADING
+    ) -> None:
         super().__init__(dt, "heun" if integrator == "heun" else "rk4")
         self.plant = plant
         self.n_state = len(VARIATION)
-        if plant.inputs[0] != "cmd_delta":
+        if axis.command not in plant.inputs[: plant.commands]:
             raise ConfigError(
-                "heading control needs a vessel whose first command is cmd_delta, found"
+                f"{axis.name} control needs a vessel with the command {axis.command}, found"
                 f" {', '.join(plant.inputs[: plant.commands])}"
             )
-        self.rudder = plant.state.index("delta") if "delta" in plant.state else -1
-        slowed = torch.tensor([1.0 if name in ("v", "r") else 0.0 for name in plant.state])
+        self.turn_about(plant.attitude, len(plant.state))
+        first = plant.inputs.index(axis.command)
+        places = range(len(plant.inputs))
+        self.take = [0 if k == first else k + 1 if k < first else k for k in places]
+        self.rudder = plant.state.index(axis.gear) if axis.gear in plant.state else -1
+        slowed = torch.tensor([1.0 if name in axis.slowed else 0.0 for name in plant.state])
         self.register_buffer("slowed", slowed, persistent=False)
         self.slowed: Tensor
         gear = torch.tensor([1.0 if "delta" in name else 0.0 for name in plant.state])
         self.register_buffer("gear", gear, persistent=False)
         self.gear: Tensor
         x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
-        w[:, 0] = 0.1
+        w[:, first] = 0.1
         # a rudder with a lag moves within a step
         self.moving = self.rudder >= 0 and bool(plant.rate(x, w)[0, self.rudder] != 0)
 
@@ -108,15 +148,16 @@ class VariedPlant(Dynamics):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step; the variation passes through."""
         varied = torch.cat((s[:, :1], s[:, 2:3], 1.0 / s[:, 1:2] - 1.0), dim=-1)
+        ordered = w[:, self.take]
         if self.moving:
-            p = self.plant.prepare(x, w)
+            p = self.plant.prepare(x, ordered)
         else:
             angle = (x[:, self.rudder : self.rudder + 1] if self.rudder >= 0 else w[:, :1]) * s[
                 :, :1
             ] + s[:, 2:]
-            held = torch.cat((angle, w[:, 1:]), dim=-1)
+            held = torch.cat((angle, w[:, 1:]), dim=-1)[:, self.take]
             p = self.plant.prepare(self._felt(x, angle), held)
-        return self.plant.end_step(self.integrate(x, p, varied), w, self.dt), s
+        return self.plant.end_step(self.integrate(x, p, varied), ordered, self.dt), s
 
 
 @final

@@ -198,7 +198,7 @@ def _nominal(rows: int) -> Tensor:
 
 
 def series(name: str, flights: Flights, variations: Tensor) -> pd.DataFrame:
-    """Return heading, yaw rate and rudder every 0.05 s, all turned to starboard."""
+    """Return heading, or depth, its rate and rudder every 0.05 s, all turned to starboard."""
     every = max(round(0.05 / flights.dt), 1)
     parts = []
     for i, variation in enumerate(variations):
@@ -210,8 +210,10 @@ def series(name: str, flights: Flights, variations: Tensor) -> pd.DataFrame:
                     "effect": float(variation[0]),
                     "time": float(variation[1]),
                     "t": torch.arange(0, flights.inputs.shape[1], every).numpy() * flights.dt,
-                    "psi": side * flights.state("psi")[i, :-1:every].numpy(),
-                    "r": side * flights.state("r")[i, :-1:every].numpy(),
+                    **{
+                        state: side * flights.state(state)[i, :-1:every].numpy()
+                        for state in (flights.axis.value, flights.axis.rate)
+                    },
                     "rudder": side * flights.inputs[i, ::every, 0].numpy(),
                 }
             )
@@ -243,7 +245,7 @@ def judged(
     the time in the means.
     """
     flown = run.fly(changes)
-    finite = torch.isfinite(flown.psi).all(1) & torch.isfinite(flown.command).all(1)
+    finite = torch.isfinite(flown.value).all(1) & torch.isfinite(flown.command).all(1)
     worst = conditions.duration + 0.5 * 180.0
     found = {
         name: torch.where(finite, values, worst if name == "cost" else torch.nan)

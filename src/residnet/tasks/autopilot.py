@@ -1,4 +1,4 @@
-"""Task `autopilot`: train heading policies, tune classical peers, and compare all of them."""
+"""Task `autopilot`: train policies of heading or depth, tune peers, and compare all of them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,21 @@ from residnet.control.heading.conditions import ConditionsConfig
 from residnet.control.heading.controllers import (
     BangBangConfig,
     ClassicalController,
+    DepthConfig,
+    DepthPolicySpec,
     NetworkPolicySpec,
     ObservedConfig,
     ObservedPolicySpec,
+    RecurrentSpec,
     TunableConfig,
+    observed_of,
 )
 from residnet.control.heading.tuning import TuningConfig
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredModel, SteeredPlant
 from residnet.core.config import (
     Config,
+    Metres,
     MetresPerSecond,
     Radians,
     Seconds,
@@ -32,6 +37,7 @@ from residnet.core.progress import say
 from residnet.data.sea import Disturbance, WindField
 from residnet.documents.gouletas2020.law import DocumentConfig, PredictiveConfig
 from residnet.dynamics.simulated import check_steps
+from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis
 from residnet.dynamics.store import chosen_model, load_model
 from residnet.physics.environment import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
@@ -55,12 +61,13 @@ class LearnedConfig(Config):
 
 
 class PolicyConfig(Config):
-    """A recurrent heading policy, trained under the run's conditions.
+    """A recurrent policy of heading or depth, trained under the run's conditions.
 
     Attributes:
-        start: name of a peer with an observer, of kind `ptos` or `lqr_observer`: the network stands
-            beside its law, whose constants as tuned are where training begins, and they are trained
-            too. Null for a network alone, without law, observer or predictor.
+        start: name of a peer with an observer, of kind `ptos` or `lqr_observer`, or of kind `depth`
+            over such a one: the network stands beside its law, whose constants as tuned are where
+            training begins, and they are trained too. Null for a network alone, without law,
+            observer or predictor.
         units: of the recurrent network; 0 trains the constants of a law alone.
         learned: a learned model to train on instead of the vessel itself; the policy is then
             compared on the vessel.
@@ -71,11 +78,6 @@ class PolicyConfig(Config):
     units: int = Field(default=16, ge=0, le=10_000)
     learned: LearnedConfig | None = None
     training: PolicyTraining = PolicyTraining()
-
-    @property
-    def spec(self) -> type[ObservedPolicySpec | NetworkPolicySpec]:
-        """The kind of description that the policy is stored with."""
-        return NetworkPolicySpec if self.start is None else ObservedPolicySpec
 
     @property
     def kind(self) -> str:
@@ -113,10 +115,24 @@ class JudgedConditions(Config):
         return {"stated": self.stated, **self.beyond}
 
 
+class DepthStepConfig(Config):
+    """A step of the depth reference in place of the heading's.
+
+    Attributes:
+        change: of the depth in m, down and up in turn.
+        band: depth error in m within which the change has settled.
+    """
+
+    change: Metres = Field(default=3.0, gt=0)
+    band: Metres = Field(default=0.1, gt=0)
+
+
 class StepTestConfig(Config):
     """The one test of all controllers: a step of the heading reference, from straight ahead.
 
     Attributes:
+        depth: a step of the depth instead, which makes depth controllers of all of them, with the
+            stern planes as their rudder; null for the heading.
         heading: change of the reference in rad; no prefilter smooths it.
         band: heading error in rad; the change has settled at the last entry into this band.
         dt: step of simulation and controllers in s.
@@ -130,6 +146,7 @@ class StepTestConfig(Config):
         sea_time: how long in s, counted from the end of the step's flight.
     """
 
+    depth: DepthStepConfig | None = None
     heading: Radians = Field(default=0.5235987755982988, gt=0, lt=3.1)
     band: Radians = Field(default=0.017453292519943295, gt=0)
     dt: Seconds = Field(default=0.02, gt=0)
@@ -147,10 +164,17 @@ class StepTestConfig(Config):
             check_steps(getattr(self, name), self.dt, name)
         return self
 
+    @property
+    def step(self) -> tuple[float, float]:
+        """The change and its band in rad, or in m of depth."""
+        if self.depth is None:
+            return self.heading, self.band
+        return self.depth.change, self.depth.band
+
 
 @final
 class AutopilotConfig(ComputingTask):
-    """Heading policies trained through the vessel, beside tuned classical controllers.
+    """Policies of heading or depth trained through the vessel, beside tuned controllers.
 
     Attributes:
         seed: of weights, batches and random vessels.
@@ -197,6 +221,7 @@ class AutopilotConfig(ComputingTask):
             raise ValueError("policies: give at least one policy here or under 'predictive'")
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"'{twice[0]}' names two controllers; names are unique in a run")
+        self._of_one_axis()
         if self.floor is not None and not isinstance(self.peers.get(self.floor), BangBangConfig):
             raise ValueError(f"floor: '{self.floor}' must name a peer of kind bang_bang")
         for name, wanted in self.policies.items():
@@ -204,10 +229,10 @@ class AutopilotConfig(ComputingTask):
                 raise ValueError(f"policies.{name}: give 'conditions' to train it under")
             if wanted.start is None:
                 continue
-            if not isinstance(self.peers.get(wanted.start), ObservedConfig):
+            if not isinstance(observed_of(self.peers.get(wanted.start)), ObservedConfig):
                 raise ValueError(
                     f"policies.{name}.start: '{wanted.start}' must name a peer of kind ptos or"
-                    " lqr_observer"
+                    " lqr_observer, or of kind depth with such a pitch"
                 )
         if self.conditions is None:
             for name, peer in self.peers.items():
@@ -228,11 +253,43 @@ class AutopilotConfig(ComputingTask):
                 )
         return self
 
+    def _of_one_axis(self) -> None:
+        dives = self.test.depth is not None
+        flown = {} if self.conditions is None else self.conditions.flown
+        for name, conditions in flown.items():
+            if (conditions.depth is not None) != dives:
+                raise ValueError(
+                    f"conditions.{name}.depth: give it where test.depth is given, and only there"
+                )
+        for name, peer in self.peers.items():
+            if isinstance(peer, DepthConfig) != dives:
+                wanted = "depth, with its law under 'pitch'" if dives else "any but depth"
+                raise ValueError(
+                    f"peers.{name}: test.depth is {'given' if dives else 'not given'}, so its kind"
+                    f" must be {wanted}"
+                )
+        for name, policy in self.policies.items():
+            if dives and (policy.start is None or policy.learned is not None):
+                raise ValueError(
+                    f"policies.{name}: a depth policy begins with a peer (start), and is trained on"
+                    " the vessel, not on a learned model"
+                )
+        if dives and (self.predictive or self.pace != 1.0):
+            raise ValueError("test.depth: leave out 'predictive' and 'pace', which turn headings")
+
     @model_validator(mode="after")
     def _felt(self) -> Self:
         plant = load_vessel(self.vessel).build()
         one = torch.ones(1, dtype=torch.float64)
-        most = float(plant.demand(one, one)[0, 0])
+        if self.axis.command not in plant.inputs[: plant.commands]:
+            raise ValueError(
+                f"vessel: '{self.vessel}' has no command '{self.axis.command}' to steer its"
+                f" {self.axis.name} with; it has {', '.join(plant.inputs[: plant.commands])}"
+            )
+        place = plant.inputs.index(self.axis.command)
+        most = float(plant.demand(one, one)[0, place])
+        if self.test.depth is not None and plant.diving is not None:
+            most = float(plant.diving[place])
         if self.rudder > (1.0 + 1e-6) * most:
             raise ValueError(
                 f"rudder: vessel '{self.vessel}' has {most:.4g} rad at most, given"
@@ -250,9 +307,20 @@ class AutopilotConfig(ComputingTask):
         return self
 
     @property
+    def axis(self) -> Axis:
+        """What is steered: the heading, or the depth."""
+        return HEADING if self.test.depth is None else DEPTH
+
+    @property
     def steered(self) -> SteeredPlant:
         """The vessel in calm water."""
-        return SteeredPlant(load_vessel(self.vessel).build())
+        return SteeredPlant(load_vessel(self.vessel).build(), axis=self.axis)
+
+    def spec_of(self, name: str) -> type[RecurrentSpec]:
+        """Return the kind of description that a policy is stored with."""
+        if self.test.depth is not None:
+            return DepthPolicySpec
+        return NetworkPolicySpec if self.policies[name].start is None else ObservedPolicySpec
 
     def recorded_seed(self) -> int:
         """Return the seed of weights, batches and random vessels."""
@@ -295,7 +363,8 @@ class AutopilotConfig(ComputingTask):
         wanted = self.policies[name].learned
         weather = any(conditions.weather for conditions in self.conditions.flown.values())
         if wanted is None:
-            return SteeredPlant(load_vessel(self.vessel).build(), calm=not weather)
+            plant = load_vessel(self.vessel).build()
+            return SteeredPlant(plant, calm=not weather, axis=self.axis)
         if weather:
             raise ConfigError(
                 f"policies.{name}.learned: a learned model feels no wind or current; leave them out"
@@ -377,10 +446,12 @@ def _check_flights(config: AutopilotConfig, turning: Turning, rate: float | None
     Raises:
         ConfigError: with the key, what is needed and what is given.
     """
-    asked = {"test": (config.test.heading, config.test.duration)}
+    # a change of depth takes the time of a dive angle, and its way
+    asked = {} if config.test.depth else {"test": (config.test.heading, config.test.duration)}
     if config.conditions is not None:
         stated = config.conditions.stated
-        asked["conditions.stated"] = (stated.heading[0], stated.duration)
+        if config.test.depth is None:
+            asked["conditions.stated"] = (stated.heading[0], stated.duration)
         for name, conditions in config.conditions.flown.items():
             if conditions.bias + _PUSHED * conditions.push >= config.rudder:
                 raise ConfigError(

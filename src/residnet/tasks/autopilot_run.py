@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from functools import partial
 from pathlib import Path
@@ -19,13 +18,15 @@ from residnet.control.heading.conditions import (
     quiet_after,
 )
 from residnet.control.heading.controllers import (
+    DepthConfig,
     ObservedConfig,
     RecurrentPolicy,
     Steering,
     TunableConfig,
     load_recurrent,
+    observed_of,
 )
-from residnet.control.heading.policies import ObservedPolicy
+from residnet.control.heading.policies import SIGHT, DepthPolicy, ObservedPolicy
 from residnet.control.heading.tuning import tune
 from residnet.control.heading.vessels import SteeredPlant, fly
 from residnet.core.progress import begin, report, say
@@ -61,6 +62,7 @@ from residnet.report.sections.autopilot import (
     cost_verdict,
     effort_table,
     settling_table,
+    words_of,
 )
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
@@ -97,13 +99,12 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
     judged_too: Controllers = {}
     for name, wanted in config.policies.items():
         start = None if wanted.start is None else complete[wanted.start]
-        assert start is None or isinstance(start, ObservedConfig)
         policy, notes[name], untrained = _policy(name, start, steering, config, folder)
         controllers = {name: (wanted.kind, policy), **controllers}
         # what it is compared with: itself untrained, and without its network
         if wanted.units > 0:
             judged_too[f"{name} untrained"] = ("untrained", untrained)
-            if isinstance(policy, ObservedPolicy):
+            if isinstance(policy, ObservedPolicy | DepthPolicy):
                 judged_too[f"{name} network off"] = ("network_off", policy.without_network())
     folder.write_json(
         folder.path / "controllers.json",
@@ -118,6 +119,10 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
         ("heading_swing", "rudder_swing", "error_end", "heading_rms", "rudder_rms", "heel_rms"),
         "rad",
     )
+    # what is of the heading error in rad is of the depth's in m
+    lengths = {"rad": "m", "rad s": "m s"} if config.test.depth else {}
+    for name in ("overshoot", "iae", "heading_swing", "error_end"):
+        channels[name] = lengths.get(channels[name], channels[name])
     folder.write_json(
         folder.metrics,
         {
@@ -130,9 +135,10 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
     )
     folder.write_table(folder.path / FLIGHTS, flown)
     folder.write_table(folder.path / PLANTS, plants)
-    tables = [settling_table(rows, config.floor), effort_table(rows)]
+    words = words_of(config.test.model_dump())
+    tables = [settling_table(rows, config.floor, words), effort_table(rows, words)]
     if config.conditions is not None:
-        tables.insert(0, cost_table(rows))
+        tables.insert(0, cost_table(rows, words))
     return Outcome(
         *_told(config, rows),
         "\n\n".join(table.text() for table in tables),
@@ -156,7 +162,7 @@ def _complete(
     found = tune(peer, steering, stated.stated, stated.evolution, config.seed + 11, CompiledRollout)
     constants = ", ".join(f"{key} {value:.4g}" for key, value in found.parameters.items())
     say(f"  tuned {name}: {constants}, cost {found.cost:.3f} s")
-    complete = type(peer).model_validate(peer.model_dump() | found.parameters)
+    complete = peer.tuned(found.parameters)
     return complete, {
         "config": complete.model_dump(mode="json"),
         "cost": found.cost,
@@ -168,12 +174,12 @@ def _complete(
 def _in_weather(config: AutopilotConfig, stated: JudgedConditions) -> SteeredPlant:
     """Return the vessel as the conditions need it: in calm water, or in wind and current."""
     calm = not any(conditions.weather for conditions in stated.flown.values())
-    return SteeredPlant(load_vessel(config.vessel).build(), calm=calm)
+    return SteeredPlant(load_vessel(config.vessel).build(), calm=calm, axis=config.axis)
 
 
 def _policy(
     name: str,
-    start: ObservedConfig | None,
+    start: AnyController | None,
     steering: Steering,
     config: AutopilotConfig,
     folder: RunFolder,
@@ -192,20 +198,21 @@ def _policy(
             f" {turning.gain:.4g} 1/s, T = {turning.time:.4g} s"
         )
     torch.manual_seed(config.seed)
-    spec = wanted.spec.model_validate(
-        {
-            "state": school.state,
-            "gain": turning.gain,
-            "time": turning.time,
-            "speed": turning.speed,
-            "limit": steering.limit,
-            "rate": school.rate,
-            "dt": steering.dt,
-            "trained_at": wanted.training.dt,
-            "units": wanted.units,
-            **({} if start is None else {"law": start.model_dump()}),
-        }
-    )
+    law = observed_of(start)
+    described = {
+        "state": school.state,
+        **vars(turning),
+        "limit": steering.limit,
+        "rate": school.rate,
+        "dt": steering.dt,
+        "trained_at": wanted.training.dt,
+        "units": wanted.units,
+        **({"law": law.model_dump()} if isinstance(law, ObservedConfig) else {}),
+    }
+    if isinstance(start, DepthConfig):
+        sight = {name: start.complete()[name] for name in SIGHT}
+        described = {"law": described, "steepest": start.steepest, "sight": sight}
+    spec = config.spec_of(name).model_validate(described)
     policy, store = spec.build(), FolderStore(folder)
     notes, started = store.finished_module(name, policy), (time.time(), time.process_time())
     if notes is None:
@@ -245,7 +252,7 @@ def stored_policy(config: AutopilotConfig, models: Path, name: str, dt: float) -
     Raises:
         UsageError: where the run lacks it, or it is not as it was written.
     """
-    policy = load_recurrent(models / name, config.policies[name].spec)
+    policy = load_recurrent(models / name, config.spec_of(name))
     policy.at(dt)
     return policy
 
@@ -255,6 +262,7 @@ def _compare(
 ) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
     """Return the rows of metrics.json, and two tables: flights of the corners, random vessels."""
     test, stated = config.test, _stated(config)
+    change, band = test.step
     ends = corners(stated.effect, stated.time)
     spread = random_variations(stated.effect, stated.time, test.plants, config.seed + 1)
     pushed = torch.tensor([[1.0, 1.0, test.bias], [1.0, 1.0, -test.bias]], dtype=torch.float64)
@@ -262,22 +270,21 @@ def _compare(
     rows: list[dict[str, Any]] = []
     flown, plants = [], []
     for name, (kind, policy) in controllers.items():
-        step = partial(step_flights, vessel, policy, test.heading, test.dt, test.duration)
+        step = partial(step_flights, vessel, policy, change, test.dt, test.duration)
         tests = {"nominal": step(ends[:1]), "corners": step(ends), "random": step(spread)}
         rows += [
-            step_row(name, kind, protocol, flights, test.band)
-            for protocol, flights in tests.items()
+            step_row(name, kind, protocol, flights, band) for protocol, flights in tests.items()
         ]
         flown.append(series(name, tests["corners"], ends))
-        found = {key: value.numpy() for key, value in measure(tests["random"], test.band).items()}
+        found = {key: value.numpy() for key, value in measure(tests["random"], band).items()}
         given = {"effect": spread[:, 0].numpy(), "time": spread[:, 1].numpy()}
         plants.append(pd.DataFrame({"controller": name, **given, **found}))
         times: dict[str, Any] = {"dt": test.dt, "duration": test.bias_time}
-        disturbed = {"bias": fly(vessel, policy, torch.full((2,), test.heading), pushed, **times)}
+        disturbed = {"bias": fly(vessel, policy, torch.full((2,), change), pushed, **times)}
         if test.wind is not None:
             disturbed["wind"] = wind_flights(plant, policy, test.wind, test.heading, **times)
         rows += [
-            step_row(name, kind, key, flights, test.band)
+            step_row(name, kind, key, flights, band)
             | {"error_end": float(flights.error[:, -1].abs().max())}
             for key, flights in disturbed.items()
         ]
@@ -329,14 +336,16 @@ def _told(
     """Return the verdict and the main figures: settling on the nominal vessel, and worst corner."""
     found = {(row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row}
     sentences, figures = cost_verdict(rows), dict[str, MainFigure]()
+    change, _ = config.test.step
+    words = words_of(config.test.model_dump())
     for name in config.policies or config.predictive:
         nominal, worst = found[name, "nominal"]["max"], found[name, "corners"]["max"]
         figures[f"{name}_settling_nominal"] = MainFigure(nominal, "s")
         figures[f"{name}_settling_worst"] = MainFigure(worst, "s")
         sentences.append(
-            f"'{name}' settles on a new heading {math.degrees(config.test.heading):.3g} deg away in"
-            f" {nominal:.2f} s on the nominal vessel, and in {worst:.2f} s on the slowest vessel at"
-            " the corners of the spread."
+            f"'{name}' settles on a new {words.value} {words.scale * change:.3g} {words.unit} away"
+            f" in {nominal:.2f} s on the nominal vessel, and in {worst:.2f} s on the slowest vessel"
+            " at the corners of the spread."
         )
     if config.floor is not None:
         sentences.append(

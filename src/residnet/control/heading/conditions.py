@@ -12,18 +12,42 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.control.base import Policy
-from residnet.control.heading.vessels import SteeredVessel
-from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
+from residnet.control.heading.vessels import SteeredVessel, lacking
+from residnet.core.config import (
+    Config,
+    Metres,
+    MetresPerSecond,
+    Radians,
+    RadiansPerSecond,
+    Seconds,
+)
 from residnet.core.errors import ExportError
-from residnet.core.frames import wrap
 from residnet.dynamics.rollout import FreeRun, Rollout, Source
 from residnet.dynamics.simulated import check_steps
-from residnet.dynamics.steering_variation import PushedSteering
+from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis, PushedSteering
 from residnet.physics.environment import JonswapSpectrum
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
 _SINES = 12
 """That a motion with the waves is made of."""
+
+
+class DepthChanges(Config):
+    """Changes of depth, in place of those of heading.
+
+    Attributes:
+        change: smallest and largest in m, down or up.
+        band: depth error in m at which half of the cost of a large one is left.
+        noise: standard deviation of white noise on the measured depth in m.
+    """
+
+    change: tuple[Metres, Metres] = (1.0, 5.0)
+    band: Metres = Field(default=0.1, gt=0)
+    noise: Metres = Field(default=0.02, ge=0)
+
+
+_DECIMETRE, _DEGREE = 0.1, math.pi / 180.0
+"""What stands for a degree of heading where depths are changed: the default bands' ratio, in m."""
 
 
 class ConditionsConfig(Config):
@@ -33,9 +57,12 @@ class ConditionsConfig(Config):
     holds its course first; the reference jumps at a random time, without prefilter. The cost of a
     flight counts from the jump on: the integral of |e| / (|e| + band) in s, plus `overshoot_weight`
     times the overshoot in deg, plus `travel_weight` times the travel of the rudder command in deg;
-    e is the true heading error.
+    e is the true heading error. With `depth` all this is of the depth, by the stern planes: a
+    decimetre of overshoot stands for a degree, sway and yaw are heave and pitch, and heading and
+    yaw rate that are measured are pitch and pitch rate.
 
     Attributes:
+        depth: changes of depth; null for those of heading.
         effect: of the rudder, as a multiple (K of Nomoto's model).
         time: constants of sway and yaw, as a multiple (T of Nomoto's model).
         delay: shortest and longest delay in s between a command and the steering gear.
@@ -60,6 +87,7 @@ class ConditionsConfig(Config):
         travel_weight: cost of a degree of rudder travel, in s.
     """
 
+    depth: DepthChanges | None = None
     effect: Range = (0.8, 1.2)
     time: Range = (0.8, 1.2)
     delay: tuple[Seconds, Seconds] = (0.0, 0.4)
@@ -89,6 +117,10 @@ class ConditionsConfig(Config):
             "heading": (*self.heading, 1e-3, 3.1),
             "wave_period": (*self.wave_period, 0.2, 60.0),
         }
+        if self.depth is not None:
+            ranges["depth.change"] = (*self.depth.change, 1e-3, 1e4)
+            if self.waves > 0:
+                raise ValueError("waves: they move the heading that is measured, and no depth")
         check_steps(self.hold + self.duration, self.dt)
         if self.wind is not None:
             ranges["wind"] = (*self.wind, 0.0, 60.0)
@@ -99,6 +131,21 @@ class ConditionsConfig(Config):
                     f" given {low:g}, {high:g}"
                 )
         return self
+
+    @property
+    def axis(self) -> Axis:
+        """What is steered: the heading, or the depth."""
+        return HEADING if self.depth is None else DEPTH
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Smallest and largest change in rad, or in m of depth."""
+        return self.heading if self.depth is None else self.depth.change
+
+    @property
+    def unit(self) -> float:
+        """A degree in rad, or a decimetre in m, which `overshoot_weight` is for."""
+        return _DEGREE if self.depth is None else _DECIMETRE
 
     @property
     def weather(self) -> bool:
@@ -130,14 +177,15 @@ class ConditionsConfig(Config):
         hold = round(self.hold / dt)
         steps = hold + round(self.duration / dt)
         scale = share * math.sqrt(self.dt / dt)
-        noise = torch.randn(rows, steps, 2, generator=random) * torch.tensor(
-            [scale * self.noise_psi, scale * self.noise_r]
-        )
+        sizes = [self.noise_psi, self.noise_r]
+        sizes = sizes if self.depth is None else [self.depth.noise, *sizes]
+        noise = torch.randn(rows, steps, len(sizes), generator=random)
+        noise *= torch.tensor([scale * size for size in sizes])
         sign = torch.where(torch.rand(rows, generator=random) < 0.5, -1.0, 1.0)
         effect, time = (1.0 + share * (even(*values) - 1.0) for values in (self.effect, self.time))
         bias = share * even(-self.bias, self.bias)
         changes = HeadingChanges(
-            heading=sign * even(*self.heading),
+            heading=sign * even(*self.span),
             start=torch.randint(0, hold + 1, (rows,), generator=random),
             variation=torch.stack((effect, time, bias), dim=1),
             delay=torch.round(share * even(*self.delay) / dt),
@@ -227,15 +275,15 @@ def gauss_markov(rows: int, steps: int, step: float, random: torch.Generator) ->
 
 @dataclass(frozen=True)
 class HeadingChanges:
-    """B heading changes of T steps, as they were drawn.
+    """B changes of heading, or of depth, of T steps, as they were drawn.
 
     Attributes:
-        heading: change [B] in rad.
+        heading: change [B] in rad, or in m of depth.
         start: number [B] of the step at which the reference jumps.
         variation: of the vessel [B, 3], `dynamics.steering_variation.VARIATION`.
         delay: of the command [B] in steps.
         push: angle [B, T] in rad that is added to the rudder's.
-        noise: on the measured heading and yaw rate [B, T, 2] in rad and rad/s.
+        noise: on what is measured of the axis (`Axis.measured`), [B, T, 2 or 3] in SI units.
         weather: constant inputs of the vessel [B] by name, SI.
         dt: step in s.
         count: number of steps that are counted, from the jump on.
@@ -252,7 +300,7 @@ class HeadingChanges:
     count: int
 
     def reference(self) -> Tensor:
-        """Return the reference [B, T] in rad: zero, then the new heading."""
+        """Return the reference [B, T]: zero, then the new heading in rad or the new depth in m."""
         steps = torch.arange(self.push.shape[1])
         return torch.where(steps >= self.start[:, None], self.heading[:, None], 0.0)
 
@@ -299,21 +347,21 @@ ExportError where it cannot."""
 class ConditionedLoop(Source):
     """A controller that sees through noisy sensors and whose commands arrive late.
 
-    Given inputs [B, m + 5]: those of the vessel, then push, reference, noise on heading and yaw
-    rate, and the delay in steps. It returns [B, m + 2]: the inputs that act, the push, and the
-    command as it was issued. Its memory holds the last commands, then that of the controller.
+    Given inputs [B, m + 3 + k]: those of the vessel, then push, reference, the delay in steps, and
+    noise on what is measured, heading and yaw rate. It returns [B, m + 2]: the inputs that act, the
+    push, and the command as it was issued. Its memory holds the last commands, then that of the
+    controller.
 
     Args:
         policy: the controller.
-        columns: of heading and yaw rate in the state.
+        columns: of what is measured in the state, k of them.
         inputs: number m of the vessel's inputs.
         longest: delay in steps that the memory holds.
     """
 
-    def __init__(self, policy: Policy, columns: tuple[int, int], inputs: int, longest: int) -> None:
+    def __init__(self, policy: Policy, columns: tuple[int, ...], inputs: int, longest: int) -> None:
         super().__init__()
-        self.policy = policy
-        self.psi, self.r = columns
+        self.policy, self.columns = policy, list(columns)
         self.inputs, self.longest = inputs, longest
 
     def initial(self, x: Tensor) -> Tensor:
@@ -323,10 +371,10 @@ class ConditionedLoop(Source):
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         m = self.inputs
-        push, reference, noise_psi, noise_r, delay = w[:, m:].split(1, dim=1)
+        push, reference, delay = w[:, m : m + 3].split(1, dim=1)
         seen = torch.zeros_like(x)
-        seen[:, self.psi : self.psi + 1] = noise_psi
-        seen[:, self.r : self.r + 1] = noise_r
+        for k, column in enumerate(self.columns):
+            seen[:, column : column + 1] = w[:, m + 3 + k : m + 4 + k]
         command, s = self.policy(x + seen, reference, memory[:, self.longest :])
         late = torch.cat((command, memory[:, : self.longest]), dim=1)
         arriving = late.gather(1, delay.to(torch.int64))
@@ -336,39 +384,39 @@ class ConditionedLoop(Source):
 
 @dataclass(frozen=True)
 class ConditionedFlights:
-    """B heading changes of T steps as they were flown.
+    """B changes of heading, or of depth, of T steps as they were flown.
 
     Attributes:
         changes: as they were drawn.
-        psi: heading [B, T] in rad at the start of each step.
-        r: yaw rate [B, T] in rad/s.
+        value: heading [B, T] in rad, or depth in m, at the start of each step.
         command: rudder command [B, T] in rad, as it was issued.
+        axis: that is steered.
     """
 
     changes: HeadingChanges
-    psi: Tensor
-    r: Tensor
+    value: Tensor
     command: Tensor
+    axis: Axis
 
     @property
     def error(self) -> Tensor:
-        """New heading less heading [B, T] in rad, wrapped."""
-        return wrap(self.changes.heading[:, None] - self.psi)
+        """New heading less heading [B, T] in rad, wrapped, or new depth less depth in m."""
+        return lacking(self.axis, self.changes.heading[:, None], self.value)
 
     def swing(self, after: float) -> tuple[Tensor, Tensor]:
-        """Return how far heading and rudder command [B] in rad move, peak to peak.
+        """Return how far heading [rad] or depth [m] and command [rad] move, peak to peak, [B].
 
         Args:
             after: time in s from the change of heading on, up to the flight's end.
         """
-        steps = torch.arange(self.psi.shape[1])
+        steps = torch.arange(self.value.shape[1])
         late = steps >= self.changes.start[:, None] + round(after / self.changes.dt)
 
         def between(values: Tensor) -> Tensor:
             highest = torch.where(late, values, -torch.inf).amax(1)
             return highest - torch.where(late, values, torch.inf).amin(1)
 
-        return between(self.psi), between(self.command)
+        return between(self.value), between(self.command)
 
     def late_swing(self, share: float) -> Tensor:
         """Return the variance of the rudder command [B] in rad^2 in the last share of what counts.
@@ -376,18 +424,20 @@ class ConditionedFlights:
         What counts is the time from the change on that the cost is of.
         """
         first = self.changes.start[:, None] + round((1.0 - share) * self.changes.count)
-        late = self.changes.counted() & (torch.arange(self.psi.shape[1]) >= first)
+        late = self.changes.counted() & (torch.arange(self.value.shape[1]) >= first)
         number = late.sum(1, keepdim=True).clamp(min=1)
         mean = (self.command * late).sum(1, keepdim=True) / number
         return ((self.command - mean).square() * late).sum(1) / number[:, 0]
 
     def measured(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
         """Return each of `QUANTITIES` by flight, [B]; what is no number is left so."""
-        dt, degrees = self.changes.dt, 180.0 / torch.pi
-        counted = self.changes.counted().to(self.psi.dtype)
+        dt, band = self.changes.dt, conditions.band
+        if conditions.depth is not None:
+            band = conditions.depth.band
+        counted = self.changes.counted().to(self.value.dtype)
         error = self.error
         size = error.abs()
-        outside = (counted * size / (size + conditions.band)).sum(1) * dt
+        outside = (counted * size / (size + band)).sum(1) * dt
         beyond = -error * self.changes.heading.sign()[:, None]
         # plus zero: no negative zero is shown
         overshoot = (beyond * counted).amax(1).clamp(min=0.0) + 0.0
@@ -395,8 +445,8 @@ class ConditionedFlights:
         travel = (moved.abs() * counted).sum(1)
         cost = (
             outside
-            + degrees * conditions.overshoot_weight * overshoot
-            + degrees * conditions.travel_weight * travel
+            + conditions.overshoot_weight / conditions.unit * overshoot
+            + conditions.travel_weight / _DEGREE * travel
         )
         values = (cost, outside, overshoot, travel, (size * counted).sum(1) * dt)
         return dict(zip(QUANTITIES, values, strict=True))
@@ -428,7 +478,7 @@ class ConditionedRun:
         longest: int | None = None,
     ) -> None:
         self.vessel, self.dtype, self.dt = vessel, dtype, dt
-        self.columns = vessel.column("psi"), vessel.column("r")
+        self.columns = tuple(map(vessel.column, vessel.axis.measured))
         self.policy, self.compiler, self.longest = policy, compiler, longest
         self._flying: dict[int, FreeRun] = {}
         self.model = PushedSteering(vessel.model(dt, integrator), len(vessel.inputs))
@@ -440,30 +490,23 @@ class ConditionedRun:
         return Rollout(self.model, loop)
 
     def given(self, changes: HeadingChanges) -> tuple[Tensor, Tensor, Tensor]:
-        """Return states [B, nx], inputs [B, T, m + 5] and the vessel's memory for a rollout."""
+        """Return states [B, nx], inputs [B, T, m + 3 + k] and the vessel's memory for a rollout."""
         rows, steps = changes.push.shape
         x, w = self.vessel.start(torch.ones(rows, dtype=self.dtype))
         for name, value in changes.weather.items():
             w[:, self.vessel.inputs.index(name)] = value.to(self.dtype)
-        extra = torch.stack(
-            (
-                changes.push,
-                changes.reference(),
-                changes.noise[:, :, 0],
-                changes.noise[:, :, 1],
-                changes.delay[:, None].expand(-1, steps),
-            ),
-            dim=2,
-        )
-        inputs = torch.cat((w.unsqueeze(1).expand(-1, steps, -1), extra.to(self.dtype)), dim=2)
+        late = changes.delay[:, None].expand(-1, steps)
+        extra = torch.stack((changes.push, changes.reference(), late), dim=2)
+        parts = (w.unsqueeze(1).expand(-1, steps, -1), extra, changes.noise)
+        inputs = torch.cat([part.to(self.dtype) for part in parts], dim=2)
         return x, inputs, self.vessel.memory(changes.variation.to(self.dtype))
 
     def flights(
         self, changes: HeadingChanges, states: Tensor, inputs: Tensor
     ) -> ConditionedFlights:
         """Return what a rollout gave: states [B, T+1, nx] and inputs [B, T, m + 2]."""
-        psi, r = (states[:, :-1, column] for column in self.columns)
-        return ConditionedFlights(changes, psi, r, inputs[:, :, -1])
+        value = states[:, :-1, self.columns[0]]
+        return ConditionedFlights(changes, value, inputs[:, :, -1], self.vessel.axis)
 
     def fly(self, changes: HeadingChanges) -> ConditionedFlights:
         """Fly heading changes without gradients."""
@@ -528,6 +571,20 @@ def quiet_after(duration: float) -> float:
     return _AFTER * duration
 
 
+class DepthLimits(Config):
+    """What a depth policy must keep to beside the planes' swing, in m.
+
+    Attributes:
+        swing: largest movement of the depth, peak to peak, once a change is long over.
+        overshoot: largest of the nominal vessel without delay and bias.
+        overshoot_p95: that one flight in twenty may exceed under the conditions.
+    """
+
+    swing: Metres = Field(default=0.02, gt=0)
+    overshoot: Metres = Field(default=0.1, gt=0)
+    overshoot_p95: Metres = Field(default=0.3, gt=0)
+
+
 class SteadinessLimits(Config):
     """What a policy must keep to without noise and slow push, for an epoch of training to be taken.
 
@@ -543,15 +600,23 @@ class SteadinessLimits(Config):
             changes of heading of all sizes.
         overshoot_p95: overshoot in rad that one flight in twenty may exceed under the conditions,
             noise and slow push included.
+        depth: what stands for those of heading where the depth is changed.
         flights: under the conditions that are looked at for swinging; half of them at corners of
             the spread.
     """
 
+    depth: DepthLimits = DepthLimits()
     heading_swing: Radians = Field(default=0.002792526803190927, gt=0)
     rudder_swing: Radians = Field(default=0.013962634015954637, gt=0)
     overshoot: Radians = Field(default=0.0020943951023931953, gt=0)
     overshoot_p95: Radians = Field(default=0.008377580409572781, gt=0)
     flights: int = Field(default=256, ge=2, le=1_000_000)
+
+    def of(self, axis: Axis) -> tuple[float, float, float]:
+        """Return the largest swing, overshoot and 95th percentile of it, in rad or m."""
+        if axis is DEPTH:
+            return self.depth.swing, self.depth.overshoot, self.depth.overshoot_p95
+        return self.heading_swing, self.overshoot, self.overshoot_p95
 
 
 @final
@@ -576,7 +641,7 @@ class SteadyTest:
         drawn = self.conditions.at_corners(drawn, limits.flights // 2, random)
         heading = drawn.heading.clone()
         sides = torch.tensor([1.0, -1.0]).repeat(_NOMINAL // 2)
-        heading[limits.flights :] = sides * torch.linspace(*conditions.heading, _NOMINAL)
+        heading[limits.flights :] = sides * torch.linspace(*conditions.span, _NOMINAL)
         self.changes = nominal(replace(drawn, heading=heading), limits.flights, _NOMINAL)
         self.flights = limits.flights + _NOMINAL
 
@@ -585,10 +650,11 @@ class SteadyTest:
         flown = run.fly(self.changes)
         heading, rudder = flown.swing(self.after)
         limits, last = self.limits, self.limits.flights
+        swing, most, _ = limits.of(flown.axis)
         over = flown.measured(self.conditions)["overshoot"]
         # what is no number is not within its limit
-        steady = (heading <= limits.heading_swing) & (rudder <= limits.rudder_swing)
-        steady[last:] &= over[last:] <= limits.overshoot
+        steady = (heading <= swing) & (rudder <= limits.rudder_swing)
+        steady[last:] &= over[last:] <= most
         return int((~steady).sum())
 
 

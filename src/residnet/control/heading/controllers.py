@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple, final
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self, final
 
 import torch
 from pydantic import Field
@@ -14,10 +14,17 @@ from torch import Tensor
 from residnet.control.base import Policy
 from residnet.control.heading.classical import BangBangHeading, RatedBangBangHeading
 from residnet.control.heading.laws import HeadingLaw, RegulatorLaw, StoppingLaw, regulator_gains
-from residnet.control.heading.policies import CONSTANTS, NetworkPolicy, ObservedPolicy
+from residnet.control.heading.policies import (
+    CONSTANTS,
+    SIGHT,
+    AnglePolicy,
+    DepthPolicy,
+    NetworkPolicy,
+    ObservedPolicy,
+)
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredVessel
-from residnet.core.config import Config, Seconds
+from residnet.core.config import Config, Metres, Radians, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.frames import wrap
 from residnet.dynamics.store import Stored, read_spec, read_weights
@@ -40,7 +47,7 @@ class SearchRange(NamedTuple):
 
 
 @final
-class LinearLaw(Policy):
+class LinearLaw(AnglePolicy):
     """The law kp e - kd r + ki I on filtered measurements, with gains of its own for every row.
 
     Heading and yaw rate pass a low pass of first order each, as autopilots have one against noise
@@ -57,8 +64,9 @@ class LinearLaw(Policy):
 
     def __init__(self, steering: Steering, gains: Sequence[Tensor]) -> None:
         super().__init__()
-        self.psi, self.r = steering.vessel.column("psi"), steering.vessel.column("r")
-        self.limit, self.dt = steering.limit, steering.dt
+        self.read_from(steering.vessel.state)
+        self.at(steering.dt)
+        self.limit = steering.limit
         for name, gain in zip(self.NUMBERS, gains, strict=True):
             self.register_buffer(name, gain.reshape(-1, 1), persistent=False)
         self.kp: Tensor
@@ -96,12 +104,12 @@ class ControllerConfig(Config, ABC):
 
 
 class TunableConfig(ControllerConfig, ABC):
-    """The config of a controller whose missing parameters are tuned.
+    """The config of a controller whose missing parameters are tuned."""
 
-    `own` names the numbers of what `rows` returns that every row has for itself.
-    """
-
-    own: ClassVar[tuple[str, ...]]
+    @property
+    @abstractmethod
+    def own(self) -> tuple[str, ...]:
+        """The names of the numbers of what `rows` returns that every row has for itself."""
 
     @abstractmethod
     def parameters(self) -> dict[str, float | None]:
@@ -114,6 +122,10 @@ class TunableConfig(ControllerConfig, ABC):
     @abstractmethod
     def rows(self, parameters: dict[str, Tensor], steering: Steering) -> Policy:
         """Return a controller whose parameters [B] differ from row to row."""
+
+    def tuned(self, found: Mapping[str, float]) -> Self:
+        """Return the config with parameters given."""
+        return type(self).model_validate(self.model_dump() | dict(found))
 
     def complete(self) -> dict[str, float]:
         """Return the parameters by name.
@@ -141,8 +153,11 @@ class TunedConfig(TunableConfig, ABC):
             others, and none where these are all given.
     """
 
-    own: ClassVar[tuple[str, ...]] = LinearLaw.NUMBERS
     filter_time: Seconds | None = Field(default=None, ge=0)
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        return LinearLaw.NUMBERS
 
     @abstractmethod
     def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
@@ -166,12 +181,12 @@ class TunedConfig(TunableConfig, ABC):
         lag = SearchRange(0.002 * turning.time, 0.3 * turning.time)
         return {**self.law_axes(turning), "filter_time": lag}
 
-    def build(self, steering: Steering) -> Policy:
+    def build(self, steering: Steering) -> LinearLaw:
         """Return the law with these parameters."""
         found = {name: torch.tensor([value]).double() for name, value in self.complete().items()}
         return self.rows(found, steering)
 
-    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> Policy:
+    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> LinearLaw:
         """Return the law with gains of its own for every row."""
         gains = self.gains(parameters, steering.turning)
         return LinearLaw(steering, [*gains, parameters["filter_time"]])
@@ -314,7 +329,9 @@ class ObservedConfig(TunableConfig, ABC):
     push_rate: Positive | None = None
     cross_rate: Positive | None = None
 
-    own: ClassVar[tuple[str, ...]] = ("constants",)
+    @property
+    def own(self) -> tuple[str, ...]:
+        return ("constants",)
 
     @abstractmethod
     def law(self, limit: float, rate: float | None) -> HeadingLaw:
@@ -339,11 +356,11 @@ class ObservedConfig(TunableConfig, ABC):
             "cross_rate": SearchRange(0.15 * once**2, 150.0 * once**2),
         }
 
-    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> Policy:
+    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> ObservedPolicy:
         """Return the law with constants of its own for every row."""
         return self.policy(parameters, steering)
 
-    def build(self, steering: Steering) -> Policy:
+    def build(self, steering: Steering) -> ObservedPolicy:
         return self.policy(self.complete(), steering)
 
     def policy(self, constants: Mapping[str, float | Tensor], steering: Steering) -> ObservedPolicy:
@@ -413,8 +430,90 @@ class PtosConfig(ObservedConfig):
 
 AnyObserved = Annotated[ObservedLqrConfig | PtosConfig, Field(discriminator="kind")]
 
+AnyPitch = Annotated[
+    PdConfig | PidConfig | LqrConfig | ObservedLqrConfig | PtosConfig, Field(discriminator="kind")
+]
+
+
+class DepthConfig(TunableConfig):
+    """A line of sight down to a depth, and a law on the dive angle; all constants are tuned as one.
+
+    Attributes:
+        pitch: the law on the dive angle, any that steers a heading.
+        steepest: largest dive angle wanted in rad.
+        lookahead: distance in m from which the line of sight points down; null to tune it, as with
+            the next two.
+        depth_rate: how fast the estimated depth follows the measured one, in 1/s.
+        drift_rate: how fast the drift of the depth is learned, in 1/s.
+    """
+
+    kind: Literal["depth"] = "depth"
+    pitch: AnyPitch
+    steepest: Radians = Field(default=0.5235987755982988, gt=0, lt=1.3)
+    lookahead: Annotated[Metres, Field(gt=0)] | None = None
+    depth_rate: Positive | None = None
+    drift_rate: Positive | None = None
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        return ("constants", *(f"law.{name}" for name in self.pitch.own))
+
+    def parameters(self) -> dict[str, float | None]:
+        """Return the constants of the line of sight, then those of the law."""
+        return {name: getattr(self, name) for name in SIGHT} | self.pitch.parameters()
+
+    def axes(self, turning: Turning) -> dict[str, SearchRange]:
+        """Return the ranges; a vessel goes speed times T while its dive angle changes."""
+        way, once = turning.speed * turning.time, 1.0 / turning.time
+        return {
+            "lookahead": SearchRange(0.3 * way, 20.0 * way),
+            "depth_rate": SearchRange(0.05 * once, 20.0 * once),
+            "drift_rate": SearchRange(0.01 * once, once),
+            **self.pitch.axes(turning),
+        }
+
+    def tuned(self, found: Mapping[str, float]) -> Self:
+        """Return the config with parameters given, those of the law in it."""
+        own = {name: found[name] for name in SIGHT}
+        law = {name: value for name, value in found.items() if name not in own}
+        return self.model_copy(update={**own, "pitch": self.pitch.tuned(law)})
+
+    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> DepthPolicy:
+        """Return the policy with constants of its own for every row."""
+        return self.over(self.pitch.rows(parameters, steering), parameters, steering)
+
+    def build(self, steering: Steering) -> DepthPolicy:
+        return self.over(self.pitch.build(steering), self.complete(), steering)
+
+    def over(
+        self, law: AnglePolicy, constants: Mapping[str, float | Tensor], steering: Steering
+    ) -> DepthPolicy:
+        """Return the policy over a law; each constant is one number or [B]."""
+        return DepthPolicy(
+            steering.vessel.state,
+            turning=steering.turning,
+            law=law,
+            constants=constants,
+            steepest=self.steepest,
+            limit=steering.limit,
+            dt=steering.dt,
+            rate=steering.vessel.rate,
+        )
+
+
+def observed_of(peer: object) -> object:
+    """Return the law that a peer steers by: that on the dive angle of a depth controller."""
+    return peer.pitch if isinstance(peer, DepthConfig) else peer
+
+
 ClassicalController = Annotated[
-    PdConfig | PidConfig | LqrConfig | ObservedLqrConfig | PtosConfig | BangBangConfig,
+    PdConfig
+    | PidConfig
+    | LqrConfig
+    | ObservedLqrConfig
+    | PtosConfig
+    | BangBangConfig
+    | DepthConfig,
     Field(discriminator="kind"),
 ]
 
@@ -427,6 +526,7 @@ class _PolicySpec(Stored):
         gain: K of that vessel about straight ahead in 1/s.
         time: T of that vessel in s.
         speed: at which K and T hold, in m/s.
+        righting: c of its dive angle; zero of a heading.
         limit: of the rudder in rad.
         rate: of the rudder in rad/s; None where it stands at its command at once.
         dt: step in s that it runs with.
@@ -437,6 +537,7 @@ class _PolicySpec(Stored):
     gain: float
     time: float = Field(gt=0)
     speed: float
+    righting: float = 0.0
     limit: float = Field(gt=0)
     rate: float | None = Field(gt=0)
     dt: float = Field(gt=0)
@@ -444,8 +545,8 @@ class _PolicySpec(Stored):
 
     @property
     def turning(self) -> Turning:
-        """K, T and speed of that vessel."""
-        return Turning(self.gain, self.time, self.speed)
+        """K, T, speed and c of that vessel."""
+        return Turning(self.gain, self.time, self.speed, self.righting)
 
 
 class ObservedPolicySpec(_PolicySpec):
@@ -505,8 +606,40 @@ class NetworkPolicySpec(_PolicySpec):
         )
 
 
-RecurrentSpec = ObservedPolicySpec | NetworkPolicySpec
-RecurrentPolicy = ObservedPolicy | NetworkPolicy
+class DepthPolicySpec(Stored):
+    """A description of a depth policy over an observed law with a recurrent network.
+
+    Attributes:
+        schema_name: kind and version of the format.
+        law: on the dive angle.
+        steepest: largest dive angle wanted in rad.
+        sight: the constants `SIGHT` that training began with.
+    """
+
+    schema_name: Literal["residnet.depth_policy/1"] = Field(
+        default="residnet.depth_policy/1", alias="schema"
+    )
+    law: ObservedPolicySpec
+    steepest: float = Field(gt=0)
+    sight: dict[str, Positive]
+
+    def build(self) -> DepthPolicy:
+        """Return the policy with its network not yet trained."""
+        law = self.law
+        return DepthPolicy(
+            law.state,
+            turning=law.turning,
+            law=law.build(),
+            constants=self.sight,
+            steepest=self.steepest,
+            limit=law.limit,
+            dt=law.dt,
+            rate=law.rate,
+        )
+
+
+RecurrentSpec = ObservedPolicySpec | NetworkPolicySpec | DepthPolicySpec
+RecurrentPolicy = ObservedPolicy | NetworkPolicy | DepthPolicy
 
 
 def load_recurrent(folder: Path, kind: type[RecurrentSpec]) -> RecurrentPolicy:

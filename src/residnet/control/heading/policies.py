@@ -1,4 +1,7 @@
-"""Learned heading policies: an observer and a law with a recurrent network, or a network alone."""
+"""Learned policies: an observer and a law with a recurrent network, or a network alone.
+
+They steer the heading, or the dive angle under a depth policy.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import torch
 from torch import Tensor, nn
@@ -15,20 +18,43 @@ from residnet.control.base import Policy
 from residnet.control.heading.laws import HeadingLaw
 from residnet.control.heading.turning import Turning
 from residnet.core.frames import wrap
+from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis
 
 
-class HeadingPolicy(Policy, ABC):
+class AnglePolicy(Policy, ABC):
+    """A policy that turns a heading, or the dive angle of a depth policy.
+
+    Attributes:
+        dt: step in s.
+    """
+
+    dt: float
+
+    def read_from(self, state: Sequence[str]) -> None:
+        """Take heading and yaw rate, and the speed, from a state with these names."""
+        self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
+
+    def at(self, dt: float) -> None:
+        """Take steps of dt seconds from now on."""
+        self.dt = dt
+
+
+class HeadingPolicy(AnglePolicy, ABC):
     """A heading policy with K, T and speed of its vessel, a rudder, and a memory with ranges.
 
     Attributes:
+        axis: that it steers.
+        measured: what it is given, with units; what it steers by stands first.
         gain: K of its vessel in 1/s.
         time: T of its vessel in s.
         speed: at which K and T hold, in m/s.
         limit: of the rudder in rad.
         rate: of the rudder in rad/s; infinite where it stands at its command at once.
-        dt: step in s.
         travel: most that the rudder moves in a step, in rad.
     """
+
+    axis: ClassVar[Axis] = HEADING
+    measured: ClassVar[Mapping[str, str]] = {"psi": "rad", "u": "m/s", "r": "rad/s"}
 
     def __init__(
         self, state: Sequence[str], turning: Turning, limit: float, rate: float | None
@@ -39,13 +65,8 @@ class HeadingPolicy(Policy, ABC):
         self.limit = limit
         self.rate = math.inf if rate is None else rate
 
-    def read_from(self, state: Sequence[str]) -> None:
-        """Take heading, speed and yaw rate from a state with these names."""
-        self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
-
     def at(self, dt: float) -> None:
-        """Take steps of dt seconds from now on."""
-        self.dt = dt
+        super().at(dt)
         # a large number where the rudder has no rate: infinity would spoil gradients
         self.travel = min(self.rate * dt, 2.0 * self.limit)
 
@@ -136,11 +157,11 @@ class Estimate(NamedTuple):
 
 @final
 class HeadingObserver(nn.Module):
-    """A Luenberger observer of T r_dot + r = K (delta + push), with a predictor.
+    """A Luenberger observer of T r_dot + r = K (delta + push - c psi), with a predictor.
 
     The rudder is taken to act `lag` seconds after its command; the predictor adds what the commands
-    of these seconds will do, in closed form. K grows and T falls with the speed. Where heading or
-    yaw rate are far from what was expected, the estimate begins anew at what is measured.
+    of these seconds will do, in closed form. K grows and T falls with the speed; c, which is
+    zero but for a dive angle, falls with its square. Where heading or yaw rate are far from what was expected, the estimate begins anew at what is measured.
 
     Args:
         turning: K, T and speed of the vessel about straight ahead.
@@ -151,7 +172,7 @@ class HeadingObserver(nn.Module):
 
     def __init__(self, turning: Turning, limit: float, lag: float, dt: float) -> None:
         super().__init__()
-        self.gain, self.time = turning.gain, turning.time
+        self.gain, self.time, self.c = turning.gain, turning.time, turning.righting
         self.limit, self.lag, self.lost = limit, lag, _LOST
         self.dt, self.pending = dt, round(lag / dt)
         self.register_buffer("left", torch.zeros(0), persistent=False)
@@ -201,8 +222,13 @@ class HeadingObserver(nn.Module):
         push = (push + constants[2] * per_push * turn).clamp(-self.limit, self.limit)
         ahead, r_ahead = heading, yaw_rate
         if self.pending > 0:
-            ahead, r_ahead = self._ahead(heading, yaw_rate, push, pending, ratio)
+            felt = self.righted(push, heading, ratio)
+            ahead, r_ahead = self._ahead(heading, yaw_rate, felt, pending, ratio)
         return Estimate(heading, yaw_rate, push, ahead, r_ahead, surprise_heading, surprise_r)
+
+    def righted(self, push: Tensor, heading: Tensor, ratio: Tensor) -> Tensor:
+        """Return the push [B, 1] in rad of rudder with what rights the vessel at an angle."""
+        return push if self.c == 0.0 else push - self.c / ratio.square() * heading
 
     def _ahead(
         self, heading: Tensor, r: Tensor, push: Tensor, pending: Tensor, ratio: Tensor
@@ -240,7 +266,8 @@ class ObservedPolicy(HeadingPolicy):
     """The command clamp(limit (law + network) - push), with the law on estimates.
 
     An observer estimates heading, yaw rate and push, a predictor where they will be once the
-    pending commands have arrived; the law sees these, and the push is taken away. The network is a
+    pending commands have arrived; the law sees these, and the push is taken away, with what rights
+    a dive angle. The network is a
     recurrent residual, odd, so that port and starboard are alike; its output starts at zero. With
     no units there is no network.
 
@@ -352,9 +379,10 @@ class ObservedPolicy(HeadingPolicy):
         error = wrap(reference - seen.heading_ahead)
         decay = ratio / self.time
         force = decay * self.gain * ratio * self.limit
-        acting = (rudder + seen.push) / self.limit
+        felt = self.observer.righted(seen.push, seen.heading_ahead, ratio)
+        acting = (rudder + felt) / self.limit
         law = self.law(error, seen.r_ahead, acting, force, decay, constants[: self.own])
-        law = law - seen.push / self.limit
+        law = law - felt / self.limit
         memory = s[:, fixed + waiting :]
         wish = law
         if self.units > 0:
@@ -381,9 +409,8 @@ class ObservedPolicy(HeadingPolicy):
         command = self.limit * wish.clamp(-1.0, 1.0)
         follows = rudder + (command - rudder).clamp(-self.travel, self.travel)
         queue = torch.cat((pending, follows), dim=1)
-        heading, yaw_rate = self.observer.expected(
-            seen.heading, seen.r, seen.push, queue[:, 0:1], ratio
-        )
+        felt = self.observer.righted(seen.push, seen.heading, ratio)
+        heading, yaw_rate = self.observer.expected(seen.heading, seen.r, felt, queue[:, 0:1], ratio)
         s = torch.cat((heading, yaw_rate, seen.push, follows, command, queue[:, 1:], memory), dim=1)
         return command, s
 
@@ -464,3 +491,123 @@ class NetworkPolicy(HeadingPolicy):
         command = self.limit * wish.clamp(-1.0, 1.0)
         follows = rudder + (command - rudder).clamp(-self.travel, self.travel)
         return command, torch.cat((follows, command, memory), dim=1)
+
+
+SIGHT = ("lookahead", "depth_rate", "drift_rate")
+"""Of a depth policy: look-ahead distance in m, and how fast depth and drift follow what is
+measured, in 1/s."""
+_DEEP = 1.2e4
+"""Largest depth in m, beyond the deepest sea."""
+_DRIFT = 0.5
+"""Largest drift of the depth as a share of the speed."""
+
+
+@final
+class DepthPolicy(HeadingPolicy):
+    """Depth by the stern planes: a line of sight down to it, and a law on the dive angle.
+
+    The dive angle wanted is atan((z_d - z) / lookahead) - d / u, within `steepest`, with depth z
+    and drift d of z_dot = u sin(dive) + d estimated: what buoyancy and the angle of attack do to
+    the depth stands in d (T. I. Fossen, Handbook of Marine Craft, 2nd ed. 2021, section 12.4, for
+    the line of sight). The law sees the dive angle -theta as heading and -q as yaw rate.
+
+    Memory s [B, 2 + k]: z expected [m], d [m/s], then that of the law.
+
+    Args:
+        state: names of the vessel's state.
+        turning: K, T, c and speed of the dive angle.
+        law: on the dive angle.
+        constants: `SIGHT`, all positive.
+        steepest: largest dive angle wanted in rad.
+        limit, rate, dt: as of a heading policy, of the planes.
+    """
+
+    axis = DEPTH
+    measured: ClassVar[Mapping[str, str]] = {"z": "m", "u": "m/s", "theta": "rad", "q": "rad/s"}
+
+    def __init__(
+        self,
+        state: Sequence[str],
+        *,
+        turning: Turning,
+        law: AnglePolicy,
+        constants: Mapping[str, float | Tensor],
+        steepest: float,
+        limit: float,
+        dt: float,
+        rate: float | None = None,
+    ) -> None:
+        super().__init__(state, turning, limit, rate)
+        self.law, self.steepest = law, steepest
+        law.read_from(tuple(HeadingPolicy.measured))
+        values = [torch.as_tensor(constants[name], dtype=torch.float32) for name in SIGHT]
+        self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
+        self.at(dt)
+
+    def read_from(self, state: Sequence[str]) -> None:
+        """Take depth, speed, pitch and pitch rate from a state with these names."""
+        self.columns = [state.index(name) for name in self.measured]
+
+    def at(self, dt: float) -> None:
+        super().at(dt)
+        self.law.at(dt)
+        self.n_state = 2 + self.law.n_state
+
+    def without_network(self) -> DepthPolicy:
+        """Return a copy whose law has no network."""
+        alone = copy.deepcopy(self)
+        assert isinstance(alone.law, ObservedPolicy)
+        alone.law = alone.law.without_network()
+        return alone
+
+    def values(self) -> dict[str, float]:
+        """Return the constants by name, those of an observed law too."""
+        found = dict(zip(SIGHT, torch.exp(self.constants.detach()).tolist(), strict=True))
+        return found | (self.law.values() if isinstance(self.law, HeadingPolicy) else {})
+
+    def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
+        assert isinstance(self.law, HeadingPolicy)
+        fast = 3.1 * _DRIFT * self.speed
+        own = {"depth": (-1.01 * _DEEP, 1.01 * _DEEP), "drift": (-fast, fast)}
+        return own | self.law.memory_ranges(turn, angle)
+
+    def described(self) -> dict[str, Any]:
+        """Return the constants, the steepest dive, and what the law says of itself."""
+        assert isinstance(self.law, HeadingPolicy)
+        return {
+            "kind": "depth",
+            "constants": dict(zip(SIGHT, torch.exp(self.constants.detach()).tolist(), strict=True)),
+            "steepest": self.steepest,
+            "law": self.law.described(),
+        }
+
+    def told(self, s: Tensor, rudder: Tensor) -> Tensor:
+        return torch.cat((s[:, :2], self.law.told(s[:, 2:], rudder)), dim=1)
+
+    def _angled(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the depth [B, 1], and dive angle, speed and rate [B, 3] as the law sees them."""
+        z, u, theta, q = x[:, self.columns].split(1, dim=1)
+        return z, torch.cat((-theta, u, -q), dim=1)
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Return the memory at the start: the depth as seen, no drift."""
+        z, angled = self._angled(x)
+        return torch.cat((z, torch.zeros_like(z), self.law.initial_state(angled)), dim=-1)
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        z, angled = self._angled(x)
+        lookahead, follow, learn = torch.exp(self.constants).split(1, dim=-1)
+        u = angled[:, 1:2].clamp(0.3 * self.speed, 3.0 * self.speed)
+        surprise = z - s[:, 0:1]
+        # no vessel does this within a step: the estimate begins anew, with the drift as it was
+        surprise = torch.where(surprise.abs() > u, torch.zeros_like(z), surprise)
+        known = z - surprise
+        depth = known + (1.0 - torch.exp(-self.dt * follow)) * surprise
+        most = _DRIFT * u
+        drift = s[:, 1:2] + (self.dt * follow * learn) * surprise
+        drift = torch.minimum(torch.maximum(drift, -most), most)
+        wanted = torch.atan((reference - depth) / lookahead) - drift / u
+        wanted = wanted.clamp(-self.steepest, self.steepest)
+        command, memory = self.law(angled, wanted, s[:, 2:])
+        moved = depth + self.dt * (u * torch.sin(angled[:, 0:1]) + drift)
+        return command, torch.cat((moved, drift, memory), dim=1)

@@ -260,11 +260,15 @@ _LONGEST = 12000
 
 @dataclass(frozen=True)
 class Turning:
-    """T r_dot + r = K delta at a speed: K [1/s], T [s], u [m/s]."""
+    """T r_dot + r = K (delta - c psi) at a speed: K [1/s], T [s], u [m/s] and c [-].
+
+    The heading of a vessel has no c; the dive angle of one that rights itself is held by planes.
+    """
 
     gain: float
     time: float
     speed: float
+    righting: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -280,6 +284,9 @@ class Steered:
         steps: the first length of a step and the largest, in s.
         rate: of the rudder in rad/s; infinite where it stands at its command, or K and T are to
             hold what moves it.
+        side: sign of yaw rate and heading under a positive command.
+        rights: whether the angle that is turned comes to rest under a held command, as a pitch
+            that weight and buoyancy right.
     """
 
     build: Callable[[float], Dynamics]
@@ -289,6 +296,8 @@ class Steered:
     columns: tuple[int, int, int]
     steps: tuple[float, float]
     rate: float = math.inf
+    side: float = 1.0
+    rights: bool = False
 
 
 def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
@@ -297,7 +306,8 @@ def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
     The angle is held first: T is the area above the yaw rate's answer over its end, less that above
     the rudder's own way to the angle. The yaw rate of
     a vessel that hardly holds its course overshoots in hard turns, or is not steady for long. Then
-    K and T are those that simulate its yaw rate best in a zigzag, with a delay beside them.
+    K and T are those that simulate its yaw rate best in a zigzag, with a delay beside them. An
+    angle that comes to rest under the held rudder tells c, and the zigzag K and T.
 
     Args:
         steered: the vessel.
@@ -309,6 +319,8 @@ def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
     """
     speed = float(steered.x[0, steered.columns[0]])
     times, rates, headings = _held(steered, angle, duration)
+    if steered.rights:
+        return _measure_righted(steered, angle, float(headings[-1]))
     while times[-1] < _PATIENCE * duration and not _settled(times, rates):
         times, rates, headings = _held(steered, angle, 2.0 * float(times[-1]))
     if not np.isfinite(rates).all():
@@ -327,8 +339,22 @@ def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
             f" {times[-1]:.3g} s; it cannot be steered (check the sign of its rudder and the limit)"
         )
     first = float(times[turned[0]])
-    found = fit_response([_zigzag(steered, angle, first)], 0.5 * first)
+    found = fit_response([_zigzag(steered, angle, angle, first)[0]], 0.5 * first)
     return Turning(gain=found.gain, time=found.time, speed=speed)
+
+
+def _measure_righted(steered: Steered, angle: float, end: float) -> Turning:
+    """Return K, T and c of a vessel that has come to rest at an angle `end` under a held one."""
+    if not (math.isfinite(end) and end * angle > 0):
+        raise FitError(
+            f"at {angle:.3g} rad of rudder the vessel comes to rest at an angle of {end:.3g} rad;"
+            " it cannot be steered (check the sign of the command that steers)"
+        )
+    righting, first = angle / end, 2.0 * steered.steps[1]
+    record, headings = _zigzag(steered, angle, min(abs(angle), 0.5 * abs(end)), first)
+    known = replace(record, rudder=record.rudder - righting * headings)
+    found = fit_response([known], _FINE * first)
+    return Turning(float(found.gain), found.time, float(steered.x[0, steered.columns[0]]), righting)
 
 
 def _settled(times: np.ndarray, rates: np.ndarray) -> bool:
@@ -353,14 +379,14 @@ def _held(
             for _ in range(min(_STEPS, round((duration - times[-1]) / dt))):
                 x, s = model.step(x, w, s)
                 times.append(times[-1] + dt)
-                rates.append(float(x[0, r]))
-                headings.append(float(x[0, psi] - steered.x[0, psi]))
+                rates.append(steered.side * float(x[0, r]))
+                headings.append(steered.side * float(x[0, psi] - steered.x[0, psi]))
             dt = min(2.0 * dt, steered.steps[1])
     return np.array(times), np.array(rates), np.array(headings)
 
 
-def _zigzag(steered: Steered, angle: float, first: float) -> Record:
-    """Return a zigzag in which the heading goes as far to each side as the rudder.
+def _zigzag(steered: Steered, angle: float, turned: float, first: float) -> tuple[Record, Array]:
+    """Return a zigzag in which the heading goes to an angle `turned` on each side, and headings.
 
     `first` is the time in s until its first change of rudder.
     """
@@ -371,6 +397,7 @@ def _zigzag(steered: Steered, angle: float, first: float) -> Record:
     side, switches = float(np.sign(angle)), 0
     rates: list[float] = []
     rudder: list[float] = []
+    headings: list[float] = []
     with torch.no_grad():
         while switches < _SWITCHES:
             if len(rates) > _LONGEST:
@@ -378,13 +405,13 @@ def _zigzag(steered: Steered, angle: float, first: float) -> Record:
                     f"a zigzag with {abs(angle):.3g} rad of rudder does not turn the vessel back"
                     f" within {dt * _LONGEST:.3g} s; it cannot be steered with so little rudder"
                 )
-            heading = float(x[0, psi] - steered.x[0, psi])
-            if side * heading > abs(angle):
+            headings.append(steered.side * float(x[0, psi] - steered.x[0, psi]))
+            if side * headings[-1] > abs(turned):
                 side, switches = -side, switches + 1
             w[:, 0] = side * abs(angle)
-            rates.append(float(x[0, r]))
+            rates.append(steered.side * float(x[0, r]))
             rudder.append(side * abs(angle))
             x, s = model.step(x, w, s)
     rate = np.array(rates)
     angle_taken = slewed(np.array([0.0, *rudder]), steered.rate, dt)[1:]
-    return Record(dt, angle_taken, rate, np.isfinite(rate))
+    return Record(dt, angle_taken, rate, np.isfinite(rate)), np.array(headings)

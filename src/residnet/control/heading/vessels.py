@@ -21,27 +21,30 @@ from residnet.dynamics.base import Dynamics
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.steering_variation import VariedModel, VariedPlant
+from residnet.dynamics.steering_variation import HEADING, Axis, VariedModel, VariedPlant
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.symmetry import live_of
 
 _LONG_STEP = 0.4
 """Longest step in s by which a vessel's answer to its rudder is measured."""
-_MOTION = ("x", "y", "psi", "phi", "u", "v", "r", "p")
+_LEVEL = ("x", "y", "z", "theta", "psi", "v", "w", "p", "q", "r")
+"""States that a straight course begins with at zero."""
 _RUN_UP = (0.1, 6000)
 """Step in s and steps of the run from rest to the speed of a straight course."""
 
 
 class SteeredVessel(ABC):
-    """A vessel whose first command is the rudder angle.
+    """A vessel whose first command is the angle that steers: the rudder's, or another axis' own.
 
     Attributes:
+        axis: that is steered.
         state: names of the columns of x.
         inputs: names of the columns of w.
         rate: of the rudder in rad/s; None where it stands at its command at once.
         any_step: whether `model` can be built with steps of any length.
     """
 
+    axis: Axis = HEADING
     state: tuple[str, ...]
     inputs: tuple[str, ...]
     rate: float | None
@@ -82,96 +85,103 @@ class SteeredVessel(ABC):
         """
         x, w = self.start(torch.ones(1, dtype=torch.float64))
         variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
-        columns = (self.column("u"), self.column("r"), self.column("psi"))
+        axis = self.axis
+        columns = (self.column("u"), self.column(axis.rate), self.column(axis.angle))
         steps = (dt, max(dt, _LONG_STEP) if self.any_step else dt)
         rate = math.inf if self.rate is None else self.rate
-        steered = Steered(self.model, x, w, self.memory(variation), columns, steps, rate)
+        memory, rights = self.memory(variation), axis.value != axis.angle
+        steered = Steered(self.model, x, w, memory, columns, steps, rate, axis.side, rights)
         return measure_turning(steered, angle, duration)
 
 
 @final
 class SteeredPlant(SteeredVessel):
-    """A simulated vessel; in calm water, or in the weather [inputs by name] given."""
+    """A simulated vessel; in calm water, or in the weather [inputs by name] given.
 
-    def __init__(self, plant: Plant, *, calm: bool = True) -> None:
+    Raises:
+        ConfigError: where nothing steers it on the axis, or it makes no way ahead.
+    """
+
+    def __init__(self, plant: Plant, *, calm: bool = True, axis: Axis = HEADING) -> None:
         if calm and isinstance(plant, HullPlant):
             plant = plant.in_calm_water()
-        self.plant = plant
-        self.state, self.inputs = plant.state, plant.inputs
-        self.rate = _rudder_rate(plant)
-        self._straight = _straight(plant)
+        self.plant, self.axis = plant, axis
+        others = [name for name in plant.inputs if name != axis.command]
+        self.state, self.inputs = plant.state, (axis.command, *others)
+        self._straight = plant.approach(1)
+        # a propeller heels what turns about all axes
+        if plant.attitude or float(self._straight[0, self.column("u")]) == 0.0:
+            self._straight = self._run_up()
+        self.rate = _rudder_rate(plant, axis)
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        return VariedPlant(self.plant, dt, integrator)
+        return VariedPlant(self.plant, dt, integrator, self.axis)
 
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return states and inputs of straight courses; thrust grows with the speed squared."""
         x = self._straight.to(speed.dtype).repeat(len(speed), 1)
         x[:, self.column("u")] *= speed
         command = self.plant.demand(speed.square(), torch.zeros_like(speed))
-        return x, torch.cat(
-            (command, command.new_zeros(len(speed), len(self.inputs) - command.shape[1])), dim=1
-        )
+        given = dict(zip(self.plant.inputs, command.unbind(1), strict=False))
+        still = torch.zeros_like(speed)
+        return x, torch.stack([given.get(name, still) for name in self.inputs], dim=1)
+
+    def _run_up(self) -> Tensor:
+        """Return the state [1, nx] of a straight course at the speed of full drive, from rest."""
+        one, column = torch.ones(1, dtype=torch.float64), self.column("u")
+        (x, w), model = self.start(one), self.model(_RUN_UP[0])
+        with torch.no_grad():
+            for k in range(_RUN_UP[1]):
+                before = float(x[0, column])
+                x, _ = model.step(x, w, torch.tensor([[1.0, 1.0, 0.0]]).double())
+                if k > 100 and abs(float(x[0, column]) - before) < 1e-7 * max(abs(before), 1e-3):
+                    break
+        if not float(x[0, column]) > 0.0:
+            raise ConfigError(
+                f"{self.axis.name} control needs a vessel that makes way ahead at full drive; this"
+                f" one reaches {float(x[0, column]):.3g} m/s"
+            )
+        straight = self.plant.approach(1)
+        still = () if self.plant.attitude else ("phi",)
+        kept = [i for i, name in enumerate(self.state) if name not in (*_LEVEL, *still)]
+        straight[:, kept] = x[:, kept]
+        return straight
 
 
-def _straight(plant: Plant) -> Tensor:
-    """Return the state [1, nx] of a straight course at the service speed.
-
-    A vessel that trials start from at rest runs up to its speed at full drive.
-    """
-    x = plant.approach(1)
-    column = plant.state.index("u")
-    if float(x[0, column]) != 0.0:
-        return x
-    one = torch.ones(1, dtype=torch.float64)
-    command = plant.demand(one, torch.zeros_like(one))
-    w = torch.cat((command, command.new_zeros(1, len(plant.inputs) - command.shape[1])), dim=1)
-    model, variation = VariedPlant(plant, _RUN_UP[0]), torch.tensor([[1.0, 1.0, 0.0]])
-    with torch.no_grad():
-        for k in range(_RUN_UP[1]):
-            before = float(x[0, column])
-            x, _ = model.step(x, w, variation.double())
-            if k > 100 and abs(float(x[0, column]) - before) < 1e-7 * max(abs(before), 1e-3):
-                break
-    if not float(x[0, column]) > 0.0:
-        raise ConfigError(
-            "heading control needs a vessel that makes way ahead at full drive; this one reaches"
-            f" {float(x[0, column]):.3g} m/s"
-        )
-    straight = plant.approach(1)
-    straight[:, column] = x[:, column]
-    others = [i for i, name in enumerate(plant.state) if name not in _MOTION]
-    straight[:, others] = x[:, others]
-    return straight
-
-
-def _rudder_rate(plant: Plant) -> float | None:
+def _rudder_rate(plant: Plant, axis: Axis) -> float | None:
     """Return the rate of the steering gear in rad/s; None for a rudder without one.
 
     It is seen from what two large angles lead to: where both move the rudder alike, its rate holds.
     """
-    if "delta" not in plant.state:
+    if axis.gear not in plant.state:
         return None
-    column, dt = plant.state.index("delta"), 1e-3
+    column, dt = plant.state.index(axis.gear), 1e-3
+    command = plant.inputs.index(axis.command)
     x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
     rates = []
     for angle in (1.0, 0.5):
-        w[:, 0] = angle
+        w[:, command] = angle
         moved = float(plant.end_step(x, w, dt)[0, column] - x[0, column]) / dt
         rates.append(moved + float(plant.rate(x, w)[0, column]))
     return rates[0] if abs(rates[0] - rates[1]) <= 1e-6 * abs(rates[0]) else None
 
 
+def lacking(axis: Axis, reference: Tensor, value: Tensor) -> Tensor:
+    """Return reference less value, any shape: of a heading [rad] wrapped, of a depth [m]."""
+    return wrap(reference - value) if axis.value == axis.angle else reference - value
+
+
 @dataclass(frozen=True)
 class Flights:
-    """B heading changes of T steps.
+    """B changes of heading, or of depth, of T steps.
 
     Attributes:
         states: [B, T+1, nx].
         inputs: [B, T, m].
-        heading: reference [B] in rad.
+        heading: reference [B] in rad, or in m of depth.
         dt: step in s.
         names: of the states.
+        axis: that is steered.
     """
 
     states: Tensor
@@ -179,6 +189,7 @@ class Flights:
     heading: Tensor
     dt: float
     names: tuple[str, ...]
+    axis: Axis = HEADING
 
     def state(self, name: str) -> Tensor:
         """Return a state [B, T+1] by its name."""
@@ -186,8 +197,8 @@ class Flights:
 
     @property
     def error(self) -> Tensor:
-        """Reference less heading [B, T+1], wrapped."""
-        return wrap(self.heading[:, None] - self.state("psi"))
+        """Reference less heading [B, T+1], wrapped, or less depth."""
+        return lacking(self.axis, self.heading[:, None], self.state(self.axis.value))
 
     def settled(self, band: float) -> Tensor:
         """Return the time [B] in s of the last entry into +-band [rad] about the reference.
@@ -266,7 +277,7 @@ def fly(
     with torch.no_grad():
         free = Rollout(vessel.model(dt), loop if surround is None else surround(loop))
         states, inputs, _ = compiled(free, steps)(x, given, vessel.memory(variation))
-    return Flights(states, inputs, heading, dt, vessel.state)
+    return Flights(states, inputs, heading, dt, vessel.state, vessel.axis)
 
 
 @final

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -25,6 +25,35 @@ PLANTS = "plants.parquet"
 """What each random vessel gave."""
 CONDITIONS = "conditions.parquet"
 """What each flight under the stated conditions cost, by controller."""
+
+
+class Words(NamedTuple):
+    """How a page calls what is steered, its unit and scale from SI, its rate, and what steers."""
+
+    value: str
+    unit: str
+    scale: float
+    rate: str
+    rudder: str
+    columns: tuple[str, str]
+
+
+_TURNS = Words("heading", "deg", DEG, "yaw rate", "rudder", ("psi", "r"))
+_DIVES = Words("depth", "m", 1.0, "pitch rate", "stern planes", ("z", "q"))
+
+
+def words_of(test: Mapping[str, Any]) -> Words:
+    """Return the words of a run by its `test`."""
+    return _DIVES if test.get("depth") else _TURNS
+
+
+def _step(test: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the step of the reference and its band in rad, or in m of depth."""
+    if depth := test.get("depth"):
+        return float(depth["change"]), float(depth["band"])
+    return float(test["heading"]), float(test["band"])
+
+
 _KINDS = {
     "policy": "learned",
     "network": "learned, no law inside",
@@ -41,10 +70,11 @@ def _figures(run: RunFiles) -> Iterator[Figure]:
     kinds = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "conditions"}
     flown = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "nominal"}
     yield _responses(run.frame(FLIGHTS), flown, run.resolved["test"], run.title)
-    yield _distributions(run.frame(PLANTS), flown, run.title)
+    words = words_of(run.resolved["test"])
+    yield _distributions(run.frame(PLANTS), flown, run.title, words)
     conditioned = run.frame(CONDITIONS)
     if conditioned is not None:
-        yield _costs(conditioned, kinds, run.title)
+        yield _costs(conditioned, kinds, run.title, words)
     fits = {name: run.fit(name) for name in run.resolved.get("policies") or {}}
     if fits:
         yield _learning(fits, run.title)
@@ -60,41 +90,42 @@ def _looks(kinds: Mapping[str, str]) -> dict[str, Look]:
 
 def _responses(series: pd.DataFrame, kinds: Mapping[str, str], test: Content, name: str) -> Figure:
     """Draw a step of the nominal vessel; of policies, the corners of the spread as shades."""
-    heading, settled = test["heading"], test["band"]
-    series = series.assign(error=heading - series["psi"])
+    words, (change, settled) = words_of(test), _step(test)
+    value, rate = words.columns
+    series = series.assign(error=change - series[value])
     looks = _looks(kinds)
-    curves: dict[str, dict[str, Curve]] = {key: {} for key in ("psi", "error", "r", "rudder")}
+    scales = {value: words.scale, "error": words.scale, rate: DEG, "rudder": DEG}
+    curves: dict[str, dict[str, Curve]] = {key: {} for key in scales}
     for controller, kind in kinds.items():
         flights = series[series["controller"] == controller]
         for quantity, panel in curves.items():
-            wide: Any = DEG * flights.pivot_table(
+            wide: Any = scales[quantity] * flights.pivot_table(
                 index="t", columns=["effect", "time"], values=quantity
             )
             panel[controller] = (wide.index.to_numpy(), wide[(1.0, 1.0)].to_numpy())
-            if kind == "policy" and quantity in ("psi", "error"):
+            if kind == "policy" and quantity in (value, "error"):
                 shade, color = f"{controller}, corners", looks[controller].color
                 looks[shade] = Look(shade, color, kind="fill", alpha=0.25, order=1)
                 values = wide.to_numpy()
                 panel[shade] = band(wide.index, values.min(axis=1), values.max(axis=1))
-    for key, middle in (("psi", heading), ("error", 0.0)):
-        curves[key]["settled"] = (np.zeros(2), DEG * (middle + settled * np.array([-1.0, 1.0])))
+    for key, middle in ((value, change), ("error", 0.0)):
+        ends = words.scale * (middle + settled * np.array([-1.0, 1.0]))
+        curves[key]["settled"] = (np.zeros(2), ends)
+    near = 2.5 * words.scale * settled
     looks["settled"] = replace(ZERO, label="band of settling", dash="dotted")
     return Figure(
         "responses",
         f"Step responses of {name}",
-        f"Step of {DEG * heading:.0f} deg. Lines show the nominal vessel, shades the corners of the"
-        f" spread under the learned policies. The dotted band of {DEG * settled:.1f} deg, enlarged"
-        " in the second panel, is the one in which a change has settled.",
+        f"Step of {words.scale * change:.3g} {words.unit}. Lines show the nominal vessel, shades"
+        " the corners of the spread under the learned policies. The dotted band of"
+        f" {words.scale * settled:.1f} {words.unit}, enlarged in the second panel, is the one in"
+        " which a change has settled.",
         looks,
         [
-            Panel("heading\n[deg]", height=195),
-            Panel(
-                "heading error\n[deg]",
-                height=150,
-                y_limits=(-2.5 * DEG * settled, 2.5 * DEG * settled),
-            ),
-            Panel("yaw rate\n[deg/s]", height=150),
-            Panel("rudder\n[deg]", "time [s]", height=150),
+            Panel(f"{words.value}\n[{words.unit}]", height=195),
+            Panel(f"{words.value} error\n[{words.unit}]", height=150, y_limits=(-near, near)),
+            Panel(f"{words.rate}\n[deg/s]", height=150),
+            Panel(f"{words.rudder}\n[deg]", "time [s]", height=150),
         ],
         [Case("", list(curves.values()))],
     )
@@ -132,13 +163,15 @@ def _share_panels(
     ]
 
 
-def _distributions(plants: pd.DataFrame, kinds: Mapping[str, str], name: str) -> Figure:
+def _distributions(
+    plants: pd.DataFrame, kinds: Mapping[str, str], name: str, words: Words
+) -> Figure:
     """Draw settling time, overshoot, error, rudder travel and energy over random vessels."""
     quantities = (
         ("settling", 1.0, "settling time [s]"),
-        ("overshoot", DEG, "overshoot [deg]"),
-        ("iae", DEG, "integral of the absolute error [deg s]"),
-        ("travel", DEG, "rudder travel [deg]"),
+        ("overshoot", words.scale, f"overshoot [{words.unit}]"),
+        ("iae", words.scale, f"integral of the absolute error [{words.unit} s]"),
+        ("travel", DEG, f"{words.rudder} travel [deg]"),
         ("energy", DEG**2, "control energy [deg² s]"),
     )
     # axes hold those controllers that settle more often than not
@@ -163,14 +196,14 @@ def _distributions(plants: pd.DataFrame, kinds: Mapping[str, str], name: str) ->
     )
 
 
-def _costs(flights: pd.DataFrame, kinds: Mapping[str, str], name: str) -> Figure:
+def _costs(flights: pd.DataFrame, kinds: Mapping[str, str], name: str, words: Words) -> Figure:
     """Draw the shares of flights under the stated conditions that stay below a value."""
     stated = flights[flights["protocol"] == "conditions"]
     quantities = (
         ("cost", 1.0, "cost [s]"),
         ("time_outside", 1.0, "time outside the band [s]"),
-        ("overshoot", DEG, "overshoot [deg]"),
-        ("travel", DEG, "rudder travel [deg]"),
+        ("overshoot", words.scale, f"overshoot [{words.unit}]"),
+        ("travel", DEG, f"{words.rudder} travel [deg]"),
     )
     known = stated[stated["controller"].isin(kinds)]
     limits: list[Sequence[float]] = []
@@ -220,16 +253,17 @@ def sections(run: RunFiles) -> list[Section]:
     """
     write_figures(run.path / "figures", _figures(run))
     test = run.resolved["test"]
-    compared = settling_table(run.rows, run.metrics.get("floor"))
+    words = words_of(test)
+    compared = settling_table(run.rows, run.metrics.get("floor"), words)
     stated = run.resolved.get("conditions")
-    cost = cost_table(run.rows) if stated else None
+    cost = cost_table(run.rows, words) if stated else None
     drawn = [one.part() for one in read_figures(run.path / "figures", "responses")]
     # settling of the nominal vessel and of the spread, or the cost of a change
     first = compared.part(0, 3) if cost is None else cost.part(1, 4)
     out = [
         Section("", [*drawn, first]),
         Section("Controllers compared", [compared, Text(_definition(run.resolved), quiet=True)]),
-        Section("Effort", [effort_table(run.rows), Text(_effort(test), quiet=True)]),
+        Section("Effort", [effort_table(run.rows, words), Text(_effort(test), quiet=True)]),
         *figures_section(run.path / "figures"),
     ]
     if cost is not None and stated:
@@ -251,12 +285,13 @@ def _by_model(rows: Sequence[Content], protocol: str) -> dict[str, dict[str, Con
     return {model: found for model, found in out.items() if protocol in found}
 
 
-def settling_table(rows: Sequence[Content], floor: str | None) -> Table:
+def settling_table(rows: Sequence[Content], floor: str | None, words: Words) -> Table:
     """Return settling time, overshoot and steady errors, a row for each controller.
 
     Args:
         rows: of metrics.json.
         floor: the controller whose nominal settling time the others are divided by.
+        words: of what is steered.
     """
     found = _by_model(rows, "nominal")
 
@@ -278,11 +313,11 @@ def settling_table(rows: Sequence[Content], floor: str | None) -> Table:
         ("worst [s]", "corners.settling.max", 2),
         ("random, mean [s]", "random.settling.mean", 2),
         ("random, 95 % [s]", "random.settling.p95", 2),
-        ("overshoot [deg]", overshoot, 3, DEG),
-        ("bias [deg]", "bias.error_end", 4, DEG),
+        (f"overshoot [{words.unit}]", overshoot, 3, words.scale),
+        (f"bias [{words.unit}]", "bias.error_end", 4, words.scale),
     ]
     if any(row["protocol"] == "wind" for row in rows):
-        columns.append(("wind [deg]", "wind.error_end", 4, DEG))
+        columns.append((f"wind [{words.unit}]", "wind.error_end", 4, words.scale))
     return table_of(
         found.values(),
         [*columns, ("not settled", unsettled)],
@@ -290,11 +325,12 @@ def settling_table(rows: Sequence[Content], floor: str | None) -> Table:
     )
 
 
-def effort_table(rows: Sequence[Content]) -> Table:
-    """Return what a change of heading costs over random vessels, and what a course costs at sea."""
-    groups = [("absolute error [deg s]", 2), ("rudder travel [deg]", 2), ("energy [deg² s]", 2)]
+def effort_table(rows: Sequence[Content], words: Words) -> Table:
+    """Return what a change costs over random vessels, and what a course costs at sea."""
+    groups = [(f"absolute error [{words.unit} s]", 2), (f"{words.rudder} travel [deg]", 2)]
+    groups.append(("energy [deg² s]", 2))
     columns: list[Column] = [("controller", "random.model")]
-    for quantity, scale in (("iae", DEG), ("travel", DEG), ("energy", DEG**2)):
+    for quantity, scale in (("iae", words.scale), ("travel", DEG), ("energy", DEG**2)):
         columns += [
             ("mean", f"random.{quantity}.mean", 2, scale),
             ("95 %", f"random.{quantity}.p95", 2, scale),
@@ -312,16 +348,16 @@ def effort_table(rows: Sequence[Content]) -> Table:
 
 
 def _definition(config: Mapping[str, Any]) -> list[str]:
-    test = config["test"]
+    test, words = config["test"], words_of(config["test"])
+    change, band = (words.scale * value for value in _step(test))
     return [
-        "One definition holds for all controllers: a step of"
-        f" {math.degrees(test['heading']):.3g} deg without prefilter, with the rudder within"
-        f" {math.degrees(config['rudder']):.3g} deg. A change has settled at its last entry into"
-        f" {math.degrees(test['band']):.3g} deg.",
+        f"One definition holds for all controllers: a step of {change:.3g} {words.unit} without"
+        f" prefilter, with the {words.rudder} within {math.degrees(config['rudder']):.3g} deg. A"
+        f" change has settled at its last entry into {band:.3g} {words.unit}.",
         "Worst: over the corners of the spread. Random: over"
         f" {test['plants']} vessels drawn from it. Overshoot: the largest over both. Bias: largest"
         f" error after {test['bias_time']:g} s under {math.degrees(test['bias']):.3g} deg of"
-        " constant rudder bias. Not settled: number of changes outside the band at their end.",
+        f" constant bias of the {words.rudder}. Not settled: number of changes outside the band at their end.",
         "Peers are tuned by the cost under the stated conditions."
         if config.get("conditions")
         else "The constants of the peers are given.",
@@ -331,8 +367,8 @@ def _definition(config: Mapping[str, Any]) -> list[str]:
 def _effort(test: Content) -> list[str]:
     texts = [
         f"Mean and 95th percentile over the {test['plants']} random vessels: integral of the"
-        " absolute heading error, travel of the rudder command, and its energy (the integral of"
-        " its square)."
+        f" absolute {words_of(test).value} error, travel of the {words_of(test).rudder} command,"
+        " and its energy (the integral of its square)."
     ]
     if test.get("wind"):
         texts.append(
@@ -391,8 +427,8 @@ def cost_verdict(rows: Sequence[Content]) -> list[str]:
     return sentences
 
 
-def cost_table(rows: Sequence[Content]) -> Table:
-    """Return cost, overshoot and rudder travel under the stated conditions by controller."""
+def cost_table(rows: Sequence[Content], words: Words) -> Table:
+    """Return cost, overshoot and travel under the stated conditions by controller."""
     best = best_classical(rows)
     found = _by_model(rows, "conditions")
     return table_of(
@@ -408,11 +444,11 @@ def cost_table(rows: Sequence[Content]) -> Table:
             ),
             ("95 % [s]", "conditions.cost.p95", 2),
             ("outside, mean [s]", "conditions.time_outside.mean", 2),
-            ("mean [deg]", "conditions.overshoot.mean", 2, DEG),
-            ("95 % [deg]", "conditions.overshoot.p95", 2, DEG),
+            (f"mean [{words.unit}]", "conditions.overshoot.mean", 2, words.scale),
+            (f"95 % [{words.unit}]", "conditions.overshoot.p95", 2, words.scale),
             ("travel, mean [deg]", "conditions.travel.mean", 1, DEG),
-            ("heading [deg]", "quiet.heading_swing.max", 2, DEG),
-            ("rudder [deg]", "quiet.rudder_swing.max", 2, DEG),
+            (f"{words.value} [{words.unit}]", "quiet.heading_swing.max", 2, words.scale),
+            (f"{words.rudder} [deg]", "quiet.rudder_swing.max", 2, DEG),
             ("diverged", "conditions.diverged", lambda lost: bad_where(lost, lost)),
         ],
         groups=[("", 1), ("cost", 3), ("", 1), ("overshoot", 2), ("", 1), ("swing, most", 2)],
@@ -444,21 +480,25 @@ def beyond_table(rows: Sequence[Content]) -> Table | None:
 
 def _conditions(judged: Mapping[str, Any]) -> list[str]:
     given = judged["stated"]
-    low, high = (math.degrees(value) for value in given["heading"])
+    depth, words = given.get("depth"), words_of(given)
+    span = depth["change"] if depth else given["heading"]
+    low, high, band = (words.scale * value for value in (*span, (depth or given)["band"]))
+    noise = f"{math.degrees(given['noise_psi']):.3g} deg on the {'pitch' if depth else 'heading'}"
+    if depth:
+        noise = f"{depth['noise']:.3g} m on the depth, {noise}"
     texts = [
-        f"{judged['flights']} changes of heading of {low:.3g} to {high:.3g} deg, which no tuning or"
-        f" training has seen, the same for all controllers. The vessel's K lies within"
-        f" {given['effect'][0]:g} to {given['effect'][1]:g} and its T within {given['time'][0]:g}"
-        f" to {given['time'][1]:g} of the nominal one; commands arrive {given['delay'][0]:g} to"
-        f" {given['delay'][1]:g} s late; the rudder has a bias of up to"
-        f" {math.degrees(given['bias']):.3g} deg and a slow push of"
-        f" {math.degrees(given['push']):.3g} deg; the noise is"
-        f" {math.degrees(given['noise_psi']):.3g} deg on the heading and"
-        f" {math.degrees(given['noise_r']):.3g} deg/s on the yaw rate.",
-        "Cost: the integral of |e| / (|e| +"
-        f" {math.degrees(given['band']):.3g} deg) over {given['duration']:g} s from the change on,"
-        f" plus {given['overshoot_weight']:g} s per deg of overshoot and"
-        f" {given['travel_weight']:g} s per deg of rudder travel. Swing: largest movement, peak to"
+        f"{judged['flights']} changes of {words.value} of {low:.3g} to {high:.3g} {words.unit},"
+        " which no tuning or training has seen, the same for all controllers. The vessel's K lies"
+        f" within {given['effect'][0]:g} to {given['effect'][1]:g} and its T within"
+        f" {given['time'][0]:g} to {given['time'][1]:g} of the nominal one; commands arrive"
+        f" {given['delay'][0]:g} to {given['delay'][1]:g} s late; the {words.rudder} has a bias of"
+        f" up to {math.degrees(given['bias']):.3g} deg and a slow push of"
+        f" {math.degrees(given['push']):.3g} deg; the noise is {noise} and"
+        f" {math.degrees(given['noise_r']):.3g} deg/s on the {words.rate}.",
+        f"Cost: the integral of |e| / (|e| + {band:.3g} {words.unit}) over"
+        f" {given['duration']:g} s from the change on, plus {given['overshoot_weight']:g} s per"
+        f" {'decimetre' if depth else 'deg'} of overshoot and {given['travel_weight']:g} s per deg"
+        f" of {words.rudder} travel. Swing: largest movement, peak to"
         f" peak, from {quiet_after(given['duration']):.3g} s after a change on in flights without"
         " noise and slow push. Classical controllers are tuned by the same cost, by differential"
         " evolution.",

@@ -165,7 +165,8 @@ class PolicyFit(EpochTraining):
         flown = loop.flights(changes, *fly(*loop.given(changes))[:2])
         found = flown.measured(self.conditions)
         loss: Tensor = (
-            found["cost"].mean() + math.degrees(settings.guiding(progress)) * found["iae"].mean()
+            found["cost"].mean()
+            + settings.guiding(progress) / self.conditions.unit * found["iae"].mean()
         )
         if quiet > 0:
             loss = loss + self._strict() * self._unsteady(flown, found["overshoot"], quiet)
@@ -185,15 +186,15 @@ class PolicyFit(EpochTraining):
         worst = swing.topk(math.ceil(quiet / 4)).values.mean()
         cost: Tensor = math.degrees(math.degrees(settings.calm)) * worst
         if last > first:
-            cost = cost + math.degrees(settings.exact) * overshoot[first:last].mean()
+            cost = cost + settings.exact / self.conditions.unit * overshoot[first:last].mean()
         return cost
 
     def _beyond(self, overshoot: Tensor) -> Tensor:
         """Return what overshoots beyond the limit of one flight in twenty cost in s."""
         steady = self.settings.steady
-        limit = math.inf if steady is None else steady.overshoot_p95
+        limit = math.inf if steady is None else steady.of(self.conditions.axis)[2]
         beyond: Tensor = (overshoot - limit).clamp(min=0.0).mean()
-        return math.degrees(self.settings.excess) * beyond
+        return self.settings.excess / self.conditions.unit * beyond
 
     def _strict(self) -> float:
         """Return the factor on what swing and nominal overshoot cost in this epoch.
@@ -216,7 +217,7 @@ class PolicyFit(EpochTraining):
         changes = self.drawn.draw(rows, self.step_size, random, share)
         changes.noise[:quiet], changes.push[:quiet] = 0.0, 0.0
         first, number = quiet // 2, quiet // 4
-        least = self.drawn.heading[0] * changes.heading.sign()
+        least = self.drawn.span[0] * changes.heading.sign()
         small = least + _LITTLE * (changes.heading - least)
         for some in (slice(0, first), slice(first + number, quiet)):
             changes.heading[some] = small[some]
@@ -255,7 +256,8 @@ class PolicyFit(EpochTraining):
         score = float(found["cost"].mean())
         if self.steady is not None:
             worse = self.start_score is not None and score > self.start_score
-            often = too_many(found["overshoot"], self.steady.limits.overshoot_p95)
+            limit = self.steady.limits.of(self.conditions.axis)[2]
+            often = too_many(found["overshoot"], limit)
             self.diverged = _ALL if worse else self.steady.refused(self.test) + often
         self.policy.at(self.step_size)
         return self.policy, score
