@@ -130,6 +130,19 @@ _ONE_POLICY = (
     "policies.policy.training.dt=0.1 s",
     "policies.policy.training.steady={flights: 2}",
 )
+_TORPEDO = (
+    *_STATED,
+    *_STEP_TEST,
+    *_policy("learned"),
+    "policies.learned.training.dt=0.1 s",
+    "policies.learned.training.steady={flights: 2}",
+    "turning_time=8 s",
+    "test.duration=8 s",
+    "test.bias_time=8 s",
+    "~conditions.beyond",
+    "~peers.pd",
+    "~peers.lqr",
+)
 _SLOW = ("conditions.stated.duration=12 s", "test.duration=26 s", "test.bias_time=26 s")
 
 _CONDITIONS = (
@@ -208,6 +221,8 @@ SHORT: dict[str, Short] = {
     ),
     "autopilot_conditions_rate": Short(_CONDITIONS),
     "autopilot_ship": Short(_CONDITIONS),
+    "autopilot_remus": Short(_TORPEDO),
+    "autopilot_remus_depth": Short(_TORPEDO),
     "autopilot_conditions_patrol": Short(
         (
             *_CONDITIONS,

@@ -17,7 +17,12 @@ from torch import Tensor
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance.course_guidance import CourseGuidance
 from residnet.control.guidance.line_of_sight import DriftEstimate
-from residnet.control.heading.controllers import NetworkPolicySpec, ObservedPolicySpec, PtosConfig
+from residnet.control.heading.controllers import (
+    DepthPolicySpec,
+    NetworkPolicySpec,
+    ObservedPolicySpec,
+    PtosConfig,
+)
 from residnet.control.heading.policies import FIXED, ObservedPolicy
 from residnet.core.errors import ExportError, UsageError
 from residnet.export import exporter, policy
@@ -60,6 +65,17 @@ def network() -> ExportedHeading:
     return ExportedHeading("pilot", made, safe="amidships", about={}, metrics=[])
 
 
+def depth() -> ExportedHeading:
+    torch.manual_seed(0)
+    seen = {"state": ("psi", "u", "r", "z", "theta", "q"), "righting": 0.3}
+    law = ObservedPolicySpec(rate=None, law=LAW, **SETTINGS | seen)
+    sight = {"lookahead": 8.0, "depth_rate": 2.0, "drift_rate": 0.2}
+    made = DepthPolicySpec(law=law, steepest=0.5, sight=sight).build().requires_grad_(False)
+    observed: Any = made.law
+    observed.network.out.weight.normal_(std=0.02)
+    return ExportedHeading("pilot", made, safe="amidships", about={}, metrics=[])
+
+
 def along() -> ExportedCoursePolicy:
     angle = np.linspace(0.0, 2.0, 1001)
     track = FAR + 45.0 * np.stack((np.sin(angle), 1.0 - np.cos(angle)), axis=-1)
@@ -71,11 +87,11 @@ def along() -> ExportedCoursePolicy:
     )
 
 
-KINDS = [heading, network, along]
+KINDS = [heading, depth, network, along]
 
 
 @pytest.mark.parametrize(
-    "make", [heading, *(pytest.param(make, marks=pytest.mark.long) for make in KINDS[1:])]
+    "make", [*KINDS[:2], *(pytest.param(make, marks=pytest.mark.long) for make in KINDS[2:])]
 )
 def test_torchscript_answers_as_the_policy_and_is_safe(
     make: Callable[[], ExportedController], tmp_path: Path

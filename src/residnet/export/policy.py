@@ -19,16 +19,15 @@ from torch import Tensor, nn
 
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
-from residnet.control.heading.policies import HeadingPolicy
+from residnet.control.heading.policies import DEEP, HeadingPolicy
 from residnet.core.errors import ExportError
 from residnet.core.version import __version__
+from residnet.dynamics.steering_variation import DEPTH, HEADING
 from residnet.export.base import Exported, Loaded, RoundingError
 from residnet.export.torchscript import require_shape, size
 
 Safe = Literal["hold", "amidships"]
 """Command while inputs are wrong: the last one, or rudder amidships."""
-HEADING = {"psi": "rad", "u": "m/s", "r": "rad/s"}
-"""What a heading policy sees: heading, speed and yaw rate."""
 COURSE = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
 """What a policy along a course sees: north and east, heading, surge and sway velocity, yaw rate."""
 PARITY_STEPS, PARITY_TOLERANCE = 1000, 1e-4
@@ -36,6 +35,10 @@ PARITY_STEPS, PARITY_TOLERANCE = 1000, 1e-4
 
 Of a limit of 35 deg it is 0.0035 deg, which no actuator follows, and float32 rounds less.
 """
+_FRAMES = {
+    HEADING: "NED; psi clockwise from north; delta > 0 turns to starboard",
+    DEPTH: "NED; z down, theta and q bow up; delta_s > 0 dives",
+}
 _TURNS = 2000.0 * math.pi
 """Largest heading in rad."""
 _FAR = 1e3
@@ -122,7 +125,7 @@ class ExportedPolicy(_Controller):
         safe: Safe,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        memory = policy.memory_ranges(limits[2][1], policy.limit).values()
+        memory = policy.memory_ranges(limits[-1][1], policy.limit).values()
         super().__init__(limits, list(memory), policy, safe, dtype)
         self.policy = policy
 
@@ -141,8 +144,8 @@ class ExportedPolicy(_Controller):
         """Return the rudder command [B, 1] in rad, memory [B, n] and fault [B].
 
         Args:
-            measured: y [B, 3] = (psi, u, r).
-            reference: heading [B, 1] in rad.
+            measured: y [B, 3] = (psi, u, r), or [B, 4] = (z, u, theta, q) of a depth policy.
+            reference: heading [B, 1] in rad, or depth in m.
             s: memory [B, n].
         """
         rows = size(y, 2, 0)
@@ -269,12 +272,16 @@ def for_export(
     """Return the policy with its checks.
 
     It takes headings up to 1000 turns, three times its speed, five times the steady turn at full
-    rudder.
+    rudder; a depth policy depths of all seas, and pitches up to a right angle.
     """
     policy = copy.deepcopy(policy).to(dtype).eval().requires_grad_(False)
-    policy.read_from(tuple(HEADING))
+    policy.read_from(tuple(policy.measured))
     turn = 5.0 * policy.gain * policy.limit
-    limits = ((-_TURNS, _TURNS), (0.0, 3.0 * policy.speed), (-turn, turn))
+    most = {"psi": _TURNS, "r": turn, "q": turn, "theta": 0.5 * math.pi, "z": DEEP}
+    limits = [
+        (0.0, 3.0 * policy.speed) if name == "u" else (-most[name], most[name])
+        for name in policy.measured
+    ]
     return ExportedPolicy(policy, limits, safe, dtype).eval()
 
 
@@ -291,7 +298,6 @@ class ExportedController(Exported):
 
     schema: str
     kind: str
-    measured: Mapping[str, str]
     methods = ("initial_state", "step")
 
     def __init__(
@@ -306,11 +312,17 @@ class ExportedController(Exported):
         self.name, self.policy, self.safe = name, policy, safe
         self.what = name if name == self.kind else f"{self.kind} {name}"
         self.about, self.metrics, self.dt = about, metrics, policy.dt
+        self.axis = policy.axis
         memory = self.controller(self.precisions[-1]).memory_low.numel()
         self.arguments = (("y", len(self.measured)), *self._given(), ("s", memory))
 
     def _given(self) -> Sequence[tuple[str, int]]:
         return ()
+
+    @property
+    def measured(self) -> Mapping[str, str]:
+        """What is measured, with units."""
+        return self.policy.measured
 
     @abstractmethod
     def controller(self, dtype: torch.dtype) -> ExportedPolicy | ExportedCourse:
@@ -350,7 +362,7 @@ class ExportedController(Exported):
             ),
             "command": [
                 {
-                    "name": "cmd_delta",
+                    "name": self.axis.command,
                     "unit": "rad",
                     "limit": policy.limit,
                     "rate": None if math.isinf(policy.rate) else policy.rate,
@@ -359,7 +371,7 @@ class ExportedController(Exported):
             "dt": policy.dt,
             **policy.described(),
             "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},
-            "frame": "NED; psi clockwise from north; delta > 0 turns to starboard",
+            "frame": _FRAMES[self.axis],
             "versions": {"residnet": __version__, "torch": torch.__version__},
             "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             **self.about,
@@ -380,7 +392,7 @@ class ExportedController(Exported):
         module: Any = self.controller(dtype)
         driven = [part.to(dtype) for part in self.drive(module)]
         wrong = torch.arange(PARITY_STEPS) % 97 == 50
-        # the yaw rate of a heading policy, the place of a course
+        # the yaw rate of a heading policy, the place of a course, the speed of a depth policy
         driven[0][wrong, 2 if len(self.measured) == 3 else 1] = torch.nan
         rows = [part.numpy() for part in driven]
         eager = module.initial_state(driven[0][:1])
@@ -414,7 +426,6 @@ class ExportedHeading(ExportedController):
 
     schema = "residnet.policy_card/1"
     kind = "policy"
-    measured = HEADING
     results = ("command", "s_after", "fault")
     flags = ("fault",)
 
@@ -425,16 +436,22 @@ class ExportedHeading(ExportedController):
         return for_export(self.policy, self.safe, dtype)
 
     def drive(self, module: Any) -> Sequence[Tensor]:
-        """Return measurements and references of a swinging vessel."""
+        """Return measurements and references of a swinging vessel.
+
+        The depths of one that dives go by what a heading goes in rad, in m.
+        """
         steps = torch.arange(PARITY_STEPS, dtype=module.low.dtype)
-        turn = float(module.high[2]) / 5.0
+        turn = float(module.high[-1]) / 5.0
         psi, r = 0.8 * torch.sin(0.01 * steps), turn * torch.cos(0.013 * steps)
-        y = torch.stack((psi, torch.full_like(psi, module.speed), r), dim=-1)
+        parts = [psi, torch.full_like(psi, module.speed), r]
+        if self.axis is DEPTH:
+            parts.insert(2, 0.3 * torch.sin(0.013 * steps))
+        y = torch.stack(parts, dim=-1)
         return y, 0.5 * torch.sign(torch.sin(0.004 * steps)).unsqueeze(-1)
 
     def described(self, module: Any) -> dict[str, Any]:
         return {
-            "reference": [{"name": "heading", "unit": "rad"}],
+            "reference": [{"name": self.axis.name, "unit": self.measured[self.axis.value]}],
             "memory": [*module.policy.memory_ranges(1.0, 1.0), "last_command"],
         }
 
@@ -450,7 +467,6 @@ class ExportedCoursePolicy(ExportedController):
 
     schema = "residnet.course_card/1"
     kind = "course of"
-    measured = COURSE
     results = ("command", "s_after", "fault", "arrived")
     flags = ("fault", "arrived")
     precisions = (torch.float64,)
@@ -468,6 +484,10 @@ class ExportedCoursePolicy(ExportedController):
     ) -> None:
         self.guidance, self.course = guidance, course
         super().__init__(name, policy, safe=safe, about=about, metrics=metrics)
+
+    @property
+    def measured(self) -> Mapping[str, str]:
+        return COURSE
 
     def controller(self, dtype: torch.dtype) -> ExportedCourse:
         return ExportedCourse(self.policy, self.guidance, self.safe).eval()

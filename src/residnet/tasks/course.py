@@ -144,6 +144,10 @@ class CourseTaskConfig(ComputingTask):
         given = self.autopilot
         file = RunFolder.open(given).resolved if given.is_dir() else given
         found = load_config(file, [], AutopilotConfig)
+        if found.test.depth is not None:
+            raise ConfigError(
+                f"autopilot: {given} steers the depth; a course takes policies of the heading"
+            )
         if self.policy not in found.policies:
             raise ConfigError(
                 f"policy: '{self.policy}' is none of {given}{nearest(self.policy, found.policies)}"

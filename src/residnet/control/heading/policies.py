@@ -160,8 +160,9 @@ class HeadingObserver(nn.Module):
     """A Luenberger observer of T r_dot + r = K (delta + push - c psi), with a predictor.
 
     The rudder is taken to act `lag` seconds after its command; the predictor adds what the commands
-    of these seconds will do, in closed form. K grows and T falls with the speed; c, which is
-    zero but for a dive angle, falls with its square. Where heading or yaw rate are far from what was expected, the estimate begins anew at what is measured.
+    of these seconds will do, in closed form. K grows and T falls with the speed; c, which is zero
+    but for a dive angle, falls with its square. Where heading or yaw rate are far from what was
+    expected, the estimate begins anew at what is measured.
 
     Args:
         turning: K, T and speed of the vessel about straight ahead.
@@ -496,7 +497,7 @@ class NetworkPolicy(HeadingPolicy):
 SIGHT = ("lookahead", "depth_rate", "drift_rate")
 """Of a depth policy: look-ahead distance in m, and how fast depth and drift follow what is
 measured, in 1/s."""
-_DEEP = 1.2e4
+DEEP = 1.2e4
 """Largest depth in m, beyond the deepest sea."""
 _DRIFT = 0.5
 """Largest drift of the depth as a share of the speed."""
@@ -538,7 +539,7 @@ class DepthPolicy(HeadingPolicy):
         rate: float | None = None,
     ) -> None:
         super().__init__(state, turning, limit, rate)
-        self.law, self.steepest = law, steepest
+        self.law, self.steepest, self.share = law, steepest, _DRIFT
         law.read_from(tuple(HeadingPolicy.measured))
         values = [torch.as_tensor(constants[name], dtype=torch.float32) for name in SIGHT]
         self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
@@ -567,8 +568,8 @@ class DepthPolicy(HeadingPolicy):
 
     def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
         assert isinstance(self.law, HeadingPolicy)
-        fast = 3.1 * _DRIFT * self.speed
-        own = {"depth": (-1.01 * _DEEP, 1.01 * _DEEP), "drift": (-fast, fast)}
+        fast = 3.1 * self.share * self.speed
+        own = {"depth": (-1.01 * DEEP, 1.01 * DEEP), "drift": (-fast, fast)}
         return own | self.law.memory_ranges(turn, angle)
 
     def described(self) -> dict[str, Any]:
@@ -603,7 +604,7 @@ class DepthPolicy(HeadingPolicy):
         surprise = torch.where(surprise.abs() > u, torch.zeros_like(z), surprise)
         known = z - surprise
         depth = known + (1.0 - torch.exp(-self.dt * follow)) * surprise
-        most = _DRIFT * u
+        most = self.share * u
         drift = s[:, 1:2] + (self.dt * follow * learn) * surprise
         drift = torch.minimum(torch.maximum(drift, -most), most)
         wanted = torch.atan((reference - depth) / lookahead) - drift / u

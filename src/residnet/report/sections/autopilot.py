@@ -357,7 +357,8 @@ def _definition(config: Mapping[str, Any]) -> list[str]:
         "Worst: over the corners of the spread. Random: over"
         f" {test['plants']} vessels drawn from it. Overshoot: the largest over both. Bias: largest"
         f" error after {test['bias_time']:g} s under {math.degrees(test['bias']):.3g} deg of"
-        f" constant bias of the {words.rudder}. Not settled: number of changes outside the band at their end.",
+        f" constant bias of the {words.rudder}. Not settled: number of changes outside the band at"
+        " their end.",
         "Peers are tuned by the cost under the stated conditions."
         if config.get("conditions")
         else "The constants of the peers are given.",

@@ -1,0 +1,135 @@
+"""Depth by the stern planes of a torpedo: the law, what it is trained in, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from pydantic import ValidationError
+
+from residnet.control.heading.conditions import ConditionedRun, ConditionsConfig, DepthChanges
+from residnet.control.heading.controllers import DepthConfig, DepthPolicySpec, Steering
+from residnet.control.heading.turning import Turning
+from residnet.control.heading.vessels import SteeredPlant, fly
+from residnet.core.errors import ConfigError, FitError
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.steering_variation import DEPTH, VariedPlant
+from residnet.physics.vessel import load_vessel
+from residnet.tasks.autopilot import AutopilotConfig
+
+DEG = math.pi / 180
+CONFIG = Path(__file__).parents[2] / "configs" / "autopilot_remus_depth.yaml"
+TURNING = Turning(0.88, 0.81, 2.55, 0.28)
+LAWS: dict[str, dict[str, Any]] = {
+    "pid": {"kind": "pid", "kp": 1.5, "damping_time": 0.5, "integral_time": 5.0},
+    "ptos": {
+        "kind": "ptos", "lag": 1.0, "steepness": 6.2, "share": 0.34, "damping": 0.8,
+        "heading_rate": 4.0, "yaw_rate_rate": 15.0, "push_rate": 0.25, "cross_rate": 1.2,
+    },
+}  # fmt: skip
+SIGHT = {"lookahead": 10.0, "depth_rate": 1.0, "drift_rate": 0.2}
+
+
+@pytest.fixture(scope="module")
+def vessel() -> SteeredPlant:
+    return SteeredPlant(load_vessel("remus_100").build(), axis=DEPTH)
+
+
+def config(law: str) -> DepthConfig:
+    return DepthConfig.model_validate({"pitch": LAWS[law], **SIGHT})
+
+
+def test_the_planes_come_first_and_nothing_varied_is_the_plant(vessel: SteeredPlant) -> None:
+    plant = vessel.plant
+    assert vessel.inputs == ("cmd_delta_s", "cmd_delta", "cmd_n")
+    x, w = vessel.start(torch.ones(1, dtype=torch.float64))
+    w[:, 0], w[:, 1] = 0.1, -0.05
+    mine, _, _ = Rollout(VariedPlant(plant, 0.1, axis=DEPTH))(
+        x, w.expand(1, 50, -1), torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+    )
+    own = w[:, [vessel.inputs.index(name) for name in plant.inputs]]
+    truth, _, _ = Rollout(PlantDynamics(plant, 0.1))(x, own.expand(1, 50, -1), x[:, :0])
+    assert torch.allclose(mine, truth, rtol=0, atol=1e-12)
+    assert mine[0, -1, vessel.column("z")] > 1.0
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_depth_is_held_to_a_centimetre_with_a_trim_that_is_off(
+    vessel: SteeredPlant, law: str
+) -> None:
+    policy = config(law).build(Steering(vessel, TURNING, 15 * DEG, 0.1))
+    biased = torch.tensor([[1.0, 1.0, 2 * DEG], [0.8, 1.2, -DEG]])
+    flown = fly(vessel, policy, torch.tensor([3.0, -2.0]), biased, dt=0.1, duration=45.0)
+    assert float(flown.error[:, -100:].abs().max()) < 0.01
+    assert float(flown.state("theta").abs().max()) < 35 * DEG
+    assert float(flown.overshoot().max()) < 1.0
+
+
+def test_rows_are_the_policies_of_their_own_constants(vessel: SteeredPlant) -> None:
+    steering = Steering(vessel, TURNING, 15 * DEG, 0.1)
+    wanted = config("ptos").complete()
+    open_ = DepthConfig.model_validate({"pitch": {"kind": "ptos", "lag": 1.0}})
+    assert list(open_.parameters()) == list(wanted) == list(open_.axes(TURNING))
+    assert open_.tuned(wanted) == config("ptos")
+    rows = {name: torch.tensor([value, 2.0 * value]) for name, value in wanted.items()}
+    many, one = open_.rows(rows, steering).float(), config("ptos").build(steering).float()
+    x = torch.zeros(2, len(vessel.state))
+    x[:, vessel.column("u")], x[:, vessel.column("theta")] = 2.5, -0.1
+    reference, s = torch.tensor([[0.5], [0.5]]), one.initial_state(x)
+    with torch.no_grad():
+        got, alone = many(x, reference, s)[0], one(x, reference, s)[0]
+    assert float(got[0]) == pytest.approx(float(alone[0]), abs=1e-6)
+    assert float(got[1]) != pytest.approx(float(alone[1]), abs=1e-3)
+
+
+def test_gradients_of_the_cost_reach_law_line_of_sight_and_network(vessel: SteeredPlant) -> None:
+    torch.manual_seed(0)
+    described = {
+        "state": vessel.state, **vars(TURNING), "limit": 15 * DEG, "rate": None, "dt": 0.1,
+        "trained_at": 0.1, "units": 3, "law": LAWS["ptos"],
+    }  # fmt: skip
+    law: Any = described
+    policy = DepthPolicySpec(law=law, steepest=0.5, sight=SIGHT).build().float()
+    conditions = ConditionsConfig(depth=DepthChanges(), hold=0.0, duration=6.0, dt=0.1)
+    assert conditions.axis is DEPTH
+    changes = conditions.draw(4, 0.1, torch.Generator().manual_seed(1))
+    assert changes.noise.shape == (4, 60, 3)
+    run = ConditionedRun(vessel, policy, 0.1, "heun", torch.float32)
+    flown = run.flights(changes, *run.rollout(4)(*run.given(changes))[:2])
+    flown.measured(conditions)["cost"].mean().backward()
+    network: Any = policy.law
+    for part in (policy.constants, network.constants, network.network.out.weight):
+        assert part.grad is not None
+        assert torch.isfinite(part.grad).all()
+        assert float(part.grad.abs().max()) > 0
+
+
+def test_planes_that_are_reversed_are_refused(vessel: SteeredPlant) -> None:
+    reversed_ = DEPTH._replace(side=1.0)
+    torpedo = SteeredPlant(load_vessel("remus_100").build(), axis=reversed_)
+    with pytest.raises(FitError, match="check the sign"):
+        torpedo.turning(10 * DEG, 8.0, 0.1)
+
+
+def test_vessels_without_planes_and_mixed_axes_are_refused() -> None:
+    with pytest.raises(ConfigError, match="depth control needs a vessel with .* cmd_delta_s"):
+        SteeredPlant(load_vessel("nomoto_oceanos").build(), axis=DEPTH).model(0.1)
+    given = yaml.safe_load(CONFIG.read_text())
+    for change, message in (
+        ({"vessel": "patrol_p06"}, "no command 'cmd_delta_s'"),
+        ({"rudder": "31 deg"}, "0.5236 rad at most"),
+        ({"peers": {**given["peers"], "lone": {"kind": "pd"}}}, "peers.lone: test.depth is given"),
+        ({"test": {**given["test"], "depth": None}}, "conditions.stated.depth"),
+        ({"policies": {"learned": {"start": None}}}, "a depth policy begins with a peer"),
+        ({"policies": {"learned": {"start": "pid"}}}, "or of kind depth with such a pitch"),
+        ({"pace": 2.0}, "leave out 'predictive' and 'pace'"),
+    ):
+        with pytest.raises(ValidationError, match=message):
+            AutopilotConfig.model_validate({**given, **change})
+    with pytest.raises(ValidationError, match="waves"):
+        ConditionsConfig(depth=DepthChanges(), waves=0.01)
