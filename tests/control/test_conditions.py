@@ -84,9 +84,7 @@ def test_the_cost_is_what_it_says() -> None:
     error[0, :start] = 70 * DEG
     command = torch.zeros(1, steps)
     command[0, start + 5 :: 2] = DEG
-    flown = ConditionedFlights(
-        changes, changes.heading[:, None] - side * error, torch.zeros(1, steps), command
-    )
+    flown = ConditionedFlights(changes, changes.heading[:, None] - side * error, command)
     found = flown.measured(CALM)
     changed = int((np.diff(command[0, : start + 120].numpy()) != 0).sum())
     assert float(found["time_outside"]) == pytest.approx(3.0 * 3 / 4 + 3.0 * 2 / 3, rel=1e-4)

@@ -125,7 +125,7 @@ def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:
     def cost(amplitude: float, swinging: int) -> float:
         command = torch.zeros(16, len(time))
         command[:swinging] = math.radians(amplitude) * wave
-        flown = ConditionedFlights(changes, torch.zeros_like(command), command, command)
+        flown = ConditionedFlights(changes, torch.zeros_like(command), command)
         return float(fit._unsteady(flown, over, 8))
 
     # 0.2 s are the overshoot; half of what an epoch may swing is free; of eight quiet flights the

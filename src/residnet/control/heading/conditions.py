@@ -396,7 +396,7 @@ class ConditionedFlights:
     changes: HeadingChanges
     value: Tensor
     command: Tensor
-    axis: Axis
+    axis: Axis = HEADING
 
     @property
     def error(self) -> Tensor:
