@@ -556,15 +556,15 @@ class DepthPolicy(HeadingPolicy):
 
     def without_network(self) -> DepthPolicy:
         """Return a copy whose law has no network."""
-        alone = copy.deepcopy(self)
-        assert isinstance(alone.law, ObservedPolicy)
-        alone.law = alone.law.without_network()
+        alone, law = copy.deepcopy(self), self.law
+        assert isinstance(law, ObservedPolicy)
+        alone.law = law.without_network()
         return alone
 
     def values(self) -> dict[str, float]:
         """Return the constants by name, those of an observed law too."""
         found = dict(zip(SIGHT, torch.exp(self.constants.detach()).tolist(), strict=True))
-        return found | (self.law.values() if isinstance(self.law, HeadingPolicy) else {})
+        return found | (self.law.values() if isinstance(self.law, ObservedPolicy) else {})
 
     def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
         assert isinstance(self.law, HeadingPolicy)

@@ -194,7 +194,8 @@ class PolicyFit(EpochTraining):
         steady = self.settings.steady
         limit = math.inf if steady is None else steady.of(self.conditions.axis)[2]
         beyond: Tensor = (overshoot - limit).clamp(min=0.0).mean()
-        return self.settings.excess / self.conditions.unit * beyond
+        cost: Tensor = self.settings.excess / self.conditions.unit * beyond
+        return cost
 
     def _strict(self) -> float:
         """Return the factor on what swing and nominal overshoot cost in this epoch.
