@@ -250,7 +250,9 @@ class FerryStudyConfig(Study, ComputingTask):
         chain = [name]
         while below := self.models[chain[0]].on:
             chain.insert(0, below)
-        rows = [results["models"][one]["exported"] for one in chain]
+        rows = [results["models"][one] for one in chain]
+        # runs of before the whole course was fitted again have one range for all
+        rows = [row.get("exported") or {**row, "range": results["training_range"]} for row in rows]
         force = ForceModel(force_hull(self.believed)[0].hull)
         for row in rows:
             numbers = (torch.tensor(row[key]).double() for key in ("coefficients", "intercept"))
