@@ -21,7 +21,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "control": (3441, 386),
     "core": (1595, 247),
     "data": (9875, 879),
-    "documents": (2557, 236),
+    "documents": (2558, 236),
     "dynamics": (2201, 278),
     "export": (1606, 177),
     "heads": (1311, 191),
