@@ -174,6 +174,11 @@ def test_motions_to_port_tell_of_those_to_starboard(short: Flown) -> None:
 
 def test_what_searches_its_settings_leaves_with_the_whole_course(short: Flown) -> None:
     assert set(short.whole) == {"plsr"}
+    judged, leaves = short.models["plsr"], short.whole["plsr"]
+    assert leaves.lag == judged.lag is not None
+    assert [leaves.fit.notes[key] for key in ("order", "mirror")] == [
+        judged.fit.notes[key] for key in ("order", "mirror")
+    ]
     # the model that is reported has not seen what judges it
     half, whole = (of["plsr"].test_mse(short.record) for of in (short.models, short.whole))
     assert all(more < less for more, less in zip(whole, half, strict=True))

@@ -100,16 +100,20 @@ def fit_lag(
         )
         return out
 
-    starts = [np.array([w, 0.8, d]) for w in (1.0, 3.0, 8.0) for d in (0.05, 0.5)]
-    first = min(starts, key=lambda p: float(np.square(miss(p)).sum()))
-    found = scipy.optimize.least_squares(
-        miss,
-        first,
-        bounds=(_LEAST, _MOST),
-        x_scale=[1.0, 0.3, 0.1],
-        diff_step=[1e-4] * 3,
-        max_nfev=60,
-    )
+    # a search may end beside the lag: at a bound, or in a hollow of its own
+    searches = [
+        scipy.optimize.least_squares(
+            miss,
+            np.array([frequency, 0.8, delay]),
+            bounds=(_LEAST, _MOST),
+            x_scale=[1.0, 0.3, 0.1],
+            diff_step=[1e-4] * 3,
+            max_nfev=60,
+        )
+        for frequency in (1.0, 3.0, 8.0)
+        for delay in (0.05, 0.5)
+    ]
+    found = min(searches, key=lambda one: float(one.cost))
     return _lag_within_bounds(found.x)
 
 

@@ -51,6 +51,7 @@ from residnet.documents.jervan2020.residual import (
     missing_coefficients,
     model_figures,
     model_sections,
+    refitted,
 )
 from residnet.documents.study import Results, Study, compared, joined, notes_text, pictures
 from residnet.dynamics.hybrid import HybridDynamics
@@ -329,7 +330,12 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Fitt
     Raises:
         FitError: where the data do not determine the model.
     """
-    return fit_model(config, record.smoothed() if config.smooth else record, base)
+    return fit_model(config, smoothed(config, record), base)
+
+
+def smoothed(config: FerryModelConfig, record: Record) -> Record:
+    """Return the record as a model is identified from it."""
+    return record.smoothed() if config.smooth else record
 
 
 @dataclass(frozen=True)
@@ -397,9 +403,9 @@ def study(config: FerryStudyConfig) -> Flown:
     for name, model in config.models.items():
         models[name] = identify(model, record, models[model.on].force if model.on else believed)
     every_sample = replace(record, train=torch.ones_like(record.train))
-    # what the judged half could choose by itself leaves with all that is known
+    # what a half chose and the other judged leaves with the coefficients of both
     whole = {
-        name: identify(model, every_sample, believed)
+        name: refitted(model, models[name], smoothed(model, every_sample), believed)
         for name, model in config.models.items()
         if model.searched and not model.on and models[name].fit.notes["order"] > 0
     }

@@ -423,13 +423,16 @@ class FittedModel(NamedTuple):
         return mse(self.remaining(record)[~record.train])
 
 
-def fit_model(config: ResidualModelConfig, record: Record, base: ForceModel) -> FittedModel:
+def fit_model(
+    config: ResidualModelConfig, record: Record, base: ForceModel, lag: Lag | None = None
+) -> FittedModel:
     """Fit one model of the residual force of `base` on the training samples of a record.
 
     Args:
         config: basis functions and estimator.
         record: motion and commanded force.
         base: the known model, F_base(nu_dot, nu).
+        lag: where the config asks for one and it is known; None to find it.
 
     Raises:
         FitError: where the data do not determine the model.
@@ -448,11 +451,12 @@ def fit_model(config: ResidualModelConfig, record: Record, base: ForceModel) -> 
         ],
         dim=-1,
     )
-    lag, force = None, record.command
+    force = record.command
     notes: dict[str, Any] = {}
     if config.lag:
         regressors = torch.cat((x, earth_axes[:, 0]), dim=-1) if config.earth else x
-        lag = fit_lag(record.averaged, needed, regressors, record.dt, train, record.runs)
+        if lag is None:
+            lag = fit_lag(record.averaged, needed, regressors, record.dt, train, record.runs)
         force = followed(record.averaged, lag, record.dt, record.runs)
         notes["lag"] = lag.model_dump()
     y, earth_force = force - needed, None
@@ -492,17 +496,18 @@ def _searched(config: ResidualModelConfig, record: Record, base: ForceModel) -> 
     none = FittedModel(base, None, Fit(torch.zeros(0), torch.zeros(0), torch.zeros(0)))
     nothing = torch.tensor(mse(none.remaining(record)[record.train]))
     tried, faults = [], []
+    known: Lag | None = None
     mirrors = [False, True] if config.mirror is None else [config.mirror]
     if mirror_signs(config.terms) is None and config.mirror is None:
         mirrors = [False]
     for lag, mirror in itertools.product((False, True), mirrors):
         try:
-            found = fit_model(
-                config.model_copy(update={"lag": lag, "mirror": mirror}), record, base
-            )
+            one = config.model_copy(update={"lag": lag, "mirror": mirror})
+            found = fit_model(one, record, base, known if lag else None)
         except FitError as error:
             faults.append(error)
             continue
+        known = found.lag
         left = found.fit.orders["left-out segments"][found.fit.notes["order"] - 1] / nothing
         tried.append((float(left.nan_to_num(torch.inf).mean()), found))
     if not tried:
@@ -514,6 +519,23 @@ def _searched(config: ResidualModelConfig, record: Record, base: ForceModel) -> 
     zero = torch.zeros_like(best.fit.coefficients)
     fit = Fit(zero, zero[0], zero, {"order": 0, "left_out": 1.0})
     return FittedModel(base.extended(Correction(config.terms, zero, zero[0])), None, fit)
+
+
+def refitted(
+    config: ResidualModelConfig, model: FittedModel, record: Record, base: ForceModel
+) -> FittedModel:
+    """Return a searched model fitted to other samples, with the settings and the lag that it has.
+
+    Raises:
+        FitError: where the samples do not determine it.
+    """
+    notes = model.fit.notes
+    chosen = {
+        "fit": config.fit.model_copy(update={"order": notes["order"]}),
+        "lag": model.lag is not None,
+        "mirror": bool(notes.get("mirror")),
+    }
+    return fit_model(config.model_copy(update=chosen), record, base, model.lag)
 
 
 def mirror_signs(terms: Sequence[str]) -> Tensor | None:
