@@ -139,14 +139,15 @@ class FerryModelConfig(ResidualModelConfig):
 
     Attributes:
         smooth: estimate the motion from all noisy measurements together before the fit
-            (`residnet.data.motion`).
+            (`residnet.data.motion`). Null does so where the noise is known and the model searches
+            its settings.
         on: name of the model whose remaining residual this one explains (3.26); empty for the
             believed hull.
         fly: fly the course, and the crossing where there is one, with this model as feed-forward.
         published: figures that the document prints for this model.
     """
 
-    smooth: bool = False
+    smooth: bool | None = None
     on: str = ""
     fly: bool = False
     published: Published = Published()
@@ -335,7 +336,8 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Fitt
 
 def smoothed(config: FerryModelConfig, record: Record) -> Record:
     """Return the record as a model is identified from it."""
-    return record.smoothed() if config.smooth else record
+    wanted = config.searched if config.smooth is None else config.smooth
+    return record.smoothed() if wanted and any(record.noise) else record
 
 
 @dataclass(frozen=True)
