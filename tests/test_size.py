@@ -21,7 +21,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "control": (3441, 386),
     "core": (1595, 247),
     "data": (9875, 879),
-    "documents": (2558, 236),
+    "documents": (2569, 238),
     "dynamics": (2201, 278),
     "export": (1606, 177),
     "heads": (1311, 191),
@@ -35,7 +35,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "simulators": (359, 44),
     "tasks": (3121, 258),
     "testing": (506, 33),
-    "training": (1326, 154),
+    "training": (1325, 154),
     "": (469, 55),
 }
 
