@@ -22,7 +22,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "core": (1595, 247),
     "data": (9875, 879),
     "documents": (2569, 238),
-    "dynamics": (2201, 278),
+    "dynamics": (2202, 278),
     "export": (1606, 177),
     "heads": (1311, 191),
     "identification": (2244, 228),

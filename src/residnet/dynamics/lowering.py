@@ -17,7 +17,8 @@ import casadi as ca
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.fx import GraphModule, Node
+from torch.fx import Graph, GraphModule, Node
+from torch.fx.node import map_aggregate
 from torch.utils import _pytree as tree
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -120,12 +121,12 @@ def lowered(
     return ca.Function("step", columns, found, [name for name, _ in arguments], list(results))
 
 
-def _placeholders(graph: GraphModule) -> list[Node]:
-    return [node for node in graph.graph.nodes if node.op == "placeholder"]
+def _placeholders(graph: Graph) -> list[Node]:
+    return [node for node in graph.nodes if node.op == "placeholder"]
 
 
 def _columns(
-    graph: GraphModule,
+    graph: Graph,
     values: dict[Node, Any],
     what: str,
     instead: Callable[[Node, Any], Any] | None = None,
@@ -138,11 +139,13 @@ def _columns(
         what: is lowered, for messages.
         instead: takes a node and its arguments, and returns its value, None for the usual one.
     """
-    for node in graph.graph.nodes:
+    for node in graph.nodes:
         if node in values:
             continue
         if node.op == "get_attr":
-            values[node] = _Value(operator.attrgetter(str(node.target))(graph).detach())
+            values[node] = _Value(
+                operator.attrgetter(str(node.target))(graph.owning_module).detach()
+            )
         elif node.op == "output":
             return [values[output].column for output in tree.tree_leaves(node.args[0])]
         else:
@@ -217,7 +220,7 @@ def in_parts(
     places = _placeholders(graph)
     alone: dict[Node, None] = dict.fromkeys(places[len(rows) :])
     constant: dict[Node, None] = {}
-    for node in graph.graph.nodes:
+    for node in graph.nodes:
         given = node.all_input_nodes
         if node.op == "get_attr" or (node.op == "call_function" and _name(node.target) in _LIKE):
             constant[node] = None
@@ -324,13 +327,13 @@ def _name(target: Any) -> str:
 
 
 def _subgraph(
-    graph: GraphModule,
+    graph: Graph,
     given: Sequence[Node],
     results: Sequence[Node],
     constant: Mapping[Node, Any] = MappingProxyType({}),
 ) -> GraphModule:
     """Return the part of a graph that makes some of its nodes from others, and constants."""
-    part, owner = torch.fx.Graph(), nn.Module()
+    part, owner = Graph(), nn.Module()
     copies: dict[Node, Node] = {}
 
     def copied(node: Node) -> Node:
@@ -341,7 +344,9 @@ def _subgraph(
                 copies[node] = part.get_attr(name)
             elif node.op == "get_attr":
                 name = f"constant_{len(copies)}"
-                owner.register_buffer(name, operator.attrgetter(str(node.target))(graph).detach())
+                owner.register_buffer(
+                    name, operator.attrgetter(str(node.target))(graph.owning_module).detach()
+                )
                 copies[node] = part.get_attr(name)
             else:
                 copies[node] = part.node_copy(node, copied)
@@ -363,8 +368,10 @@ def in_numbers(function: ca.Function) -> ca.Function:
     return ca.Function("step", symbols, found, function.name_in(), function.name_out())
 
 
-def recorded(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -> GraphModule:
+def recorded(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -> Graph:
     """Return the graph of the operations of torch that a step makes of examples.
+
+    Its owning module has its constants.
 
     Raises:
         ExportError: where Python decides by values.
@@ -397,36 +404,37 @@ class _Recorder(TorchDispatchMode):
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        from torch._decomp import core_aten_decompositions
+        # `core_aten_decompositions` adds those that each operation has itself, in 60 ms
+        from torch._decomp import _core_aten_decompositions_post_autograd
 
-        self._rules: Any = core_aten_decompositions()
-        # else it would be recorded as an alias, as much else is
-        self._rules.pop(torch.ops.aten.detach.default, None)
-        self._graph, self._owner = torch.fx.Graph(), nn.Module()
+        self._rules: Any = _core_aten_decompositions_post_autograd()
+        self._owner = GraphModule({}, Graph())
+        self._graph = Graph(self._owner)
         # numbers are kept, so that none is taken for another that had its place in memory
         self._nodes: dict[int, tuple[Node, Tensor]] = {}
         self._varying: set[Node] = set()
 
-    def graph_of(self, step: Callable[..., Any], examples: Sequence[Tensor]) -> GraphModule:
+    def graph_of(self, step: Callable[..., Any], examples: Sequence[Tensor]) -> Graph:
         """Return the graph of a step."""
         for k, example in enumerate(examples):
             self._nodes[id(example)] = self._graph.placeholder(f"given_{k}"), example
         self._varying.update(node for node, _ in self._nodes.values())
         with self:
             found = step(*examples)
-        self._graph.output(tree.tree_map(self._node, found))
+        self._graph.output(map_aggregate(found, self._node))
         self._graph.eliminate_dead_code()
-        return GraphModule(self._owner, self._graph)
+        return self._graph
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         given = kwargs or {}
-        rules = [func.decompose, *([self._rules[func]] if func in self._rules else [])]
-        for rule in reversed(rules):
+        # what only moves numbers is kept: torch's rules would hide a detach, and import sympy
+        rules = (self._rules.get(func), func.decompose)
+        for rule in filter(None, () if _name(func) in _MOVES else rules):
             with self:
                 found = rule(*args, **given)
             if found is not NotImplemented:
                 return found
-        node = self._graph.call_function(func, *tree.tree_map(self._node, (args, given)))
+        node = self._graph.call_function(func, *map_aggregate((args, given), self._node))
         if not self._varying.isdisjoint(node.all_input_nodes):
             self._varying.add(node)
             if torch.Tag.data_dependent_output in func.tags:
@@ -518,7 +526,7 @@ def _called(target: Any, args: Any, settings: Any, what: str) -> Any:
     leaves = [leaf for leaf in tree.tree_leaves((args, settings)) if isinstance(leaf, _Value)]
 
     def plain(part: Any) -> Any:
-        return tree.tree_map(lambda leaf: leaf.example if isinstance(leaf, _Value) else leaf, part)
+        return map_aggregate(part, lambda leaf: leaf.example if isinstance(leaf, _Value) else leaf)
 
     example = target(*plain(args), **plain(settings))
     if name in _LIKE or all(leaf.constant for leaf in leaves):
@@ -556,7 +564,7 @@ def _moved(
         count += leaf.example.numel()
         return leaf.places + (count - leaf.example.numel())
 
-    given = [tree.tree_map(placed, arg) if i in moved else plain(arg) for i, arg in enumerate(args)]
+    given = [map_aggregate(arg, placed) if i in moved else plain(arg) for i, arg in enumerate(args)]
     places = target(*given, **settings)
     whole = columns[0] if len(columns) == 1 else ca.vertcat(*columns)
     if isinstance(example, Tensor):
