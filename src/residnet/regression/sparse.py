@@ -216,11 +216,13 @@ def _independent(
         if not lost:
             break
         kept = [i for i in kept if i not in lost]
-    gone = [i for i in range(len(names)) if i not in kept]
+    q, triangle = np.linalg.qr(r[:, kept])
     dependent: dict[str, dict[str, float]] = {}
-    for i in gone:
+    for i in sorted({*range(len(names))} - {*kept}):
         before = [k for k in kept if k < i]
-        share = np.linalg.lstsq(r[:, before], r[:, i], rcond=None)[0]
+        share = scipy.linalg.solve_triangular(
+            triangle[: len(before), : len(before)], q[:, : len(before)].T @ r[:, i]
+        )
         parts = {
             names[k]: float(s * scale[i] / scale[k])
             for k, s in zip(before, share, strict=True)
