@@ -29,9 +29,9 @@ def test_going_away_from_where_a_course_begins_is_no_approach() -> None:
     (passage,) = passages(track, [buoy])
     assert passage.side == passage.side_there == "port"
     assert passage.least == pytest.approx(11.0, abs=0.05)
-    assert first_fault(track, [buoy], "sides", 0.1) is None
+    assert first_fault(track, [buoy], "sides", 5.0) is None
     other = buoy._replace(leave_to="starboard")
-    assert "not left to starboard" in str(first_fault(track, [other], "sides", 0.1))
+    assert "not left to starboard" in str(first_fault(track, [other], "sides", 5.0))
     distance = np.hypot(*(track - (1.0, 1.0)).T)
     begin = left_behind(distance, 10.0)
     assert distance[begin] == pytest.approx(np.hypot(1.0, 39.0))
@@ -41,9 +41,22 @@ def test_a_circle_that_is_never_left_is_cut() -> None:
     track = line((0.0, 0.0), (0.0, 5.0))
     buoy = Asked(north=1.0, east=1.0, radius=10.0, leave_to="port")
     assert left_behind(np.hypot(*(track - (1.0, 1.0)).T), 10.0) == len(track)
-    assert "is cut" in str(first_fault(track, [buoy], "sides", 0.1))
+    assert "is cut" in str(first_fault(track, [buoy], "sides", 5.0))
 
 
 def test_one_that_begins_outside_counts_from_the_start() -> None:
     track = line((0.0, 0.0), (0.0, 30.0))
     assert left_behind(np.hypot(*(track - (0.0, 20.0)).T), 5.0) == 0
+
+
+@pytest.mark.parametrize("offset", np.linspace(0.0, 1.0, 5))
+def test_a_circle_that_is_touched_between_samples_is_entered(offset: float) -> None:
+    """A turn of 10 m touches a circle of 3 m from outside; its samples, 0.4 m apart, only near it."""
+    turn, radius, step = 10.0, 3.0, 0.4
+    angle = (np.arange(-40, 41) + offset) * step / turn
+    track = turn * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    touched = Asked(north=turn + radius, east=0.0, radius=radius, leave_to="port")
+    assert first_fault(track, [touched], "enter", turn) is None
+    missed = touched._replace(north=turn + radius + 0.02)
+    assert "not entered" in str(first_fault(track, [missed], "enter", turn))
+    assert first_fault(track, [missed], "enter", turn, missed=0.02) is None

@@ -156,6 +156,30 @@ def test_circles_of_acceptance_are_entered(vessel: SteeredPlant) -> None:
     assert planned.course.length <= 1.06 * planned.reference
 
 
+def test_what_is_missed_is_passed_farther_off_next_time(vessel: SteeredPlant) -> None:
+    """The shortest outline leads to fits that miss the last of these buoys by six metres."""
+    places = (
+        (3.54, 5.07),
+        (6.02, -1.6),
+        (10.82, 5.38),
+        (15.54, 4.04),
+        (17.74, 12.8),
+        (15.84, 2.67),
+    )
+    sides = ("port", "port", "port", "starboard", "port", "port")
+    steady = smallest_turn(WANTED, vessel, TURNING, LIMIT)
+    radius = steady.radius
+    buoys = tuple(
+        BuoyConfig(north=radius * n, east=radius * e, leave_to=side, radius=1.000001 * radius)
+        for (n, e), side in zip(places, sides, strict=True)
+    )
+    wanted = WANTED.model_copy(update={"buoys": buoys})
+    planned = plan_course(wanted, "sides", vessel, TURNING, LIMIT, steady)
+    for buoy in buoys:
+        away = np.hypot(*(planned.course.track - (buoy.north, buoy.east)).T)
+        assert away.min() > 0.99 * radius
+
+
 def test_buoys_too_close_for_the_vessel_are_refused(vessel: SteeredPlant) -> None:
     near = WANTED.model_copy(
         update={

@@ -112,18 +112,23 @@ def _side(track: Array, at: int, buoy: Asked) -> str:
 
 
 def first_fault(
-    track: Array, buoys: Sequence[Asked], protocol: Protocol, slack: float
+    track: Array, buoys: Sequence[Asked], protocol: Protocol, turn: float, missed: float = 0.0
 ) -> tuple[int, str] | None:
     """Return the first buoy, from 0, where a track [N, 2] does wrong, and what; None where nowhere.
+
+    Between its samples the track may be nearer to a buoy by what `_between` says.
 
     Args:
         track: north, east in m.
         buoys: in their order.
         protocol: see there.
-        slack: of distances in m.
+        turn: least radius of its turns in m.
+        missed: by which circles may be missed, in m.
     """
+    step = float(np.hypot(*np.diff(track, axis=0).T).max())
     for place, (passage, buoy) in enumerate(zip(passages(track, buoys), buoys, strict=True)):
         number = place + 1
+        slack = missed + _between(buoy.radius, step, turn)
         if protocol == "enter":
             if passage.distance > buoy.radius + slack:
                 return place, (
@@ -136,3 +141,11 @@ def first_fault(
         elif {passage.side, passage.side_there} != {buoy.leave_to}:
             return place, f"buoy {number}: it is not left to {buoy.leave_to} where it is nearest"
     return None
+
+
+def _between(distance: float, step: float, turn: float) -> float:
+    """Return how much nearer than its samples a track may come to a point that it passes.
+
+    A sample lies at most half a step from the closest approach, along an arc that bends away.
+    """
+    return min(0.5 * step, step**2 / 8 * (1 / turn + 1 / distance)) if distance else 0.0

@@ -126,18 +126,18 @@ class _Joining:
 
 
 _TRIES = ((1.0, 1.0, 1), (0.5, 1.0, 1), (0.0, 1.0, 1))
-_MORE = ((1.0, 1.5, 2), (1.0, 1.0, 2), (0.0, 1.0, 2), (0.5, 2.0, 2), (1.0, 3.0, 2))
+_MORE = ((1.0, 1.5, 2), (1.0, 1.0, 2), (0.0, 1.0, 2), (0.5, 2.0, 2))
 """What outlines are looked for with: share of the room before and behind turns, multiple of their
 radius, and how many distances buoys may be passed at.
 """
 _EFFORT = 600
-"""Times that a route is drawn for fits, beyond which no other outline is fitted."""
+"""Times that a route is drawn for fits, beyond which no other outline of a round is fitted."""
 _TOLERANCE = 2e-3
 """Of distances, as a share of the vessel's turning radius."""
-_LAST = 1e-2
-"""The same before a course is refused: what buoys ask for is checked all the same, and plans keep a
-margin to that.
-"""
+_APART = 0.3
+"""Turning radii by which the next outline keeps farther off a circle that was missed."""
+_ROUNDS_APART = 6
+"""How often it does."""
 _FAR = 0.1
 """Turning radii by which a fit may miss its circles and still be simplified."""
 _MENDED = 0.1
@@ -223,49 +223,56 @@ def _planned(
     make: TurnMaker | None,
     reasons: list[tuple[float, int, str]],
 ) -> Course | None:
-    """Return the quickest course found that passes the check; None, and reasons, where none is."""
-    known: set[tuple[object, ...]] = set()
-    effort = 0
-    near: list[tuple[Fit, Fitted]] = []
+    """Return the quickest course found that passes the check; None, and reasons, where none is.
 
-    def settled(found: list[tuple[Fit, Fitted]], tolerance: float) -> Course | None:
+    Where the courses of an outline miss a circle, the next outline keeps farther off it.
+    """
+    known: set[tuple[object, ...]] = set()
+    radius = request.turns.radius
+    apart = np.zeros(len(request.circles))
+
+    def settled(found: list[tuple[Fit, Fitted]]) -> Course | None:
         found.sort(key=lambda one: one[1].time)
         for fit, fitted in found if make is None else joined(request.turns, found, make):
-            if _right(request, fit, fitted, step, reasons, tolerance):
+            if _right(request, fit, fitted, step, reasons):
                 return _sampled(fit.route, fitted.z, step, beyond)
-            if fitted.missed <= tolerance * request.turns.radius:
+            if fitted.missed <= _TOLERANCE * radius:
                 fitted = fit.alone(fitted.z, _MENDED)
-                if _right(request, fit, fitted, step, reasons, tolerance):
+                if _right(request, fit, fitted, step, reasons):
                     return _sampled(fit.route, fitted.z, step, beyond)
         return None
 
-    for number, tries in enumerate((_TRIES, *((one,) for one in _MORE))):
-        report("planning", number, 1 + len(_MORE))
+    for number, tries in enumerate((_TRIES, *(_MORE,) * _ROUNDS_APART)):
+        report("planning", number, 1 + _ROUNDS_APART)
         found: list[tuple[Fit, Fitted]] = []
+        before, effort = len(reasons), 0
         for room, wide, rings in tries:
             if effort > _EFFORT:
                 break
-            sketch = _outline(request, room, wide, RINGS[:rings])
+            sketch = _outline(request, apart, room, wide, RINGS[:rings])
             for outline in () if sketch is None else _simplified(request, sketch):
                 if (shape := _shape(outline)) in known:
                     continue
                 known.add(shape)
                 fits = _fitted(request, outline)
                 right = [one for one in fits if _right(request, *one, step, reasons)]
-                close = [one for one in fits if one[1].missed <= _TOLERANCE * request.turns.radius]
+                close = [one for one in fits if one[1].missed <= _TOLERANCE * radius]
                 if close and not right:
                     # what is passed out of its turn may be on the wrong side there
                     fit, fitted = min(close, key=lambda one: one[1].time)
                     fitted = fit.alone(fitted.z)
                     right = [(fit, fitted)] if _right(request, fit, fitted, step, reasons) else []
-                near += [one for one in fits if one[1].missed <= _LAST * request.turns.radius]
                 found += right
                 effort += sum(fit.effort for fit, _ in fits)
                 if found:
                     break
-        if (course := settled(found, _TOLERANCE)) is not None:
+        if (course := settled(found)) is not None:
             return course
-    return settled(near, _LAST)
+        worst = min(reasons[before:] or reasons, default=None)
+        if worst is None:
+            return None
+        apart[worst[1]] += _APART * radius
+    return None
 
 
 def _excluding(
@@ -310,21 +317,19 @@ def _right(
     fitted: Fitted,
     step: float,
     reasons: list[tuple[float, int, str]],
-    tolerance: float = _TOLERANCE,
 ) -> bool:
     """Return whether a course passes the check; where it does not, the reason is added.
 
     A reason is what is missed in m, the number of the buoy from 0, and the words for it.
     """
-    if fitted.missed > tolerance * request.turns.radius:
+    if fitted.missed > _TOLERANCE * request.turns.radius:
         reasons.append((fitted.missed, fitted.worst, f"buoy {fitted.worst + 1}"))
         return False
     course = _sampled(fit.route, fitted.z, step, step)
     # to the end, between samples
     track = course.track[: math.ceil(course.length / step) + 1]
-    # between two samples a turn bends by no more
-    between = 0.5 * step**2 / request.turns.radius
-    wrong = first_fault(track, request.buoys, request.protocol, between)
+    radius = request.turns.radius
+    wrong = first_fault(track, request.buoys, request.protocol, radius, fitted.missed)
     if wrong is not None:
         reasons.append((0.0, *wrong))
     return wrong is None
@@ -366,9 +371,12 @@ def _shape(sketch: Sketch) -> tuple[object, ...]:
 
 
 def _outline(
-    request: CourseRequest, share: float, wide: float, rings: Sequence[float]
+    request: CourseRequest, apart: Array, share: float, wide: float, rings: Sequence[float]
 ) -> Sketch | None:
-    """Return the shortest outline for turns that need a share of their room."""
+    """Return the shortest outline for turns that need a share of their room.
+
+    It keeps farther off circles, or reaches farther into them, by `apart` in m.
+    """
 
     def room(number: int) -> Room:
         radius, before, behind = request.turns.tables[number].fitted
@@ -377,7 +385,10 @@ def _outline(
     return Outlines(
         complex(*request.start),
         request.heading,
-        request.circles,
+        [
+            replace(circle, radius=max(circle.radius + (more if circle.side else -more), 0.0))
+            for circle, more in zip(request.circles, apart, strict=True)
+        ],
         room(0),
         [room(circle.table) for circle in request.circles],
         request.turns.radius,
