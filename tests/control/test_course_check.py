@@ -51,7 +51,7 @@ def test_one_that_begins_outside_counts_from_the_start() -> None:
 
 @pytest.mark.parametrize("offset", np.linspace(0.0, 1.0, 5))
 def test_a_circle_that_is_touched_between_samples_is_entered(offset: float) -> None:
-    """A turn of 10 m touches a circle of 3 m from outside; its samples, 0.4 m apart, only near it."""
+    """A turn of 10 m touches a circle of 3 m from outside; samples 0.4 m apart only near it."""
     turn, radius, step = 10.0, 3.0, 0.4
     angle = (np.arange(-40, 41) + offset) * step / turn
     track = turn * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
