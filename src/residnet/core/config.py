@@ -7,6 +7,7 @@ with a unit (`20 deg`). Every error is one line.
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import re
@@ -180,15 +181,19 @@ def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> A
     return _validated(data, model, _Origin(where), folder)
 
 
+@functools.cache
+def _adapter(model: Any) -> TypeAdapter[Any]:
+    """Return what reads a type; for a union of vessels pydantic takes 35 ms to make it."""
+    return TypeAdapter(model)
+
+
 def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> Any:
     # what is computed, as in a model's description, may be as good as zero
     _require_usual(data, origin, 0.0 if origin.root is None else 1.0 / _HUGE)
     # pydantic is strict without refusing lists for tuples or text for enums and paths only when it
     # reads JSON
     try:
-        return TypeAdapter(model).validate_json(
-            to_json(data), strict=True, context={"folder": folder}
-        )
+        return _adapter(model).validate_json(to_json(data), strict=True, context={"folder": folder})
     except ValidationError as error:
         raise ConfigError(describe(error, model, origin.source)) from error
     except PydanticSerializationError as error:
