@@ -171,15 +171,7 @@ def known_unit(unit: str, expected: str | None = None) -> str:
         UsageError: where the unit is not known, of another dimension than `expected`, or, without
             `expected`, may be one of two that differ in case.
     """
-    exact, folded = _spellings()
-    text = _tidy(unit)
-    meant: tuple[str, ...] = ()
-    fitting: list[str] = []
-    for spellings, written in ((exact, text), (folded, text.casefold())):
-        meant = meant or spellings.get(written, ())
-        fitting = fitting or [
-            name for name in spellings.get(written, ()) if expected in (None, _UNITS[name][0])
-        ]
+    meant, fitting = _meant(unit, expected)
     if len({_UNITS[name] for name in fitting}) == 1:
         return fitting[0]
     usual = [name for name, (base, _) in _UNITS.items() if base == expected]
@@ -194,6 +186,25 @@ def known_unit(unit: str, expected: str | None = None) -> str:
             f" {', '.join(usual) or 'none'}"
         )
     raise UsageError(f"unit '{unit}' may be {' or '.join(fitting)}; write the one that is meant")
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is a unit that `known_unit` knows; no other name is looked for."""
+    return len({_UNITS[name] for name in _meant(text, None)[1]}) == 1
+
+
+def _meant(unit: str, expected: str | None) -> tuple[tuple[str, ...], list[str]]:
+    """Return the units that a spelling may mean, and those of them that measure `expected`."""
+    exact, folded = _spellings()
+    text = _tidy(unit)
+    meant: tuple[str, ...] = ()
+    fitting: list[str] = []
+    for spellings, written in ((exact, text), (folded, text.casefold())):
+        meant = meant or spellings.get(written, ())
+        fitting = fitting or [
+            name for name in spellings.get(written, ()) if expected in (None, _UNITS[name][0])
+        ]
+    return meant, fitting
 
 
 def _tidy(unit: str) -> str:

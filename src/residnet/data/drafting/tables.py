@@ -13,7 +13,7 @@ import numpy as np
 
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.names import CHANNEL_UNITS, shown
-from residnet.core.units import known_unit, to_si
+from residnet.core.units import is_unit, to_si
 from residnet.data.channels import ALIKE, REGULAR, without_fills
 from residnet.data.drafting.channels import (
     CHANNELS,
@@ -531,11 +531,7 @@ def _described(table: pd.DataFrame) -> dict[str, str]:
 def _unit_in(cell: str) -> str:
     """Return the unit that a cell beneath a name holds; empty where it holds none."""
     unit = cell.strip(" []()")
-    try:
-        known_unit(unit)
-    except UsageError:
-        return ""
-    return unit
+    return unit if is_unit(unit) else ""
 
 
 def _excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, shown
-from residnet.core.units import known_unit
+from residnet.core.units import is_unit, known_unit
 from residnet.data.readers.base import Advance
 
 if TYPE_CHECKING:
@@ -265,11 +265,7 @@ def _without_unit(cells: pd.Series) -> tuple[str, pd.Series]:
 def _unit_behind(cell: str) -> str:
     """Return the unit behind a number, as it is written; empty for none."""
     found = _WITH_UNIT.fullmatch(cell)
-    if found is None or found["unit"] in _SIDES:
-        return ""
-    try:
-        known_unit(found["unit"])
-    except UsageError:
+    if found is None or found["unit"] in _SIDES or not is_unit(found["unit"]):
         return ""
     return found["unit"]
 
