@@ -178,8 +178,7 @@ SHORT: dict[str, Short] = {
     "patrol_identified": Short(_trained("mlp")),
     "patrol_roll": Short((*_TRIALS, "refit={}", "bands=null", *_trained("network"))),
     "remus_100": Short((*_DIVES, *_trained("mlp", "lstm"))),
-    # of so few trials: the export sweeps all thrusters at once, and any model of them rolls over
-    "bluerov2_heavy": Short((*_DIVES, *_trained("lstm"), "export.models=[]")),
+    "bluerov2_heavy": Short((*_DIVES, *_trained("lstm"))),
     "kvlcc2": Short(
         (
             "prepare.grid={step: 0.5 s, held: [n, delta]}",
