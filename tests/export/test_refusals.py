@@ -10,7 +10,7 @@ import torch
 from exported_models import VARIANTS, built, spec_of
 from tiny import TINY, call
 
-from residnet.core.errors import ResidnetError
+from residnet.core.errors import ExportError, ResidnetError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, save_model
 from residnet.export import FORMATS as REGISTERED
@@ -111,3 +111,29 @@ def refusal(name: str, spec: ModelSpec, model: HybridDynamics, file: Path) -> st
     except ResidnetError as error:
         return str(error).splitlines()[-1]
     return None
+
+
+def swept(spec: ModelSpec, model: HybridDynamics) -> float:
+    """Return the share of the training range that the inputs of the free run sweep at most."""
+    _, w, _ = ExportedVessel(spec, model).free_run(torch.float64)
+    n = spec.signals.live.size
+    low, high = torch.tensor(spec.low[n:]), torch.tensor(spec.high[n:])
+    return float(((w[0].amax(dim=0) - w[0].amin(dim=0)) / (high - low)).max())
+
+
+def test_inputs_that_ask_for_too_much_together_sweep_less() -> None:
+    """Inputs were logged one at a time; together they leave the states that logs hold."""
+    spec, model = built("plsr")
+    assert swept(spec, model) == pytest.approx(0.8, abs=0.01)
+    n = spec.signals.live.size
+    low, high = ((*b[:n], *(3.0 * value for value in b[n:])) for b in (spec.low, spec.high))
+    wide = spec.model_copy(update={"low": low, "high": high})
+    assert swept(wide, model) in (pytest.approx(0.4, abs=0.01), pytest.approx(0.2, abs=0.01))
+
+
+def test_a_model_that_diverges_under_any_sweep_is_refused() -> None:
+    spec, model = built("plsr")
+    with torch.no_grad():
+        model.baseline.theta[0].abs_()  # type: ignore[index, operator]
+    with pytest.raises(ExportError, match=r"diverges .* accepted .* choose another model"):
+        swept(spec, model)
