@@ -166,7 +166,7 @@ def test_what_is_missed_is_passed_farther_off_next_time(vessel: SteeredPlant) ->
         (17.74, 12.8),
         (15.84, 2.67),
     )
-    sides = ("port", "port", "port", "starboard", "port", "port")
+    sides: list[Literal["port", "starboard"]] = ["port"] * 3 + ["starboard"] + ["port"] * 2
     steady = smallest_turn(WANTED, vessel, TURNING, LIMIT)
     radius = steady.radius
     buoys = tuple(
