@@ -1,4 +1,4 @@
-"""The contract of every head, found from the union `residnet.heads.HeadConfig` itself."""
+"""What every head keeps beyond `residnet.testing.check_head`, by the union of heads itself."""
 
 from __future__ import annotations
 
@@ -50,58 +50,16 @@ def test_the_union_names_each_kind_once() -> None:
     assert len(KINDS) >= 7
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_step_and_memory(kind: str, dtype: torch.dtype) -> None:
-    head, z = ready(kind).to(dtype), typical().to(dtype)[:, 0]
-    s = torch.zeros(4, head.n_state, dtype=dtype)
-    with torch.no_grad():
-        rho, after = head(z, s)
-    assert rho.shape == (4, 3)
-    assert after.shape == (4, head.n_state)
-    assert rho.dtype == after.dtype == dtype
-    assert float(rho.abs().max()) > 0, "a head that answers zero is not tested by this"
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_sequence_equals_steps(kind: str, dtype: torch.dtype) -> None:
-    head, z = ready(kind).to(dtype), typical().to(dtype)
-    s = torch.zeros(4, head.n_state, dtype=dtype)
+def test_sequence_equals_steps_in_single_precision(kind: str) -> None:
+    head, z = ready(kind).float(), typical().float()
+    s = torch.zeros(4, head.n_state)
     out = []
     with torch.no_grad():
         for k in range(z.shape[1]):
             rho, s = head(z[:, k], s)
             out.append(rho)
-        tolerance = 1e-6 if dtype == torch.float32 else 1e-12
-        torch.testing.assert_close(
-            head.sequence(z), torch.stack(out, dim=1), rtol=tolerance, atol=tolerance
-        )
-        torch.testing.assert_close(head.warmup(z), s, rtol=tolerance, atol=tolerance)
-        assert torch.equal(head.warmup(z[:, :0]), torch.zeros(4, head.n_state, dtype=dtype))
-
-
-def test_rows_do_not_see_each_other(kind: str) -> None:
-    head, z = ready(kind).double(), typical()
-    with torch.no_grad():
-        whole = head.sequence(z)
-        for i in range(len(z)):
-            torch.testing.assert_close(
-                head.sequence(z[i : i + 1]), whole[i : i + 1], rtol=1e-10, atol=1e-12
-            )
-
-
-def test_scriptable_with_the_same_answers(kind: str) -> None:
-    head = ready(kind).float()
-    if head.refusal:
-        pytest.skip(f"{kind}: {head.refusal}")
-    compiled = torch.jit.script(head)
-    z = typical().float()
-    a = b = torch.zeros(4, head.n_state)
-    with torch.no_grad():
-        for k in range(z.shape[1]):
-            rho, a = head(z[:, k], a)
-            same, b = compiled(z[:, k], b)
-            torch.testing.assert_close(same, rho, rtol=1e-5, atol=1e-6)
-            torch.testing.assert_close(b, a, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(head.sequence(z), torch.stack(out, dim=1), rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(head.warmup(z), s, rtol=1e-6, atol=1e-6)
 
 
 def test_finite_far_outside_the_training_range(kind: str) -> None:
@@ -132,14 +90,6 @@ def test_features_choose_what_a_head_sees(kind: str) -> None:
         assert torch.equal(head.sequence(z), head.sequence(changed))
     with pytest.raises(ConfigError, match="did you mean 'tau_x'"):
         KINDS[kind](features=("u", "tau_z")).build(NAMES)  # type: ignore[attr-defined]
-
-
-def test_differentiable_with_respect_to_its_inputs(kind: str) -> None:
-    head, z = ready(kind).double(), typical()[:, 0].requires_grad_()
-    head(z, torch.zeros(4, head.n_state, dtype=torch.float64))[0].sum().backward()
-    assert z.grad is not None
-    assert bool(torch.isfinite(z.grad).all())
-    assert float(z.grad.abs().max()) > 0
 
 
 def spec_of(config: FeatureConfig) -> ModelSpec:
