@@ -158,20 +158,17 @@ def test_circles_of_acceptance_are_entered(vessel: SteeredPlant) -> None:
 
 def test_what_is_missed_is_passed_farther_off_next_time(vessel: SteeredPlant) -> None:
     """The shortest outline leads to fits that miss the last of these buoys by six metres."""
-    places = (
-        (3.54, 5.07),
-        (6.02, -1.6),
-        (10.82, 5.38),
-        (15.54, 4.04),
-        (17.74, 12.8),
-        (15.84, 2.67),
-    )
-    sides: list[Literal["port", "starboard"]] = ["port"] * 3 + ["starboard"] + ["port"] * 2
     steady = smallest_turn(WANTED, vessel, TURNING, LIMIT)
     radius = steady.radius
+    places = (3.54, 5.07), (6.02, -1.6), (10.82, 5.38), (15.54, 4.04), (17.74, 12.8), (15.84, 2.67)
     buoys = tuple(
-        BuoyConfig(north=radius * n, east=radius * e, leave_to=side, radius=1.000001 * radius)
-        for (n, e), side in zip(places, sides, strict=True)
+        BuoyConfig(
+            north=radius * n,
+            east=radius * e,
+            leave_to="starboard" if k == 3 else "port",
+            radius=1.000001 * radius,
+        )
+        for k, (n, e) in enumerate(places)
     )
     wanted = WANTED.model_copy(update={"buoys": buoys})
     planned = plan_course(wanted, "sides", vessel, TURNING, LIMIT, steady)
