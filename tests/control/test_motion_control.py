@@ -23,7 +23,7 @@ from residnet.control import (
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.physics.actuators import AzimuthThrusters
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
@@ -222,5 +222,5 @@ def test_allocated_to_azimuth_thrusters() -> None:
     w[..., plant.inputs.index("force_north")] = 40.0
     loop = ClosedLoop(Allocated(controller, plant.actuators), GivenReference(point))
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, dt), loop)(x0, w, x0[:, :0])
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, dt), loop)(x0, w, x0[:, :0])
     torch.testing.assert_close(states[0, -1, :3], point[0, 0, :3], atol=0.02, rtol=0)

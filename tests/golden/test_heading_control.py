@@ -34,7 +34,7 @@ from residnet.control import (
 from residnet.documents.gouletas2020.law import DocumentAutopilot, SimulatedPredictor
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.hull import PatrolConfig
@@ -147,7 +147,7 @@ def patrol_document(parameters: str, horizon: str, tau: str | None, spacing: flo
     plant, h = patrol(parameters), float(horizon)
     # whole steps of at most 0.25 s make both the spacing of the rows and the horizon
     dt = min(spacing / np.ceil(spacing / 0.25 - 1e-9), h)
-    model = TracedPlantDynamics(plant, dt)
+    model = RecordedPlantDynamics(plant, dt)
     predictor = SimulatedPredictor(
         model, plant.state, round(h / dt), torch.tensor([THRUST], dtype=torch.float64)
     )
@@ -162,7 +162,7 @@ def patrol_pd(parameters: str, heading: str) -> Case:
     plant = patrol(parameters)
     policy = HeadingPID(plant.state, kp=6.0, kd=6.0, limit=LIMIT)
     return Case(
-        plant, TracedPlantDynamics(plant, 0.05), partial(follow, policy, step_to(float(heading)))
+        plant, RecordedPlantDynamics(plant, 0.05), partial(follow, policy, step_to(float(heading)))
     )
 
 

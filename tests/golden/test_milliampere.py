@@ -30,7 +30,7 @@ from residnet.control import (
 from residnet.core.config import load_config
 from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Playback, Rollout
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.physics.hull import MassMatrixConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import vessel_files
@@ -140,7 +140,7 @@ def flights(folder: Path, scale: float, disturbed: bool, seconds: float) -> dict
         )
     with torch.no_grad():
         states, inputs, _ = Rollout(
-            TracedPlantDynamics(plant, DT), ClosedLoop(controller, guidance)
+            RecordedPlantDynamics(plant, DT), ClosedLoop(controller, guidance)
         )(x0, w, x0[:, :0])
         every = range(0, steps, EVERY["closed"])
         reference, waypoint = torch.stack(guidance.asked), torch.stack(guidance.waypoints)
@@ -198,7 +198,7 @@ def simulated(path: Path, seconds: float) -> pd.DataFrame:
     w[..., 3:6] = torch.tensor(case.force, dtype=torch.float64)
     assert plant.inputs[3:6] == ("force_x", "force_y", "force_n")
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, OPEN_DT), Playback())(x0, w, x0[:, :0])
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, OPEN_DT), Playback())(x0, w, x0[:, :0])
     return pd.DataFrame(states[0, :: EVERY["open"], :6].numpy(), columns=STATE[:6])
 
 
@@ -332,6 +332,6 @@ def test_the_disturbed_plant_is_the_calm_one_without_disturbance() -> None:
     )
     w = torch.cat((command, torch.zeros(2, 1000, 7, dtype=torch.float64)), dim=-1)
     with torch.no_grad():
-        plain, _, _ = Rollout(TracedPlantDynamics(full, DT))(x0, w, x0[:, :0])
-        fast, _, _ = Rollout(TracedPlantDynamics(calm, DT))(x0, command, x0[:, :0])
+        plain, _, _ = Rollout(RecordedPlantDynamics(full, DT))(x0, w, x0[:, :0])
+        fast, _, _ = Rollout(RecordedPlantDynamics(calm, DT))(x0, command, x0[:, :0])
     torch.testing.assert_close(fast, plain, rtol=1e-10, atol=1e-11)

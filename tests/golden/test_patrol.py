@@ -17,7 +17,7 @@ from golden_tables import over_its_length, table
 from kinds import of_kind
 
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
+from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource, StackedSource
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.actuators.rudders import SternRudders
@@ -139,7 +139,7 @@ def trajectories(
     x0[:, plant.state.index("phi")] = torch.tensor(np.radians([run.phi for run in runs]))
     w = torch.zeros(len(runs), steps, len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
-        states, inputs, _ = Rollout(TracedPlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
+        states, inputs, _ = Rollout(RecordedPlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
     assert plant.state == COLUMNS
     return {path.name: (states[i].numpy(), inputs[i, :, 0].numpy()) for i, path in enumerate(files)}
 

@@ -21,7 +21,7 @@ from scipy.linalg import expm
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.heads.zero import ZeroHead
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 from residnet.manoeuvres.closed_loop import Zigzag
@@ -108,7 +108,7 @@ def trajectories(
     x0 = torch.zeros(len(files), len(plant.state), dtype=torch.float64)
     w = torch.zeros(len(files), steps, len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
-        states, inputs, _ = Rollout(TracedPlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
+        states, inputs, _ = Rollout(RecordedPlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
     return {
         path.name: (states[i].numpy(), inputs[i, :, :2].numpy()) for i, path in enumerate(files)
     }

@@ -16,7 +16,7 @@ from residnet.data.sea import Disturbance, SensorNoise
 from residnet.data.simulated import Craft, Sea, fly
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.manoeuvres.base import Helm, StackedSource, Watched
 from residnet.manoeuvres.closed_loop import (
     Spiral,
@@ -251,7 +251,7 @@ def test_four_corner_course_of_the_ferry(vessel: str) -> None:
     assert course.lasts(10.0) == 720.0
     craft = Craft(
         vessel,
-        TracedPlantDynamics(plant, 0.2, 2),
+        RecordedPlantDynamics(plant, 0.2, 2),
         Helm.from_plant(plant),
         plant.commands,
         plant.approach(1),

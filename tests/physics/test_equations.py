@@ -18,7 +18,7 @@ from torch import Tensor
 from residnet.core.config import load_config
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
+from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.actuators import AzimuthThrusters
 from residnet.physics.actuators.rudders import WaterJets
@@ -128,18 +128,20 @@ def test_speeds_in_the_end() -> None:
     boat = plant_of("wam_v_cal").in_calm_water()
     one, none = torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
     w = boat.demand(torch.cat((one, none)), torch.cat((none, one)))
-    end = rolled(TracedPlantDynamics(boat, 0.05), boat.approach(2), w[:, None].expand(-1, 1200, -1))
+    end = rolled(
+        RecordedPlantDynamics(boat, 0.05), boat.approach(2), w[:, None].expand(-1, 1200, -1)
+    )
     assert float(end[0, -1, 3]) == pytest.approx(2.19, abs=0.005)
     assert np.degrees(float(end[1, -1, 5])) == pytest.approx(25.9, abs=0.05)
     assert float(end[1, -1, 4]) == pytest.approx(-0.19, abs=0.005)
     jets = plant_of("odin_jets").in_calm_water()
     w = torch.tensor([[2000 / 60, 0.0]], dtype=torch.float64)[:, None].expand(1, 1200, 2)
-    assert float(rolled(TracedPlantDynamics(jets, 0.05), jets.approach(1), w)[0, -1, 3]) == (
+    assert float(rolled(RecordedPlantDynamics(jets, 0.05), jets.approach(1), w)[0, -1, 3]) == (
         pytest.approx(9.96, abs=0.005)
     )
     ferry = plant_of("milliampere", "actuators.response={kind: immediate}").in_calm_water()
     w = torch.tensor([[200.0, 0.0, 0.0]], dtype=torch.float64)[:, None].expand(1, 3000, 3)
-    u = float(rolled(TracedPlantDynamics(ferry, 0.1), ferry.approach(1), w)[0, -1, 3])
+    u = float(rolled(RecordedPlantDynamics(ferry, 0.1), ferry.approach(1), w)[0, -1, 3])
     assert 27.632 * u + 110.064 * u**2 + 13.965 * u**3 == pytest.approx(200.0, rel=1e-6)
 
 
@@ -272,7 +274,7 @@ def test_forces_follow_by_the_thruster_dynamics() -> None:
     w = torch.zeros(1, 300, len(plant.inputs), dtype=torch.float64)
     w[..., 0], w[..., 1], w[..., 2] = 100.0, -5000.0, 30.0
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.01))(x0, w, x0[:, :0])
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.01))(x0, w, x0[:, :0])
     t = 0.01 * np.arange(301)
     step = 1 - np.exp(-1.6 * t) * (np.cos(1.2 * t) + 1.6 / 1.2 * np.sin(1.2 * t))
     np.testing.assert_allclose(states[0, :, 6:9], step[:, None] * [100.0, -995.0, 30.0], atol=1e-5)
@@ -478,7 +480,7 @@ def test_heel_and_steady_turns_are_those_of_errata() -> None:
     plant = load_config(vessel_files()["patrol_p06"], ["actuators.rate=null"], VesselConfig).build()
     w = torch.cat([inputs(plant, 1, np.radians(angle)) for angle in (5.0, 10.0)])
     states = rolled(
-        TracedPlantDynamics(plant, 0.05), plant.approach(2), w[:, None].expand(-1, 4000, -1)
+        RecordedPlantDynamics(plant, 0.05), plant.approach(2), w[:, None].expand(-1, 4000, -1)
     )
     phi = np.degrees(states[1, :, 2].numpy())
     assert phi.max() == pytest.approx(1.25, abs=0.01)
@@ -497,7 +499,7 @@ def test_roll_decays_with_the_period_of_errata() -> None:
     x0[1, 4] = 0.0
     x0[:, 2] = np.radians(10.0)
     w = torch.cat((inputs(plant, 1), inputs(plant, 1, 0.0, 0.0)))
-    states = rolled(TracedPlantDynamics(plant, 0.01), x0, w[:, None].expand(-1, 3000, -1))
+    states = rolled(RecordedPlantDynamics(plant, 0.01), x0, w[:, None].expand(-1, 3000, -1))
     for row, period in enumerate((6.63, 6.69)):
         phi = states[row, :, 2].numpy()
         at = np.flatnonzero((phi[:-1] > 0) & (phi[1:] <= 0))
@@ -569,7 +571,7 @@ def test_a_turn_of_the_mariner() -> None:
     x0 = plant.approach(1)
     assert float(x0[0, 3]) == SERVICE
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, dt, substeps=5))(x0, w, x0[:, :0])
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, dt, substeps=5))(x0, w, x0[:, :0])
 
     def rate(_: float, s: np.ndarray) -> np.ndarray:
         c, i = np.cos(s[2]), np.sin(s[2])

@@ -11,7 +11,7 @@ from torch import Tensor
 from residnet.core.config import load_config
 from residnet.core.names import CHANNEL_UNITS
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
+from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
 from residnet.physics.hull import SubmergedConfig
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.vessel import VesselConfig, load_vessel
@@ -100,7 +100,7 @@ def test_a_vessel_turns_to_starboard_where_it_is_steered(name: str) -> None:
     w = torch.zeros(2, 200, len(plant.inputs), dtype=torch.float64)
     w[:, :, : plant.commands] = plant.demand(torch.ones_like(steer), steer)[:, None]
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.1))(x, w, x[:, :0])
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.1))(x, w, x[:, :0])
     turned = states[:, -1, plant.state.index("psi")]
     assert float(turned[0]) > 0 > float(turned[1])
     assert bool((states[:, -1, plant.state.index("u")] > 0).all())
@@ -129,7 +129,7 @@ def test_calm_water_held_forces_and_the_recorded_step_are_the_same_vessel(name: 
     assert calm.inputs == full.actuators.commands
     after = PlantDynamics(full, 0.05, substeps=2).step(x, w, x[:, :0])[0]
     command = w[:, : calm.commands]
-    for model in (PlantDynamics(calm, 0.05, 2), TracedPlantDynamics(calm, 0.05, 2)):
+    for model in (PlantDynamics(calm, 0.05, 2), RecordedPlantDynamics(calm, 0.05, 2)):
         torch.testing.assert_close(
             model.step(x, command, x[:, :0])[0], after, rtol=1e-9, atol=1e-11
         )
@@ -174,7 +174,7 @@ def test_a_manoeuvre_in_a_current_is_the_manoeuvre_and_the_drift() -> None:
     x0 = plant.approach(2)
     x0[1, 3], x0[1, 4] = 0.3, 0.2
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.04))(x0, w, x0[:, :0])
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.04))(x0, w, x0[:, :0])
     drift = states[1, -1, :3] - states[0, -1, :3]
     wanted = torch.tensor([0.3 * 20, 0.2 * 20, 0.0], dtype=torch.float64)
     torch.testing.assert_close(drift, wanted, rtol=0, atol=1e-4)
@@ -220,7 +220,7 @@ def test_energy_is_kept_without_damping_and_falls_with_it(
     x0[:, n : 2 * n] = torch.randn(16, n, generator=random, dtype=torch.float64) * spread
     w = torch.zeros(16, 300, len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.01, 2 if n == 6 else 1))(
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.01, 2 if n == 6 else 1))(
             x0, w, x0[:, :0]
         )
     nu, mass = states[..., n : 2 * n], 0.5 * (plant.hull.mass + plant.hull.mass.T)
@@ -253,7 +253,7 @@ def test_the_torpedo_makes_its_published_speed() -> None:
     w[:, :, plant.inputs.index("cmd_n")] = 1525.0 / 60.0
     x0 = plant.approach(1)
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.2))(x0, w, x0[:, :0])
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.2))(x0, w, x0[:, :0])
     assert float(states[0, -1, plant.state.index("u")]) == pytest.approx(2.5, rel=0.05)
 
 
@@ -265,7 +265,7 @@ def test_a_submerged_vessel_rights_itself_and_settles(name: str) -> None:
     x0[0, 3], x0[0, 4] = 0.5, 0.4
     w = torch.zeros(1, 900, len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
-        states, _, _ = Rollout(TracedPlantDynamics(plant, 0.1, 2))(x0, w, x0[:, :0])
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.1, 2))(x0, w, x0[:, :0])
     last = states[0, -1]
     assert float(last[3:5].abs().max()) < 0.05
     # of 13.5 kg in 13.4 l of fresh water 1 N weighs down, against 33 N s/m and 190 N s^2/m^2

@@ -14,7 +14,7 @@ from torch import Tensor
 from residnet.core.log import Log
 from residnet.core.registry import kinds
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.replay import Replay
@@ -90,9 +90,9 @@ def times(seconds: float = DURATION, dt: float = DT) -> Tensor:
 
 
 @lru_cache
-def traced(plant: Plant, dt: float = DT) -> TracedPlantDynamics:
+def traced(plant: Plant, dt: float = DT) -> RecordedPlantDynamics:
     """The step of a vessel, recorded once."""
-    return TracedPlantDynamics(plant, dt)
+    return RecordedPlantDynamics(plant, dt)
 
 
 def fly(

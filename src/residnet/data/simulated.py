@@ -19,7 +19,7 @@ from residnet.core.names import CHANNEL_UNITS
 from residnet.data.sea import Disturbance, SensorNoise, gusty_wind
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics, check_steps
+from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics, check_steps
 from residnet.manoeuvres import FamilyConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, Watched
 from residnet.physics.plant import HullPlant, Plant
@@ -290,7 +290,7 @@ def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list
     and the true wind where there is any. Float64.
     """
     plant = surrounded(config.vessel, config.disturbance)
-    traced = TracedPlantDynamics(plant, config.step, config.substeps)
+    traced = RecordedPlantDynamics(plant, config.step, config.substeps)
     craft = replace(trials_craft(config), dynamics=traced)
     sea = Sea(plant, config.disturbance, config.noise, config.seed)
     return fly(craft, manoeuvres, sea, config.duration, config.step, {"vessel": config.vessel})

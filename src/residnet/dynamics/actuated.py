@@ -15,7 +15,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.physics.plant import ROLLING, SUBMERGED, Plant
 from residnet.physics.symmetry import live_of
 
@@ -70,7 +70,7 @@ class PlantActuators(Actuators):
             if name not in (*ROLLING.names, *SUBMERGED.names)
         ]
         self.state = tuple(plant.state[i] for i in self.columns)
-        self.dynamics = TracedPlantDynamics(plant, dt, substeps) if self.columns else None
+        self.dynamics = RecordedPlantDynamics(plant, dt, substeps) if self.columns else None
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         return self.plant.demand(drive, steer)

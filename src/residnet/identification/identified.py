@@ -19,7 +19,7 @@ from residnet.data.simulated import SimulatedTrials, surrounded
 from residnet.data.sources import MeasuredLogs
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.models import FittedModel, references
 from residnet.identification.recipe import MEAN
@@ -181,7 +181,7 @@ def _truth(data: SimulatedTrials) -> Candidate | None:
         # no log shows what is under way in a delay line, so that the plant could not start from one
         return None
     commands = plant.inputs[: plant.commands]
-    model = TracedPlantDynamics(plant, data.step, data.substeps)
+    model = RecordedPlantDynamics(plant, data.step, data.substeps)
     unknown = len(plant.inputs) - len(commands)
     return Candidate("truth", "truth", model, plant.state, commands, unknown, "baseline")
 

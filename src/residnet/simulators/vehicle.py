@@ -13,7 +13,7 @@ from residnet.core.layout import SURGE
 from residnet.core.names import STATE
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.dynamics.store import chosen_model, load_model
 from residnet.export.guard import GuardedDynamics
 from residnet.physics.plant import Plant
@@ -135,7 +135,7 @@ def plant_vehicle(name: str, plant: Plant, dt: float) -> Vehicle:
     return _settled(
         Vehicle(
             name,
-            TracedPlantDynamics(plant, dt),
+            RecordedPlantDynamics(plant, dt),
             plant.state,
             plant.inputs,
             plant.commands,

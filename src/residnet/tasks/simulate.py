@@ -34,7 +34,7 @@ from residnet.data.simulated import (
     trials_craft,
 )
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
-from residnet.dynamics.simulated import TracedPlantDynamics, check_steps
+from residnet.dynamics.simulated import RecordedPlantDynamics, check_steps
 from residnet.dynamics.store import chosen_model, load_model
 from residnet.judge.booklet import index_contents, index_rows
 from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
@@ -211,7 +211,7 @@ class Programme(Config):
         self.noise.check(logged, step, vessel)
         craft = Craft(
             load_vessel(vessel).name,
-            TracedPlantDynamics(plant, step, self.substeps),
+            RecordedPlantDynamics(plant, step, self.substeps),
             Helm.from_plant(plant),
             plant.commands,
             self._started(plant.approach(1), plant.state, vessel),

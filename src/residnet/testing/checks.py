@@ -29,7 +29,7 @@ from residnet.data.readers.base import LogReader
 from residnet.data.sea import Disturbance, SensorNoise
 from residnet.data.simulated import Craft, Flight, Sea, fly, source_of
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
+from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
 from residnet.dynamics.store import load_model, save_model
 from residnet.export.base import Exporter
 from residnet.export.vessel import ExportedVessel
@@ -343,7 +343,7 @@ def check_manoeuvre(
     require(read == manoeuvre, f"{who}: changes when it is written and read back")
     plant = load_vessel(vessel).build()
     duration = manoeuvre.lasts(duration)
-    dynamics = TracedPlantDynamics(plant, _STEP)
+    dynamics = RecordedPlantDynamics(plant, _STEP)
     _check_batch(manoeuvre, dynamics, duration, who)
     helm, length = Helm.from_plant(plant), load_vessel(vessel).length.value
     craft = Craft(vessel, dynamics, helm, plant.commands, plant.approach(1))
@@ -360,7 +360,7 @@ def check_manoeuvre(
 
 
 def _flown(
-    manoeuvres: list[Manoeuvre], dynamics: TracedPlantDynamics, seconds: float
+    manoeuvres: list[Manoeuvre], dynamics: RecordedPlantDynamics, seconds: float
 ) -> tuple[Tensor, Tensor]:
     """Return states [B, T+1, nx] and inputs [B, T, m] of manoeuvres of one kind side by side."""
     plant = dynamics.plant
@@ -376,7 +376,7 @@ def _flown(
 
 
 def _check_batch(
-    manoeuvre: Manoeuvre, dynamics: TracedPlantDynamics, seconds: float, who: str
+    manoeuvre: Manoeuvre, dynamics: RecordedPlantDynamics, seconds: float, who: str
 ) -> None:
     alone, inputs = _flown([manoeuvre], dynamics, seconds)
     pair, commands = _flown([manoeuvre, manoeuvre], dynamics, seconds)

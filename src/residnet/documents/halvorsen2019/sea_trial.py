@@ -37,7 +37,7 @@ from residnet.documents.halvorsen2019.standard_model import (
     truth,
 )
 from residnet.documents.study import Results, Study, compared, histories, listed, pictures
-from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
 from residnet.heads.symbolic import SymbolicConfig
@@ -424,7 +424,7 @@ def sail(config: SeaTrialConfig) -> Trial:
     for place, course in enumerate(config.programme.courses):
         plant = vessel.build()
         given.check(plant, name)
-        dynamics = TracedPlantDynamics(plant, config.step)
+        dynamics = RecordedPlantDynamics(plant, config.step)
         craft = Craft(name, dynamics, Helm.from_plant(plant), plant.commands, plant.approach(1))
         turned = given
         if given.waves is not None:

@@ -34,7 +34,7 @@ from residnet.core.errors import ConfigError, DataError
 from residnet.core.layout import ACTUATORS, MOTION, POSE, VELOCITIES
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.rollout import FreeRun, Rollout, Source
-from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
+from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
 from residnet.judge.courses import Tracking, tracking
 from residnet.physics.actuators import ForceActuators
 from residnet.physics.force_model import ForceModel
@@ -282,7 +282,7 @@ class Ferry:
             if isinstance(path, CrossingConfig):
                 guidance = Crossing(path, step, feeds)
                 source = Sensed(ClosedLoop(policy, guidance), noise[..., MOTION])
-                model: FreeRun = Rollout(TracedPlantDynamics(self.true, step), source)
+                model: FreeRun = Rollout(RecordedPlantDynamics(self.true, step), source)
                 given = (x0, w, x0[:, :0])
             else:
                 followed = Followed(Sensing(policy), inputs)
