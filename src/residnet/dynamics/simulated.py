@@ -8,6 +8,7 @@ from typing import Any, final
 import torch
 from torch import Tensor
 
+from residnet.core.errors import ExportError
 from residnet.dynamics.base import Dynamics
 from residnet.physics.plant import Plant
 
@@ -68,7 +69,7 @@ class RecordedPlantDynamics(Dynamics):
     """A `PlantDynamics` whose step is recorded as a CasADi function when it is first taken.
 
     The numbers are the same. For simulation only: it runs without gradients, in float64, at any
-    batch size.
+    batch size. A plant whose step cannot be recorded is stepped as it is.
     """
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
@@ -97,16 +98,23 @@ class RecordedPlantDynamics(Dynamics):
     @torch.no_grad()
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step of the log; the memory passes through."""
+        if self._one is None:
+            try:
+                self._one = self._recorded()
+            except ExportError:
+                self._one = False
+        if self._one is False:
+            return PlantDynamics(self.plant, self.dt, self.substeps).step(x, w, s)
         if len(x) not in self._rows:
-            self._one = self._one or self._recorded()
             self._rows[len(x)] = self._one.map(len(x), "serial").buffer()
         buffer, evaluate = self._rows[len(x)]
         after = torch.empty_like(x, dtype=torch.float64, memory_format=torch.contiguous_format)
         # a function of CasADi holds numbers column by column: the rows of a batch are its columns
-        given = [part.detach().double().contiguous().numpy() for part in (x, w)]
+        given: list[Any] = [part.detach().double().contiguous().numpy() for part in (x, w)]
+        taken: Any = after.numpy()
         for place, part in enumerate(given):
             buffer.set_arg(place, memoryview(part))
-        buffer.set_res(0, memoryview(after.numpy()))
+        buffer.set_res(0, memoryview(taken))
         evaluate()
         return after, s
 
