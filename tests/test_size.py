@@ -22,7 +22,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "core": (1603, 250),
     "data": (9869, 879),
     "documents": (2569, 238),
-    "dynamics": (2202, 278),
+    "dynamics": (2225, 279),
     "export": (1609, 177),
     "heads": (1311, 191),
     "identification": (2244, 228),
