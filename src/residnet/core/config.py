@@ -7,7 +7,6 @@ with a unit (`20 deg`). Every error is one line.
 
 from __future__ import annotations
 
-import functools
 import math
 import os
 import re
@@ -21,7 +20,6 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     GetCoreSchemaHandler,
-    TypeAdapter,
     ValidationError,
     ValidationInfo,
 )
@@ -39,7 +37,7 @@ from residnet.core.config_yaml import KeyPath, dump, line_of, parse
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.files import shipped_configs
 from residnet.core.names import nearest, shown
-from residnet.core.registry import Kinds
+from residnet.core.registry import Kinds, adapter
 from residnet.core.renamed import renamed
 from residnet.core.units import si_unit, to_si, units
 
@@ -181,19 +179,13 @@ def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> A
     return _validated(data, model, _Origin(where), folder)
 
 
-@functools.cache
-def _adapter(model: Any) -> TypeAdapter[Any]:
-    """Return what reads a type; for a union of vessels pydantic takes 35 ms to make it."""
-    return TypeAdapter(model)
-
-
 def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> Any:
     # what is computed, as in a model's description, may be as good as zero
     _require_usual(data, origin, 0.0 if origin.root is None else 1.0 / _HUGE)
     # pydantic is strict without refusing lists for tuples or text for enums and paths only when it
     # reads JSON
     try:
-        return _adapter(model).validate_json(to_json(data), strict=True, context={"folder": folder})
+        return adapter(model).validate_json(to_json(data), strict=True, context={"folder": folder})
     except ValidationError as error:
         raise ConfigError(describe(error, model, origin.source)) from error
     except PydanticSerializationError as error:

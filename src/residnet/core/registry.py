@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from pydantic import BaseModel, GetCoreSchemaHandler, ValidationInfo
+from pydantic import BaseModel, GetCoreSchemaHandler, TypeAdapter, ValidationInfo
 from pydantic_core import CoreSchema, core_schema, to_json
 
 import residnet
@@ -97,9 +97,16 @@ def _loaded(point: importlib.metadata.EntryPoint) -> ThirdParty:
         return ThirdParty(point.name, package, None, f"{type(error).__name__}: {lines[0]}")
 
 
+@functools.cache
+def adapter(model: Any) -> TypeAdapter[Any]:
+    """Return what reads a type; for a union of vessels pydantic takes 35 ms to make it."""
+    return TypeAdapter(model)
+
+
 def forget() -> None:
     """Read the entry points anew when they are next needed, for tests that install packages."""
     third_party.cache_clear()
+    adapter.cache_clear()
 
 
 @dataclass(frozen=True, eq=False)
