@@ -14,7 +14,7 @@ from read_page import plain
 from tiny import call
 
 from residnet.core.config import load_config
-from residnet.judge.autopilots import objections
+from residnet.judge.autopilots import cycling, objections
 from residnet.report.sections.autopilot import cost_verdict
 from residnet.tasks.autopilot import AutopilotConfig
 from residnet.tasks.autopilot_run import stored_policy
@@ -153,3 +153,21 @@ def test_the_verdict_begins_with_the_cheapest_policy() -> None:
     assert cost_verdict(rows)[1] == costly
     rows[2]["cost"]["mean"] = 6.0
     assert objections("b", rows) == ["under its conditions a flight costs 6.1 s, with law 6 s"]
+
+
+def test_the_verdict_tells_a_policy_that_keeps_swinging() -> None:
+    def quiet(name: str, kind: str, number: int) -> dict[str, Any]:
+        swing = {"rudder_swing": {"max": 0.698}, "cycling": number, "n": 100}
+        return {"protocol": "quiet", "model": name, "kind": kind, **swing}
+
+    rows = [quiet("a", "policy", 1), quiet("lqr", "classical", 2), quiet("pd", "classical", 0)]
+    rows += [
+        {"protocol": "conditions", "model": row["model"], "kind": row["kind"], "cost": {"mean": 6}}
+        for row in rows
+    ]
+    said = "'a' keeps swinging in 1 of 100 flights without noise, its command by up to 40 deg; "
+    assert cost_verdict(rows)[1] == said + "not so pd."
+    assert cycling("lqr", rows)[0].endswith("not so pd.")
+    assert cycling("pd", rows) == []
+    rows[2]["cycling"] = 1
+    assert cycling("a", rows) == [said + "each tuned law does so too."]

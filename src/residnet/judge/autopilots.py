@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from residnet.control.heading.conditions import (
     ConditionedRun,
     ConditionsConfig,
     HeadingChanges,
+    SteadinessLimits,
 )
 from residnet.control.heading.vessels import Flights, SteeredPlant, SteeredVessel, fly
 from residnet.data.sea import Disturbance
@@ -68,6 +70,21 @@ def not_for(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
         sentence
         for protocol in beyond
         for sentence in _cheaper(model, rows, protocol, f"under '{protocol[7:]}'")
+    ]
+
+
+def cycling(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return in a sentence in how many flights without noise a policy keeps swinging, if any."""
+    quiet = {row["model"]: row for row in rows if row["protocol"] == "quiet"}
+    if not (own := quiet.get(model)) or not own.get("cycling"):
+        return []
+    calm = [
+        name for name, row in quiet.items() if row["kind"] == "classical" and not row["cycling"]
+    ]
+    return [
+        f"'{model}' keeps swinging in {own['cycling']} of {own['n']} flights without noise, its"
+        f" command by up to {math.degrees(own['rudder_swing']['max']):.3g} deg; "
+        + (f"not so {', '.join(calm)}." if calm else "each tuned law does so too.")
     ]
 
 
@@ -221,6 +238,8 @@ def series(name: str, flights: Flights, variations: Tensor) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
+_ALLOWED = 1.25
+"""Of the limits that choose an epoch of training, which are a fifth below what a policy may do."""
 QUIET_FLIGHTS = 100
 """Flights without noise, waves and push; chosen by hand: fewer tell, and each takes longer."""
 
@@ -274,6 +293,10 @@ def swinging(
     """
     flown = run.fly(changes)
     heading, rudder = flown.swing(after)
+    limits = SteadinessLimits()
+    most = _ALLOWED * limits.of(flown.axis)[0], _ALLOWED * limits.rudder_swing
+    # what is no number is not within its limit
+    steady = (heading <= most[0]) & (rudder <= most[1])
     return {
         "model": controller,
         "kind": kind,
@@ -281,5 +304,6 @@ def swinging(
         "protocol": "quiet",
         "heading_swing": distribution(heading),
         "rudder_swing": distribution(rudder),
+        "cycling": int((~steady).sum()),
         "n": len(heading),
     }

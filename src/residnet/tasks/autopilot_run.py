@@ -38,6 +38,7 @@ from residnet.judge.autopilots import (
     QUANTITIES,
     QUIET_FLIGHTS,
     corners,
+    cycling,
     drawn,
     judged,
     measure,
@@ -371,7 +372,7 @@ def export_policy(config: AutopilotConfig, asked: ExportRequest) -> Path:
     about = {"vessel": config.vessel, "conditions": _stated(flown).model_dump(mode="json")}
     learned = config.policies[name].learned
     about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
-    about |= {"not_for": not_for(name, rows)}
+    about |= {"not_for": [*not_for(name, rows), *cycling(name, rows)]}
     exported = ExportedHeading(
         name,
         stored_policy(config, asked.run.models, name, flown.test.dt),

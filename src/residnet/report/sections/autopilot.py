@@ -13,7 +13,7 @@ import pandas as pd
 
 from residnet.control.heading.conditions import quiet_after
 from residnet.core.format import DEG, signed
-from residnet.judge.autopilots import not_for
+from residnet.judge.autopilots import cycling, not_for
 from residnet.report.blocks import Block, Code, Column, Section, Table, Text, bad_where, table_of
 from residnet.report.figure import ZERO, Case, Curve, Figure, Look, Panel, band, family, steps
 from residnet.report.figure_files import figures_section, read_figures, write_figures
@@ -425,6 +425,7 @@ def cost_verdict(rows: Sequence[Content]) -> list[str]:
         )
         if worse := not_for(name, rows):
             sentences.append(f"Do not use '{name}' there: {'; '.join(worse)}.")
+        sentences += cycling(name, rows)
     return sentences
 
 
