@@ -14,15 +14,16 @@ from torch import Tensor
 
 from residnet.baselines.given import StillConfig
 from residnet.core.config import validate
-from residnet.core.errors import ConfigError
+from residnet.core.errors import ConfigError, ExportError
 from residnet.data.align import GridConfig
 from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.sea import Disturbance, SensorNoise
 from residnet.data.simulated import Craft, Flight, Sea, SimulatedTrials, fly, simulate
+from residnet.dynamics import lowering
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
 from residnet.heads.base import ResidualHead
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.zero import ZeroHead
@@ -207,3 +208,20 @@ def test_a_learned_model_flies_zigzags_by_itself(flights: list[tuple[Flight, Fli
         assert not np.array_equal(
             ship.motion["psi"][: len(model.motion)], model.motion["psi"][: len(ship.motion)]
         )
+
+
+def test_a_plant_that_cannot_be_recorded_is_stepped_as_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: object) -> None:
+        raise ExportError("a step that Python decides by values")
+
+    plant = load_vessel("wam_v_vrx").build()
+    x = plant.approach(2)
+    w, s = torch.ones(2, len(plant.inputs), dtype=torch.float64), x[:, :0]
+    wanted = PlantDynamics(plant, 0.1, 5).step(x, w, s)[0]
+    recorded = RecordedPlantDynamics(plant, 0.1, 5)
+    assert torch.allclose(recorded.step(x, w, s)[0], wanted, rtol=1e-13, atol=1e-15)
+    monkeypatch.setattr(lowering, "lowered", refuse)
+    plain = RecordedPlantDynamics(plant, 0.1, 5)
+    assert torch.equal(plain.step(x, w, s)[0], wanted)

@@ -75,6 +75,7 @@ class RecordedPlantDynamics(Dynamics):
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
         super().__init__(dt, "rk4")
         self.plant, self.substeps = plant, substeps
+        self._plain: PlantDynamics | None = None
         self._one: Any = None
         self._rows: dict[int, tuple[Any, Any]] = {}
 
@@ -98,13 +99,13 @@ class RecordedPlantDynamics(Dynamics):
     @torch.no_grad()
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step of the log; the memory passes through."""
-        if self._one is None:
+        if self._one is None and self._plain is None:
             try:
                 self._one = self._recorded()
             except ExportError:
-                self._one = False
-        if self._one is False:
-            return PlantDynamics(self.plant, self.dt, self.substeps).step(x, w, s)
+                self._plain = PlantDynamics(self.plant, self.dt, self.substeps)
+        if self._plain is not None:
+            return self._plain.step(x, w, s)
         if len(x) not in self._rows:
             self._rows[len(x)] = self._one.map(len(x), "serial").buffer()
         buffer, evaluate = self._rows[len(x)]

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from residnet.core.columns import motion
 from residnet.core.errors import ExportError
 from residnet.core.layout import SURGE
+from residnet.core.progress import say
 from residnet.core.version import __version__
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, scripted
@@ -197,6 +198,7 @@ class ExportedVessel(Exported):
         self.arguments = (("x", len(self.states)), ("w", inputs), ("s", model.n_state))
         # what is written and what is read back are compared with one run
         self._free: dict[torch.dtype, tuple[Tensor, Tensor, Tensor]] = {}
+        self._swept = _SWEEPS[0]
 
     def at(self, dtype: torch.dtype) -> HybridDynamics:
         """Return the model in a precision."""
@@ -293,7 +295,7 @@ class ExportedVessel(Exported):
         if loaded.reorders and (single or tolerance > base.DOUBLE):
             self.require_tracks(loaded, what, dtype, tolerance)
         self.require_defined(loaded, what, dtype)
-        return {"steps": PARITY_STEPS, "share_of_range": shares}
+        return {"steps": PARITY_STEPS, "sweep": self._swept, "share_of_range": shares}
 
     def drive(self, dtype: torch.dtype, share: float = _SWEEPS[0]) -> tuple[Tensor, Tensor]:
         """Return states of the past [1, 50, nx] and inputs [1, 50 + steps, m] of the parity check.
@@ -335,8 +337,12 @@ class ExportedVessel(Exported):
                 states = Rollout(model)(y[:, -1], w[:, PAST:], s0)[0]
             wrong = ~((states[0] >= least) & (states[0] <= most))
             if not bool(wrong.any()):
-                self._free[dtype] = y, w, states
+                self._free[dtype], self._swept = (y, w, states), share
                 return self._free[dtype]
+            say(
+                f"{self.what}: its free run leaves what exports accept while all inputs sweep"
+                f" {share:.0%} of the training range at once"
+            )
         k = int(wrong.any(dim=1).to(torch.int).argmax())
         i = int(wrong[k].to(torch.int).argmax())
         raise ExportError(
