@@ -177,6 +177,14 @@ def test_what_is_missed_is_passed_farther_off_next_time(vessel: SteeredPlant) ->
         assert away.min() > 0.99 * radius
 
 
+def test_a_course_that_begins_in_all_circles_is_refused(vessel: SteeredPlant) -> None:
+    here = tuple(BuoyConfig(north=n, east=0, leave_to="port", radius=10) for n in (0.0, 1.5))
+    wanted = WANTED.model_copy(update={"buoys": here})
+    steady = smallest_turn(wanted, vessel, TURNING, LIMIT)
+    with pytest.raises(ConfigError, match="begins within every circle"):
+        plan_course(wanted, "enter", vessel, TURNING, LIMIT, steady)
+
+
 def test_buoys_too_close_for_the_vessel_are_refused(vessel: SteeredPlant) -> None:
     near = WANTED.model_copy(
         update={

@@ -209,6 +209,14 @@ def plan(
     Raises:
         ConfigError: where none is found.
     """
+    away = [math.dist(request.start, (buoy.north, buoy.east)) for buoy in request.buoys]
+    if request.protocol == "enter" and all(
+        far <= buoy.radius for far, buoy in zip(away, request.buoys, strict=True)
+    ):
+        raise ConfigError(
+            "no course to plan: it begins within every circle that it is to enter; move a buoy or"
+            " the start"
+        )
     reasons: list[tuple[float, int, str]] = []
     course = _planned(request, step, beyond, make, reasons)
     if course is None:
