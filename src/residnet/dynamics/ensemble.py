@@ -167,7 +167,7 @@ class MeanOfTrajectories(HybridDynamics):
         memory: list[Tensor] = []
         for i, member in enumerate(self.members):
             at, part = self._own(x, s, kept, i)
-            given = w.expand(self.copies[i], w.shape[0], w.shape[1]).reshape(-1, w.shape[1])
+            given = w.repeat(self.copies[i], 1)
             after, own = member.step(at, given, part)
             reached.append(after)
             memory.append(own)
@@ -317,7 +317,7 @@ class SampledDynamics(Dynamics):
             )
             return after
 
-        split = [part.reshape(-1, draws, part.shape[-1]) for part in (x, w)]
+        split = [part.unflatten(0, (len(part) // draws, draws)) for part in (x, w)]
         split.append(s.reshape(x.shape[0] // draws, draws, s.shape[-1]))
         after, memory = torch.vmap(one, in_dims=(0, 1, 1, 1), out_dims=1)(self.theta, *split)
         return after.reshape(x.shape), memory.reshape(s.shape)

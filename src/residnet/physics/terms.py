@@ -183,10 +183,10 @@ class TermLibrary(nn.Module):
         """Return the terms [..., J] of channels z [..., nz]."""
         if self.linear:
             return z if self.same else z.index_select(-1, self.channel)
-        ones = torch.ones_like(z[..., :1])
         if self.depth == 0:
-            return ones.expand(z.shape[:-1] + (self.count,))  # noqa: RUF005 (TorchScript)
-        parts = [ones, z, z.abs()]
+            # constants need no channel
+            return z.new_ones(z.shape[:-1] + (self.count,))  # noqa: RUF005 (TorchScript)
+        parts = [torch.ones_like(z[..., :1]), z, z.abs()]
         for function, channel in self.further:
             if function != "":
                 parts.append(_function(function, z.narrow(-1, channel, 1)))
