@@ -101,7 +101,9 @@ def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> F
     from residnet.dynamics.compiled import CompiledRollout
 
     try:
-        _KNOWN[key] = made = CompiledRollout(rollout, x0, w, s)
+        # the trial of a step that draws numbers (dropout) must not shift those of the training
+        with torch.random.fork_rng(devices=[]):
+            _KNOWN[key] = made = CompiledRollout(rollout, x0, w, s)
         return made
     except Exception as error:
         # no compiler, or a step that C does not hold
