@@ -212,6 +212,7 @@ NOT_RUN = {
     "bash scripts/quickstart.sh": "installs packages from a registry; .ci/run and wheel.sh do",
     "bash scripts/test.sh": "runs the tests, and so itself",
     "sim_vehicle.py": "comes with ArduPilot",
+    "colcon build": "comes with ROS 2; a test compiles the node and steps it",
     "from my_package": "is the reader's own; examples/residnet_sample is tested in its place",
 }
 """Beginning of a line -> why the block with it is not carried out."""
@@ -267,8 +268,9 @@ if words[0] == "autopilot":
 if words[0] == "run":
     name = words[1].split("/")[-1].removesuffix(".yaml")
     words += [word for key in shorter.get(name, ()) for word in ("-s", key)]
+    out = Path(words[words.index("--out") + 1]) if "--out" in words else Path("runs", name)
     # what stands there is of the same command
-    words += ["--resume"] if Path("runs", name).exists() else []
+    words += ["--resume"] if out.exists() else []
 if words[0] == "export":
     # what has hardly been trained may be worse than nothing
     words += ["--anyway"]
