@@ -33,6 +33,23 @@ class Pendulum(Dynamics):
 
 
 @final
+class Forgetful(Dynamics):
+    """A pendulum whose damping drops out at random."""
+
+    def __init__(self) -> None:
+        super().__init__(DT, "euler")
+        self.damping = nn.Parameter(torch.full((1, 1), 0.3, dtype=torch.float64))
+        self.dropout = nn.Dropout(0.5)
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        drag = self.dropout(self.damping.expand_as(x[:, 1:])) * x[:, 1:]
+        return torch.cat((x[:, 1:], p - torch.sin(x[:, :1]) - drag), dim=1)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        return self.integrate(x, w, s), s
+
+
+@final
 class Printed(Source):
     """A source that TorchScript cannot express."""
 
@@ -93,6 +110,18 @@ def test_models_of_one_structure_are_scripted_once(monkeypatch: pytest.MonkeyPat
         loops[1].model.apart = torch.ones(1)
         free_runs.compiled(loops[1], 300)(*case())
     assert made[1:] == [loops[1]]
+
+
+def test_what_is_drawn_does_not_hang_on_what_ran_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first run tries to compile the step, in vain, for it draws numbers."""
+    monkeypatch.setattr(free_runs, "_KNOWN", {})
+    x0, w, s = case()
+    found = []
+    for _ in range(2):
+        torch.manual_seed(3)
+        found.append(free_runs.compiled(Rollout(Forgetful()), 600)(x0, w[:, :40], s)[0])
+    assert [*free_runs._KNOWN.values()] == [False]
+    assert torch.equal(*found)
 
 
 def test_what_cannot_be_compiled_or_is_short_runs_as_it_is() -> None:

@@ -93,23 +93,19 @@ def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> F
     if steps < _WORTH:
         once = not (torch.is_grad_enabled() or structure.apart)
         return _scripted_once(key, rollout, steps) if once else scripted(rollout, steps)
-    known = _KNOWN.get(key)
-    if known:
-        return known.of(rollout)
-    if known is not None:
-        return scripted(rollout, steps)
-    from residnet.dynamics.compiled import CompiledRollout
+    if key not in _KNOWN:
+        from residnet.dynamics.compiled import CompiledRollout
 
-    try:
-        # the trial of a step that draws numbers (dropout) must not shift those of the training
-        with torch.random.fork_rng(devices=[]):
-            _KNOWN[key] = made = CompiledRollout(rollout, x0, w, s)
-        return made
-    except Exception as error:
-        # no compiler, or a step that C does not hold
-        _KNOWN[key] = False
-        _tell(error)
-        return scripted(rollout, steps)
+        try:
+            # the trial of a step that draws numbers (dropout) must not shift those of the training
+            with torch.random.fork_rng(devices=[]):
+                _KNOWN[key] = CompiledRollout(rollout, x0, w, s)
+        except Exception as error:
+            # no compiler, or a step that C does not hold
+            _KNOWN[key] = False
+            _tell(error)
+    known = _KNOWN[key]
+    return known.of(rollout) if known else scripted(rollout, steps)
 
 
 def _scripted_once(key: bytes, rollout: Rollout, steps: int) -> FreeRun:
