@@ -18,7 +18,7 @@ ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
     "api": (726, 84),
     "baselines": (883, 128),
-    "control": (3453, 387),
+    "control": (3457, 387),
     "core": (1603, 250),
     "data": (9869, 879),
     "documents": (2569, 238),

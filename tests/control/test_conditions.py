@@ -21,7 +21,7 @@ from residnet.control.heading.conditions import (
     quiet,
     wave_motion,
 )
-from residnet.control.heading.controllers import PdConfig, Steering
+from residnet.control.heading.controllers import PdConfig, PidConfig, Steering
 from residnet.control.heading.tuning import TuningConfig, tune
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredPlant
@@ -195,6 +195,15 @@ def test_evolution_finds_better_gains_than_a_grid_of_guesses_and_again_the_same(
             guess = ConditionedRun(VESSEL, law, 0.1).fly(changes).measured(config)["cost"].mean()
             assert found.cost < float(guess) * 1.01
     assert tune(PdConfig(), STEERING, config, settings, 5) == found
+
+
+@pytest.mark.parametrize("given", [{}, {"kp": 2.0, "damping_time": 1.0}])
+def test_pid_is_never_worse_than_the_pd_within_it(given: dict[str, Any]) -> None:
+    config = ConditionsConfig(dt=0.1, duration=8.0, hold=0.0, bias=0.0, push=0.0)
+    settings = TuningConfig(flights=8, population=2, generations=1)
+    pd, pid = (tune(law(**given), STEERING, config, settings, 5) for law in (PdConfig, PidConfig))
+    # an integral of a million T is not quite none
+    assert pid.cost <= pd.cost * (1 + 1e-6)
 
 
 def test_the_loop_keeps_the_controllers_memory_behind_the_late_commands() -> None:

@@ -40,10 +40,17 @@ class Steering(NamedTuple):
 
 
 class SearchRange(NamedTuple):
-    """A range of a parameter that tuning searches, by its logarithm."""
+    """A range of a parameter that tuning searches, by its logarithm.
+
+    Attributes:
+        low, high: its ends.
+        idle: value at which the law does without the parameter, None for none. The law is searched
+            without it too, so that none does worse than the simpler one within it.
+    """
 
     low: float
     high: float
+    idle: float | None = None
 
 
 @final
@@ -236,8 +243,9 @@ class PidConfig(TunedConfig):
     integral_time: Seconds | None = Field(default=None, gt=0)
 
     def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
-        pd = PdConfig().law_axes(turning)
-        return {**pd, "integral_time": SearchRange(turning.time, 50.0 * turning.time)}
+        """Return those of PD, and T to 50 T; a million T is no integral in single precision."""
+        pd, time = PdConfig().law_axes(turning), turning.time
+        return {**pd, "integral_time": SearchRange(time, 50.0 * time, idle=1e6 * time)}
 
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
@@ -474,7 +482,7 @@ class DepthConfig(TunableConfig):
 
     def tuned(self, found: Mapping[str, float]) -> Self:
         """Return the config with parameters given, those of the law in it."""
-        own = {name: found[name] for name in SIGHT}
+        own = {name: found[name] for name in SIGHT if name in found}
         law = {name: value for name, value in found.items() if name not in own}
         return self.model_copy(update={**own, "pitch": self.pitch.tuned(law)})
 

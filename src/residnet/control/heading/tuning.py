@@ -65,7 +65,8 @@ def tune(
 ) -> TuningResult:
     """Return the missing parameters of least mean cost, by differential evolution.
 
-    `compiler` makes the flights of the search quick.
+    What a law may do without is searched with and without it. `compiler` makes the flights of the
+    search quick.
 
     Source: R. Storn and K. Price, 1997; scipy's implementation, over the logarithms.
 
@@ -94,8 +95,7 @@ def tune(
 
     if not names:
         alone = {name: torch.tensor([value]).double() for name, value in fixed.items()}
-        cost = float(trials.costs(alone)[0])
-        return TuningResult(fixed, cost, 1)
+        return TuningResult(fixed, float(trials.costs(alone)[0]), 1)
     axes = config.axes(steering.turning)
     bounds: Any = [(math.log(axes[name].low), math.log(axes[name].high)) for name in names]
     found = differential_evolution(
@@ -117,7 +117,11 @@ def tune(
         )
     best = dict(zip(names, (math.exp(value) for value in found.x), strict=True))
     ordered = {name: best.get(name, fixed.get(name, 0.0)) for name in given}
-    return TuningResult(ordered, float(found.fun), int(found.nfev))
+    result = TuningResult(ordered, float(found.fun), int(found.nfev))
+    if not (idle := {name: end for name in names if (end := axes[name].idle) is not None}):
+        return result
+    simpler = tune(config.tuned(idle), steering, conditions, settings, seed, compiler)
+    return min(result, simpler, key=lambda each: each.cost)
 
 
 @final
