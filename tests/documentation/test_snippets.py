@@ -267,7 +267,8 @@ if words[0] == "autopilot":
     words = ["run", words[words.index("--out") + 1]]
 if words[0] == "run":
     name = words[1].split("/")[-1].removesuffix(".yaml")
-    words += [word for key in shorter.get(name, ()) for word in ("-s", key)]
+    # before the block's own, which have the last word
+    words[2:2] = [word for key in shorter.get(name, ()) for word in ("-s", key)]
     out = Path(words[words.index("--out") + 1]) if "--out" in words else Path("runs", name)
     # what stands there is of the same command
     words += ["--resume"] if out.exists() else []
