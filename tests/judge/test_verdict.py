@@ -113,7 +113,7 @@ def test_unsound_models_and_divergences_are_named() -> None:
         (
             [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))],
             "good",
-            "Up to 30 s ahead: there",
+            "Up to 30 s ahead, where",
         ),
         (
             [horizon(10, errors(0.5, 2.0)), horizon(30, errors(9.0, 5.0))],
@@ -133,7 +133,7 @@ def test_unsound_models_and_divergences_are_named() -> None:
             "1 window of 4 logs on test data cannot say",
         ),
         # as near as the sensors tell is good, however short the way
-        ([horizon(0.5, errors(0.15, 0.3))], "good", "Up to 0.5 s ahead"),
+        ([horizon(0.5, errors(0.15, 0.3))], "good", "Up to 0.50 s ahead"),
     ],
 )
 def test_a_model_is_good_in_metres_and_degrees(
@@ -187,7 +187,7 @@ def test_a_horizon_is_judged_by_the_protocol_of_most_windows() -> None:
     given = evidence(limits={"T10": many, "T30": few})
     assert level(given) == "good"
     said = verdict(given)
-    assert said[0].startswith("Up to 10 s ahead: there mlp is off by 0.60 m")
+    assert said[0].startswith("Up to 10 s ahead, where mlp is off by 0.60 m")
     assert any("12 free runs" not in text and "20 free runs (T10)" in text for text in said)
     # a horizon that only another protocol has is not asked for
     assert "20 s" not in " ".join(said)

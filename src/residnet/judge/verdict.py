@@ -181,7 +181,7 @@ def ahead(evidence: Evidence) -> list[str]:
     until = good_until(evidence) if enough else 0.0
     chosen = next((e for e in entries if e["seconds"] == until), (enough or entries)[-1])
     off = _off(chosen, evidence.selected, chosen["sailed"])
-    after, wanted = f"{chosen['seconds']:.4g} s ahead", []
+    after, wanted = f"{number(chosen['seconds'], 2)} s ahead", []
     if not enough:
         start = (
             f"{plural(chosen['windows'], 'window')} of {plural(chosen['logs'], 'log')} on"
@@ -189,7 +189,7 @@ def ahead(evidence: Evidence) -> list[str]:
             f" {FEW_LOGS} logs are needed); {after} it is off by {off}."
         )
     elif until:
-        start = f"Up to {after}: there {evidence.selected} is off by {off}."
+        start = f"Up to {after}, where {evidence.selected} is off by {off}."
     else:
         start = f"{after[0].upper()}{after[1:]} {evidence.selected} is off by {off}."
         limits = {
