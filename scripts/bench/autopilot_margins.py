@@ -100,6 +100,23 @@ def margins(run: Path, name: str) -> list[float]:
     ]
 
 
+def outside(run: Path, name: str) -> dict[str, tuple[float, float, float]]:
+    """Return the costs [s] of the policy, the best law and PD by what lies beyond the conditions.
+
+    The law is the one that costs least there, whichever that is.
+    """
+    costs: dict[str, dict[str, float]] = {}
+    laws = set()
+    for row in json.loads((run / "metrics.json").read_text())["rows"]:
+        if row["protocol"].startswith("beyond_"):
+            costs.setdefault(row["protocol"], {})[row["model"]] = row["cost"]["mean"]
+            laws |= {row["model"]} if row["kind"] == "classical" else set()
+    return {
+        protocol: (each[name], min(each[law] for law in laws), each.get("pd", math.nan))
+        for protocol, each in costs.items()
+    }
+
+
 class Drawn:
     """A vessel: K [1/s], T [s], rate of the rudder [deg/s] and largest delay [s].
 
@@ -204,7 +221,7 @@ def seeded(config: str, policy: str, seeds: range, out: Path) -> list[Path]:
 
 
 def main() -> None:
-    """Print a line for each figure, a column for each run, and their spread."""
+    """Print a line for each figure, a column for each run, their spread, and costs outside."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path, nargs="*")
     parser.add_argument("--policy", default="learned")
@@ -225,7 +242,8 @@ def main() -> None:
         values = margins(run, given.policy)
         print("  " + ", ".join(f"{t} {v:.3g}" for t, v in zip(COLUMNS, values, strict=True)))
     seeds = range(given.seed, given.seed + given.seeds)
-    given.runs += seeded(given.config, given.policy, seeds, given.out)
+    if given.seeds:
+        given.runs += seeded(given.config, given.policy, seeds, given.out)
     if not given.runs:
         parser.error("name the folders of finished runs, or give --draw or --seeds")
     found = np.array([margins(run, given.policy) for run in given.runs])
@@ -235,6 +253,12 @@ def main() -> None:
         deviation = values.std(ddof=1) if len(values) > 1 else math.nan
         shown = [*values, values.mean(), deviation, values.min(), values.max()]
         print(f"{title:24s}" + "".join(f"{value:12.3f}" for value in shown))
+    beyond = [outside(run, given.policy) for run in given.runs]
+    for protocol in [one for one in beyond[0] if all(one in each for each in beyond)]:
+        costs = np.array([each[protocol] for each in beyond])
+        spread = costs.std(axis=0, ddof=1) if len(costs) > 1 else np.full(3, math.nan)
+        told = [f"{m:.3f} ({d:.3f})" for m, d in zip(costs.mean(axis=0), spread, strict=True)]
+        print(f"{protocol:24s}policy {told[0]}, best law {told[1]}, PD {told[2]} s")
 
 
 if __name__ == "__main__":
