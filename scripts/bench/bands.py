@@ -2,11 +2,13 @@
 
 Of a finished run, or of what `residnet evaluate` wrote, the selected model's bands are judged on
 the stored free runs. With `--cross`, all logs of a config are divided into folds instead: each is
-judged with bands of a fit that has seen none of it. With `--alone`, models that the judged one
-does not stand on are left out of these fits: networks take most of the time.
+judged with bands of a fit that has seen none of it. With `--kinds` a fold is all logs of a kind of
+manoeuvre, so that no band was calibrated on the kind that judges it. With `--alone`, models that
+the judged one does not stand on are left out of these fits: networks take most of the time.
 
     python scripts/bench/bands.py RUN [--split test]
-    python scripts/bench/bands.py --cross CONFIG [--model physics] [--alone] [--folds 5] [-s K=V]
+    python scripts/bench/bands.py --cross CONFIG [--model physics] [--alone] [--folds 5] [--kinds]
+        [-s K=V]
 """
 
 from __future__ import annotations
@@ -74,12 +76,16 @@ def alone(config: FitConfig, model: str) -> list[str]:
     return out
 
 
-def crossed(config: FitConfig, model: str, folds: int, seed: int) -> dict[str, list[Judged]]:
+def crossed(
+    config: FitConfig, model: str, folds: int, seed: int, by_kind: bool
+) -> dict[str, list[Judged]]:
     """Return free runs over all logs of a config with bands of fits that have not seen them."""
     prepared = prepare_logs(config.logs(), config)
     logs = [log for members in prepared.values() for log in members]
     kinds = [log.log.manoeuvre for log in logs]
     number = fold_numbers(kinds, folds, seed)
+    if by_kind:
+        number = np.unique(kinds, return_inverse=True)[1]
     out: dict[str, list[Judged]] = {}
     for k in range(int(number.max()) + 1):
         others = [log for log, own in zip(logs, number, strict=True) if own != k]
@@ -151,6 +157,7 @@ def main() -> None:
     parser.add_argument("--model")
     parser.add_argument("--alone", action="store_true")
     parser.add_argument("--folds", type=int, default=5)
+    parser.add_argument("--kinds", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-s", dest="overrides", action="append", default=[])
     given = parser.parse_args()
@@ -162,7 +169,7 @@ def main() -> None:
             left_out = alone(config, given.model or "baseline")
             config = load_task(given.cross, [*given.overrides, *left_out])
             assert isinstance(config, FitConfig)
-        found = crossed(config, given.model or "baseline", given.folds, given.seed)
+        found = crossed(config, given.model or "baseline", given.folds, given.seed, given.kinds)
     else:
         metrics = json.loads((given.run / "metrics.json").read_text())
         model = given.model or metrics["selected"]

@@ -331,7 +331,7 @@ def keep(models: Any, splits: Splits, effort: float, parts: Sequence[str], file:
     """Write what the members of a fit missed, and what they miss of logs that they did not see."""
     whole = {"test": missed(models, "test", dense=False)}
     whole["validation"] = missed(models, "validation", dense=True)
-    if models.identified.chosen is not None:
+    if models.identified.seen:
         with mock.patch.object(fit, "final_fit", return_value=False):
             first = fitted(splits, effort, parts)
         whole["seen"] = whole["validation"]

@@ -4,9 +4,11 @@ Each draw takes one of two shipped vessels with scattered parameters, a mixture 
 noise, random forces and currents, and models of three kinds: a linear baseline, hull terms refitted
 through rollouts, and a closed-form residual. The tables give coverage by protocol and kind of
 manoeuvre over all draws, then the lowest of single draws. How much the coverage of single logs
-differs tells how far a band may be off that so many logs calibrate and so many judge.
+differs tells how far a band may be off that so many logs calibrate and so many judge. With
+`--others` kinds of manoeuvres judge that neither fitted nor calibrated anything.
 
     python scripts/bench/simulated_bands.py [--draws 12] [--seed 0] [--logs 40] [--test 25]
+        [--others]
 """
 
 from __future__ import annotations
@@ -38,16 +40,25 @@ VESSELS: dict[str, dict[str, Any]] = {
 }
 """Inputs of each vessel, and the largest standard deviations of its random forces in N and N m."""
 STEP, SECONDS = 0.1, 60.0
-KINDS = ("zigzag", "three_two_one_one", "acceleration_deceleration", "random_steps")
+KINDS = (
+    "zigzag", "three_two_one_one", "acceleration_deceleration", "random_steps", "turning_circle",
+)  # fmt: skip
 _ASKED = 0.02
 """Largest distance of the mean coverage from 0.9 that is asked for."""
 CHANNELS = ("u", "v", "r", "heading", "position", "mean", "whole")
 
 
-def drawn(vessel: str, random: np.random.Generator, logs: int, test: int) -> dict[str, list[Log]]:
-    """Return logs of a scattered vessel: so many for fits, and so many of each kind to judge."""
+def drawn(
+    vessel: str, random: np.random.Generator, logs: int, test: int, others: bool
+) -> dict[str, list[Log]]:
+    """Return logs of a scattered vessel: so many for fits, and so many of each kind to judge.
+
+    Of `others`, kinds judge that no fit has.
+    """
     # at least a tenth of the calibration's logs is of each kind that there is
-    kinds = ["zigzag", *random.permutation(KINDS[1:])[: int(random.integers(1, 4))]]
+    kinds = ["zigzag", *random.permutation(KINDS[1:4])[: int(random.integers(1, 4))]]
+    if others:
+        kinds = kinds[:2]
     shares = 0.1 + random.dirichlet(np.full(len(kinds), 2.0)) * (1.0 - 0.1 * len(kinds))
     counts = np.floor(shares * logs).astype(int)
     counts[0] += logs - counts.sum()
@@ -58,7 +69,9 @@ def drawn(vessel: str, random: np.random.Generator, logs: int, test: int) -> dic
         "three_two_one_one": {"unit": ["2 s", "4 s"], "steer": [0.4, 1.0]},
         "acceleration_deceleration": {"high": [0.5, 1.0], "low": [0.0, 0.3]},
         "random_steps": {"band": [0.02, 0.2]},
+        "turning_circle": {"steer": [0.3, 1.0]},
     }
+    judges = [kind for kind in KINDS if kind not in kinds] if others else []
     drive = {"drive": [0.3, 1.0]}
     with tempfile.TemporaryDirectory() as folder:
         content = {
@@ -79,7 +92,7 @@ def drawn(vessel: str, random: np.random.Generator, logs: int, test: int) -> dic
                     **given[kind],
                     **({} if kind == "acceleration_deceleration" else drive),
                 }
-                for kind, count in zip(kinds, counts, strict=True)
+                for kind, count in [*zip(kinds, counts, strict=True), *((k, 0) for k in judges)]
             ],
             "identification": {kind: int(count) for kind, count in zip(kinds, counts, strict=True)},
             "validation": {
@@ -90,7 +103,7 @@ def drawn(vessel: str, random: np.random.Generator, logs: int, test: int) -> dic
         manoeuvres = config.draw()
         out: dict[str, list[Log]] = {}
         for log, split in zip(simulate(manoeuvres, config), config.splits(manoeuvres), strict=True):
-            out.setdefault(split, []).append(log)
+            out.setdefault("test" if log.manoeuvre in judges else split, []).append(log)
     return out
 
 
@@ -137,6 +150,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--logs", type=int, default=40)
     parser.add_argument("--test", type=int, default=25)
+    parser.add_argument("--others", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
@@ -145,7 +159,9 @@ def main() -> None:
         started = time.process_time()
         random = np.random.default_rng([given.seed, number])
         vessel = list(VESSELS)[number % len(VESSELS)]
-        models, test = identified(vessel, drawn(vessel, random, given.logs, given.test))
+        models, test = identified(
+            vessel, drawn(vessel, random, given.logs, given.test, given.others)
+        )
         found = [
             {**row, "draw": number, "vessel": vessel}
             for row in models.evaluate(test).rows

@@ -94,9 +94,34 @@ def test_the_mean_is_reported_first_and_a_single_model_is_chosen_beside_it(
     chosen = identified.select(judged)
     families = {entry.name: entry.family for entry in chosen.contenders}
     assert chosen.predictor == chosen.selected_ensemble == "mean"
-    assert families[chosen.selected] != "ensemble"
+    assert (chosen.selected, families["hull"]) == ("hull", "refitted baseline")
     assert families["hull_network"] == families["mean"] == "ensemble"
     assert identified["mean"].notes["members"] == ["hull", "hull_network"]
+
+
+@pytest.mark.long
+def test_a_hull_that_runs_away_is_not_the_single_model(
+    identified: Identified, logs: PreparedSplits
+) -> None:
+    judged = {"validation": identified.evaluate(logs["validation"])}
+    found = judged["validation"].runs[0].predictions
+    found["hull"] = [replace(one, diverged=True) for one in found["hull"]]
+    assert identified.select(judged).selected == "baseline"
+
+
+@pytest.mark.long
+def test_bands_of_short_logs_come_from_fits_without_some_of_them(
+    logs: PreparedSplits,
+) -> None:
+    found = fit(logs, settings(effort=0.01))
+    banded = {name: entry.bands["T8"] for name, entry in found.items() if entry.bands}
+    assert list(banded) == ["zero", "baseline", "hull", "mean"]
+    hull, mean = banded["hull"], banded["mean"]
+    assert hull.logs == len(logs["train"]) + len(logs["validation"])
+    np.testing.assert_array_equal(mean.width, hull.width)
+    assert "hull" in mean.cautions[0]
+    assert mean.usual is not None
+    assert hull.usual is None
 
 
 @pytest.mark.long

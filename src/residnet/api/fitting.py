@@ -254,7 +254,7 @@ class Models(Mapping[str, Model]):
 
     @property
     def selected(self) -> str:
-        """Name of the simplest sound model that validation does not tell from the best."""
+        """Name of the single model: the recipe's hull, else the simplest that is alike the best."""
         return self.selection.selected
 
     @property
@@ -439,7 +439,7 @@ def metrics(
 
 
 def select(models: Models) -> Model:
-    """Return the simplest sound model that validation does not tell from the best.
+    """Return the recipe's hull, else the simplest sound model that is alike the best.
 
     Free runs over the validation logs decide; `models.selection.reason` says why.
 

@@ -163,7 +163,9 @@ def calibrate_bands(
 
     Training logs are predicted by models that leave them out, validation logs by the models
     themselves. A model that is not fitted again without logs takes the form of its reference's
-    band, with the level that its own errors on the validation logs ask for.
+    band, with the level that its own errors on the validation logs ask for. Where these were fitted
+    too, a mean takes the band of its reference as it is, wider where its members lie farther apart
+    than on these logs; networks have none.
 
     Args:
         identified: the fit.
@@ -186,49 +188,6 @@ def calibrate_bands(
         for name, band in runs.bands().items():
             out.setdefault(name, {})[protocol] = band
     return {name: _banded(entry, out.get(name, {})) for name, entry in identified.items()}
-
-
-def borrowed_bands(
-    last: Identified, chosen: Identified, logs: Sequence[Prepared], config: BandsConfig
-) -> dict[str, FittedModel]:
-    """Return the models of a last fit with the bands of an earlier one that left logs out.
-
-    No log is left that networks and means were not fitted on. A mean takes the band of the hull,
-    and widens it where its members lie farther apart than on the logs; networks have none.
-
-    Args:
-        last: fit of all logs.
-        chosen: fit of the training logs alone, whose bands are calibrated.
-        logs: that show how far members usually lie apart.
-        config: starts of the runs.
-    """
-    best = max((one for one in chosen.values() if one.bands), key=_order, default=None)
-    out = {}
-    for name, entry in last.items():
-        own = chosen.get(name)
-        bands = {} if own is None else own.bands
-        if own is None and best is not None and (members := members_of(entry)):
-            said = _BORROWED.format(best.name)
-            bands = {k: replace(b, cautions=(said, *b.cautions)) for k, b in best.bands.items()}
-            models = {one: last[one].model for one in (*members, name)}
-            for k in bands:
-                seen = _Calibration(last, k, config, {})
-                seen.add(models, logs, validation=True)
-                usual = usual_spread(seen.validated.get(name, []), bands[k].steps)
-                bands[k] = replace(bands[k], usual=usual)
-        out[name] = _banded(entry, bands)
-    return out
-
-
-_BORROWED = (
-    "Short logs leave none that this model was not fitted on: its band is that of {} as it was"
-    " before the last fit."
-)
-
-
-def _order(entry: FittedModel) -> tuple[bool, int]:
-    """Return what puts the baseline with the most parameters last."""
-    return entry.spec.role == "baseline", round(sum(entry.model.baseline.parameter_count()))
 
 
 def _banded(entry: FittedModel, bands: Mapping[str, Band]) -> FittedModel:
@@ -283,6 +242,9 @@ class _Calibration:
             for name, model in models.items()
         ]
         found = free_run(candidates, windows, logs, self.step, self.identified.limit)
+        if validation and self.identified.seen:
+            # these logs tell of no error, but how far members usually lie apart
+            found = {name: found[name] for name in found if members_of(self.identified[name])}
         for name, predictions in found.items():
             runs = run_errors(windows, predictions, logs)
             (self.validated if validation else self.crossed).setdefault(name, []).extend(runs)
@@ -323,15 +285,16 @@ class _Calibration:
         """Return the band of a model that was not fitted again without logs."""
         runs = self.validated[entry.name]
         logs = len({run.log for run in runs})
-        if reference not in known or not self.validated.get(reference):
+        judged = self.validated.get(reference)
+        if reference not in known or not (judged or self.identified.seen):
             band = calibrate(runs, self.config.level, self.step, unit)
             why = self.failed.get(entry.name, "")
             return replace(band, cautions=(*_alone(logs, why), *few(logs)))
         single = known[reference]
         other = replace(single, usual=usual_spread(runs, single.steps))
-        ratio = _level(runs, other, self.config.level) / _level(
-            self.validated[reference], single, self.config.level
-        )
+        if not judged:
+            return replace(other, cautions=(_BORROWED.format(reference), *single.cautions))
+        ratio = _level(runs, other, self.config.level) / _level(judged, single, self.config.level)
         ratio = np.where(np.isfinite(ratio), ratio, 1.0)
         return replace(
             other,
@@ -341,6 +304,12 @@ class _Calibration:
             logs=logs,
             cautions=(*_scaled(reference, logs), *few(logs)),
         )
+
+
+_BORROWED = (
+    "Short logs leave none that this model was not fitted on: its band is that of {}, which was"
+    " fitted again without some of them."
+)
 
 
 def _level(runs: Sequence[RunErrors], band: Band, level: float) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from threading import Event, Thread
@@ -22,7 +21,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, restored
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
-from residnet.identification.bands import borrowed_bands, calibrate_bands
+from residnet.identification.bands import calibrate_bands
 from residnet.identification.fitter import Fitter
 from residnet.identification.identified import Identified
 from residnet.identification.models import FitStore, FittedModel, NoStore
@@ -49,26 +48,15 @@ def fit(logs: Logs, settings: FitSettings, *, store: FitStore | None = None) -> 
     """
     store = store or NoStore()
     fitter = Fitter(logs, settings, store)
-    found = fitter.settings
-    if not final_fit(found, logs["train"]):
+    if not final_fit(fitter.settings, logs["train"]):
         return _fitted(fitter, logs)
-    say("  first without the validation logs, which choose a single model")
-    nothing: dict[str, Any] = {"heads": {}, "base_of": {}, "means": {}, "training": {}}
-    fitter.settings = found.model_copy(update=nothing)
-    chosen = _fitted(fitter, logs)
-    say("  then with them: logs are short, and nothing is chosen any more")
+    say("  logs are short, and nothing is chosen: validation logs are fitted too")
     whole = {**logs, "train": [*logs["train"], *logs["validation"]]}
-    without = found.model_copy(update={"bands": None})
-    last = _fitted(Fitter(whole, without, store, settle=False, seen=True), whole)
-    if found.bands is not None:
-        last.models.update(borrowed_bands(last, chosen, logs["validation"], found.bands))
-        for model in last.values():
-            store.keep(model)
-    return replace(last, chosen=chosen)
+    return _fitted(Fitter(whole, fitter.settings, store, settle=False, seen=True), whole)
 
 
 def final_fit(settings: FitSettings, train: Sequence[Prepared]) -> bool:
-    """Return whether the last fit uses the validation logs too: the recipe's does, of short logs.
+    """Return whether a fit uses the validation logs too: the recipe's does, of short logs.
 
     A quarter of five minutes tells networks more than it tells a choice.
     """
@@ -93,7 +81,7 @@ def _fitted(fitter: Fitter, logs: Logs) -> Identified:
         with _optional(settings, name):
             models[name] = fitter.mean(name, [models[one] for one in members if one in models])
             say(f"  {name}: {_said(models[name])}")
-    identified = Identified(settings, models, fitter.limit, fitter.train)
+    identified = Identified(settings, models, fitter.limit, fitter.train, fitter.seen)
     if settings.bands is not None:
         identified.models.update(calibrate_bands(identified, logs["validation"], settings.bands))
         for model in identified.values():

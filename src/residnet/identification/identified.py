@@ -22,13 +22,13 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.models import FittedModel, references
-from residnet.identification.recipe import MEAN
+from residnet.identification.recipe import HULL, MEAN
 from residnet.identification.settings import FitSettings
 from residnet.judge.band import Bands
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.goodness import OneStep, table
 from residnet.judge.metrics import Judged, metrics_table
-from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
+from residnet.judge.protocol import EvaluationConfig
 from residnet.judge.selection import (
     Contender,
     Selection,
@@ -195,7 +195,6 @@ def select(
     judged: Mapping[str, Evaluation],
     findings: Mapping[str, Sequence[Finding]],
     config: EvaluationConfig,
-    deciding: FreeRun | None = None,
 ) -> Selection:
     """Choose among the models of a fit by their free runs over the validation logs.
 
@@ -204,14 +203,13 @@ def select(
         judged: their free runs by split; `validation` is needed, `train` shows divergences too.
         findings: of the checks for physical sanity, by model.
         config: its `selection` protocol decides.
-        deciding: free runs over the validation logs that decide in its place.
 
     Raises:
         UsageError: where the validation logs have not been judged.
     """
     validation = judged.get("validation")
     runs = [] if validation is None else validation.runs
-    run = deciding or next((run for run in runs if run.protocol == config.selection), None)
+    run = next((run for run in runs if run.protocol == config.selection), None)
     if validation is None or run is None:
         raise UsageError(
             f"select: no free runs over validation logs by protocol '{config.selection}'; evaluate"
@@ -219,8 +217,6 @@ def select(
         )
     blocks, labels = blocks_of(run)
     counted = {split: judged[split].runs for split in _CHECKED if split in judged}
-    if deciding is not None:
-        counted["validation"] = [*counted["validation"], deciding]
     scales = config.scales.named()
     models = {entry.name: entry for entry in fitted}
     parts = {
@@ -286,15 +282,14 @@ class Identified(Mapping[str, FittedModel]):
         models: by name.
         limit: size of what moves [n] beyond which a free run has diverged.
         train: the logs that fitted them.
-        chosen: an earlier fit without the validation logs, which chooses a single model; None where
-            this fit does.
+        seen: whether the validation logs are among them.
     """
 
     settings: FitSettings
     models: dict[str, FittedModel]
     limit: np.ndarray
     train: Sequence[Prepared]
-    chosen: Identified | None = None
+    seen: bool = False
 
     def evaluate(
         self, logs: Sequence[Prepared], data: MeasuredLogs | SimulatedTrials | None = None
@@ -345,6 +340,9 @@ class Identified(Mapping[str, FittedModel]):
     def select(self, judged: Mapping[str, Evaluation]) -> Selection:
         """Choose a single model and an ensemble by their free runs.
 
+        The recipe chooses neither: the evidence is smaller than its noise. Its hull is the single
+        model, unless it diverged in a window, and its mean the ensemble.
+
         Args:
             judged: what `evaluate` returned, by split; `validation` is needed, and divergences on
                 `train` count where it is there.
@@ -352,36 +350,16 @@ class Identified(Mapping[str, FittedModel]):
         Raises:
             UsageError: where the validation logs have not been judged.
         """
-        found = select(
-            self.values(),
-            judged,
-            self.findings,
-            self.settings.evaluation,
-            self._overlapping(judged.get("validation")),
-        )
-        if self.chosen is not None:
-            before = self.chosen.evaluate_splits(
-                {split: judged[split].logs for split in _CHECKED if split in judged}
-            )
-            first = self.chosen.select(before)
-            reason = f"{first.reason} The last fit uses the validation logs too."
-            found = replace(found, selected=first.selected, reason=reason)
+        found = select(self.values(), judged, self.findings, self.settings.evaluation)
         if self.settings.recipe is None or MEAN not in self.models:
             return found
-        # the evidence for a choice among means is smaller than its noise
-        return replace(found, selected_ensemble=MEAN, leading=MEAN)
-
-    def _overlapping(self, validation: Evaluation | None) -> FreeRun | None:
-        """Return free runs over overlapping windows, by which the recipe's models are chosen."""
-        settings = self.settings
-        if settings.recipe is None or validation is None:
-            return None
-        config, step, logs = settings.evaluation, settings.prepare.grid.step, validation.logs
-        name = f"{config.selection}, overlapping"
-        windows = all_windows(overlapping(config.protocols[config.selection]), logs, step, name)
-        models = candidates(self.values())
-        return FreeRun(
-            name, "validation", windows, free_run(models, windows, logs, step, self.limit)
+        found = replace(found, selected_ensemble=MEAN, leading=MEAN)
+        hull = next((one for one in found.contenders if one.name == HULL), None)
+        if hull is None or hull.diverged:
+            return found
+        against = f"; against it speaks: {'; '.join(hull.faults)}" if hull.faults else ""
+        return replace(
+            found, selected=HULL, reason=f"{HULL} is the recipe's single model{against}."
         )
 
     def __getitem__(self, name: str) -> FittedModel:

@@ -346,7 +346,9 @@ PARTS = (
     "baseline", "baselines", "refit", "heads", "base_of", "ensembles", "means", "training",
 )  # fmt: skip
 """Keys of a fit that the recipe stands in place of."""
-_BASES = {"hull_network": "hull", "network": "zero"}
+HULL = "hull"
+"""Name of the model that is taken where one single is needed."""
+_BASES = {"hull_network": HULL, "network": "zero"}
 """What the networks stand on."""
 MEAN = "mean"
 """Name of the mean of unlike models, which is reported first."""
@@ -375,12 +377,12 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     terms = full_hull_terms(facts) if long(facts) else hull_terms(facts)
     return {
         "baseline": _regressors(1e-6, linear_terms(facts)),
-        "baselines": {"hull": _regressors(1e-4, terms)},
-        "refit": dict.fromkeys(("baseline", "hull"), refit_settings(facts)),
+        "baselines": {HULL: _regressors(1e-4, terms)},
+        "refit": dict.fromkeys(("baseline", HULL), refit_settings(facts)),
         "heads": heads,
         "base_of": {name: base for name, base in _BASES.items() if name in heads},
         "ensembles": {},
-        "means": {MEAN: ("hull", *heads)},
+        "means": {MEAN: (HULL, *heads)},
         "training": dict.fromkeys(heads, training_settings(facts, effort)),
     }
 

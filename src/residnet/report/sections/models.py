@@ -205,8 +205,7 @@ def _heads(run: RunFiles) -> Section | None:
     )
     about = (
         "A head adds to the accelerations of a baseline what that leaves. Further baselines and"
-        " ensembles stand alone. The simplest sound model is selected that validation does not tell"
-        " from the best one."
+        " ensembles stand alone."
     )
     return Section("Residual heads and further models", [Text(about, quiet=True), table])
 
