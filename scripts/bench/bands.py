@@ -22,13 +22,17 @@ import numpy as np
 import torch
 
 from residnet.core.files import read_table
-from residnet.core.layout import POSITION
+from residnet.core.layout import PLANAR, POSITION
 from residnet.core.names import STATE
 from residnet.identification.bands import fold_numbers
 from residnet.identification.fit import fit
+from residnet.identification.identified import unlike_models
 from residnet.identification.prepared import prepare_logs
-from residnet.judge.band import CHANNELS, Band, covered, interval_score, read_bands, worst
+from residnet.judge.band import Band, covered, interval_score, read_bands, worst
 from residnet.judge.bands import RunErrors, calibrate, run_errors
+from residnet.judge.freerun import spread_of
+from residnet.runs.folder import RunFolder
+from residnet.runs.model_store import FolderStore
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.registry import load_task
 
@@ -42,15 +46,20 @@ def stored(run: Path, split: str, model: str, bands: dict[str, Band]) -> dict[st
         for entry in json.loads((run / "data_quality.json").read_text())
     }
     out: dict[str, list[Judged]] = {}
+    store = FolderStore(RunFolder(run))
+    unlike = unlike_models(map(store.load, store.names()))
     for file in sorted((run / "rollouts" / split).glob("*.parquet")):
-        table = read_table(file)
-        for (protocol, _), part in table[table["model"] == model].groupby(["protocol", "window"]):
-            states = part[[f"{name}_hat" for name in STATE]].to_numpy(float)
+        for (protocol, _), every in read_table(file).groupby(["protocol", "window"]):
+            of = dict(iter(every.groupby("model")))
+            part, predicted = of[model], [f"{name}_hat" for name in STATE]
+            states = part[predicted].to_numpy(float)
+            beside = [of[name][predicted].to_numpy(float) for name in unlike]
+            spread = spread_of(beside) if len(beside) > 1 else None
             apart = (states - part[list(STATE)].to_numpy(float))[1:]
             error = np.abs(apart[:, [3, 4, 5, 2, 0]])
             error[:, 4] = np.hypot(*apart[:, POSITION].T)
             error[np.ix_(~part["usable"].to_numpy(bool)[1:], [0, 1, 4])] = np.nan
-            given = RunErrors(file.stem, manoeuvres[file.stem], error, states)
+            given = RunErrors(file.stem, manoeuvres[file.stem], error, states, spread)
             out.setdefault(str(protocol), []).append((given, bands[str(protocol)]))
     return out
 
@@ -110,7 +119,7 @@ def show(protocol: str, judged: Sequence[Judged]) -> None:
     """Print coverage by kind and channel, and scores beside those of a band fitted in hindsight."""
     runs = [run for run, _ in judged]
     first = judged[0][1]
-    widths = [band.half_widths(run.states) for run, band in judged]
+    widths = [run.within(band) for run, band in judged]
     whole = np.stack(
         [
             worst([run.error], [width])[0] <= band.whole
@@ -119,7 +128,8 @@ def show(protocol: str, judged: Sequence[Judged]) -> None:
     )
     print(f"\n{protocol}: {len(runs)} runs of {len({run.log for run in runs})} logs")
     print(
-        f"{'':12s}{'runs':>5s}" + "".join(f"{name:>10s}" for name in (*CHANNELS, "mean", "whole"))
+        f"{'':12s}{'runs':>5s}"
+        + "".join(f"{name:>10s}" for name in (*PLANAR.banded, "mean", "whole"))
     )
     for kind in ("all", *sorted({run.manoeuvre for run in runs})):
         chosen = [i for i, run in enumerate(runs) if kind in ("all", run.manoeuvre)]

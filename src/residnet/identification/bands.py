@@ -19,12 +19,17 @@ from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads.base import ClosedFormHead, EquationHead
+from residnet.heads.base import ClosedFormHead
 from residnet.identification.fitter import residual_samples
-from residnet.identification.identified import Identified, members_of
+from residnet.identification.identified import (
+    Identified,
+    closed_form,
+    members_of,
+    unlike_models,
+)
 from residnet.identification.models import FittedModel, references
 from residnet.judge.band import Band, BandsConfig, corrected, independent, quantile, run_weights
-from residnet.judge.bands import RunErrors, calibrate, few, run_errors, usual_spread
+from residnet.judge.bands import RunErrors, calibrate, few, run_errors
 from residnet.judge.freerun import Candidate, free_run
 from residnet.judge.protocol import Window
 from residnet.regression.estimator import Solution
@@ -92,10 +97,8 @@ class FoldModels:
             return [copy.deepcopy(fitted.model) for _ in range(self.count)]
         if role == "baseline":
             return self._baseline(fitted)
-        head = fitted.model.head
         name = self.identified.settings.baseline_name_of(fitted.name)
-        quick = isinstance(head, ClosedFormHead) and not isinstance(head, EquationHead)
-        if role != "head" or not quick or name not in before[0]:
+        if not closed_form(fitted) or name not in before[0]:
             return []
         return [self._head(fitted, before[k][name], k) for k in range(self.count)]
 
@@ -164,8 +167,7 @@ def calibrate_bands(
     Training logs are predicted by models that leave them out, validation logs by the models
     themselves. A model that is not fitted again without logs takes the form of its reference's
     band, with the level that its own errors on the validation logs ask for. Where these were fitted
-    too, a mean takes the band of its reference as it is, wider where its members lie farther apart
-    than on these logs; networks have none.
+    too, means take the band of their reference as it is, and networks have none.
 
     Args:
         identified: the fit.
@@ -184,7 +186,8 @@ def calibrate_bands(
                 log for log, number in zip(identified.train, fold, strict=True) if number == k
             )
             runs.add(models, own, validation=False)
-        runs.add({name: entry.model for name, entry in identified.items()}, validation, True)
+        if not identified.seen:
+            runs.add({name: entry.model for name, entry in identified.items()}, validation, True)
         for name, band in runs.bands().items():
             out.setdefault(name, {})[protocol] = band
     return {name: _banded(entry, out.get(name, {})) for name, entry in identified.items()}
@@ -237,14 +240,12 @@ class _Calibration:
         windows = self._windows(logs)[:: 1 if validation else self.every]
         if not windows or not models:
             return
+        unlike = unlike_models(self.identified[name] for name in models)
         candidates = [
-            Candidate(name, "", model, members=members_of(self.identified[name]))
+            Candidate(name, "", model, members=members_of(self.identified[name]), unlike=unlike)
             for name, model in models.items()
         ]
         found = free_run(candidates, windows, logs, self.step, self.identified.limit)
-        if validation and self.identified.seen:
-            # these logs tell of no error, but how far members usually lie apart
-            found = {name: found[name] for name in found if members_of(self.identified[name])}
         for name, predictions in found.items():
             runs = run_errors(windows, predictions, logs)
             (self.validated if validation else self.crossed).setdefault(name, []).extend(runs)
@@ -275,8 +276,13 @@ class _Calibration:
             {name: entry.notes for name, entry in self.identified.items()},
         )
         for name, entry in self.identified.items():
+            reference = compared.get(name, "baseline")
             if name not in out and self.validated.get(name):
-                out[name] = self._like(entry, out, compared.get(name, "baseline"), unit)
+                out[name] = self._like(entry, out, reference, unit)
+            elif name not in out and members_of(entry) and reference in out:
+                band = out[reference]
+                cautions = (_BORROWED.format(reference), *band.cautions)
+                out[name] = replace(band, cautions=cautions)
         return {name: out[name] for name in self.identified if name in out}
 
     def _like(
@@ -285,22 +291,20 @@ class _Calibration:
         """Return the band of a model that was not fitted again without logs."""
         runs = self.validated[entry.name]
         logs = len({run.log for run in runs})
-        judged = self.validated.get(reference)
-        if reference not in known or not (judged or self.identified.seen):
+        if reference not in known or not self.validated.get(reference):
             band = calibrate(runs, self.config.level, self.step, unit)
             why = self.failed.get(entry.name, "")
             return replace(band, cautions=(*_alone(logs, why), *few(logs)))
         single = known[reference]
-        other = replace(single, usual=usual_spread(runs, single.steps))
-        if not judged:
-            return replace(other, cautions=(_BORROWED.format(reference), *single.cautions))
-        ratio = _level(runs, other, self.config.level) / _level(judged, single, self.config.level)
+        ratio = _level(runs, single, self.config.level) / _level(
+            self.validated[reference], single, self.config.level
+        )
         ratio = np.where(np.isfinite(ratio), ratio, 1.0)
         return replace(
-            other,
-            width=other.width * ratio,
-            plain=other.plain * ratio,
-            constant=other.constant * ratio,
+            single,
+            width=single.width * ratio,
+            plain=single.plain * ratio,
+            constant=single.constant * ratio,
             logs=logs,
             cautions=(*_scaled(reference, logs), *few(logs)),
         )

@@ -153,6 +153,7 @@ def candidates(
         {name: entry.spec.role for name, entry in models.items()},
         {name: entry.notes for name, entry in models.items()},
     )
+    unlike = unlike_models(models.values())
     out = [
         Candidate(
             name,
@@ -162,6 +163,7 @@ def candidates(
             ranges=entry.spec.ranges,
             bands=entry.bands,
             members=members_of(entry),
+            unlike=unlike,
         )
         for name, entry in models.items()
     ]
@@ -172,6 +174,22 @@ def candidates(
 def members_of(entry: FittedModel) -> tuple[str, ...]:
     """Return the models whose trajectories a model is the mean of; empty for any other."""
     return tuple(one.name for one in entry.spec.members if entry.spec.of == "trajectories")
+
+
+def unlike_models(fitted: Iterable[FittedModel]) -> tuple[str, ...]:
+    """Return the models whose distance tells where logs did not determine the motion.
+
+    They are those that can quickly be fitted again without some of the logs: baselines and heads of
+    closed form. Bands know of each how far they lie apart in free runs over logs left out.
+    """
+    return tuple(one.name for one in fitted if one.spec.role == "baseline" or closed_form(one))
+
+
+def closed_form(entry: FittedModel) -> bool:
+    """Return whether a model has a head of closed form that is solved again in no time."""
+    head = entry.model.head
+    quick = isinstance(head, ClosedFormHead) and not isinstance(head, EquationHead)
+    return entry.spec.role == "head" and quick
 
 
 def _truth(data: SimulatedTrials) -> Candidate | None:

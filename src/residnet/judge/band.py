@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -196,8 +197,8 @@ class Band:
         logs: number of logs that calibrated it.
         number: of independent scores among them.
         cautions: whole sentences about what the band does not promise.
-        usual: root mean square [G, c] over the runs that calibrated it of how far the members of a
-            mean lie apart; None for a single model.
+        usual: root mean square [G, c] over the runs that calibrated it of how far unlike models lie
+            apart; None where there are none.
         channels: their names.
     """
 
@@ -220,28 +221,19 @@ class Band:
     def half_widths(self, states: np.ndarray, spread: np.ndarray | None = None) -> np.ndarray:
         """Return half widths [L, c] along a run with predicted states [L + 1, 3 + n].
 
-        Beyond the longest calibrated horizon they grow in proportion to time. Where the members of
-        a mean lie farther apart than they usually do, they grow in proportion to that.
+        Beyond the longest calibrated horizon they grow in proportion to time. By what unlike models
+        lie farther apart than they usually do, a prediction errs besides: variances add up.
 
         Args:
             states: predicted.
-            spread: standard deviation between the members [L, c]; None for a single model.
+            spread: standard deviation between unlike models [L, c]; None where there are none.
         """
         z = self.activity.of_run(states, self.step)
         out = self.tabled(self.width, len(z)) * factor(z, self.slope)
-        return np.asarray(out if spread is None else out * self.wider(spread))
-
-    def wider(self, spread: np.ndarray) -> np.ndarray:
-        """Return the factors [L, 1], 1 or more, by which a spread [L, c] widens the band.
-
-        A few members tell each channel's spread badly: its root mean square over all is taken.
-        """
-        if self.usual is None:
-            return np.ones((len(spread), 1))
-        known = self.usual.any(axis=0)
-        ratio = spread / np.maximum(self.tabled(self.usual, len(spread)), 1e-300)
-        ratio = np.compress(known, ratio, axis=1)
-        return np.asarray(np.maximum(np.sqrt(np.mean(ratio**2, axis=1, keepdims=True)), 1.0))
+        if spread is None or self.usual is None:
+            return np.asarray(out)
+        more = disagreement(spread, self.tabled(self.usual, len(z)), self.level, self.channels)
+        return np.asarray(np.sqrt(out**2 + more))
 
     def tabled(self, table: np.ndarray, count: int) -> np.ndarray:
         """Return a table [G, c] at steps 1 to `count`, [count, c]."""
@@ -333,6 +325,23 @@ class Band:
             table("usual_spread") if content.get("usual_spread") else None,
             channels,
         )
+
+
+def disagreement(
+    spread: np.ndarray, usual: np.ndarray, level: float, channels: Sequence[str]
+) -> np.ndarray:
+    """Return the squared half widths [..., c] of what a spread [..., c] has beyond the usual one.
+
+    Args:
+        spread: standard deviations between unlike models; that of the position is per axis.
+        usual: their root mean square over runs.
+        level: share of normal errors that the widths are to hold.
+        channels: their names.
+    """
+    radial = np.array([name == "position" for name in channels])
+    normal = NormalDist().inv_cdf(0.5 + level / 2.0)
+    squares = np.where(radial, -2.0 * np.log(1.0 - level), normal**2)
+    return np.asarray(squares * np.maximum(spread**2 - usual**2, 0.0))
 
 
 def factor(z: np.ndarray, slope: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from residnet.judge.band import (
     by_channel,
     corrected,
     covered,
+    disagreement,
     factor,
     independent,
     interval_score,
@@ -33,7 +33,7 @@ from residnet.judge.band import (
     run_weights,
     worst,
 )
-from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction, spread_of
+from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction
 from residnet.judge.protocol import Window
 
 _MASKED = tuple(PLANAR.banded.index(name) for name in ("u", "v", "position"))
@@ -49,7 +49,7 @@ class RunErrors:
         manoeuvre: its kind.
         error: absolute errors [L, c] by channel, NaN where they are not scored.
         states: predicted [L + 1, 3 + n], from the initial state on.
-        spread: standard deviation between the members of a mean [L, c]; None for a single model.
+        spread: standard deviation between unlike models [L, c]; None where there are none.
         live: what moves, by which channels are.
     """
 
@@ -97,10 +97,6 @@ def run_errors(
     ]
 
 
-_FITTED = ("baseline", "head")
-"""Kinds of the models whose spread is compared with the bands."""
-
-
 @dataclass(frozen=True)
 class BandCounts:
     """Sums over the scored samples of each of W windows, by channel [W, c].
@@ -112,7 +108,6 @@ class BandCounts:
         whole: 1 where the band of whole runs holds the window, NaN where nothing is scored.
         score: sum of the interval scores, in the units of the band.
         constant: the same of a band of one width.
-        spread: the same of the spread of the run's models; None where there are too few.
     """
 
     channels: tuple[str, ...]
@@ -121,7 +116,6 @@ class BandCounts:
     whole: np.ndarray
     score: np.ndarray
     constant: np.ndarray
-    spread: np.ndarray | None
 
     def row(self, chosen: np.ndarray) -> dict[str, Any]:
         """Return what a row of metrics.json says of chosen windows [W] bool."""
@@ -141,7 +135,6 @@ class BandCounts:
             },
             "band_score": float(mean(self.score).mean()),
             "band_score_constant": float(mean(self.constant).mean()),
-            "band_score_spread": None if self.spread is None else float(mean(self.spread).mean()),
         }
 
 
@@ -159,22 +152,17 @@ def count_bands(
         logs: that the windows belong to.
         found: errors by model.
     """
-    fitted = [c.name for c in candidates if c.kind in _FITTED]
-    spreads = _spreads(run, fitted) if len(fitted) > 1 else None
     return {
         one.name: _counted(
             run_errors(run.windows, run.predictions[one.name], logs, found[one.name]),
             one.bands[run.protocol],
-            spreads,
         )
         for one in candidates
         if run.protocol in one.bands
     }
 
 
-def _counted(
-    runs: Sequence[RunErrors], band: Band, spreads: Sequence[np.ndarray] | None
-) -> BandCounts:
+def _counted(runs: Sequence[RunErrors], band: Band) -> BandCounts:
     errors = [own.error for own in runs]
     widths = [own.within(band) for own in runs]
     largest = worst(errors, widths)
@@ -187,11 +175,6 @@ def _counted(
             ]
         )
 
-    spread = None
-    if spreads is not None:
-        normal, radial = _reach(band.level)
-        reach = np.where([name == "position" for name in band.channels], radial, normal)
-        spread = scores([reach * own for own in spreads])
     return BandCounts(
         band.channels,
         np.stack([np.isfinite(error).sum(axis=0) for error in errors]),
@@ -201,41 +184,7 @@ def _counted(
         np.where(np.isnan(largest), np.nan, largest <= band.whole),
         scores(widths),
         scores([np.broadcast_to(band.constant, error.shape) for error in errors]),
-        spread,
     )
-
-
-def _reach(level: float) -> tuple[float, float]:
-    """Return the standard deviations that hold normal errors at a level, of one axis and of two."""
-    return NormalDist().inv_cdf(0.5 + level / 2.0), float(np.sqrt(-2.0 * np.log(1.0 - level)))
-
-
-def _spreads(run: FreeRun, models: Sequence[str]) -> list[np.ndarray]:
-    """Return the standard deviation [L, c] between models along each window."""
-    return [
-        spread_of([run.predictions[model][i].states for model in models])
-        for i in range(len(run.windows))
-    ]
-
-
-def usual_spread(runs: Sequence[RunErrors], steps: np.ndarray) -> np.ndarray | None:
-    """Return the root mean square [G, c] over runs of how far members lie apart.
-
-    None where they are the runs of a single model.
-
-    Args:
-        runs: that calibrate a band.
-        steps: its horizons [G].
-    """
-    squares = np.full((len(runs), len(steps), runs[0].error.shape[1] if runs else 0), np.nan)
-    for i, run in enumerate(runs):
-        if run.spread is None:
-            return None
-        reached = steps[steps <= len(run)] - 1
-        squares[i, : len(reached)] = run.spread[reached] ** 2
-    weight = np.where(np.isfinite(squares), run_weights([r.log for r in runs])[:, None, None], 0.0)
-    mean = (weight * np.nan_to_num(squares)).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
-    return np.asarray(np.sqrt(_smooth(mean, steps)))
 
 
 def limits(states: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -307,8 +256,16 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
         step: of the runs in s.
         unit: that scores are given in, [c].
     """
-    given = _at_horizons(runs, step)
-    names, weight = given.names, given.weight
+    whole_error = _at_horizons(runs, step)
+    names, weight, channels = whole_error.names, whole_error.weight, runs[0].live.layout.banded
+    spread = _spreads(runs, whole_error)
+    usual = None if spread is None else _usual(spread, whole_error)
+    given = whole_error
+    if spread is not None and usual is not None:
+        # what the disagreement of models explains is no error that the rest of the band must hold
+        explained = np.nan_to_num(disagreement(spread, usual, level, channels))
+        left = np.sqrt(np.maximum(given.error**2 - explained, 0.0))
+        given = replace(given, error=left)
     shape, slope = _scale(given)
     scale = _scales_of_others(given)
     inside = np.nanmean(covered(given.error, _quantiles(given, scale, level) * scale), axis=(1, 2))
@@ -317,11 +274,10 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
     quantiles = _quantiles(given, scale, raised)
     # a channel that no velocity moves is not scored, and its band has no width
     width = np.nan_to_num(shape * quantiles)
-    same = _shape(given, np.zeros_like(slope))
-    plain = same * _quantiles(given, np.broadcast_to(same, given.error.shape), raised)
+    same = _shape(whole_error, np.zeros_like(slope))
+    plain = same * _quantiles(whole_error, np.broadcast_to(same, given.error.shape), raised)
     plain = np.nan_to_num(plain)
-    channels = runs[0].live.layout.banded
-    flat = given.error.reshape(-1, len(channels))
+    flat = whole_error.error.reshape(-1, len(channels))
     band = Band(
         level,
         step,
@@ -335,9 +291,10 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
         slope,
         len(set(names)),
         number,
+        usual=usual,
         channels=channels,
     )
-    largest = worst([run.error for run in runs], [band.half_widths(run.states) for run in runs])
+    largest = worst([run.error for run in runs], [run.within(band) for run in runs])
     # as far as the runs of other logs know the scale
     seen = shape * factor(given.measures, slope)
     largest *= _largest(given.error, scale * quantiles) / _largest(given.error, seen * quantiles)
@@ -345,9 +302,28 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
     return replace(band, whole=whole, cautions=few(band.logs))
 
 
+def _spreads(runs: Sequence[RunErrors], given: _Runs) -> np.ndarray | None:
+    """Return how far unlike models lie apart in each run [W, G, c]; None where there are none."""
+    out = np.full_like(given.error, np.nan)
+    for run, row in zip(runs, out, strict=True):
+        if run.spread is None:
+            return None
+        reached = given.steps[given.steps <= len(run)] - 1
+        row[: len(reached)] = run.spread[reached]
+    return out
+
+
+def _usual(spread: np.ndarray, given: _Runs) -> np.ndarray:
+    """Return the root mean square [G, c] of a spread [W, G, c] over runs."""
+    weight = np.where(np.isfinite(spread), given.weight[:, None, None], 0.0)
+    total = (weight * np.nan_to_num(spread) ** 2).sum(axis=0)
+    return np.asarray(np.sqrt(_smooth(total / np.maximum(weight.sum(axis=0), 1e-300), given.steps)))
+
+
 def _largest(error: np.ndarray, width: np.ndarray) -> np.ndarray:
     """Return the largest error in half widths of each run [W, c], over horizons."""
-    return np.asarray(np.nanmax(np.where(np.isfinite(error), error / width, 1e-12), axis=1))
+    ratio = np.where(np.isfinite(error) & (width > 0.0), error / np.maximum(width, 1e-300), 0.0)
+    return np.asarray(np.maximum(ratio.max(axis=1), 1e-12))
 
 
 def _scale(given: _Runs) -> tuple[np.ndarray, np.ndarray]:

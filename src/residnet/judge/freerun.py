@@ -47,6 +47,8 @@ class Candidate:
             are not known.
         bands: of its free runs by protocol; empty where there are none.
         members: models beside it whose free runs it is the mean of; empty for none.
+        unlike: models beside it that lie apart where the logs of the fit do not tell the motion;
+            empty for none.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Candidate:
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     bands: Mapping[str, Band] = field(default_factory=dict)
     members: tuple[str, ...] = ()
+    unlike: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -66,8 +69,8 @@ class Prediction:
     """A prediction of one model for one window.
 
     States [L, 3 + n] hold what moves in the model and the pose integrated from it; `diverged`
-    says whether the free run ran away. `spread` [L - 1, c] is the standard deviation between the
-    members of a mean by channel of a band, from the first step on; None for a single model.
+    says whether the free run ran away. `spread` [L - 1, c] is the standard deviation between unlike
+    models by channel of a band, from the first step on; None where there are none.
     """
 
     states: np.ndarray
@@ -222,7 +225,15 @@ def free_run(
             nu = np.mean(states, axis=0)
             nu = nu if logs[0].live.spatial else nu[:, logs[0].live.columns]
             own = next(found) if i in alone else _prediction(windows[i], nu, logs, step, limit)
-            out[mean.name].append(replace(own, spread=spread_of(states)))
+            out[mean.name].append(own)
+    apart: dict[tuple[str, ...], list[np.ndarray]] = {}
+    for one in candidates:
+        if len(one.unlike) > 1 and set(one.unlike) <= names:
+            if one.unlike not in apart:
+                beside = [*zip(*(out[name] for name in one.unlike), strict=True)]
+                apart[one.unlike] = [spread_of([each.states for each in some]) for some in beside]
+            both = zip(out[one.name], apart[one.unlike], strict=True)
+            out[one.name] = [replace(own, spread=spread) for own, spread in both]
     return {candidate.name: out[candidate.name] for candidate in candidates}
 
 

@@ -382,14 +382,14 @@ def bands(run: RunFiles) -> Section | None:
     level = f"{100 * band['level']:.0f} %"
     about = [
         f"A band is to hold {level} of the errors of a free run on logs that nobody has seen. It"
-        " grows with the horizon, and is wider where the predicted run is livelier. It was"
-        " calibrated over logs that its model was not fitted on: training logs, predicted by"
-        " models that leave them out, and the validation logs.",
+        " grows with the horizon, and is wider where the predicted run is livelier or the models"
+        " disagree. It was calibrated over logs that its model was not fitted on: training logs,"
+        " predicted by models that leave them out, and the validation logs.",
         f"The tables say what the bands held of the {run.focus} data. Whole: share of the runs that"
         f" a band holds from beginning to end, each channel for itself, where it is widened to hold"
         f" {level} of them. Score: mean width, and {2 / (1 - band['level']):.0f} times what lies"
-        " outside, in units of the error of zero; less is better. Beside it stand a band of one"
-        " width at all horizons and the spread of the run's models, taken for normal.",
+        " outside, in units of the error of zero; less is better. Beside it stands a band of one"
+        " width at all horizons.",
     ]
     blocks: list[Block] = [Text(about)]
     if told := cautions(run, run.lead):
@@ -447,8 +447,7 @@ def _coverage(
             *((name, f"band_coverage.{name}", 2) for name in (*shown, "mean", "whole")),
             ("bands", "band_score", number),
             ("one width", lambda row: beside(row, "band_score_constant")),
-            ("spread", lambda row: beside(row, "band_score_spread")),
         ],
-        groups=[("coverage", len(shown) + 2), ("score", 3)],
+        groups=[("coverage", len(shown) + 2), ("score", 2)],
         selected=lambda row: row["model"] == selected,
     )
