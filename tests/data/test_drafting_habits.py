@@ -18,6 +18,7 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.reading import read_drafted
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.drafting.words import state_channel, words_of
 from residnet.data.motion import MotionConfig, complete_motion
@@ -525,3 +526,33 @@ def test_logs_with_other_columns_beside_each_other_are_no_messages(
         columns |= {"battery [V]": 24.0 - 0.01 * log.t} if k % 2 else {}
         pd.DataFrame(columns).to_csv(tmp_path / f"run_{k}.csv", index=False)
     assert len(residnet.read_logs(tmp_path)) == 4
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["dives", "rises"])
+def test_planes_are_told_by_the_pitch_that_they_hold(tmp_path: Path, side: float) -> None:
+    random, t = np.random.default_rng(3), np.arange(0.0, 120.0, 0.1)
+    planes = random.uniform(-0.2, 0.2, 31)[(t / 4.0).astype(int)]
+    theta, q = np.zeros(t.size), np.zeros(t.size)
+    for k in range(t.size - 1):
+        # the pitch rate is gone by the end of most holds, the pitch is not
+        turn = -1.5 * q[k] - 0.9 * np.sin(theta[k]) - 0.5 * planes[k]
+        theta[k + 1], q[k + 1] = theta[k] + 0.1 * q[k], q[k] + 0.1 * turn
+    u, heave = 1.5 + 0.1 * np.sin(0.2 * t), -0.2 * q
+    down = heave * np.cos(theta) - u * np.sin(theta)
+    frame = pd.DataFrame(
+        {
+            "Zeit [s]": t,
+            "Fahrt [m/s]": u,
+            "heave velocity [m/s]": heave,
+            "pitch rate [deg/s]": np.degrees(q),
+            "pitch [deg]": np.degrees(theta + 1e-4 * random.normal(size=t.size)),
+            "Tiefe [m]": 10.0 + 0.1 * np.cumsum(down),
+            "Tiefenruder [deg]": np.degrees(side * planes),
+            "rpm": 900.0 + 50.0 * np.cos(0.2 * t),
+        }
+    )
+    frame.to_csv(file := tmp_path / "dive.csv", index=False)
+    read = read_drafted([file], Marks()).logs[file]
+    assert {"u", "w", "q", "theta", "z", "delta_s", "n"} <= read.channels.keys()
+    assert "v" not in read.channels
+    np.testing.assert_allclose(read["delta_s"], planes, atol=1e-6)

@@ -11,7 +11,7 @@ from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS, STATE, WIND_INPUTS
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.reading import INPUTS
-from residnet.data.drafting.words import input_channel, state_channel, words_of
+from residnet.data.drafting.words import PLANES, input_channel, state_channel, words_of
 from residnet.data.readers.quantities import QUATERNION
 
 _PASSIVE = (
@@ -170,11 +170,11 @@ def lacks(names: Sequence[str], live: Live = ALIVE) -> str:
 
     Forces, thrusters that turn, and several thrusters do both.
     """
-    plain = [name.removeprefix("cmd_") for name in names]
+    plain = [name.removeprefix("cmd_") for name in names if not PLANES.match(name)]
     steering = [name.startswith("delta") for name in plain]
     driving = [name in ("n", "thrust", "throttle") for name in plain]
     # one whose name says neither may do either
-    rest = [n for n, s, d in zip(names, steering, driving, strict=True) if not (s or d)]
+    rest = [n for n, s, d in zip(plain, steering, driving, strict=True) if not (s or d)]
     both = any(name.startswith(("tau", "azimuth", "nozzle")) for name in rest)
     if both or any(steering) + any(driving) + len(rest) > 1:
         return ""

@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
+from residnet.core.layout import Live
 from residnet.core.names import BOW_WIND, CHANNEL_UNITS
 from residnet.core.units import to_si
 from residnet.data.channels import STILL
@@ -25,7 +26,7 @@ from residnet.data.drafting.physics import (
 )
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.units import si_of, thrown, unit_by_size, written_unit
-from residnet.data.drafting.words import axis_velocity, words_of
+from residnet.data.drafting.words import axis_velocity, deep_channel, words_of
 from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
 from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
 
@@ -41,12 +42,7 @@ misread; of boats that turn by less than a radian a third is taken as its name s
 """
 _SAMPLES = 50
 """Samples of a wind that tell nothing yet."""
-_DEEP = {
-    "w": r"w|heave(?: (?:velocity|speed))?",
-    "q": r"q|pitch (?:rate|velocity|speed)",
-    "z": r"z|depth",
-    "theta": r"theta|pitch(?: angle)?",
-}
+_DEEP = ("w", "q", "z", "theta")
 """What a vessel under water is told by, beside the channels of a roll."""
 STATE_NAMES = (
     *("x", "y", "psi", "u", "v", "r", "phi", "p", *_DEEP, "wind_speed", "wind_dir"),
@@ -89,22 +85,19 @@ def quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
 
 
 def submerged(columns: Sequence[str], named: Collection[str]) -> dict[str, str]:
-    """Return heave, pitch rate, depth and pitch -> column; none without depth, pitch and roll.
+    """Return heave, pitch rate, depth and pitch -> column, of vessels that may dive alone.
+
+    They do with depth, pitch and roll, and where nothing turns them.
 
     Args:
         columns: names.
         named: channels that are known already.
     """
-    if "phi" not in named:
-        return {}
-    texts = {column: words_of(column).text for column in columns}
-    found = {
-        name: column
-        for name, pattern in _DEEP.items()
-        for column, text in reversed(texts.items())
-        if re.fullmatch(pattern, text)
-    }
-    return found if {"z", "theta"} <= found.keys() else {}
+    deep = {column: deep_channel(words_of(column)) for column in columns}
+    found = {name: column for column, name in reversed(deep.items()) if name}
+    found = {name: found[name] for name in _DEEP if name in found}
+    whole = "phi" in named and {"z", "theta"} <= found.keys()
+    return found if whole or Live.plunging({*named, *found}) else {}
 
 
 def levelled(

@@ -188,24 +188,27 @@ def follows(logs: Sequence[Raw], motions: Sequence[Motion | None], channel: str)
 
 
 def turns_to(
-    logs: Sequence[Raw], channel: str, rate: Mapping[int, np.ndarray]
+    logs: Sequence[Raw], channel: str, rate: Mapping[int, np.ndarray], angle: str | None = None
 ) -> tuple[float, float]:
     """Return how a rudder's angle turns the vessel, and the standard error of that.
 
     The growth of the yaw rate over two seconds is explained by the rudder's mean angle over them
-    and by the yaw rate itself.
+    and by the yaw rate itself. Of planes it is the pitch rate, which weight and buoyancy change by
+    the pitch, too.
 
     Args:
         logs: with the column.
-        channel: of the rudder.
-        rate: yaw rate [T] of each log by its number, rad/s.
+        channel: of the rudder or the planes.
+        rate: yaw or pitch rate [T] of each log by its number, rad/s.
+        angle: column of the angle that the vessel is righted by; None for none.
     """
     rows, grown = [], []
     for number, raw in enumerate(logs):
         values, r = raw.columns.get(channel), rate.get(number)
         if values is None or r is None:
             continue
-        known = np.isfinite(values) & np.isfinite(r) & np.isfinite(raw.t)
+        held = np.zeros(raw.t.size) if angle is None else raw.columns[angle]
+        known = np.isfinite(values) & np.isfinite(r) & np.isfinite(raw.t) & np.isfinite(held)
         if known.sum() < 50:
             continue
         t, v, w = without_pauses(raw.t[known]), values[known], r[known]
@@ -217,7 +220,8 @@ def turns_to(
         mean = np.mean(
             [np.interp(grid + share * span, t, v) for share in (0.0, 0.25, 0.5, 0.75)], 0
         )
-        rows.append(np.stack((mean, first, np.ones(grid.size)), axis=1))
+        tilt = np.interp(grid, t, held[known])
+        rows.append(np.stack((mean, first, np.ones(grid.size), tilt), axis=1))
         grown.append(last - first)
     if not rows:
         return 0.0, 1.0

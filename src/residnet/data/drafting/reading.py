@@ -25,6 +25,7 @@ from residnet.data.drafting.physics import Raw, turns_to
 from residnet.data.drafting.questions import Key, Marks
 from residnet.data.drafting.recordings import draft_recordings
 from residnet.data.drafting.tables import draft_tables, named, peek
+from residnet.data.drafting.words import PLANES
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import kind_of, to_table
@@ -232,28 +233,34 @@ def read_each(paths: Sequence[Path]) -> list[DraftedLogs]:
 
 
 def _turn_rudders(read: DraftedLogs) -> None:
-    """Turn the sign of rudders whose positive angles turn the vessel to port."""
+    """Turn the sign of rudders whose positive angles turn the vessel to port, of planes those that
+    turn it up.
+    """
     channels, places = _entries(read.reader)
     held = dict.fromkeys(name for log in read.logs.values() for name in log.channels)
     names = [name for name in held if re.match(r"(cmd_)?delta(?!_rate)", name)]
     moving = [moved for log in read.logs.values() if names and (moved := _turning(log))]
     for name in names:
-        there = [log for log in moving if name in log.channels]
-        logs = [Raw(log.t, {name: log[name]}) for log in there]
-        slope, error = turns_to(logs, name, {i: log["r"] for i, log in enumerate(there)})
+        dives = PLANES.match(name) is not None
+        rate, way, wrong = ("q", -1.0, "up") if dives else ("r", 1.0, "to port")
+        columns = [name, "theta"] if dives else [name]
+        there = [log for log in moving if {rate, *columns} <= log.channels.keys()]
+        logs = [Raw(log.t, {column: log[column] for column in columns}) for log in there]
+        rates = {number: way * log[rate] for number, log in enumerate(there)}
+        slope, error = turns_to(logs, name, rates, "theta" if dives else None)
         key = places.get(name, INPUTS)
         if abs(slope) < 4.0 * error:
-            read.marks.guess(key, f"the logs do not tell to which side {name} turns the vessel")
+            read.marks.guess(key, f"the logs do not tell which way {name} turns the vessel")
         elif slope < 0.0 and name in channels:
             channels[name]["sign"] = -1 * int(channels[name].get("sign", 1))
-            text = f"positive values turned the vessel to port in the logs ({-slope / error:.0f}"
+            text = f"positive values turned the vessel {wrong} in the logs ({-slope / error:.0f}"
             read.marks.guess(key, f"{text} standard errors): the sign is turned")
             for path, log in read.logs.items():
                 if name in log.channels:
                     turned = {**log.channels, name: -log[name]}
                     read.logs[path] = log.replace(channels=turned)
         elif slope < 0.0:
-            text = f"positive values of {name} turned the vessel to port in the logs"
+            text = f"positive values of {name} turned the vessel {wrong} in the logs"
             read.marks.guess(key, text)
 
 
@@ -273,9 +280,10 @@ def _entries(reader: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict
 
 
 def _turning(log: Log) -> Log | None:
-    """Return a log with its yaw rate; None where it has none."""
+    """Return a log with its yaw rate and, where it dives, its pitch rate; None without."""
     try:
         told = Live.told(log.channels)
-        return log if "r" in log.channels else complete_motion(log, MotionConfig(), told)
+        rates = {"r", "q"} if told.spatial else {"r"}
+        return log if rates <= log.channels.keys() else complete_motion(log, MotionConfig(), told)
     except ResidnetError:
         return None

@@ -60,6 +60,8 @@ _ABOUT: dict[str, str] = {
     "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre руль 타각"
     " dumen | delta rudder rud ror rsa steering helm pala leme ster tiller rorkult barra pinne"
     " ruderpinne",
+    "planes": "sternplane diveplane hydroplane tiefenruder hohenruder elevator dybderor djuproder"
+    " hoogteroer 潜舵 横舵 升降舵 | plane planes",
     "propeller": "propel schraube helice schroef 推進 プロペラ propulseur 螺旋桨 винт srub pervane"
     " 프로펠러 | prop screw shaft welle eje arbre aksel 軸 elica",
     "engine": "engine motor maschine maquina moteur hovedmaskin 主機 двигат silnik makine 엔진"
@@ -81,9 +83,10 @@ _ABOUT: dict[str, str] = {
     "direction": "direction direzion richtung riktning direccion richting retning angle winkel"
     " 方向 風向 | dir twd from angulo hoek vinkel twa awa",
     "angle": "angle winkel angulo hoek vinkel lage 角 | ang angolo",
-    "roll": "roll roulis balanceo krenging 横揺 kranken slagside 横摇 横倾 крен przechyl 횡동요 |"
-    " phi heel yalpa",
+    "roll": "roll roulis balanceo krenging krangung 横揺 kranken slagside 横摇 横倾 крен przechyl"
+    " 횡동요 | phi heel yalpa",
     "pitch": "pitch tangage cabeceo stampf | theta trim",
+    "heave": "heave vertical tauch sink pilonnement arfada 升沉 上下揺 | hiv descent",
     "acceleration": "accel beschleun versnell akselerasjon 加速 | udot vdot rdot dot acc",
     "command": "command soll setpoint consigne befehl gevraagd onsket 指令 demand reference"
     " desired задан 명령 komut | cmd set ref des order ordre ordered comando",
@@ -111,6 +114,8 @@ _WORDS = frozenset(
 """All words that compounds are made of."""
 MOTION = ("x", "y", "psi", "u", "v", "r", "p", "phi", "wind_speed", "wind_dir", *BOW_WIND)
 """Channels of the motion and of the wind."""
+PLANES = re.compile(r"(cmd_)?delta_s(_|$)")
+"""How channels of planes begin, which turn a vessel down and not to a side."""
 
 
 class Words(NamedTuple):
@@ -179,7 +184,7 @@ _KNOWN = frozenset(
 )
 _DRIVING = frozenset(
     word
-    for thing in ("rudder", "propeller", "engine", "revolutions", "throttle", "servo")
+    for thing in ("rudder", "planes", "propeller", "engine", "revolutions", "throttle", "servo")
     for word in _ABOUT[thing].replace("|", " ").split()
 )
 
@@ -228,7 +233,10 @@ def state_channel(words: Words) -> str | None:
         if w.has("speed") and "dir" not in w.text.split():
             return f"{felt}wind_speed"
         return (f"{felt}wind_angle" if felt else "wind_dir") if w.has("direction") else None
-    if not w.lacks("command", "acceleration", "rudder", "propeller", "current", "depth", "age"):
+    if not w.lacks(
+        *("command", "acceleration", "rudder", "planes", "propeller", "current", "depth", "age"),
+        "heave",
+    ):
         return None
     driven = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")
     if not w.lacks(*driven) and not (w.has("position") and w.has("north")):
@@ -249,6 +257,21 @@ def state_channel(words: Words) -> str | None:
     if axis := axis_velocity(w):
         return axis
     return _place(w) or _velocity(w)
+
+
+def deep_channel(words: Words) -> str | None:
+    """Return w, q, z or theta of a vessel under water that a name stands for; None for others."""
+    w = words
+    if w.text in ("w", "q", "z", "theta"):
+        return w.text
+    moves = not w.lacks("rate", "speed", "angular")
+    if not w.lacks("command", "acceleration", "age", "index", "machinery", "thrust", "engine"):
+        return None
+    if w.has("pitch") and w.lacks("propeller", "heave"):
+        return "q" if moves else "theta"
+    if w.has("heave") or (w.has("depth") and moves):
+        return "w" if moves else None
+    return "z" if w.has("depth") else None
 
 
 _YAWING = re.compile(r" [zr](?: (?:dps|deg s|rad s))?$")
@@ -319,6 +342,9 @@ def input_channel(words: Words) -> str | None:
         return None
     if w.has("azimuth"):
         return f"azimuth{side}{_ordered(w)}"
+    if w.has("planes"):
+        name = f"delta_s{side.removesuffix('_stern')}"
+        return f"cmd_{name}" if w.has("command") else name
     if w.has("rudder"):
         name = "delta" if w.lacks("rate") else "delta_rate"
         return f"cmd_{name}{side}" if w.has("command") else f"{name}{side}"
