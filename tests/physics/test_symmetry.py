@@ -67,6 +67,18 @@ def test_parity_of_terms_is_the_sign_that_the_mirror_gives_their_values() -> Non
     assert set(parity.tolist()) == {-1.0, 1.0}
 
 
+def test_a_lone_propeller_heels() -> None:
+    def names(*inputs: str) -> tuple[str, ...]:
+        return SignalsConfig(inputs=inputs, velocities=("u", "v", "r", "p")).build().names
+
+    lone, pair = names("delta", "n"), names("delta", "n_port", "n_stbd")
+    assert mirrored_channels(lone) is None
+    assert mirrored_channels(pair) is not None
+    # its torque acts about the roll, and no thrust to a side
+    assert [wrong_parity("|n| u", axis, lone) for axis in range(4)] == [False, True, True, False]
+    assert wrong_parity("u|u|", 3, lone)
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_term_is_wrong_where_it_breaks_the_symmetry_of_its_axis(axis: int) -> None:
     """A symmetric vessel's acceleration f has f(M z) = M f(z)."""

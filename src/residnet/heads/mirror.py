@@ -59,7 +59,8 @@ class MirroredHead(ResidualHead):
         if mirror is None:
             raise ConfigError(
                 f"mirror: it is not known how all of the channels {', '.join(names)} change in the"
-                " mirror; leave `mirror` out"
+                " mirror (the torque of a lone propeller heels a vessel that rolls); leave `mirror`"
+                " out"
             )
         self.inner = inner
         self.width = inner.n_state

@@ -221,9 +221,10 @@ def _acting_terms(facts: Facts) -> tuple[list[str], list[str], list[str]]:
 def _terms(facts: Facts) -> list[str]:
     """Return the terms of all axes together."""
     forces, turning, driving = _acting_terms(facts)
-    moving = live_of(facts.names).moving
-    if live_of(facts.names).spatial:
-        return submerged(Roles(moving, (*forces, *driving), tuple(turning), (), False))
+    live = live_of(facts.names)
+    moving = live.moving
+    if live.spatial:
+        return submerged(Roles(live.channels, (*forces, *driving), tuple(turning), (), False))
     return [
         *("1", *moving, *_HULL, *(_ROLL if "p" in moving else ()), *forces),
         *(term for name in driving for term in _propeller(name, name in facts.astern)),
@@ -286,7 +287,7 @@ def refit_settings(facts: Facts) -> dict[str, Any]:
     return {
         "horizon": readable(horizon),
         "every": readable(0.5 * horizon),
-        "prior": 1e-2 if long(facts) else 1.0,
+        "prior": 1e-2 if long(facts) or live_of(facts.names).spatial else 1.0,
         "asymmetric": 0.05,
     }
 
@@ -375,9 +376,10 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     }
     heads = {"hull_network": network} | ({"network": network} if long(facts) else {})
     terms = full_hull_terms(facts) if long(facts) else hull_terms(facts)
+    ridge = 1e-6 if live_of(facts.names).spatial else 1e-4
     return {
         "baseline": _regressors(1e-6, linear_terms(facts)),
-        "baselines": {HULL: _regressors(1e-4, terms)},
+        "baselines": {HULL: _regressors(ridge, terms)},
         "refit": dict.fromkeys(("baseline", HULL), refit_settings(facts)),
         "heads": heads,
         "base_of": {name: base for name, base in _BASES.items() if name in heads},

@@ -77,6 +77,15 @@ def pair_parity(name: str) -> int:
     return -1 if name.removeprefix("cmd_").startswith(_ANGLES) else 1
 
 
+def heeling(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the lone propellers among channels of a vessel that rolls.
+
+    Their torque heels it to one side, whichever way it is looked at.
+    """
+    lone = [name for name in ("n", "cmd_n") if name in names and name not in partners_of(names)]
+    return tuple(lone) if live_of(names).rolls else ()
+
+
 def _parity(factors: Iterable[Factor], parities: Mapping[str, float]) -> int:
     """Return the sign that a product changes by where its channels change theirs."""
     sign = 1
@@ -97,8 +106,13 @@ def term_parity(term: str, names: Sequence[str]) -> int | None:
 def wrong_parity(term: str, axis: int, names: Sequence[str]) -> bool:
     """Return whether a mirror-symmetric vessel cannot have this term in an axis' acceleration.
 
-    The axes are those of what moves (`Live.moving`): 0 surge, 1 sway, 2 yaw.
+    The axes are those of what moves (`Live.moving`): 0 surge, 1 sway, 2 yaw. A roll may have any
+    term of a lone propeller.
     """
+    if live_of(names).moving[axis] == "p":
+        torque = heeling(names)
+        if any(factor.name in torque for factor in parse_term(term, names)):
+            return False
     parity = term_parity(term, names)
     return parity is not None and parity != axis_parities(names)[axis]
 
@@ -111,9 +125,11 @@ def axis_parities(names: Sequence[str]) -> list[int]:
 def mirrored_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | None:
     """Return how channels look in the mirror: the column that each is taken from, and the sign.
 
-    The result is None where the parity of one is not known. Channels of a port/starboard pair
-    change places.
+    The result is None where the parity of one is not known, or a propeller heels the vessel.
+    Channels of a port/starboard pair change places.
     """
+    if heeling(names):
+        return None
     partners = partners_of(names)
     index = [names.index(partners.get(name, name)) for name in names]
     signs = [pair_parity(name) if name in partners else channel_parity(name) for name in names]
