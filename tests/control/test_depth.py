@@ -116,6 +116,15 @@ def test_planes_that_are_reversed_are_refused(vessel: SteeredPlant) -> None:
         torpedo.turning(10 * DEG, 8.0, 0.1)
 
 
+def test_a_vessel_that_nothing_rights_is_refused(tmp_path: Path) -> None:
+    content = yaml.safe_load(Path("configs/vessels/remus_100.yaml").read_text())
+    content["rigid_body"]["z_G"]["value"] = 0.0
+    (file := tmp_path / "neutral.yaml").write_text(yaml.safe_dump(content))
+    neutral = SteeredPlant(load_vessel(str(file)).build(), axis=DEPTH)
+    with pytest.raises(FitError, match="nothing rights it"):
+        neutral.turning(math.radians(15.0), 20.0, 0.1)
+
+
 def test_vessels_without_planes_and_mixed_axes_are_refused() -> None:
     with pytest.raises(ConfigError, match="needs a vessel with the command cmd_delta_s"):
         SteeredPlant(load_vessel("nomoto_oceanos").build(), axis=DEPTH).model(0.1)

@@ -320,6 +320,15 @@ def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
     speed = float(steered.x[0, steered.columns[0]])
     times, rates, headings = _held(steered, angle, duration)
     if steered.rights:
+        half = np.array_split(headings, 2)[1]
+        # an angle that is righted nears its end; one that is not goes round and round
+        if not np.ptp(half) <= abs(half.mean()):
+            raise FitError(
+                f"at {angle:.3g} rad of planes the vessel is at {headings[-1]:.3g} rad after"
+                f" {times[-1]:.3g} s and does not come to rest: nothing rights it. The planes hold"
+                " an angle against what rights the vessel: check that its weight lies below its"
+                " buoyancy (rigid_body.z_G, buoyancy.z_B) and its speed, or give turning_time more"
+            )
         return _measure_righted(steered, angle, float(headings[-1]))
     while times[-1] < _PATIENCE * duration and not _settled(times, rates):
         times, rates, headings = _held(steered, angle, 2.0 * float(times[-1]))
