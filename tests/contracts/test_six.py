@@ -192,7 +192,7 @@ def test_what_logs_tell_and_lack() -> None:
     with pytest.raises(UsageError, match="z is not measured at every sample"):
         complete_motion(log.replace(channels=held), MotionConfig(), live)
     with pytest.raises(ResidnetError, match="all six"):
-        validate({"inputs": ["n"], "velocities": ["u", "w"]}, SignalsConfig, "here")
+        validate({"inputs": ["n"], "velocities": ["u", "v", "w"]}, SignalsConfig, "here")
     assert {"damping heave", "damping pitch", "restoring pitch"} <= {
         c.name for c in causes(SUBMERGED)
     }

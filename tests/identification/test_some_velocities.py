@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,72 @@ def test_a_fit_is_of_what_the_logs_tell(
             runs.plot_track()
     words = " ".join(models.verdict)
     assert (" m " in words or " m;" in words, " deg" in words) == (live.moves, live.turns)
+
+
+def dive(number: int, *channels: str) -> Log:
+    """Return a vehicle that dives by planes and a propeller, and rights itself in pitch."""
+    random, t = np.random.default_rng(number), np.arange(0.0, 100.0, STEP)
+    hold = (t / 5.0).astype(int)
+    n, planes = random.uniform(8.0, 16.0, 21)[hold], random.uniform(-0.2, 0.2, 21)[hold]
+    x = np.zeros((t.size, 5))
+    x[0] = 1.2, 0.0, 0.0, 0.0, 20.0
+    for k in range(t.size - 1):
+        x[k + 1] = x[k]
+        for _ in range(8):
+            u, w, q, theta, _ = x[k + 1]
+            force = (
+                -0.1 * u * u + 1e-3 * n[k] ** 2,
+                -0.8 * u * w + 0.5 * u * q - 0.25 * u * u * planes[k],
+            )
+            turn = -0.9 * q * u - 0.9 * np.sin(theta) - 0.35 * u * u * planes[k] - 0.6 * u * w
+            down = w * np.cos(theta) - u * np.sin(theta)
+            x[k + 1] += STEP / 8 * np.array([*force, turn, q, down])
+    noise = 0.002 * random.normal(size=x.shape)
+    known = dict(zip(("u", "w", "q", "theta", "z"), (x + noise).T, strict=True))
+    known |= {"n": n, "delta_s": planes}
+    return Log(f"dive_{number}", t, {name: known[name] for name in channels})
+
+
+def sink(number: int, *channels: str) -> Log:
+    """Return a float that a thrust moves down and up."""
+    random, t = np.random.default_rng(number), np.arange(0.0, 100.0, STEP)
+    thrust, w = random.uniform(-10.0, 10.0, 13)[(t / 8.0).astype(int)], np.zeros(t.size)
+    for k in range(t.size - 1):
+        w[k + 1] = w[k] + STEP * (0.01 * thrust[k] - 0.4 * w[k] * abs(w[k]) - 0.05 * w[k])
+    z = STEP * np.cumsum(w) + 0.002 * random.normal(size=t.size)
+    known = {"w": w, "z": z, "thrust": thrust}
+    return Log(f"sink_{number}", t, {name: known[name] for name in channels}, {"thrust": "N"})
+
+
+@pytest.mark.parametrize(
+    ("made", "channels", "velocities"),
+    [
+        (dive, ("u", "w", "q", "theta", "z", "n", "delta_s"), ("u", "w", "q")),
+        (dive, ("u", "theta", "z", "n", "delta_s"), ("u", "w", "q")),
+        (dive, ("w", "q", "n", "delta_s"), ("w", "q")),
+        (sink, ("z", "thrust"), ("w",)),
+        (sink, ("w", "thrust"), ("w",)),
+    ],
+)
+def test_a_vehicle_that_only_dives(
+    made: Callable[..., Log], channels: tuple[str, ...], velocities: tuple[str, ...]
+) -> None:
+    data = residnet.prepare([made(number, *channels) for number in range(6)])
+    assert data.signals.velocities == velocities
+    models = residnet.fit(data, {"kind": "regressors", "sets": ["fossen"], "ridge": 1e-6})
+    table = residnet.metrics(models, split="test")
+    live = Live(velocities)
+    assert {name for name in map(str, table) if name.startswith("rmse_")} == {
+        f"rmse_{one}" for one in (*velocities, "z", *["theta"] * ("q" in velocities))
+    }
+    ends = {"position": "u" in velocities, "depth": True, "attitude": "q" in velocities}
+    assert [f"{name}_error_end" in table for name in ends] == [*ends.values()]
+    error = table.groupby("model")["nrmse_mean"].mean()
+    assert error["baseline"] < error["zero"] * (1.0 if velocities == ("w", "q") else 0.3)
+    x = np.full(len(live.states), 0.1)
+    after, _ = models["baseline"].step(x, np.full(len(data.signals.inputs), 0.1))
+    assert not after[[live.states.index(name) for name in live.dead]].any()
+    assert after[live.states.index("z")] != x[live.states.index("z")]
 
 
 def test_the_pose_is_what_the_live_velocities_lead_to() -> None:

@@ -23,7 +23,8 @@ class Roles(NamedTuple):
     """The roles of a model's channels.
 
     Attributes:
-        moving: velocities, and the angles that forces depend on.
+        moving: velocities, and the angles that forces depend on; in six degrees of freedom those
+            that live.
         drives: those that push.
         steers: those that turn.
         others: inputs of which neither is known.
@@ -58,7 +59,9 @@ class Roles(NamedTuple):
         drives = tuple(drive) or tuple(name for name in acting if name in _DRIVES)
         steers = tuple(steer) or tuple(name for name in acting if name in _STEERS)
         others = tuple(name for name in acting if name not in (*drives, *steers) and not forces)
-        return cls(live_of(names).moving, drives, steers, others, "wind_u" in names)
+        live = live_of(names)
+        moving = live.channels if live.spatial else live.moving
+        return cls(moving, drives, steers, others, "wind_u" in names)
 
     def known(self, who: str) -> Roles:
         """Return the same, where every input has a role.
@@ -81,7 +84,8 @@ class Roles(NamedTuple):
 
 def is_force(name: str) -> bool:
     """Return whether a channel is a force that acts as it is: tau_x, or a thruster's thrust."""
-    return name in FORCE_CHANNELS or name.removeprefix("cmd_").startswith("thrust_")
+    plain = name.removeprefix("cmd_")
+    return name in FORCE_CHANNELS or plain == "thrust" or plain.startswith("thrust_")
 
 
 def _linear(roles: Roles) -> list[str]:
@@ -92,6 +96,11 @@ def _linear(roles: Roles) -> list[str]:
 def _thrust(drive: str) -> list[str]:
     """Return a force as it is, or the thrust of a propeller, which falls with the inflow."""
     return [drive] if is_force(drive) else [drive, f"{drive}|{drive}|", f"|{drive}| u"]
+
+
+def _turns(drive: str) -> bool:
+    """Return whether a channel counts the revolutions of a propeller, whose thrust is known."""
+    return drive.removeprefix("cmd_").partition("_")[0] == "n"
 
 
 def _turning(steer: str, drives: Sequence[str]) -> list[str]:
@@ -122,7 +131,7 @@ def _fossen(roles: Roles) -> list[str]:
     (7)-(9)). Of a roll its damping, what speed does to damping and restoring, and a restoring that
     is not linear (document 004).
     """
-    if "q" in roles.moving:
+    if "z" in roles.moving:
         return submerged(roles)
     hull = ["u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|"]
     if "p" in roles.moving:
@@ -145,10 +154,14 @@ def submerged(roles: Roles) -> list[str]:
     pairs = [" ".join(pair) for pair in combinations(velocities, 2)]
     turns = [f"{name}^2" for name in velocities if name in ("p", "q", "r")]
     driving = (*roles.drives, *roles.others)
-    thrust = [t for n in driving for t in ([n] if is_force(n) else [f"{n}|{n}|", f"|{n}| u"])]
-    fins = [f"u^2 {fin}{power}" for fin in roles.steers for power in ("", "^2")]
+    thrust = [t for n in driving for t in _thrust(n)[0 if is_force(n) or not _turns(n) else 1 :]]
+    # where no log tells the speed it is that of a usual one
+    flow = "u^2 " if "u" in velocities else ""
+    fins = [f"{flow}{fin}{power}" for fin in roles.steers for power in ("", "^2")]
     damping = [f"{name}|{name}|" for name in velocities]
-    return [*velocities, *damping, *pairs, *turns, *VERTICAL, *thrust, *fins]
+    # one that stays upright has weight and buoyancy along heave whatever its pitch
+    level = () if "phi" in roles.moving else ("sin(theta)", "1")
+    return [*velocities, *damping, *pairs, *turns, *(level or VERTICAL), *thrust, *fins]
 
 
 def _abkowitz(roles: Roles) -> list[str]:

@@ -86,6 +86,8 @@ ROLL = StateLayout(names.POSE, (*names.VELOCITY, "p"), ("phi",))
 """Four degrees of freedom: x, y, psi, u, v, r, p, phi."""
 SIX = StateLayout(names.POSE, (*names.VELOCITY, "w", "p", "q"), ("z", "phi", "theta"))
 """Six degrees of freedom: x, y, psi, u, v, r, w, p, q, z, phi, theta. Rotations are composed."""
+VERTICAL = ("u", "w", "q")
+"""Velocities of a motion in an upright plane, which no roll and no turn leaves."""
 _RATES = {"phi": "p", "theta": "q"}
 """The velocity about whose axis an angle turns, and, where nothing else turns, its rate."""
 
@@ -142,7 +144,7 @@ class Live:
     Of u, v and r the others are zero at all times: they have no equation, no term and no error. The
     pose is what the live ones lead to, a straight line from surge alone, a turn on the spot from
     yaw alone; so the time loop, exports and windows are those of the planar state. With p the
-    states are those of `ROLL`; with w, p and q, which need all others, those of `SIX`.
+    states are those of `ROLL`; with w or q, beside u alone or all others, those of `SIX`.
 
     Attributes:
         velocities: names of those that live, of u, v, r, w, p and q.
@@ -167,17 +169,34 @@ class Live:
         if held >= {"theta", "z", "psi"} and "phi" in channels and placed and _dives(channels):
             # what turns and sinks the vessel follows from its attitude and depth
             return cls(SIX.velocities)
+        if plunging := cls.plunging(held):
+            return cls(plunging)
         held |= set(PLANAR.velocities) if held.issuperset(PLANAR.pose) else set()
         held |= {"r"} if "psi" in held else set()
         found = [name for name in PLANAR.velocities if name in held] or [*PLANAR.velocities]
         return cls((*found, *(["p"] if "phi" in held else [])))
 
+    @staticmethod
+    def plunging(held: Iterable[str]) -> tuple[str, ...]:
+        """Return the velocities of a motion in an upright plane by channels; none of another.
+
+        A depth beside a speed and nothing else may be that of the water below a boat.
+        """
+        held = set(held)
+        deep = held & {"w", "q"}
+        deep |= {"w"} if "z" in held and (deep or "theta" in held or "u" not in held) else set()
+        deep |= {"q"} if "theta" in held and "w" in deep else set()
+        if not deep or held & {"v", "r", "p", *PLANAR.pose, "latitude", "longitude"}:
+            return ()
+        return tuple(name for name in VERTICAL if name in held | deep)
+
     @classmethod
     def shared(cls, told: Iterable[Live]) -> Live:
         """Return the velocities that each of several tells; u, v and r where they share none."""
+        told = list(told)
         sets = [one.velocities for one in told]
-        if sets and all(one == SIX.velocities for one in sets):
-            return cls(SIX.velocities)
+        if told and all(one.spatial and one == told[0] for one in told):
+            return told[0]
         found = [name for name in ROLL.velocities if all(name in one for one in sets)]
         planar = any(name in PLANAR.velocities for name in found)
         return cls(tuple(found) if planar else PLANAR.velocities)
@@ -225,6 +244,11 @@ class Live:
         return self.layout is SIX
 
     @property
+    def upright(self) -> bool:
+        """Whether it moves in an upright plane alone, so that it neither rolls nor turns."""
+        return self.spatial and set(self.velocities) <= set(VERTICAL)
+
+    @property
     def hidden(self) -> tuple[str, ...]:
         """Names of what moves and drives nothing: dead velocities, and the depth."""
         return (*self.dead, *(("z",) if self.spatial else ()))
@@ -241,8 +265,10 @@ class Live:
 
     @property
     def dead(self) -> tuple[str, ...]:
-        """Names of those that do not."""
-        return tuple(name for name in self.layout.velocities if name not in self.velocities)
+        """Names of those that do not, and of angles that nothing turns."""
+        still = [name for name in self.layout.velocities if name not in self.velocities]
+        angles = [name for name, rate in _RATES.items() if self.upright and rate in still]
+        return (*still, *angles)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -273,12 +299,16 @@ class Live:
     def ends(self) -> tuple[str, ...]:
         """Names of the errors of the pose that the velocities lead to, in `names.END_UNITS`."""
         if self.spatial:
-            return ("position", "depth", "attitude")
+            turns = not self.upright or "q" in self.velocities
+            return (*["position"] * self.moves, "depth", *["attitude"] * turns)
         return (*["position"] * self.moves, *["heading"] * self.turns)
 
     @property
     def text(self) -> str:
         """What follows from the velocities not being u, v and r, for a reader; empty for these."""
+        if self.upright:
+            text = f"the logs tell {' and '.join(self.velocities)} alone: the vessel moves in an"
+            return f"{text} upright plane, without roll, turn or drift"
         if self.spatial:
             return "all six degrees of freedom, with depth, roll and pitch"
         if self.whole:
@@ -289,6 +319,8 @@ class Live:
             return f"{text}: the vessel turns on the spot, and has no error of position"
         if not self.turns:
             return f"{text}: positions are the distance run on a straight line"
+        if "v" in self.velocities:
+            return text
         return f"{text}: the vessel moves over ground where it points, without drift"
 
     def require_on_surface(self, who: str) -> None:

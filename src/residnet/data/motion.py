@@ -88,6 +88,7 @@ def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
 
 
 def _completed(log: Log, config: MotionConfig, live: Live) -> Log:
+    log = _plunging(log, live) if live.upright else log
     log = _turning(log if live.whole else _still(log, live))
     log = _rolling(log) if live.rolls and not live.spatial else log
     if live.spatial:
@@ -96,7 +97,7 @@ def _completed(log: Log, config: MotionConfig, live: Live) -> Log:
         if lost := [name for name in live.states if name not in (*STATE, *held)]:
             raise UsageError(
                 f"log {log.name}: {', '.join(lost)} {'are' if len(lost) > 1 else 'is'} not measured"
-                " at every sample, which a model of six degrees of freedom needs; name the"
+                f" at every sample, which a model of {', '.join(live.velocities)} needs; name the"
                 " columns, or let it move on the surface alone (signals.velocities: [u, v, r])"
             )
     told = without_held(log)
@@ -274,6 +275,36 @@ def _submerged(log: Log) -> Log:
     )
 
 
+def _plunging(log: Log, live: Live) -> Log:
+    """Return a log of a motion in an upright plane with what of it follows from the rest.
+
+    Pitch and its rate tell each other, heave and depth do with the speed forward.
+    """
+    held = {name: log[name] for name in log.channels if _dense(log[name])}
+    still, made = np.zeros(len(log)), {}
+    if "q" in live.velocities and "theta" in held and "q" not in held:
+        made["q"] = _turned_by(log, held["theta"], "q")[1]
+    elif "q" in held and "theta" not in held:
+        made["theta"] = _integral(log.t, held["q"])
+    theta = {**held, **made}.get("theta", still) if "q" in live.velocities else still
+    ahead = held.get("u", still) if "u" in live.velocities else still
+    if "w" in live.velocities and "z" in held and "w" not in held:
+        sunk = _turned_by(log, held["z"], "")[1] + ahead * np.sin(theta)
+        made["w"] = sunk / np.cos(theta)
+    if "z" not in held:
+        down = {**held, **made}.get("w", still) if "w" in live.velocities else still
+        made["z"] = _integral(log.t, down * np.cos(theta) - ahead * np.sin(theta))
+    if not made:
+        return log
+    text = f"{', '.join(made)} are not measured and follow from the rest of the motion"
+    note = remark("note", "smoothed_motion", text, channels=len(made))
+    return log.replace(
+        channels={**log.channels, **made},
+        units={**log.units, **{name: CHANNEL_UNITS[name] for name in made}},
+        meta={**log.meta, "findings": [*log.meta.get("findings", ()), note]},
+    )
+
+
 def _turned_by(log: Log, angle: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a smoothed angle [T] in rad and its rate [T] in rad/s, from both or the first.
 
@@ -302,7 +333,11 @@ def _integrated(log: Log, missing: Sequence[str]) -> Log:
     """
     pose = {"psi": _integral(log.t, log["r"]) if "psi" in missing else np.asarray(log["psi"])}
     heading = np.exp(1j * np.nan_to_num(pose["psi"]))
-    ground = heading * (np.nan_to_num(log["u"]) + 1j * np.nan_to_num(log["v"]))
+    ahead = np.nan_to_num(log["u"])
+    if {"w", "theta"} <= log.channels.keys():
+        theta = np.nan_to_num(log["theta"])
+        ahead = ahead * np.cos(theta) + np.nan_to_num(log["w"]) * np.sin(theta)
+    ground = heading * (ahead + 1j * np.nan_to_num(log["v"]))
     pose |= {"x": _integral(log.t, ground.real), "y": _integral(log.t, ground.imag)}
     made = {name: pose[name] for name in missing}
     text = (

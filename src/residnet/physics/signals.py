@@ -17,7 +17,7 @@ from residnet.core.columns import heading, surge, sway, velocities
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
-from residnet.core.layout import PLANAR, ROLL, SIX, Live
+from residnet.core.layout import PLANAR, ROLL, SIX, VERTICAL, Live
 from residnet.core.names import CHANNEL_UNITS, WIND_INPUTS, nearest
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig
@@ -45,7 +45,9 @@ class SignalsConfig(Config):
         velocities: those of u, v and r that the logs tell and the model moves; the others are zero
             at all times. A model of surge alone has [u]. With p behind them the model rolls: logs
             need the roll angle phi, which is a state and a channel of it. [u, v, r, w, p, q] are
-            all six degrees of freedom: logs need depth z, roll and pitch.
+            all six degrees of freedom: logs need depth z, roll and pitch. Those of u, w and q are
+            of a motion in an upright plane, as a float or a vehicle that only dives has: with w or
+            q, and pitch where there is q.
     """
 
     inputs: tuple[str, ...]
@@ -72,10 +74,12 @@ class SignalsConfig(Config):
                 f"forces are made by two thrusters, but inputs are {list(self.inputs)}"
             )
         if self.live.spatial:
-            if self.velocities != SIX.velocities:
+            plane = tuple(name for name in VERTICAL if name in self.velocities)
+            if self.velocities not in (SIX.velocities, plane):
                 raise ValueError(
-                    "velocities: heave and pitch need all six, u, v, r, w, p, q in this order;"
-                    f" given {', '.join(self.velocities)}"
+                    "velocities: heave and pitch go with surge alone (u, w, q and what of these"
+                    " moves) or need all six, u, v, r, w, p, q, in this order; given"
+                    f" {', '.join(self.velocities)}"
                 )
             if self.exogenous or self.forces:
                 raise ValueError(
@@ -86,7 +90,7 @@ class SignalsConfig(Config):
             raise ValueError(
                 f"velocities are named once each, in the order u, v, r, p; given {self.velocities}"
             )
-        if not set(self.velocities) & set(PLANAR.velocities):
+        if not self.live.spatial and not set(self.velocities) & set(PLANAR.velocities):
             raise ValueError("velocities: a model moves at least one of u, v, r; [p] has none")
         if self.exogenous and self.live.dead:
             raise ValueError(
