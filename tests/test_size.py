@@ -18,11 +18,11 @@ ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
     "api": (726, 84),
     "baselines": (890, 129),
-    "control": (3460, 387),
+    "control": (3462, 388),
     "core": (1625, 252),
     "data": (9919, 881),
     "documents": (2569, 238),
-    "dynamics": (2226, 279),
+    "dynamics": (2229, 279),
     "export": (1612, 177),
     "heads": (1311, 191),
     "identification": (2216, 227),

@@ -52,6 +52,15 @@ def test_turning_is_that_of_the_model() -> None:
     assert turning.time == pytest.approx(TIME, rel=1e-3)
 
 
+def test_a_rudder_that_lags_is_part_of_the_answer() -> None:
+    # fins of a torpedo in six degrees of freedom follow with a time constant of a second
+    vessel, learned = pair("remus_100")
+    assert (vessel.rate, vessel.lag) == (None, pytest.approx(1.0, rel=1e-3))
+    turning = learned.turning(5 * DEG, 60.0)
+    assert turning.gain == pytest.approx(GAIN, rel=1e-6)
+    assert turning.time == pytest.approx(TIME + 1.0, rel=1e-2)
+
+
 def test_gradients_pass_through_the_model_in_single_precision() -> None:
     _, learned = pair("nomoto_oceanos_rate10")
     model = learned.model(0.1)

@@ -162,9 +162,9 @@ class VariedPlant(Dynamics):
 
 @final
 class VariedModel(Dynamics):
-    """A learned hull behind a rudder with a rate, each row with its own variation.
+    """A learned hull behind a rudder with a rate or a lag, each row with its own variation.
 
-    State x [B, 3 + n or one more]: that of the model, and the rudder angle where it has a rate.
+    State x [B, 3 + n or one more]: that of the model, and the rudder angle where it has either.
     Memory s [B, 3 + k]: the variation, then the head's. `effect` multiplies the rudder angle that
     the model is given, `time` divides what a step changes in sway and yaw.
 
@@ -173,14 +173,21 @@ class VariedModel(Dynamics):
         dt: step in s.
         take: for each input of the model its column of w; the rudder's command is the first of w.
         mean: whether the model's inputs are means over the step.
-        rate: of the rudder in rad/s; None where it stands at its command at once.
+        rate: of the rudder in rad/s; None where it has none.
+        lag: time constant in s with which the rudder follows; None where it has none.
 
     Raises:
         ConfigError: where the model has a memory and steps of another length.
     """
 
     def __init__(
-        self, model: HybridDynamics, dt: float, take: Sequence[int], mean: bool, rate: float | None
+        self,
+        model: HybridDynamics,
+        dt: float,
+        take: Sequence[int],
+        mean: bool,
+        rate: float | None,
+        lag: float | None = None,
     ) -> None:
         super().__init__(dt, model.integrator)
         if model.n_state > 0 and not math.isclose(model.dt, dt, rel_tol=1e-9):
@@ -199,6 +206,8 @@ class VariedModel(Dynamics):
         self.dof, self.rolls = model.dof, model.rolls
         self.take, self.mean = list(take), mean
         self.travel = None if rate is None else rate * dt
+        self.share = None if lag is None else 1.0 - math.exp(-dt / lag)
+        self.geared = rate is not None or lag is not None
 
     def initial_state(self, batch: int) -> Tensor:
         return torch.tensor([1.0, 1.0] + [0.0] * (self.n_state - 2)).expand(batch, -1)
@@ -208,11 +217,11 @@ class VariedModel(Dynamics):
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         command, angle = w[:, :1], actuators(x, self.dof)
-        if self.travel is None:
-            angle_before = angle_after = command
-        else:
-            moved_by = (command - angle).clamp(-self.travel, self.travel)
-            angle_before, angle_after = angle, angle + moved_by
+        angle_before, angle_after = (angle, angle) if self.geared else (command, command)
+        if self.travel is not None:
+            angle_after = angle + (command - angle).clamp(-self.travel, self.travel)
+        elif self.share is not None:
+            angle_after = angle + self.share * (command - angle)
         held = 0.5 * (angle_before + angle_after) if self.mean else angle_before
         effect, time_share, bias = s[:, : len(VARIATION)].split(1, dim=1)
         effective = effect * held + bias
@@ -220,7 +229,7 @@ class VariedModel(Dynamics):
         moved, memory = self._of(x).step(motion(x, self.dof), given, s[:, len(VARIATION) :])
         slowed = x[:, LATERAL] + (moved[:, LATERAL] - x[:, LATERAL]) / time_share
         parts = [moved[:, :SWAY], slowed, moved[:, LATERAL.stop :]]
-        parts += [] if self.travel is None else [angle_after]
+        parts += [angle_after] if self.geared else []
         return torch.cat(parts, dim=1), torch.cat((s[:, : len(VARIATION)], memory), dim=1)
 
 

@@ -112,7 +112,7 @@ class SteeredPlant(SteeredVessel):
         # a propeller heels what turns about all axes
         if plant.attitude or float(self._straight[0, self.column("u")]) == 0.0:
             self._straight = self._run_up()
-        self.rate = _rudder_rate(plant, axis)
+        self.rate, self.lag = _rudder_gear(plant, axis)
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
         return VariedPlant(self.plant, dt, integrator, self.axis)
@@ -148,22 +148,29 @@ class SteeredPlant(SteeredVessel):
         return straight
 
 
-def _rudder_rate(plant: Plant, axis: Axis) -> float | None:
-    """Return the rate of the steering gear in rad/s; None for a rudder without one.
+def _rudder_gear(plant: Plant, axis: Axis) -> tuple[float | None, float | None]:
+    """Return the rate of the steering gear in rad/s and its time constant in s; None without one.
 
-    It is seen from what two large angles lead to: where both move the rudder alike, its rate holds.
+    They are seen from what two angles lead to: where large ones move the rudder alike, its rate
+    holds, and where small ones move it in their proportion, it follows with a time constant.
     """
     if axis.gear not in plant.state:
-        return None
+        return None, None
     column, dt = plant.state.index(axis.gear), 1e-3
     command = plant.inputs.index(axis.command)
     x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
-    rates = []
-    for angle in (1.0, 0.5):
+
+    def moved(angle: float) -> float:
         w[:, command] = angle
-        moved = float(plant.end_step(x, w, dt)[0, column] - x[0, column]) / dt
-        rates.append(moved + float(plant.rate(x, w)[0, column]))
-    return rates[0] if abs(rates[0] - rates[1]) <= 1e-6 * abs(rates[0]) else None
+        step = float(plant.end_step(x, w, dt)[0, column] - x[0, column]) / dt
+        return step + float(plant.rate(x, w)[0, column])
+
+    far, near, least = moved(1.0), moved(0.02), moved(0.01)
+    if abs(far - moved(0.5)) <= 1e-6 * abs(far):
+        return far, None
+    # what is at its command within a step has no lag
+    lags = abs(near - 2.0 * least) <= 1e-6 * abs(near) and near * dt < 0.5 * 0.02
+    return None, 0.02 / near if lags else None
 
 
 def lacking(axis: Axis, reference: Tensor, value: Tensor) -> Tensor:
@@ -298,11 +305,10 @@ class SteeredModel(SteeredVessel):
     def __init__(
         self, model: HybridDynamics, columns: tuple[str, ...], hold: str, vessel: SteeredPlant
     ) -> None:
-        live = live_of(model.signals.names)
-        live.require_on_surface("an autopilot")
-        states = live.states
+        states = live_of(model.signals.names).states
         self.hull, self.vessel, self.mean = model, vessel, hold == "mean"
-        self.state = states if vessel.rate is None else (*states, "delta")
+        geared = vessel.rate is not None or vessel.lag is not None
+        self.state = (*states, "delta") if geared else states
         self.inputs, self.rate = vessel.inputs, vessel.rate
         if not {"delta", "cmd_delta"} & set(columns):
             raise ConfigError(
@@ -325,7 +331,7 @@ class SteeredModel(SteeredVessel):
 
         One without memory takes steps of any length.
         """
-        return VariedModel(self.hull, dt, self.take, self.mean, self.rate)
+        return VariedModel(self.hull, dt, self.take, self.mean, self.rate, self.vessel.lag)
 
     def memory(self, variation: Tensor) -> Tensor:
         """Return the variation, then the head's memory without a past."""
