@@ -21,7 +21,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "control": (3462, 388),
     "core": (1625, 252),
     "data": (9919, 881),
-    "documents": (2569, 238),
+    "documents": (2587, 240),
     "dynamics": (2229, 279),
     "export": (1612, 177),
     "heads": (1311, 191),

@@ -86,6 +86,9 @@ _STANDARD_PARAMETERS = (4.0, 8.0, 8.0)
 """Number of parameters of the standard model in surge, sway and yaw."""
 _EXCERPT = 60.0
 """Length in s of the stretch of accelerations that is shown."""
+_CUTOFFS = (0.025, 0.05, 0.1, 0.2)
+"""Cut-offs of the filter that are drawn side by side."""
+_ACCELERATION_ROWS = (("u' [m/s²]", 1.0), ("v' [m/s²]", 1.0), ("r' [deg/s²]", DEG))
 _UNITS = dict(zip(ACCELERATION, ("m/s^2", "m/s^2", "rad/s^2"), strict=True))
 _SAME_COST = 1e-6
 """Costs that differ by a smaller share count as the same minimum."""
@@ -412,8 +415,8 @@ class Trial:
         ]
 
 
-def sail(config: SeaTrialConfig) -> Trial:
-    """Simulate the programme with the vessel and prepare its logs.
+def sailed(config: SeaTrialConfig) -> list[Log]:
+    """Return the logs of the programme, sailed by the vessel.
 
     Raises:
         ConfigError: where the vessel cannot feel the disturbance or is of another kind.
@@ -435,7 +438,7 @@ def sail(config: SeaTrialConfig) -> Trial:
         programme = config.programme.manoeuvres()
         flights = fly(craft, programme, sea, config.programme.zigzag, config.step)
         logs += [flight.log for flight in flights]
-    return prepared(logs, vessel, config.preparation, config.seed)
+    return logs
 
 
 def prepared(
@@ -511,7 +514,7 @@ class Fitted(NamedTuple):
 def study(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], list[Figure]]:
     """Simulate one trial, and fit and judge every model on every set of samples.
 
-    Returns what was found and its figures: 7.1, 7.2 (one) and 7.8 to 7.14.
+    Returns what was found and its figures: 7.1, 7.2 (one), 7.4 to 7.6 (one) and 7.8 to 7.14.
 
     Beside the models that are fitted to one set stands for each one that consists of those of the
     single phases.
@@ -520,7 +523,14 @@ def study(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], list
         ResidnetError: where the trial cannot be sailed or a model is not determined.
     """
     config, mass = settings.trials[name], settings.standard.mass
-    trial = sail(config)
+    vessel, logs = odin(config.vessel), sailed(config)
+    trials = {
+        cutoff: prepared(
+            logs, vessel, config.preparation.model_copy(update={"cutoff": cutoff}), config.seed
+        )
+        for cutoff in sorted({*_CUTOFFS, config.preparation.cutoff})
+    }
+    trial = trials[config.preparation.cutoff]
     sets: dict[str, np.ndarray] = {
         phase: trial.phase == place for place, phase in enumerate(PHASES)
     }
@@ -554,7 +564,6 @@ def study(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], list
                 predicted[sets[phase]] = models[model, phase].predicted[sets[phase]]
                 count += models[model, phase].parameter_count
         models[model, SEPARATE] = Fitted(predicted, tuple(count), {})
-    vessel = odin(config.vessel)
     known, spread = truth(vessel, mass), a.std(axis=0)
     content = {
         "samples": len(trial.phase),
@@ -563,6 +572,12 @@ def study(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], list
         "logs": int(trial.log.max()) + 1,
         "validation_share": float(trial.validates.mean()),
         "acceleration_std": dict(zip(ACCELERATION, spread.tolist(), strict=True)),
+        "acceleration_std_by_cutoff": {
+            f"{cutoff:g}": dict(
+                zip(ACCELERATION, each.samples.target.std(0, correction=0).tolist(), strict=True)
+            )
+            for cutoff, each in trials.items()
+        },
         "phases": {
             phase: float((trial.phase == place).mean()) for place, phase in enumerate(PHASES)
         },
@@ -579,7 +594,11 @@ def study(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], list
         },
         "rows": _judged(vessel, trial, sets, models),
     }
-    figures = [_sailed(name, trial), _parameters_figure(name, standard, known)]
+    figures = [
+        _sailed(name, trial),
+        _cutoffs(name, trials),
+        _parameters_figure(name, standard, known),
+    ]
     return content, figures + [_excerpt(name, trial, models, where) for where in standard]
 
 
@@ -648,6 +667,31 @@ def _sailed(name: str, trial: Trial) -> Figure:
     )
 
 
+def _cutoffs(name: str, trials: Mapping[float, Trial]) -> Figure:
+    looks, paths = {}, {}
+    shown = _turning(next(iter(trials.values())), np.ones(1, dtype=bool))
+    for (cutoff, trial), color in zip(trials.items(), COLORS, strict=False):
+        label = f"cut-off {cutoff:g}"
+        looks[label] = Look(label, color, width=1)
+        nozzle = trial.samples.z[:, CHANNELS.index("cmd_nozzle"), None]
+        paths[label] = torch.cat((trial.samples.target, nozzle), dim=1).numpy()[shown]
+    units = (*_ACCELERATION_ROWS, ("nozzle [deg]", DEG))
+    words = (
+        "Shares of the Nyquist frequency. A low one reacts before the inputs do and is too small."
+    )
+    t = np.arange(len(shown)) * next(iter(trials.values())).step
+    title = ("Accelerations by the filter's cut-off", words)
+    return histories(f"cutoffs_{name}", title, looks, t, paths, units, height=150)
+
+
+def _turning(trial: Trial, keep: np.ndarray) -> np.ndarray:
+    """Return the indices of the minute that turns most: straight runs show little."""
+    nozzle = trial.samples.z.numpy()[:, CHANNELS.index("cmd_nozzle")]
+    pieces = trial.pieces(np.broadcast_to(keep, nozzle.shape))
+    piece = max(pieces, key=lambda indices: float(np.abs(nozzle[indices]).sum()))
+    return piece[: round(_EXCERPT / trial.step)]
+
+
 def _parameters_figure(
     name: str, fits: Mapping[str, StandardFit], truth: Mapping[str, float]
 ) -> Figure:
@@ -686,10 +730,7 @@ def _excerpt(
     keep = (
         trial.validates if where == ALL else trial.validates & (trial.phase == PHASES.index(where))
     )
-    nozzle = trial.samples.z.numpy()[:, CHANNELS.index("cmd_nozzle")]
-    # the stretch with the largest nozzle angles: straight runs show nothing of sway and yaw
-    piece = max(trial.pieces(keep), key=lambda indices: float(np.abs(nozzle[indices]).sum()))
-    piece = piece[: round(_EXCERPT / trial.step)]
+    piece = _turning(trial, keep)
     t, paths = np.arange(len(piece)) * trial.step, {"measured": trial.samples.target.numpy()[piece]}
     looks = {"measured": MEASURED}
     other = next((key for key in models if key[0] != STANDARD and key[1] == where), None)
@@ -698,10 +739,11 @@ def _excerpt(
             label = f"{key[0]}, fitted on {SET_NAMES[where]}"
             looks[label] = replace(look, label=label)
             paths[label] = models[key].predicted[piece]
-    units = (("u' [m/s²]", 1.0), ("v' [m/s²]", 1.0), ("r' [deg/s²]", DEG))
     words = "Accelerations measured and predicted from measured velocities and inputs."
     title = f"Validation, {SET_NAMES[where]}"
-    return histories(f"{where}_{name}", (title, words), looks, t, paths, units, height=180)
+    return histories(
+        f"{where}_{name}", (title, words), looks, t, paths, _ACCELERATION_ROWS, height=180
+    )
 
 
 def _best(rows: Sequence[Results]) -> dict[str, Results]:
