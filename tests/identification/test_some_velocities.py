@@ -90,6 +90,17 @@ def dive(number: int, *channels: str) -> Log:
     return Log(f"dive_{number}", t, {name: known[name] for name in channels})
 
 
+def slowly(made: Callable[..., Log]) -> Callable[..., Log]:
+    """Return logs whose depth comes at every fifth sample."""
+
+    def slow(number: int, *channels: str) -> Log:
+        log = made(number, *channels)
+        z = np.where(np.arange(len(log)) % 5 == 0, log["z"], np.nan)
+        return log.replace(channels={**log.channels, "z": z})
+
+    return slow
+
+
 def sink(number: int, *channels: str) -> Log:
     """Return a float that a thrust moves down and up."""
     random, t = np.random.default_rng(number), np.arange(0.0, 100.0, STEP)
@@ -101,13 +112,26 @@ def sink(number: int, *channels: str) -> Log:
     return Log(f"sink_{number}", t, {name: known[name] for name in channels}, {"thrust": "N"})
 
 
+def test_a_boat_over_a_bottom_does_not_dive() -> None:
+    """Its echo sounder and the pitch that waves and trim give do not follow from one another."""
+    logs = []
+    for number in range(3):
+        random, log = np.random.default_rng(number), trial(number, "u", "n")
+        z = 12.0 + 0.02 * np.cumsum(random.normal(size=len(log)))
+        theta = 0.03 * np.sin(2.0 * log.t) + 0.02 * log["u"]
+        logs.append(log.replace(channels={**log.channels, "z": z, "theta": theta}))
+    assert residnet.prepare(logs).signals.velocities == ("u",)
+
+
 @pytest.mark.parametrize(
     ("made", "channels", "velocities"),
     [
         (dive, ("u", "w", "q", "theta", "z", "n", "delta_s"), ("u", "w", "q")),
         (dive, ("u", "theta", "z", "n", "delta_s"), ("u", "w", "q")),
         (dive, ("w", "q", "n", "delta_s"), ("w", "q")),
+        (slowly(dive), ("u", "w", "q", "theta", "z", "n", "delta_s"), ("u", "w", "q")),
         (sink, ("z", "thrust"), ("w",)),
+        (slowly(sink), ("z", "thrust"), ("w",)),
         (sink, ("w", "thrust"), ("w",)),
     ],
 )

@@ -15,6 +15,7 @@ import numpy as np
 
 from residnet.core import names
 from residnet.core.errors import UsageError
+from residnet.core.format import listed
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -115,15 +116,15 @@ def _dives(channels: Mapping[str, np.ndarray]) -> bool:
 
     The waves that lift a boat, the water below it and the drift of a receiver's height do not.
     """
-    z, theta = np.asarray(channels["z"]), np.asarray(channels["theta"])
-    if {"u", "v"} <= channels.keys():
-        sinking = -channels["u"] * np.sin(theta)
-        sideways = channels["v"] * np.sin(channels["phi"]) * np.cos(theta)
-        down = channels.get("w", np.zeros(z.size)) * np.cos(channels["phi"]) * np.cos(theta)
-        change = sinking + sideways + down
-    else:
+    z = np.asarray(channels["z"])
+    known = {name: channels.get(name, np.zeros(z.size)) for name in SIX.moving}
+    phi, theta = known["phi"], known["theta"]
+    if channels.keys() >= {"x", "y"} and not channels.keys() >= {"u", "v"}:
         way = np.hypot(*(np.diff(channels[name], prepend=np.nan) for name in ("x", "y")))
         change = -way * np.tan(theta)
+    else:
+        level = known["v"] * np.sin(phi) + known["w"] * np.cos(phi)
+        change = level * np.cos(theta) - known["u"] * np.sin(theta)
     span = max(1, z.size // _SPANS)
     said = np.cumsum(np.nan_to_num(change))
     said, seen = said[span:] - said[:-span], z[span:] - z[:-span]
@@ -169,7 +170,10 @@ class Live:
         if held >= {"theta", "z", "psi"} and "phi" in channels and placed and _dives(channels):
             # what turns and sinks the vessel follows from its attitude and depth
             return cls(SIX.velocities)
-        if plunging := cls.plunging(held):
+        plunging = cls.plunging(held)
+        # one that goes ahead may be a boat in waves over a bottom: its depth or its planes tell
+        plane = bool({"delta_s", "cmd_delta_s"} & held) or ("z" in held and _dives(channels))
+        if plunging and ("u" not in plunging or plane):
             return cls(plunging)
         held |= set(PLANAR.velocities) if held.issuperset(PLANAR.pose) else set()
         held |= {"r"} if "psi" in held else set()
@@ -307,7 +311,7 @@ class Live:
     def text(self) -> str:
         """What follows from the velocities not being u, v and r, for a reader; empty for these."""
         if self.upright:
-            text = f"the logs tell {' and '.join(self.velocities)} alone: the vessel moves in an"
+            text = f"the logs tell {listed(self.velocities)} alone: the vessel moves in an"
             return f"{text} upright plane, without roll, turn or drift"
         if self.spatial:
             return "all six degrees of freedom, with depth, roll and pitch"

@@ -278,25 +278,33 @@ def _submerged(log: Log) -> Log:
 def _plunging(log: Log, live: Live) -> Log:
     """Return a log of a motion in an upright plane with what of it follows from the rest.
 
-    Pitch and its rate tell each other, heave and depth do with the speed forward.
+    Pitch and its rate tell each other, heave and depth do with the speed forward. A depth and a
+    pitch that come more slowly than the samples are smoothed over them.
     """
-    held = {name: log[name] for name in log.channels if _dense(log[name])}
-    still, made = np.zeros(len(log)), {}
-    if "q" in live.velocities and "theta" in held and "q" not in held:
-        made["q"] = _turned_by(log, held["theta"], "q")[1]
-    elif "q" in held and "theta" not in held:
-        made["theta"] = _integral(log.t, held["q"])
-    theta = {**held, **made}.get("theta", still) if "q" in live.velocities else still
-    ahead = held.get("u", still) if "u" in live.velocities else still
-    if "w" in live.velocities and "z" in held and "w" not in held:
-        sunk = _turned_by(log, held["z"], "")[1] + ahead * np.sin(theta)
-        made["w"] = sunk / np.cos(theta)
-    if "z" not in held:
-        down = {**held, **made}.get("w", still) if "w" in live.velocities else still
+    known = {name: log[name] for name in log.channels if _dense(log[name])}
+    made: dict[str, np.ndarray] = {}
+    still, rates = np.zeros(len(log)), {}
+    for angle, rate in (("theta", "q"), ("z", "w")):
+        finite = np.isfinite(log.channels.get(angle, np.array(np.nan)))
+        if rate not in live.velocities or not finite.any() or {angle, rate} <= known.keys():
+            continue
+        smooth, rates[angle] = _turned_by(log, log[angle], rate if angle == "theta" else "")
+        if angle not in known:
+            made[angle] = np.where(_near(log.t, log.t[finite]), smooth, np.nan)
+    if "theta" in rates and "q" not in known:
+        made["q"] = rates["theta"]
+    elif "q" in known and "theta" not in {*known, *made}:
+        made["theta"] = _integral(log.t, known["q"])
+    theta = {**known, **made}.get("theta", still) if "q" in live.velocities else still
+    ahead = known.get("u", still) if "u" in live.velocities else still
+    if "z" in rates and "w" not in known:
+        made["w"] = (rates["z"] + ahead * np.sin(theta)) / np.cos(theta)
+    if "z" not in {*known, *made}:
+        down = {**known, **made}.get("w", still) if "w" in live.velocities else still
         made["z"] = _integral(log.t, down * np.cos(theta) - ahead * np.sin(theta))
     if not made:
         return log
-    text = f"{', '.join(made)} are not measured and follow from the rest of the motion"
+    text = f"{', '.join(made)} are not measured at every sample and follow from the motion"
     note = remark("note", "smoothed_motion", text, channels=len(made))
     return log.replace(
         channels={**log.channels, **made},

@@ -384,7 +384,7 @@ def bands(run: RunFiles) -> Section | None:
         f"A band is to hold {level} of the errors of a free run on logs that nobody has seen. It"
         " grows with the horizon, and is wider where the predicted run is livelier or the models"
         " disagree. It was calibrated over logs that its model was not fitted on: training logs,"
-        " predicted by models that leave them out, and the validation logs.",
+        " predicted by models that leave them out, and validation logs that no fit has seen.",
         f"The tables say what the bands held of the {run.focus} data. Whole: share of the runs that"
         f" a band holds from beginning to end, each channel for itself, where it is widened to hold"
         f" {level} of them. Score: mean width, and {2 / (1 - band['level']):.0f} times what lies"
