@@ -176,8 +176,8 @@ def all_windows(
         whole = max((stretch_bounds(log.piece)[1] - np.arange(len(log))).max() for log in logs)
         raise DataError(
             f"protocol {name}: none of {len(logs)} '{logs[0].split}' logs holds a window; the"
-            f" longest, {longest.log.name}, lasts {len(longest) * step:.1f} s, and {whole * step:.1f}"
-            " s is the longest stretch without a gap; give longer logs, fill gaps that may be"
+            f" longest, {longest.log.name}, lasts {len(longest) * step:.1f} s, and the longest"
+            f" stretch without a gap {whole * step:.1f} s; give longer logs, fill gaps that may be"
             " interpolated, or shorten the protocol"
         )
     return out
