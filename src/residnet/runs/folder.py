@@ -269,8 +269,8 @@ class RunFolder:
             )
         if not overwrite:
             raise UsageError(
-                f"{self.path}: exists already; give another --out, continue it with --resume, or"
-                " replace it with --overwrite"
+                f"{self.path}: exists already; give another --out (in Python `folder`), continue it"
+                " with --resume (`resume=True`), or replace it with --overwrite (`overwrite=True`)"
             )
 
 
