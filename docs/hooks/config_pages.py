@@ -18,7 +18,6 @@ _LOG = get_plugin_logger("config_pages")
 FOLDER = "reference/config"
 PAGES = {
     "tasks": ("Tasks", "A run is one YAML file. Its key `task` says what kind of run it is."),
-    "identification": ("Identification", "These classes describe how models are identified."),
     "documents": ("Studies of the five documents", "These tasks repeat published experiments."),
     "data": ("Logs and their preparation", "These classes describe where logs come from."),
     "baselines": ("Baselines", "A baseline is the known part of a model."),
@@ -29,7 +28,6 @@ PAGES = {
     "control": ("Control", "These classes describe controllers, guidance and courses."),
     "manoeuvres": ("Manoeuvres", "These classes describe what a vessel is told to do."),
     "physics": ("Vessels and their surroundings", "These classes describe vessel files."),
-    "core": ("Shared parts", "These classes are used on several pages."),
 }
 _INVISIBLE = {"regression", "export", "simulators", "report", "runs"}
 
