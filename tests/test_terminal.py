@@ -8,9 +8,9 @@ import time
 
 import pytest
 
-from residnet import terminal
+from residnet import cli
+from residnet.cli import drawn_progress
 from residnet.core.progress import begin, report, say
-from residnet.terminal import drawn_progress
 
 
 def test_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
@@ -61,7 +61,7 @@ def test_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_long_work_is_never_silent(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(terminal, "SILENCE", 0.05)
+    monkeypatch.setattr(cli, "SILENCE", 0.05)
     with drawn_progress():
         begin("calibrating bands")
         say("  First fix this: a clock")

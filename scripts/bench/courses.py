@@ -27,8 +27,7 @@ from residnet.control.courses.config import (
     plan_course,
     smallest_turn,
 )
-from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
-from residnet.control.guidance.line_of_sight import DriftEstimate
+from residnet.control.guidance import CourseGuidance, DriftEstimate, TrackKeeping
 from residnet.control.heading.classical import HeadingPID
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.vessels import SteeredPlant

@@ -30,10 +30,10 @@ import exported_models  # noqa: E402
 
 from residnet.dynamics.c_code import compiler  # noqa: E402
 from residnet.export import exporter, vessel  # noqa: E402
-from residnet.export.aoti import AotiModel  # noqa: E402
-from residnet.export.casadi_function import CasadiModel  # noqa: E402
+from residnet.export.c import CasadiModel  # noqa: E402
 from residnet.export.guard import GuardedDynamics  # noqa: E402
 from residnet.export.onnx_file import OnnxModel  # noqa: E402
+from residnet.export.torchscript import AotiModel  # noqa: E402
 from residnet.export.vessel import ExportedVessel  # noqa: E402
 
 SIZES = {"mlp": {"hidden": (64, 64)}, "lstm": {"hidden_size": 64}}

@@ -29,7 +29,7 @@ import torch
 import yaml
 from torch import Tensor, nn
 
-from residnet.control.motion.anticipation import Lag
+from residnet.control.motion import Lag
 from residnet.core.config import load_config
 from residnet.documents.jervan2020.ferry import (
     FerryModelConfig,

@@ -42,7 +42,7 @@ from residnet.testing import (
     check_vessel,
     example_samples,
 )
-from residnet.testing.examples import ROLLING, SIGNALS, SUBMERGED, example_model, example_spec
+from residnet.testing.checks import ROLLING, SIGNALS, SUBMERGED, example_model, example_spec
 
 RUDDER = SignalsConfig(inputs=("n", "delta"))
 # what a baseline cannot do without, and whose trials it is identified from

@@ -38,7 +38,7 @@ from residnet.physics.vessel import load_vessel
 from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
 from residnet.simulators.vehicle import vehicle
 from residnet.testing import example_samples
-from residnet.testing.examples import ROLLING, SUBMERGED, example_model, example_spec
+from residnet.testing.checks import ROLLING, SUBMERGED, example_model, example_spec
 
 PHI, P = ROLL.names.index("phi"), ROLL.names.index("p")
 

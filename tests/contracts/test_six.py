@@ -34,7 +34,7 @@ from residnet.physics.hull import SubmergedConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 from residnet.testing import check_head, example_samples
-from residnet.testing.examples import STEP, SUBMERGED, example_model, example_spec
+from residnet.testing.checks import STEP, SUBMERGED, example_model, example_spec
 from residnet.training import refit
 
 DEPTH = SIX.names.index("z")

@@ -21,7 +21,7 @@ from residnet.control.courses.config import (
 )
 from residnet.control.courses.course_plan import Course
 from residnet.control.courses.turns import TurnMaker, steady_turn, turning_step
-from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
+from residnet.control.guidance import CourseGuidance, TrackKeeping
 from residnet.control.heading.classical import HeadingPID
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredPlant

@@ -13,14 +13,15 @@ from scipy.optimize import brentq
 
 from residnet.control.base import ClosedLoop, Policy, Reference
 from residnet.control.courses.course_plan import Course
-from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
-from residnet.control.guidance.line_of_sight import (
+from residnet.control.guidance import (
+    CourseGuidance,
     DriftEstimate,
     IntegralLookAhead,
     LineOfSight,
     LookAhead,
+    TrackKeeping,
+    WaypointGuidance,
 )
-from residnet.control.guidance.waypoints import WaypointGuidance
 from residnet.control.heading.classical import HeadingPID
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError

@@ -9,12 +9,12 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from residnet.control.guidance.line_of_sight import (
+from residnet.control.guidance import (
     EnclosureConfig,
     IntegralLookAheadConfig,
     LookAheadConfig,
+    WaypointGuidance,
 )
-from residnet.control.guidance.waypoints import WaypointGuidance
 from residnet.core.errors import ConfigError
 
 STATE = ("x", "y", "psi", "u", "v", "r")

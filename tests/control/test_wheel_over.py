@@ -10,8 +10,7 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from residnet.control.guidance.line_of_sight import LookAhead
-from residnet.control.guidance.waypoints import WaypointGuidance, WheelOver
+from residnet.control.guidance import LookAhead, WaypointGuidance, WheelOver
 from residnet.control.heading.turning import Turning
 
 TURNING = Turning(3.47, 3.94, 3.2)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from residnet.data.readers.clocks import steady_clock
 from residnet.data.readers.quantities import true_headings
+from residnet.data.readers.written import steady_clock
 
 T = 0.1 * np.arange(300)
 COLUMNS = [np.sin(T)]

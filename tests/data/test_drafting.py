@@ -14,8 +14,7 @@ from residnet.core.config import validate
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks, Question
 from residnet.data.drafting.tables import draft_tables, peek
-from residnet.data.drafting.units import written_unit
-from residnet.data.drafting.words import input_channel, state_channel, words_of
+from residnet.data.drafting.words import input_channel, state_channel, words_of, written_unit
 from residnet.data.readers import ReaderConfig
 
 GERMAN = Style(

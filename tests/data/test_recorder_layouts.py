@@ -20,7 +20,7 @@ from residnet.data.drafting.tables import draft_tables
 from residnet.data.drafting.words import input_channel, state_channel, words_of
 from residnet.data.readers import ReaderConfig
 from residnet.data.split import stretch_of
-from residnet.tasks.driving import driving
+from residnet.tasks.drafting import driving
 
 T = np.arange(0.0, 60.0, 0.2)
 PSI = 0.4 * np.sin(0.2 * T)

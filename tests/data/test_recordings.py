@@ -15,7 +15,7 @@ from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.progress import Progress, listen
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.frames import tangent_plane
+from residnet.data.readers.quantities import tangent_plane
 
 
 def folder(tmp_path: Path, **topics: dict[str, Any]) -> Path:

@@ -13,7 +13,7 @@ import torch
 
 import residnet
 from residnet.baselines.given import BelievedConfig
-from residnet.control.motion.anticipation import Derivatives, Lag, course, needed_force
+from residnet.control.motion import Derivatives, Lag, course, needed_force
 from residnet.core.config import load_config
 from residnet.core.errors import FitError
 from residnet.documents.jervan2020.ferry import (

@@ -15,7 +15,7 @@ from residnet.dynamics.store import ModelSpec
 from residnet.export.vessel import ExportedModel
 from residnet.heads.symbolic import DelayConfig, SymbolicConfig, SymbolicHead
 from residnet.testing import check_bad_inputs
-from residnet.testing.examples import example_models, example_samples, example_spec
+from residnet.testing.checks import example_models, example_samples, example_spec
 
 RATIO = SymbolicConfig(
     terms=("u n_port^-1", "v", "n_port"), delay=DelayConfig(channels=("n_port",), longest=4)

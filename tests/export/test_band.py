@@ -14,7 +14,7 @@ from residnet.export import exporter, vessel
 from residnet.export.c_code import compile_shared
 from residnet.export.vessel import ExportedModel, ExportedVessel
 from residnet.physics.signals import SignalsConfig
-from residnet.testing.examples import ROLLING, SIGNALS, SUBMERGED, example_model, example_spec
+from residnet.testing.checks import ROLLING, SIGNALS, SUBMERGED, example_model, example_spec
 
 TABLE = BandTable(
     level=0.9,

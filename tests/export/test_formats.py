@@ -26,13 +26,11 @@ from residnet.dynamics.c_code import compiler
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.lowering import lowered
 from residnet.export import base, exporter, torchscript, vessel
-from residnet.export.aoti import AotiModel
 from residnet.export.base import Loaded, RoundingError, released
-from residnet.export.c import CompiledModel
+from residnet.export.c import CasadiModel, CompiledModel
 from residnet.export.c_code import STRICT, CFunction, c_files, compile_shared
-from residnet.export.casadi_function import CasadiModel
 from residnet.export.onnx_file import OnnxModel
-from residnet.export.torchscript import ScriptedModel
+from residnet.export.torchscript import AotiModel, ScriptedModel
 from residnet.export.vessel import ExportedVessel
 from residnet.testing import check_bad_inputs
 

@@ -15,8 +15,7 @@ from s_functions import SFunction
 from torch import Tensor
 
 from residnet.control.courses.course_plan import Course
-from residnet.control.guidance.course_guidance import CourseGuidance
-from residnet.control.guidance.line_of_sight import DriftEstimate
+from residnet.control.guidance import CourseGuidance, DriftEstimate
 from residnet.control.heading.controllers import (
     DepthPolicySpec,
     NetworkPolicySpec,
@@ -30,7 +29,7 @@ from residnet.export.base import Loaded
 from residnet.export.c import CompiledModel
 from residnet.export.c_code import compile_shared
 from residnet.export.policy import COURSE, ExportedController, ExportedCoursePolicy, ExportedHeading
-from residnet.testing.bad_inputs import check_bad_measurements
+from residnet.testing.checks import check_bad_measurements
 
 DEG = math.pi / 180
 DT, GAIN, TIME, SPEED, LIMIT = 0.02, 3.47, 3.94, 3.2, 5 * DEG

@@ -27,9 +27,17 @@ from residnet.heads import HeadConfig
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.terms import TermLibrary, parse_term
-from residnet.regression.expressions import Algebra, ExpressionLibrary, Limits, Sum, tables
+from residnet.regression.expressions import (
+    Algebra,
+    ExpressionLibrary,
+    Limits,
+    Sum,
+    equation,
+    symbolic_sum,
+    tables,
+    term,
+)
 from residnet.regression.genetic import breed, limits_of
-from residnet.regression.writing import equation, symbolic_sum, term
 
 FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
 

@@ -15,7 +15,7 @@ from residnet.core.errors import ConfigError, ExportError
 from residnet.dynamics.store import load_model, save_model
 from residnet.export.vessel import ExportedVessel
 from residnet.heads.scikit import SklearnConfig, SklearnHead
-from residnet.testing.examples import example_model, example_spec
+from residnet.testing.checks import example_model, example_spec
 
 PROCESS: dict[str, Any] = {
     "sklearn.gaussian_process.GaussianProcessRegressor": {

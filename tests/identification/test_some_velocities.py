@@ -15,7 +15,7 @@ from residnet.data.motion import MotionConfig, complete_motion
 from residnet.identification.planning import TrialLimits, candidates, shares_of
 from residnet.identification.settings import FitSettings
 from residnet.physics.signals import SignalsConfig
-from residnet.testing.examples import example_spec
+from residnet.testing.checks import example_spec
 
 STEP = 0.2
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from residnet.core.errors import DataError
-from residnet.judge.still_fits import StillFitsConfig, still_fits
+from residnet.documents.jervan2020.ferry import StillFitsConfig, still_fits
 
 N = 600
 FOLD = torch.arange(N) // 100

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.control.motion.pid import MotionPIDConfig
+from residnet.control.motion import MotionPIDConfig
 from residnet.core.errors import UsageError
 from residnet.data.sea import Disturbance, SensorNoise
 from residnet.data.simulated import Craft, Sea, fly

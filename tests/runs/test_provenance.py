@@ -11,11 +11,10 @@ from pathlib import Path
 
 import pytest
 
-import residnet.runs.provenance as provenance_module
+import residnet.runs.folder as provenance_module
 from residnet.core.files import sha256
 from residnet.core.version import __version__
-from residnet.runs.folder import RunFolder
-from residnet.runs.provenance import Provenance, git_revision
+from residnet.runs.folder import Provenance, RunFolder, git_revision
 
 
 def test_provenance_names_every_input_by_its_hash(

@@ -17,7 +17,7 @@ from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.replay import Replay
+from residnet.manoeuvres.open_loop import Replay
 from residnet.physics.plant import Plant
 
 FAMILIES, MANOEUVRES = kinds(FamilyConfig), kinds(ManoeuvreConfig)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from residnet.control.motion.anticipation import Lag
+from residnet.control.motion import Lag
 from residnet.core.errors import FitError
 from residnet.training.lag import fit_lag, followed
 

@@ -31,8 +31,7 @@ from residnet.data.split import SPLITS, check_leaks, divided, log_names
 from residnet.identification.recipe import Preparation, judging
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.tasks.drafting import Draft, drafted
-from residnet.tasks.driving import driving
+from residnet.tasks.drafting import Draft, drafted, driving
 
 if TYPE_CHECKING:
     import pandas as pd

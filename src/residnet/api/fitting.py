@@ -24,8 +24,7 @@ from residnet.identification.fit import fit as identify
 from residnet.identification.identified import Evaluation, Identified, candidates, evaluate
 from residnet.identification.prepared import require_window, through_currents, velocity_limit
 from residnet.identification.settings import FitSettings, Parts
-from residnet.judge.metrics import metrics_table
-from residnet.judge.rollout_files import columns_of
+from residnet.judge.metrics import columns_of, metrics_table
 from residnet.judge.selection import Selection
 from residnet.judge.verdict import Evidence, by_windows, verdict
 from residnet.report.run_reader import StoredWindow

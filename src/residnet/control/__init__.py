@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from residnet.control.base import ClosedLoop, GivenReference, Policy, Reference
 from residnet.control.heading.classical import BangBangHeading, HeadingPID
-from residnet.control.motion.pid import (
+from residnet.control.motion import (
     Allocated,
     FeedForward,
     HullFeedForward,
     MotionPID,
     MotionPIDConfig,
     NoFeedForward,
+    ReferenceFilter,
+    ReferenceFilterConfig,
 )
-from residnet.control.motion.reference_filter import ReferenceFilter, ReferenceFilterConfig
 
 __all__ = [
     "Allocated",

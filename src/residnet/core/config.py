@@ -13,24 +13,13 @@ import re
 import types
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, overload
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    GetCoreSchemaHandler,
-    ValidationError,
-    ValidationInfo,
-)
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, ValidationInfo
 from pydantic.fields import FieldInfo
-from pydantic_core import (
-    CoreSchema,
-    ErrorDetails,
-    PydanticSerializationError,
-    core_schema,
-    to_json,
-)
+from pydantic_core import CoreSchema, ErrorDetails, PydanticSerializationError, core_schema, to_json
 from yaml.nodes import Node
 
 from residnet.core.config_yaml import KeyPath, dump, line_of, parse
@@ -38,8 +27,52 @@ from residnet.core.errors import ConfigError, UsageError
 from residnet.core.files import shipped_configs
 from residnet.core.names import nearest, shown
 from residnet.core.registry import Kinds, adapter
-from residnet.core.renamed import renamed
 from residnet.core.units import si_unit, to_si, units
+
+# Keys of the tables are ends of dotted key paths, `*` for any one key; a kind that was renamed has
+# `=<old kind>` behind the path of its discriminator. Values are what to write instead.
+RENAMED: dict[str, str] = {
+    "recurrent": "policies",
+    "policies.*.hidden": "units",
+    "policies.*.observer": "start",
+    "policies.*.imitate": "start",
+    "policies.*.training.horizon": "duration",
+    "policies.*.training.margin": "steady.overshoot",
+    "policies.*.training.overshoot": "exact",
+    "policies.*.training.sharp": "conditions.stated.band",
+    "policies.*.training.slowest": "conditions.stated.time",
+    "policies.*.training.smoothness": "calm",
+    "spread": "conditions.stated",
+    "test.bias_error": "conditions.stated",
+    "test.overshoot": "conditions.stated.overshoot_weight",
+    "tuning_points": "conditions.evolution",
+}
+"""For example `"free_run.lead": "warmup"`, `"baseline.kind=fossen": "hull"`."""
+
+
+GONE: dict[str, str] = {
+    "refit.*.folds": "the prior is fixed by the length of the logs",
+    "refit_baseline": "refit the baseline before its networks, by `refit`",
+    "begin_with": "a network begins from its baseline alone",
+    "swaps": "the search keeps a beam of sets and trims them",
+    "separate": "models of single phases are always fitted besides",
+    "standard.bounds": "parameters are free, as in the document",
+    "identify": "the first half identifies, as in the document",
+}
+"""Keys that nothing took the place of, and what holds instead."""
+
+
+def renamed(path: tuple[str | int, ...], value: str | None = None) -> str:
+    """Return `; it is 'new' now` for an old key or value, `; it is gone: ...`, or nothing."""
+    written = ".".join(map(str, path)) + ("" if value is None else f"={value}")
+    for old, new in RENAMED.items():
+        if fnmatchcase(f".{written}", f"*.{old}"):
+            return f"; it is '{new}' now"
+    for old, instead in GONE.items():
+        if fnmatchcase(f".{written}", f"*.{old}"):
+            return f"; it is gone: {instead}"
+    return ""
+
 
 T = TypeVar("T")
 

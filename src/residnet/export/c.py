@@ -1,4 +1,4 @@
-"""The format `c`: one C99 source file and its header, without any runtime."""
+"""The formats `c`, one C99 source file and its header without a runtime, and `casadi`, for MPC."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, final
 
+import casadi as ca
 import numpy as np
 import torch
 
 from residnet.dynamics.c_code import literal
-from residnet.dynamics.lowering import lowered
+from residnet.dynamics.lowering import in_numbers, lowered
 from residnet.dynamics.store import BandTable
 from residnet.export.base import (
     Exported,
@@ -25,13 +26,7 @@ from residnet.export.base import (
     name_of,
     write_card,
 )
-from residnet.export.c_code import (
-    CFunction,
-    c_files,
-    compile_shared,
-    footprint,
-    identifier,
-)
+from residnet.export.c_code import CFunction, c_files, compile_shared, footprint, identifier
 from residnet.export.policy import ExportedController
 from residnet.export.vessel import ExportedVessel
 
@@ -294,4 +289,43 @@ class CExporter(Exporter):
             file.with_suffix(".h").write_text(written.header)
             write_card(file, card)
             file.write_text(written.source)
+        return card
+
+
+class CasadiModel(Loaded):
+    """A written function, loaded back."""
+
+    def __init__(self, file: Path) -> None:
+        self.function: Any = ca.Function.load(str(file))
+
+    def step(self, *given: Numbers) -> tuple[Any, ...]:
+        return tuple(part.full().reshape(-1) for part in self.function(*given))
+
+
+@final
+class CasadiExporter(Exporter):
+    """A CasADi function of state, inputs and memory, in double precision."""
+
+    name: ClassVar[str] = "casadi"
+    suffix: ClassVar[str] = ".casadi"
+    about: ClassVar[str] = "The model's step as a CasADi function with exact derivatives, for MPC."
+
+    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+        exported.require_numbers()
+        step = lowered(
+            exported.graph(torch.float64), exported.arguments, exported.results, exported.what
+        )
+        with tempfile.TemporaryDirectory() as name:
+            partial = Path(name) / file.name
+            in_numbers(step).save(str(partial))
+            parity = exported.check(CasadiModel(partial), "the CasADi function", torch.float64)
+            card = exported.card() | {
+                "format": "casadi",
+                "dtype": "float64",
+                "parity": parity,
+                "safety": "The file holds expressions only.",
+            }
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_card(file, card)
+            file.write_bytes(partial.read_bytes())
         return card

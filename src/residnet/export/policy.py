@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.courses.course_plan import Course
-from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
+from residnet.control.guidance import CourseGuidance, TrackKeeping
 from residnet.control.heading.policies import DEEP, HeadingPolicy
 from residnet.core.errors import ExportError
 from residnet.core.version import __version__

@@ -15,10 +15,9 @@ from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.physics.symmetry import live_of
 from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term
 from residnet.regression.estimator import Solution
-from residnet.regression.expressions import ExpressionLibrary, Weights
+from residnet.regression.expressions import ExpressionLibrary, Term, Weights, term
 from residnet.regression.genetic import EquationSearchConfig, GeneticEquations
 from residnet.regression.sparse import SparseRegression
-from residnet.regression.writing import Term, term
 
 
 class GeneticConfig(FeatureConfig, EquationSearchConfig):

@@ -30,8 +30,8 @@ from residnet.regression.equation_rows import (
     unbroken_stretches,
 )
 from residnet.regression.estimator import Coefficient, Solution
+from residnet.regression.expressions import equation, symbolic, total
 from residnet.regression.sparse import SearchConfig, SparseRegression
-from residnet.regression.writing import equation, symbolic, total
 
 _PRECISION = 1e-14
 """Share of the energy of a target that rounding leaves."""

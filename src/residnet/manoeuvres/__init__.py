@@ -55,7 +55,7 @@ else:
                 "stopping": f"{_CLOSED}:Stopping",
                 "waypoints": f"{_COURSES}:Waypoints",
                 "four_corner": f"{_COURSES}:FourCorner",
-                "replay": "residnet.manoeuvres.replay:Replay",
+                "replay": f"{_OPEN}:Replay",
             },
         ),
     ]

@@ -11,11 +11,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.control.guidance.line_of_sight import LookAhead
-from residnet.control.guidance.waypoints import WaypointGuidance
+from residnet.control.guidance import LookAhead, WaypointGuidance
 from residnet.control.heading.classical import HeadingPID
-from residnet.control.motion.pid import MotionPIDConfig
-from residnet.control.motion.reference_filter import ReferenceFilterConfig, Waypoint
+from residnet.control.motion import MotionPIDConfig, ReferenceFilterConfig, Waypoint
 from residnet.core.config import Metres, RadiansPerSecond, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.frames import wrap_array

@@ -37,11 +37,15 @@ from residnet.regression.expressions import (
     Limits,
     Product,
     Sum,
+    Term,
     TooLargeError,
+    equation,
+    symbolic_sum,
     tables,
+    term,
+    total,
 )
 from residnet.regression.sparse import SearchConfig, coefficient_row, everything, find, reduce
-from residnet.regression.writing import Term, equation, symbolic_sum, term, total
 
 Operator = Literal["+", "-", "*", "/", "abs", "sin", "cos", "sqrt"]
 BINARY = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide"}

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, final
 import torch
 from torch import Tensor
 
-from residnet.core.arrays.tally import Tally
 from residnet.core.errors import FitError
+from residnet.core.samples import Tally
 from residnet.regression.estimator import (
     Data,
     Estimator,

@@ -19,7 +19,7 @@ from residnet.core.format import SHOWN_UNITS, shown_unit
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.names import CHANNEL_UNITS, END_UNITS, to_si
 from residnet.core.units import known_unit
-from residnet.judge.rollout_files import INPUT, columns_of
+from residnet.judge.metrics import INPUT, columns_of
 from residnet.judge.verdict import by_windows, sized
 
 Content = Mapping[str, Any]

@@ -25,8 +25,7 @@ from residnet.core.errors import (
 from residnet.core.names import nearest
 from residnet.core.processes import keep_freed_memory
 from residnet.report.blocks import EXPORTS
-from residnet.runs.folder import RunFolder, seal
-from residnet.runs.provenance import Provenance
+from residnet.runs.folder import Provenance, RunFolder, seal
 
 if TYPE_CHECKING:
     from residnet.export.base import Exported

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from residnet.control.courses.config import BuoyCourseConfig, plan_course, smallest_turn
 from residnet.control.courses.course_check import Protocol
-from residnet.control.guidance.line_of_sight import AnyLineOfSight
+from residnet.control.guidance import AnyLineOfSight
 from residnet.core.config import (
     Config,
     ExistingPath,

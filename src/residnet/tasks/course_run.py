@@ -14,17 +14,17 @@ from pydantic import TypeAdapter
 from torch import Tensor
 
 from residnet.control.base import ClosedLoop, Policy, Reference
-from residnet.control.courses.config import (
-    PlannedCourse,
-    feasibility,
-    plan_course,
-    smallest_turn,
-)
+from residnet.control.courses.config import PlannedCourse, feasibility, plan_course, smallest_turn
 from residnet.control.courses.course_check import Protocol
 from residnet.control.courses.turns import SteadyTurn
-from residnet.control.guidance.course_guidance import CourseGuidance, TrackKeeping
-from residnet.control.guidance.line_of_sight import AnyLineOfSight, DriftEstimate
-from residnet.control.guidance.waypoints import WaypointGuidance, WheelOver
+from residnet.control.guidance import (
+    AnyLineOfSight,
+    CourseGuidance,
+    DriftEstimate,
+    TrackKeeping,
+    WaypointGuidance,
+    WheelOver,
+)
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.policies import HeadingPolicy
 from residnet.control.heading.turning import Turning

@@ -41,16 +41,14 @@ from residnet.identification.prepared import (
 )
 from residnet.judge.band import bands_content
 from residnet.judge.goodness import content, repeatability
-from residnet.judge.metrics import LIMITS_SCHEMA, metrics_content
-from residnet.judge.rollout_files import write_rollouts
+from residnet.judge.metrics import LIMITS_SCHEMA, metrics_content, write_rollouts
 from residnet.judge.soundness import sanity_content
 from residnet.judge.verdict import objections
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import errors_table
 from residnet.report.sections.verdict import evidence, level, verdict
-from residnet.runs.folder import RunFolder
+from residnet.runs.folder import Provenance, RunFolder
 from residnet.runs.model_store import FolderStore
-from residnet.runs.provenance import Provenance
 from residnet.runs.task import ExportRequest, Exports, Finished, MainFigure, Outcome
 from residnet.tasks.booklet import write_booklet
 

@@ -40,9 +40,8 @@ from residnet.report.blocks import Section, Table, bad_where, table_of
 from residnet.report.figure import DASHED, GLANCE, SOLID, ZERO, Case, Figure, Panel, family
 from residnet.report.figure_files import write_figure
 from residnet.report.page import write_page
-from residnet.runs.folder import RunFolder
+from residnet.runs.folder import Provenance, RunFolder
 from residnet.runs.model_store import FolderStore
-from residnet.runs.provenance import Provenance
 from residnet.runs.task import Outcome
 from residnet.tasks.fit_run import SPLIT, external_logs, fit_outcome, limit_of, write_judged
 from residnet.training.left_out import left_open

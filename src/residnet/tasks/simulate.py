@@ -39,7 +39,7 @@ from residnet.dynamics.store import chosen_model, load_model
 from residnet.judge.booklet import index_contents, index_rows
 from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.replay import Replay
+from residnet.manoeuvres.open_loop import Replay
 from residnet.physics.vessel import load_vessel
 from residnet.report.figure_files import write_figures
 from residnet.report.sections.manoeuvres import flight_figures, indices_text

@@ -11,16 +11,17 @@ Each function takes a part and raises an `AssertionError` of one line where it b
 
 from __future__ import annotations
 
-from residnet.testing.bad_inputs import check_bad_inputs
 from residnet.testing.checks import (
+    check_bad_inputs,
     check_baseline,
     check_exporter,
     check_head,
     check_manoeuvre,
     check_reader,
     check_vessel,
+    example_models,
+    example_samples,
 )
-from residnet.testing.examples import example_models, example_samples
 
 __all__ = [
     "check_bad_inputs",

@@ -21,7 +21,7 @@ from residnet.identification.monitoring import (
     Watcher,
 )
 from residnet.identification.recursive_refit import recursive_refit
-from residnet.testing.examples import STEP, example_model, example_spec
+from residnet.testing.checks import STEP, example_model, example_spec
 
 SECONDS, WINDOW = 60, 100
 NOISE = np.array([0.0, 0.0, 0.002, 0.02, 0.02, 0.003])

@@ -14,8 +14,15 @@ from pydantic import Field
 from residnet.control.courses.course_check import Asked, Protocol
 from residnet.control.courses.course_plan import Course, CourseRequest, plan
 from residnet.control.courses.outline import Circle
-from residnet.control.courses.turn_table import Turns, arcs, simulated_turns
-from residnet.control.courses.turns import SteadyTurn, TurnMaker, steady_turn, turning_step
+from residnet.control.courses.turns import (
+    SteadyTurn,
+    TurnMaker,
+    Turns,
+    arcs,
+    simulated_turns,
+    steady_turn,
+    turning_step,
+)
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds

@@ -4,7 +4,7 @@ They keep out of circles on given sides or reach into them, in the order given, 
 
 A course of arcs and tangents needs a yaw rate that jumps. A vessel with a yaw time constant T
 runs U T past the point where such an arc begins; here every turn is one that the vessel makes
-(`turn_table.TurnTable`). An outline is found first (`outline.Outlines`), then how long the rudder
+(`turns.TurnTable`). An outline is found first (`outline.Outlines`), then how long the rudder
 is held and how long legs are (`fitting.Fit`).
 """
 
@@ -21,14 +21,18 @@ from numpy.typing import NDArray
 from residnet.control.courses.course_check import Asked, Protocol, first_fault
 from residnet.control.courses.fitting import Fit, Fitted
 from residnet.control.courses.outline import RINGS, Circle, Outlines, Room
-from residnet.control.courses.route import LEG, Bend, Route, Sketch
-from residnet.control.courses.turn_table import (
+from residnet.control.courses.turns import (
+    LEG,
     POINTS,
+    Array,
+    Bend,
+    Route,
+    Sketch,
+    TurnMaker,
     Turns,
     following_turns,
     state_behind,
 )
-from residnet.control.courses.turns import Array, TurnMaker
 from residnet.core.errors import ConfigError
 from residnet.core.progress import report
 

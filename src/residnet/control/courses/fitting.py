@@ -16,9 +16,7 @@ from scipy.optimize import linprog, minimize
 
 from residnet.control.courses.course_check import left_behind
 from residnet.control.courses.outline import Circle
-from residnet.control.courses.route import LEG, Drawn, Route
-from residnet.control.courses.turn_table import POINTS
-from residnet.control.courses.turns import Array
+from residnet.control.courses.turns import LEG, POINTS, Array, Drawn, Route
 
 _ROUNDS = 45
 """Most steps of a fit; those that settle take far fewer."""

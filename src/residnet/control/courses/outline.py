@@ -15,8 +15,7 @@ from typing import NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from residnet.control.courses.route import Bend, Sketch
-from residnet.control.courses.turns import Array
+from residnet.control.courses.turns import Array, Bend, Sketch
 
 _ANGLES = 36
 """Places about a circle at which it may be touched, ten degrees apart."""

@@ -12,8 +12,14 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.control.base import Policy
-from residnet.control.heading.classical import BangBangHeading, RatedBangBangHeading
-from residnet.control.heading.laws import HeadingLaw, RegulatorLaw, StoppingLaw, regulator_gains
+from residnet.control.heading.classical import (
+    BangBangHeading,
+    HeadingLaw,
+    RatedBangBangHeading,
+    RegulatorLaw,
+    StoppingLaw,
+    regulator_gains,
+)
 from residnet.control.heading.policies import (
     CONSTANTS,
     SIGHT,

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.base import Policy
-from residnet.control.heading.laws import HeadingLaw
+from residnet.control.heading.classical import HeadingLaw
 from residnet.control.heading.turning import Turning
 from residnet.core.frames import wrap
 from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis

@@ -1,39 +1,475 @@
 """Logs of any format read without a config: their reader is drafted, and read them.
 
 `inspect`, `read_logs`, `fit`, `new` and `draft` come through here, so that each has the same map.
+What recordings say of themselves is taken, checked, and completed by names.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from residnet.core.config import validate
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.layout import Live
 from residnet.core.log import Log
-from residnet.core.names import STATE
+from residnet.core.names import CHANNEL_UNITS, STATE
 from residnet.core.progress import report
-from residnet.data.drafting.channels import READER
-from residnet.data.drafting.physics import Raw, turns_to
+from residnet.data.drafting.channels import (
+    CHANNELS,
+    FRAMES,
+    READER,
+    Fit,
+    Motion,
+    Raw,
+    along,
+    drafted_channels,
+    follows,
+    motion_of,
+    turns_to,
+)
 from residnet.data.drafting.questions import Key, Marks
-from residnet.data.drafting.recordings import draft_recordings
-from residnet.data.drafting.tables import draft_tables, named, peek
-from residnet.data.drafting.words import PLANES
+from residnet.data.drafting.tables import draft_tables, mark_folders, named, peek
+from residnet.data.drafting.words import (
+    MOTION,
+    PLANES,
+    input_channel,
+    si_of,
+    state_channel,
+    thrown,
+    unit_by_size,
+    words_of,
+    written_unit,
+)
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.detect import kind_of, to_table
+from residnet.data.readers.compose import heading_part, position_part
+from residnet.data.readers.detect import AutoConfig, kind_of, to_table
 from residnet.data.readers.joined import partners
-from residnet.data.readers.quantities import QUATERNION
-from residnet.data.readers.recording import Recording
+from residnet.data.readers.messages import in_ned, standard_plan
+from residnet.data.readers.quantities import (
+    QUATERNION,
+    Angle,
+    FieldMap,
+    Geodetic,
+    HeadingConfig,
+    Local,
+    Plan,
+    PositionConfig,
+    Quaternion,
+)
+from residnet.data.readers.recording import EVERYTHING, Recording, Series
 from residnet.data.readers.tables import column_names
+from residnet.data.readers.topics import align_clocks
 from residnet.data.split import log_names, logs_below
+
+# how well position, heading and velocities of a recording that is taken as it is fit together, of 1
+_COHERENT = 0.7
+# interval in s from which a pose is looked for that comes more often
+_SLOW = 0.6
+# rows of a topic of the motion, and of one of inputs
+_FEWEST, _FEW = 50, 20
+_MOST = 12
+"""Positions, and headings, that are tried with each other; chosen by hand: 144 poses take long."""
+_PAIRS = (("x", "y"), ("north", "east"), ("east", "north"))
+
+
+@dataclass(frozen=True)
+class _Sources:
+    """Where the motion comes from.
+
+    Attributes:
+        content: position, heading, channels and what else goes with them in a reader's settings.
+        taken: topics and fields that it takes.
+        step: the shorter of the usual steps of position and heading, s.
+    """
+
+    content: dict[str, Any]
+    taken: set[tuple[str, str]]
+    step: float
+
+
+def draft_recordings(
+    paths: Sequence[Path], marks: Marks
+) -> tuple[dict[str, Any], dict[Path, Recording]]:
+    """Return the settings of a reader of recordings of one format, and those that were loaded.
+
+    Standard messages map themselves. Where position, heading and velocities do not fit together by
+    them, or the pose comes rarely, other topics and frames are tried, unless the format fixes its
+    frames. Inputs are found by names.
+
+    Args:
+        paths: files and folders.
+        marks: is told what is not sure.
+
+    Raises:
+        UsageError: where the first one cannot be read.
+        DataError: where it holds nothing that can be used.
+    """
+    # what stands still in one recording may move in another: three are looked at
+    stride = max(1, (len(paths) - 1) // 2)
+    auto = AutoConfig()
+    loaded = {path: auto.load(path, EVERYTHING) for path in (paths[0], *paths[::stride])}
+    some = [align_clocks(recording, {}, None) for recording in loaded.values()]
+    content: dict[str, Any] = {"kind": "auto", **mark_folders(paths, marks)}
+    try:
+        log = auto.build().log_of(loaded[paths[0]])
+    except ResidnetError:
+        log = None
+    plan = standard_plan(some[0], Plan())
+    whole = log is not None and {"x", "y", "psi"} <= set(log.channels)
+    sources = _standard(some[0], log, plan)
+    posed = [source.topic for source in (plan.position, plan.heading) if source is not None]
+    settled = any(in_ned(some[0][topic]) for topic in posed)
+    if by_name := _named_fields(some, marks):
+        sources = by_name
+    elif log is None or not whole or not _sound(log, marks):
+        found = None
+        if not (whole and settled):
+            found = _fitting(some[0], marks, _COHERENT if whole else 0.0)
+        if found is None and whole:
+            text = "position, heading and velocities fit together badly: check the frames"
+            marks.guess(READER, text)
+        sources = found or sources
+    elif sources.step > _SLOW and not settled:
+        others = Marks()
+        found = _fitting(some[0], others, _COHERENT)
+        # the same pose again would lose the velocities that stand beside it
+        if found is not None and found.step < 0.9 * sources.step:
+            marks.extend(others)
+            sources = found
+    content |= sources.content
+    content["clock"] = {"kind": "uniform", "step": f"{float(f'{sources.step:.2g}'):g} s"}
+    marks.note((*READER, "clock"), "as often as the heading or the position comes")
+    standard = "standard_messages" not in content
+    known = set(log.channels) if log is not None and standard else set()
+    channels = dict(content.pop("channels", {}))
+    if standard:
+        channels |= _renamed(some, plan.channels, known, marks)
+    for name, (topic, field) in _inputs(some, sources.taken).items():
+        if name not in known and name not in channels:
+            channels[name] = _entry(name, topic, field, _values(some, topic, field), marks)
+    return content | ({"channels": channels} if channels else {}), loaded
+
+
+def _step_of(series: Series) -> float:
+    return float(np.median(np.diff(series.clock))) if len(series) > 1 else float("inf")
+
+
+def _standard(recording: Recording, log: Log | None, plan: Plan) -> _Sources:
+    poses = [source for source in (plan.position, plan.heading) if source is not None]
+    taken = {(entry.topic or "", entry.field) for entry in plan.channels.values()}
+    taken |= {(source.topic or "", field) for source in poses for field in source.fields}
+    steps = [_step_of(recording.series[s.topic]) for s in poses if s.topic in recording.series]
+    step = max(min(steps), 0.02) if steps else 1.0
+    if not steps and log is not None:
+        step = float(np.median(np.diff(log.t)))
+    return _Sources({}, taken, step)
+
+
+def _sound(log: Log, marks: Marks) -> bool:
+    """Return whether position, heading and velocities fit together as they are."""
+    raw = Raw(log.t, log.channels)
+    motions = [motion_of(raw, "rad", frame) for frame in FRAMES]
+    if None in motions:
+        return True
+    scores = []
+    for motion in motions:
+        fits = [follows([raw], [motion], name) for name in ("u", "v") if name in log.channels]
+        both = sum(f.correlation * np.sign(f.factor) for f in fits) / 2
+        scores.append(both if len(fits) == 2 else along([motion]))
+    if scores[0] < _COHERENT and max(scores) > scores[0] + 0.1:
+        return False
+    if scores[0] < 0.3:
+        if along(motions[:1]) > _COHERENT:
+            # the pose is right, and the velocities are not those of the body
+            return False
+        text = f"position, heading and velocities fit together badly ({scores[0]:.2f} of 1)"
+        marks.guess(READER, f"{text}: check the frames")
+    return True
+
+
+def _named_fields(recordings: Sequence[Recording], marks: Marks) -> _Sources | None:
+    """Return the motion and inputs of the only table whose fields are named as columns are.
+
+    MATLAB structs and HDF5 groups are such; units, signs and frames are settled as those of a
+    table. None where no series without a message type holds position and heading.
+    """
+    found = []
+    for series in recordings[0].series.values():
+        held = {state_channel(words_of(name)) for name in series.fields}
+        placed = {"x", "y"} <= held or {"latitude", "longitude"} <= held
+        if not series.kind and len(series) >= _FEWEST and "psi" in held and placed:
+            found.append(series)
+    if len({frozenset(series.fields) for series in found}) < len(found):
+        alike = ", ".join(series.name for series in found)
+        raise DataError(
+            f"{recordings[0].path}: holds {len(found)} tables of the same columns ({alike[:120]}),"
+            " each a log of its own; write each to a file, in Python"
+            " pandas.DataFrame({name: column for name, column in table.items()}).to_csv(...)"
+        )
+    if len(found) != 1:
+        return None
+    series = found[0]
+    topic, same = (
+        series.name,
+        [r.series[series.name] for r in recordings if series.name in r.series],
+    )
+    fields = [
+        name
+        for name in series.fields
+        if all(one.has(name) and np.isfinite(one[name]).any() for one in same)
+        and not (words_of(name).has("time") and bool((np.diff(series[name]) > 0.0).all()))
+    ]
+    names = named(fields, marks)
+    logs = [Raw(one.clock, {name: one[field] for name, field in names.items()}) for one in same]
+    rest = drafted_channels(names, logs, marks)
+    idle = [name for name in fields if name not in names.values()]
+    if idle:
+        marks.note(CHANNELS, f"fields that no channel takes: {', '.join(idle[:20])}")
+    content: dict[str, Any] = {"standard_messages": False}
+    for kind, pair, keys in (
+        ("local", ("x", "y"), ("north", "east")),
+        ("geodetic", ("latitude", "longitude"), ("latitude", "longitude")),
+    ):
+        if set(pair) <= set(rest):
+            first, second = (rest.pop(name) for name in pair)
+            place = {"kind": kind, "topic": topic, keys[0]: first["column"]}
+            content["position"] = place | {keys[1]: second["column"], "unit": first["unit"]}
+    heading = rest.pop("psi")
+    content["heading"] = {"kind": "angle", "topic": topic, "field": heading["column"]}
+    content["heading"] |= {"unit": heading["unit"], "frame": heading.get("frame", "ned")}
+    for name, place_of in (("x", "position"), ("y", "position"), ("psi", "heading")):
+        marks.move((*CHANNELS, name), (*READER, place_of))
+    content["channels"] = {
+        name: {"topic": topic, "field": entry.pop("column"), **entry}
+        for name, entry in rest.items()
+    }
+    return _Sources(content, {(topic, name) for name in series.fields}, _step_of(series))
+
+
+def _fitting(recording: Recording, marks: Marks, least: float) -> _Sources | None:
+    """Return the position and heading that fit together best and come most often.
+
+    None where there is no pair of both that fits at least as well as asked, of 1.
+    """
+    positions, headings = list(_positions(recording)), list(_headings(recording))
+    velocities = list(_velocities(recording))
+    best: tuple[float, Any] = (-np.inf, None)
+    for position in positions[:_MOST]:
+        for heading in headings[:_MOST]:
+            pose = _pose(recording, position, heading)
+            if pose is None:
+                continue
+            score, velocity = _score(pose, velocities)
+            rates = [_step_of(recording[source.topic]) for source in (position, heading)]
+            # a pose that comes once a second is worth less than one that comes ten times
+            value = score - 0.3 * float(np.log10(max(max(rates), 0.05) / 0.05))
+            if value > best[0]:
+                best = value, (position, heading, score, velocity, min(rates))
+    if best[1] is None or best[1][2] < least:
+        return None
+    position, heading, score, velocity, step = best[1]
+    text = f"of {len(positions)} positions and {len(headings)} headings these fit together and come"
+    marks.guess((*READER, "position"), f"{text} most often (fit {score:.2f} of 1)")
+    marks.guess((*READER, "heading"), f"frame {heading.frame}: with it the motion fits")
+    if velocity is not None:
+        marks.note(READER, f"velocities in {velocity} served to check the frames only")
+    content: dict[str, Any] = {"standard_messages": False}
+    for name, source in (("position", position), ("heading", heading)):
+        told = source.model_dump(mode="json", exclude_defaults=True)
+        content[name] = {"kind": source.kind, **told}
+    taken = {(source.topic, field) for source in (position, heading) for field in source.fields}
+    return _Sources(content, taken, max(step, 0.02))
+
+
+def _measured(recording: Recording) -> Iterator[Series]:
+    """Yield the topics with enough rows that are no references that somebody asks for."""
+    for series in recording.series.values():
+        words = words_of(series.name)
+        if len(series) >= _FEWEST and not words.has("command") and "guidance" not in words.text:
+            yield series
+
+
+def _positions(recording: Recording) -> Iterator[PositionConfig]:
+    """Yield the positions that a recording may hold, in both orders of their axes."""
+    for series in _measured(recording):
+        if series.has("latitude") and series.has("longitude"):
+            yield Geodetic(topic=series.name)
+            continue
+        called = {state_channel(words_of(field)): field for field in reversed(series.fields)}
+        if {"latitude", "longitude"} <= set(called):
+            fixes = called["latitude"], called["longitude"]
+            largest = [float(np.nanmax(np.abs(series[name]), initial=0.0)) for name in fixes]
+            if min(largest) > 0.0 and max(largest) <= 180.0:
+                yield Geodetic(topic=series.name, latitude=fixes[0], longitude=fixes[1])
+                continue
+        prefixes = ("pose.pose.position.", "pose.position.", "position.", "")
+        pairs = ((f"{p}{a}", f"{p}{b}") for p in prefixes for a, b in _PAIRS)
+        pair = next((pair for pair in pairs if all(map(series.has, pair))), None)
+        if pair is None or ("." not in pair[0] and "orientation" in series.name):
+            continue
+        if all(float(np.nanstd(series[name])) > 0.05 for name in pair):
+            yield Local(topic=series.name, north=pair[0], east=pair[1])
+            if not in_ned(series):
+                yield Local(topic=series.name, north=pair[1], east=pair[0])
+
+
+def _headings(recording: Recording) -> Iterator[HeadingConfig]:
+    for series in _measured(recording):
+        frames: tuple[Literal["ned", "enu"], ...] = ("ned",) if in_ned(series) else ("ned", "enu")
+        for whole in [field[:-2] for field in series.fields if field.endswith((".w", "_w"))]:
+            if all(series.has(f"{whole}.{axis}") for axis in "xyz") and series[f"{whole}.w"].any():
+                for frame in frames:
+                    yield Quaternion(topic=series.name, field=whole, frame=frame)
+        for field in series.fields:
+            if state_channel(words_of(field)) == "psi" and np.isfinite(series[field]).any():
+                largest = float(np.nanmax(np.abs(series[field])))
+                unit = "deg" if largest > 7.0 else "rad"
+                if 0.0 < largest <= 400.0:
+                    for frame in frames:
+                        yield Angle(topic=series.name, field=field, unit=unit, frame=frame)
+
+
+def _velocities(recording: Recording) -> Iterator[tuple[Series, str, str]]:
+    """Yield pairs of fields that may be the velocities forward and sideways."""
+    for series in _measured(recording):
+        prefixes = ("twist.twist.linear.", "twist.linear.", "linear.")
+        at = next((p for p in prefixes if series.has(f"{p}x") and series.has(f"{p}y")), None)
+        if at is not None:
+            yield series, f"{at}x", f"{at}y"
+
+
+def _pose(recording: Recording, position: PositionConfig, heading: HeadingConfig) -> Raw | None:
+    """Return north, east and heading at the times of the positions; None where they cannot be."""
+    try:
+        place = position_part(recording, position, 1.0).log
+        angle = heading_part(recording, heading, 1.0).log
+    except ResidnetError:
+        return None
+    known = np.isfinite(angle["psi"])
+    # a heading that stands still fits a velocity over ground as well as one through the water
+    if known.sum() < _FEWEST or float(np.ptp(angle["psi"][known])) < 0.3:
+        return None
+    if angle.t[-1] < place.t[0] or angle.t[0] > place.t[-1]:
+        return None
+    at = np.interp(place.t, angle.t[known], angle["psi"][known], left=np.nan, right=np.nan)
+    return Raw(place.t, {"x": place["x"], "y": place["y"], "psi": at})
+
+
+def _score(pose: Raw, velocities: list[tuple[Series, str, str]]) -> tuple[float, str | None]:
+    """Return how well a pose fits the velocities, and the topic of these; itself without any."""
+    motion = motion_of(pose, "rad", FRAMES[0])
+    if motion is None:
+        return -1.0, None
+    still = Raw(pose.t, {**pose.columns, "psi": np.zeros(pose.t.size)})
+    ground = motion_of(still, "rad", FRAMES[0])
+    fits = [(-1.0, "")]
+    for series, first, second in velocities:
+        turned = [(first, second), (second, first)]
+        over = [_agreement(still, ground, series, *pair) for pair in turned] if ground else [0.0]
+        # along north and east it says nothing of the heading
+        if max(over) <= 0.85:
+            fits.append((_agreement(pose, motion, series, first, second), series.name))
+    best = max(fits)
+    return best if best[0] > 0.3 else (along([motion]), None)
+
+
+def _agreement(pose: Raw, motion: Motion, series: Series, first: str, second: str) -> float:
+    """Return the mean correlation of forward and sideways velocity with a pair of fields."""
+    fits: list[Fit] = []
+    for name, field in (("u", first), ("v", second)):
+        known = np.isfinite(series[field])
+        if known.sum() < _FEWEST:
+            return -1.0
+        at = np.interp(pose.t, series.clock[known], series[field][known])
+        fits.append(follows([Raw(pose.t, {**pose.columns, name: at})], [motion], name))
+    forward, sideways = fits
+    # the speed itself must agree: a heading that is turned by a right angle swaps the two
+    return float(0.5 * (forward.correlation * np.sign(forward.factor) + sideways.correlation))
+
+
+def _renamed(
+    recordings: Sequence[Recording],
+    standard: Mapping[str, FieldMap],
+    known: set[str],
+    marks: Marks,
+) -> dict[str, dict[str, Any]]:
+    """Return entries of plain numbers whose topic or joint is named as an actuator is.
+
+    A message that holds a bare number says neither what it measures nor its unit.
+    """
+    out: dict[str, dict[str, Any]] = {}
+    for name, entry in standard.items():
+        topic, field = entry.topic or "", entry.field
+        if name in CHANNEL_UNITS or entry.unit not in ("-", "rad"):
+            continue
+        # the last part of a topic says more than the folders that it lies in
+        names = (topic.rsplit("/", 1)[-1], name) if field == "data" else (name,)
+        channels = [input_channel(words_of(one.removesuffix("_position"))) for one in names]
+        channel = next((one for one in channels if one), None)
+        if topic in recordings[0].series and channel and channel not in known | set(out):
+            values = _values(recordings, topic, field)
+            out[channel] = _entry(channel, topic, field, values, marks)
+    return out
+
+
+def _values(recordings: Sequence[Recording], topic: str, field: str) -> np.ndarray:
+    """Return the values of a field in all recordings that hold it."""
+    held = [r.series[topic] for r in recordings if topic in r.series]
+    return np.concatenate([series[field] for series in held if series.has(field)])
+
+
+def _inputs(
+    recordings: Sequence[Recording], taken: set[tuple[str, str]]
+) -> dict[str, tuple[str, str]]:
+    """Return channel -> topic and field of those that are named as actuators are.
+
+    Several actuators of one topic are told apart by a number alone, `control[0]` and `control[1]`:
+    each is taken. Of other fields that stand for one channel the first one is.
+    """
+    found: dict[str, list[tuple[str, str]]] = {}
+    for topic, series in recordings[0].series.items():
+        for field in series.fields:
+            channel = input_channel(words_of(f"{topic} {field}"))
+            if channel is None or channel in MOTION or (topic, field) in taken:
+                continue
+            values = _values(recordings, topic, field)
+            known = values[np.isfinite(values)]
+            if known.size >= _FEW and float(np.ptp(known)) > 0.0:
+                found.setdefault(channel, []).append((topic, field))
+    out: dict[str, tuple[str, str]] = {}
+    for channel, same in found.items():
+        first = same[0][0], re.sub(r"\d+", "#", same[0][1])
+        alike = [one for one in same if (one[0], re.sub(r"\d+", "#", one[1])) == first]
+        several = len(alike) > 1
+        out |= {f"{channel}_{i}" if several else channel: one for i, one in enumerate(alike, 1)}
+    return out
+
+
+def _entry(
+    channel: str, topic: str, field: str, values: np.ndarray, marks: Marks
+) -> dict[str, Any]:
+    entry: dict[str, Any] = {"topic": topic, "field": field}
+    if throw := thrown(channel, field, values):
+        marks.guess((*CHANNELS, channel), throw.reason)
+        return {**entry, **throw.settings, "hold": True}
+    if unit := written_unit(field, si_of(channel)):
+        marks.guess((*CHANNELS, channel), "taken by its name")
+        return {**entry, "unit": unit, "hold": True}
+    unit, reason = unit_by_size(channel, values)
+    marks.guess((*CHANNELS, channel), f"taken by its name; {reason}")
+    return {**entry, "unit": unit, "hold": True}
+
 
 INPUTS = ("signals", "inputs")
 """Key of a config's inputs."""
@@ -94,8 +530,8 @@ class DraftedLogs:
 
     reader: dict[str, Any]
     marks: Marks
-    logs: dict[Path, Log] = field(default_factory=dict)
-    left_out: dict[Path, ResidnetError] = field(default_factory=dict)
+    logs: dict[Path, Log] = dataclasses.field(default_factory=dict)
+    left_out: dict[Path, ResidnetError] = dataclasses.field(default_factory=dict)
 
 
 def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -> DraftedLogs:

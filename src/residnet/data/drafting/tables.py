@@ -20,18 +20,24 @@ from residnet.data.drafting.channels import (
     MAGNETIC,
     READER,
     STATE_NAMES,
+    Raw,
     circles,
     drafted_channels,
     levelled,
     quaternions,
     submerged,
 )
-from residnet.data.drafting.physics import Raw
 from residnet.data.drafting.questions import Marks
-from residnet.data.drafting.units import other_dimension, written_unit
-from residnet.data.drafting.words import MOTION, input_channel, plain, state_channel, words_of
+from residnet.data.drafting.words import (
+    MOTION,
+    input_channel,
+    other_dimension,
+    plain,
+    state_channel,
+    words_of,
+    written_unit,
+)
 from residnet.data.readers.base import require_file
-from residnet.data.readers.clocks import first_of_copies, steady_clock
 from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
 from residnet.data.readers.tables import TABLES, excel_sheet, json_rows, parquet_rows, sheet_names
 from residnet.data.readers.texts import first_rows
@@ -40,9 +46,11 @@ from residnet.data.readers.written import (
     LetterO,
     date_order,
     degrees_of,
+    first_of_copies,
     looks_dated,
     parse_texts,
     side_signs,
+    steady_clock,
     unit_of_steps,
     unix_unit,
 )

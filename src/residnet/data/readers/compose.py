@@ -21,13 +21,6 @@ from residnet.core.names import CHANNEL_UNITS, to_si
 from residnet.data.channels import without_fills
 from residnet.data.derivatives import SavitzkyGolay
 from residnet.data.readers.base import LogReader, digest, require_samples, unwrap
-from residnet.data.readers.frames import (
-    at_centre,
-    body_velocity,
-    fixes_on_plane,
-    unit_quaternion,
-    yaw_of,
-)
 from residnet.data.readers.messages import standard_plan
 from residnet.data.readers.quantities import (
     Angle,
@@ -46,6 +39,11 @@ from residnet.data.readers.quantities import (
     Source,
     Uniform,
     VelocityConfig,
+    at_centre,
+    body_velocity,
+    fixes_on_plane,
+    unit_quaternion,
+    yaw_of,
 )
 from residnet.data.readers.recording import (
     CLOCK_ONLY,

@@ -37,15 +37,16 @@ from residnet.data.readers.base import (
     require_values,
     unwrap,
 )
-from residnet.data.readers.clocks import first_of_copies, steady_clock
-from residnet.data.readers.frames import fixes_on_plane, unit_quaternion, yaw_of
 from residnet.data.readers.quantities import (
     COSINE,
     QUATERNION,
     SINE,
     ChannelMap,
     factor,
+    fixes_on_plane,
     told_headings,
+    unit_quaternion,
+    yaw_of,
 )
 from residnet.data.readers.recording import Remark, remark
 from residnet.data.readers.texts import (
@@ -56,7 +57,15 @@ from residnet.data.readers.texts import (
     positions,
     read_csv,
 )
-from residnet.data.readers.written import Order, degrees_of, parse_texts, side_signs, zone_of
+from residnet.data.readers.written import (
+    Order,
+    degrees_of,
+    first_of_copies,
+    parse_texts,
+    side_signs,
+    steady_clock,
+    zone_of,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

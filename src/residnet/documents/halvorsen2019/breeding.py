@@ -17,9 +17,8 @@ from residnet.core.format import DASH, number
 from residnet.documents.study import Results, Study, pictures
 from residnet.heads.genetic import GeneticConfig
 from residnet.physics.parameters import Mass, Parameter, above_zero, of_dimension
-from residnet.regression.expressions import Algebra
+from residnet.regression.expressions import Algebra, term
 from residnet.regression.genetic import breed, limits_of, validating
-from residnet.regression.writing import term
 from residnet.report.blocks import Cell, Section, Text, table_of
 from residnet.report.figure import COLORS, Case, Figure, Look, Panel, names_of
 from residnet.runs.folder import RunFolder

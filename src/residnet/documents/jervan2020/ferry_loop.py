@@ -15,11 +15,20 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.control.base import ClosedLoop, Followed, Policy
-from residnet.control.guidance.crossing import Crossing, CrossingConfig
+from residnet.control.guidance import Crossing, CrossingConfig
 from residnet.control.heading.conditions import quickly
-from residnet.control.motion.anticipation import Assisted, Lag, course, needed_force, reference_row
-from residnet.control.motion.pid import Allocated, Gain, MotionPID, MotionPIDConfig
-from residnet.control.motion.reference_filter import ReferenceFilterConfig
+from residnet.control.motion import (
+    Allocated,
+    Assisted,
+    Gain,
+    Lag,
+    MotionPID,
+    MotionPIDConfig,
+    ReferenceFilterConfig,
+    course,
+    needed_force,
+    reference_row,
+)
 from residnet.core.config import (
     Config,
     Metres,

@@ -21,7 +21,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.baselines.given import BelievedConfig, HullEquations
-from residnet.control.motion.anticipation import Lag
+from residnet.control.motion import Lag
 from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.core.format import number

@@ -14,7 +14,7 @@ from residnet.core.log import Log
 from residnet.data.simulated import Flight
 from residnet.manoeuvres.closed_loop import Spiral, Zigzag
 from residnet.manoeuvres.courses import Waypoints
-from residnet.manoeuvres.replay import Replay
+from residnet.manoeuvres.open_loop import Replay
 from residnet.report.blocks import (
     Block,
     Bullets,

@@ -13,7 +13,7 @@ from residnet.core.format import DEG, fixed, shown_unit
 from residnet.core.layout import Live
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.stretches import stretches
-from residnet.judge.rollout_files import columns_of
+from residnet.judge.metrics import columns_of
 from residnet.report.figure import (
     BLUE,
     COLORS,

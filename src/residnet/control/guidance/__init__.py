@@ -1,1 +1,0 @@
-"""Guidance laws: from way-points or a planned course to a desired heading."""

@@ -1,1 +1,0 @@
-"""Motion control in three degrees of freedom: reference filter, PID and feed-forward."""
