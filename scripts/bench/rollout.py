@@ -7,16 +7,20 @@
   on a linear baseline: what no state decides found for many steps at once, against step by step.
 - `compiled`: free runs of 1, 64 and 1,024 rows, and the gradient of 64 windows of 40 steps, by
   LSTMs on a linear baseline: as compiled C against TorchScript with what it finds ahead.
+- `device`: free runs and gradients of 40 steps as compiled C on one core beside TorchScript on a
+  GPU, by the number of rows, and from how many on the GPU pays. Left out where there is none.
 
 Times are CPU seconds of this process, the least of `--repeats`, so that a busy machine matters
-little; one thread, with the memory settings of a run (`keep_freed_memory`).
+little; one thread, with the memory settings of a run (`keep_freed_memory`). Those of `device` are
+by the clock, since a GPU does not count in the former.
 
-    python scripts/bench/rollout.py [--parts rollout ahead compiled] [--repeats 5]
+    python scripts/bench/rollout.py [--parts rollout ahead compiled device] [--repeats 5]
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import os
 import platform
 import time
@@ -39,14 +43,16 @@ NAMES = ("u", "v", "r", "tau_x", "tau_n")
 _BATCH, _STEPS = 1_024, 200
 
 
-def least(work: Callable[[], object], repeats: int) -> float:
-    """Return the least CPU time of some work in s, after one call that warms up."""
+def least(
+    work: Callable[[], object], repeats: int, clock: Callable[[], float] = time.process_time
+) -> float:
+    """Return the least time of some work in s, after one call that warms up."""
     work()
     found = []
     for _ in range(repeats):
-        begun = time.process_time()
+        begun = clock()
         work()
-        found.append(time.process_time() - begun)
+        found.append(clock() - begun)
     return min(found)
 
 
@@ -160,17 +166,74 @@ def compiled_runs(repeats: int) -> None:
         print(f"compiled, LSTM of {hidden}: {'; '.join(told)}")
 
 
+def on_gpu(repeats: int) -> None:
+    """Print free runs and gradients on one core and on a GPU, by the number of rows."""
+    if not torch.cuda.is_available():
+        print("device: no GPU on this machine")
+        return
+    steps, rows = 40, (64, 256, 1_024, 4_096, 16_384, 65_536)
+    print(f"device: one core beside {torch.cuda.get_device_name(0)}, {steps} steps")
+
+    def clock() -> float:
+        torch.cuda.synchronize()
+        return time.perf_counter()
+
+    for hidden in (24, 100):
+        model = model_of(LstmConfig(hidden_size=hidden)).requires_grad_(False)
+        model.positions = False
+        model.head.requires_grad_(True)
+        pays: dict[str, int] = {}
+        for count in rows:
+            found: dict[str, dict[str, float]] = {}
+            for device in ("cpu", "cuda"):
+                there = copy.deepcopy(model).to(device)
+                given = tuple(
+                    one.to(device)
+                    for one in (
+                        torch.randn(count, 6),
+                        torch.randn(count, steps, 2),
+                        model.initial_state(count),
+                    )
+                )
+                runner = Rollout(there)
+                run: FreeRun = (
+                    CompiledRollout(runner, *(one[:64] for one in given))
+                    if device == "cpu"
+                    else scripted(runner, MANY)
+                )
+
+                def gradient(run: FreeRun = run, given: tuple[Tensor, ...] = given) -> None:
+                    run(*given)[0].square().mean().backward()
+
+                with torch.no_grad():
+                    free = least(partial(run, *given), repeats, clock)
+                found[device] = {"free run": free, "gradient": least(gradient, repeats, clock)}
+            told = []
+            for what, core in found["cpu"].items():
+                gpu = found["cuda"][what]
+                told.append(f"{what} {1e3 * core:.1f} ms, on the GPU {1e3 * gpu:.1f} ms")
+                if gpu < core:
+                    pays.setdefault(what, count)
+            print(f"device, LSTM of {hidden}, {count} rows: {'; '.join(told)}")
+        for what in ("free run", "gradient"):
+            at = f"from {pays[what]} rows" if what in pays else f"at none of up to {rows[-1]} rows"
+            print(f"device, LSTM of {hidden}: for a {what} the GPU pays {at}")
+
+
+PARTS = {"rollout": rollouts, "ahead": ahead, "compiled": compiled_runs, "device": on_gpu}
+
+
 def main() -> None:
     """Print the parts that were asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", nargs="+", default=["rollout", "ahead", "compiled"])
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS))
     parser.add_argument("--repeats", type=int, default=5)
     given = parser.parse_args()
     torch.set_num_threads(1)
     keep_freed_memory()
     print(f"torch {torch.__version__}, {platform.platform()}, load {os.getloadavg()[0]:.1f}")
     for part in given.parts:
-        {"rollout": rollouts, "ahead": ahead, "compiled": compiled_runs}[part](given.repeats)
+        PARTS[part](given.repeats)
 
 
 if __name__ == "__main__":
