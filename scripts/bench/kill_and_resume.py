@@ -67,7 +67,7 @@ CONFIG: dict[str, Any] = {
         "lstm": {"kind": "lstm", "hidden_size": 6, "dropout": 0.1},
     },
     "ensembles": {"mean": ["plsr", "lstm"]},
-    "training": {"mlp": {**_SCHEDULE, "average": 0.9}, "lstm": _SCHEDULE},
+    "training": {"mlp": _SCHEDULE, "lstm": _SCHEDULE},
     "evaluation": {
         "protocols": {
             "manoeuvre": {"kind": "manoeuvre"},

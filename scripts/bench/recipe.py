@@ -1,8 +1,8 @@
 """The mean of the standard recipe beside its members, the selected model, and a plain network.
 
-    python scripts/bench/recipe.py [--logs boats|shipped|measured] [--count N] [--seed S]
-        [--minutes M ...] [--vessels NAME ...] [--effort E] [--without PART ...] [--network]
-        [--peer] [--records FILE] [--keep FOLDER]
+    python scripts/bench/recipe.py [--logs boats|shipped|measured] [--count N]
+        [--seed S | --numbered N] [--minutes M ...] [--vessels NAME ...] [--effort E]
+        [--without PART ...] [--network] [--peer] [--records FILE] [--keep FOLDER]
 
 Nothing is said to `residnet.fit` but the logs: M minutes for training and validation (three to
 one), as long for the test, which takes part in no choice.
@@ -15,8 +15,7 @@ one), as long for the test, which takes part in no choice.
 
 Means of fewer members need no fit of their own and stand beside the recipe's. `--without` fits once
 more for each part of the training that is named, with the same seeds: `mirror` (no mirrored
-windows), `average` (the last weights in place of their average), `members` (one
-network in place of several).
+windows), `members` (one network in place of several).
 
 `--network` lets networks alone take part where logs are short, as they do of long ones.
 
@@ -258,7 +257,6 @@ class Peer:
 
 PARTS: dict[str, Callable[[dict[str, Any]], None]] = {
     "mirror": lambda plan: _each(plan["training"], mirror=False),
-    "average": lambda plan: _each(plan["training"], average=0.0),
     "members": lambda plan: _each(plan["heads"], members=1),
     "network": lambda plan: _alone(plan),
 }
@@ -409,6 +407,9 @@ def main() -> None:
     parser.add_argument("--logs", choices=list(SOURCES), default="boats")
     parser.add_argument("--count", type=int, default=8, help="number of draws")
     parser.add_argument("--seed", type=int, default=0, help="of all draws")
+    parser.add_argument(
+        "--numbered", type=int, help="the first of draws as commit b1b99e7 numbers them; no --seed"
+    )
     parser.add_argument("--minutes", type=float, nargs="+", default=[5.0])
     parser.add_argument("--vessels", nargs="+", help="of the source; all of it otherwise")
     parser.add_argument("--effort", type=float, default=1.0, help="of the recipe's networks")
@@ -423,9 +424,11 @@ def main() -> None:
     names = given.vessels or names
     records = []
     for number in range(given.count):
-        name = names[number % len(names)]
+        first = given.numbered
+        name = names[(number + (first or 0)) % len(names)]
         minutes = given.minutes[number // len(names) % len(given.minutes)]
-        random = np.random.default_rng([given.seed, number])
+        told = [given.seed, number] if first is None else [first + number, 17]
+        random = np.random.default_rng(told)
         logs = source(name, 60.0 * minutes / STRETCHES, given.seed + number // 2, random)
         kept = given.keep and given.keep / f"{name}_{minutes:g}_{given.seed}_{number}.npz"
         records.append(

@@ -45,7 +45,6 @@ TINY: dict[str, Any] = {
                 {"horizon": 1.0, "epochs": 2, "batch": 16},
                 {"horizon": 2.0, "epochs": 3, "batch": 16},
             ],
-            "average": 0.9,
             "start_noise": 0.1,
         }
     },

@@ -36,7 +36,6 @@ SETTINGS: dict[str, Any] = {
     "multi_step": [{"horizon": 0.5, "epochs": 4, "batch": 7}],
     "start_noise": 0.1,
     "beginnings": {"share": 0.3, "initial": 0.3},
-    "average": 0.9,
 }
 
 

@@ -1,6 +1,4 @@
-"""The trainer on a small vessel: it learns, stops, keeps what validated best, and averages weights
-as it says.
-"""
+"""The trainer on a small vessel: it learns, stops, and keeps what validated best."""
 
 from __future__ import annotations
 
@@ -14,7 +12,6 @@ from typing import Any
 
 import pytest
 import torch
-from kinds import of_kind
 from made_system import LINEAR, SCALES, STEP, free_run_error, model_of, trials
 from torch import Tensor
 
@@ -26,7 +23,7 @@ from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.lstm import LstmConfig
-from residnet.heads.mlp import MlpConfig, MlpHead
+from residnet.heads.mlp import MlpConfig
 from residnet.training.config import TrainingConfig
 from residnet.training.heads import HeadTraining, Validate, train
 from residnet.training.score import Score, Shown
@@ -190,51 +187,6 @@ def test_no_finite_free_run_is_one_line(logs: Sequence[Prepared], tmp_path: Path
     with pytest.raises(FitError, match="mlp: no epoch gave a finite free run") as caught:
         trained(logs, tmp_path, Scripted([math.nan]))
     assert "\n" not in str(caught.value)
-
-
-def test_averaged_weights_are_validated_and_kept(logs: Sequence[Prepared], tmp_path: Path) -> None:
-    validate = Scripted([2.0, 1.0])
-    model, _ = trained(logs, tmp_path, validate, average=0.9)
-    assert validate.models[0] is validate.models[1]
-    assert validate.models[0] is not model
-    assert same(state_of(model), validate.seen[1])
-    # what was stepped is not what was kept
-    checkpoint = torch.load(tmp_path / "checkpoints" / "mlp" / "last.ckpt", weights_only=True)
-    raw = {
-        name.removeprefix("model."): value
-        for name, value in checkpoint["state_dict"].items()
-        if name.startswith("model.")
-    }
-    assert not same({name: raw[name] for name in state_of(model)}, state_of(model))
-
-
-def first_weight(model: HybridDynamics) -> Tensor:
-    """The weights of the first layer of an MLP head."""
-    return of_kind(of_kind(model.head, MlpHead).net[0], torch.nn.Linear).weight
-
-
-def at_step(step: int) -> property:
-    """A count of the training steps that stands at this one."""
-    return property(lambda module: step)
-
-
-def test_the_average_is_the_recursion_written_out(
-    logs: Sequence[Prepared], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    module, _ = untrained(logs, average=0.6)
-    assert module.average is not None
-    weight = first_weight(module.model)
-    expected = weight.detach().double().clone()
-    for step in range(1, 12):
-        with torch.no_grad():
-            weight.add_(torch.randn_like(weight))
-        monkeypatch.setattr(HeadTraining, "global_step", at_step(step))
-        module.on_train_batch_end(None, None, 0)
-        keep = min(0.6, (1 + step) / (10 + step))
-        expected = keep * expected + (1 - keep) * weight.detach().double()
-    torch.testing.assert_close(
-        first_weight(module.average).double(), expected, rtol=1e-5, atol=1e-6
-    )
 
 
 def test_learning_rates_fall_along_a_cosine_in_each_stage(

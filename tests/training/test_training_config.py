@@ -54,7 +54,6 @@ def test_after_the_last_epoch_stands_the_last_stage() -> None:
         ({"multi_step": [{"epochs": 1}]}, "multi_step.0.horizon: missing"),
         ({"beginnings": {}, "one_step": {"batch": 1}}, "batches of at least 2 windows"),
         ({"beginnings": {"share": 1.0}}, "beginnings.share: must be less than 1"),
-        ({"average": 1.0}, "average: must be less than 1"),
         ({"one_step": {"rate": 1e-3}}, "one_step.rate: unknown key"),
     ],
 )

@@ -51,6 +51,7 @@ RENAMED: dict[str, str] = {
 
 
 GONE: dict[str, str] = {
+    "training.*.average": "learning rates that fall to a few percent average by themselves",
     "refit.*.folds": "the prior is fixed by the length of the logs",
     "refit_baseline": "refit the baseline before its networks, by `refit`",
     "begin_with": "a network begins from its baseline alone",

@@ -314,7 +314,6 @@ def training_settings(facts: Facts, effort: float) -> dict[str, Any]:
         "one_step": {"epochs": 0},
         "multi_step": stages,
         "steps": max(1, round((_STEPS_LONG if long(facts) else _STEPS) * effort)),
-        "average": 0.99,
         "start_noise": 0.03,
         "weight_decay": 0.001,
         "robust": 0.05,

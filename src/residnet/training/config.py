@@ -186,8 +186,6 @@ class TrainingConfig(MachineConfig):
             scales) is far above this count by their error and not by its square.
         gradient_clip: largest norm of the gradient.
         weight_decay: of AdamW, on matrices only.
-        average: decay of the exponential average of the weights that is validated and kept; 0 for
-            none.
         mirror: every other window is seen in the mirror, port for starboard.
         patience: stop when this many validations in a row bring no better free run, once the last
             stage has begun.
@@ -203,7 +201,6 @@ class TrainingConfig(MachineConfig):
     robust: float = Field(default=0.0, ge=0)
     gradient_clip: float = Field(default=1.0, gt=0)
     weight_decay: float = Field(default=0.0, ge=0)
-    average: float = Field(default=0.0, ge=0, lt=1)
     mirror: bool = False
     patience: int = Field(default=20, ge=1)
     validate_every: int = Field(default=1, ge=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -180,7 +179,6 @@ class HeadTraining(EpochTraining):
     ) -> None:
         super().__init__(config, seed)
         self.model = model
-        self.average = copy.deepcopy(model).requires_grad_(False) if config.average > 0 else None
         self.rollout = Rollout(model)
         self._compiled: FreeRun | None = None
         self.scales = scales
@@ -311,21 +309,11 @@ class HeadTraining(EpochTraining):
             self._compiled = compiled(self.rollout, MANY)
         return self._compiled
 
-    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Move the averaged weights."""
-        if self.average is None:
-            return
-        # a short memory at first, or the average would remember the untrained start
-        decay = min(self.settings.average, (1.0 + self.global_step) / (10.0 + self.global_step))
-        for kept, new in zip(self.average.parameters(), self.model.parameters(), strict=True):
-            kept.lerp_(new.detach(), 1.0 - decay)
-
     def validated(self) -> tuple[nn.Module, float]:
-        """Return the averaged model, where there is one, and its free-run error."""
-        model = self.model if self.average is None else self.average
-        score = self.validate(model)
+        """Return the model and its free-run error."""
+        score = self.validate(self.model)
         self.diverged, self.axes, self.shown = score.diverged, score.axes, score.shown
-        return model, score.error
+        return self.model, score.error
 
 
 def train(
