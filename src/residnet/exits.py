@@ -154,9 +154,37 @@ def write_crash_file(error: BaseException) -> Path | None:
     files; None where neither can be. Passwords, tokens and the name of the user are left out, and
     the environment is not looked at.
     """
+    import platform
     import tempfile
+    import traceback
+    from importlib.metadata import PackageNotFoundError, requires, version
 
-    text = without_secrets(_content(error))
+    from residnet.core.version import __version__
+
+    found = []
+    for requirement in requires("residnet") or ():
+        name = re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0]
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    parts = [
+        f"residnet {__version__}, Python {platform.python_version()}, {platform.platform()}",
+        "packages: " + ", ".join(sorted(set(found))),
+        f"command: residnet {' '.join(sys.argv[1:])}",
+        "".join(traceback.format_exception(error)),
+    ]
+    out = []
+    for word in sys.argv[1:]:
+        try:
+            file = Path(word) / "resolved.yaml" if Path(word).is_dir() else Path(word)
+            if file.suffix in (".yaml", ".yml") and file.is_file():
+                text = file.read_text(encoding="utf-8", errors="backslashreplace")
+                out.append(f"{file}:\n{text[:_LONGEST_CONFIG]}")
+        except (OSError, ValueError):
+            # a word that is no path, or a file that cannot be read
+            continue
+    text = without_secrets("\n\n".join([*parts, *out]) + "\n")
     name = f"residnet-crash-{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}.txt"
     for folder in (Path.cwd, lambda: Path(tempfile.gettempdir())):
         try:
@@ -177,47 +205,3 @@ def without_secrets(text: str) -> str:
     if len(home) > 1:
         text = text.replace(home, "~")
     return _ACCOUNT.sub("://***@", _SECRET.sub(r"\1***", text))
-
-
-def _content(error: BaseException) -> str:
-    import platform
-    import traceback
-
-    from residnet.core.version import __version__
-
-    parts = [
-        f"residnet {__version__}, Python {platform.python_version()}, {platform.platform()}",
-        "packages: " + ", ".join(_versions()),
-        f"command: residnet {' '.join(sys.argv[1:])}",
-        "".join(traceback.format_exception(error)),
-    ]
-    return "\n\n".join([*parts, *_configs()]) + "\n"
-
-
-def _versions() -> list[str]:
-    """Versions of the packages that residnet needs, those of its extras where they are there."""
-    from importlib.metadata import PackageNotFoundError, requires, version
-
-    found = []
-    for requirement in requires("residnet") or ():
-        name = re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0]
-        try:
-            found.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
-    return sorted(set(found))
-
-
-def _configs() -> list[str]:
-    """Texts of the configs that the command names, by file or by run folder."""
-    out = []
-    for word in sys.argv[1:]:
-        try:
-            file = Path(word) / "resolved.yaml" if Path(word).is_dir() else Path(word)
-            if file.suffix in (".yaml", ".yml") and file.is_file():
-                text = file.read_text(encoding="utf-8", errors="backslashreplace")
-                out.append(f"{file}:\n{text[:_LONGEST_CONFIG]}")
-        except (OSError, ValueError):
-            # a word that is no path, or a file that cannot be read
-            continue
-    return out

@@ -145,7 +145,26 @@ def parse(text: str, where: str, *, located: bool = True) -> tuple[Any, Node | N
         node = loader.get_single_node()
         if node is None:
             return None, None
-        _require_small(node, where)
+        sizes: dict[int, int] = {}
+
+        def size(node: Node) -> int:
+            if id(node) not in sizes:
+                sizes[id(node)] = _MOST_VALUES + 1  # met again meanwhile: it stands within itself
+                children = (
+                    [part for pair in node.value for part in pair]
+                    if isinstance(node, MappingNode)
+                    else node.value
+                    if isinstance(node, SequenceNode)
+                    else []
+                )
+                sizes[id(node)] = 1 + sum(map(size, children))
+            return sizes[id(node)]
+
+        if size(node) > _MOST_VALUES:
+            raise ConfigError(
+                f"{where}: stands for more than {_MOST_VALUES} values, or refers to itself; write"
+                " out what its aliases mean"
+            )
         return _unshared(loader.construct_document(node)), node
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
@@ -160,34 +179,6 @@ def parse(text: str, where: str, *, located: bool = True) -> tuple[Any, Node | N
         raise ConfigError(f"{where}: not YAML: {' '.join(str(error).split())}") from error
     except RecursionError as error:
         raise ConfigError(f"{where}: nested too deeply, or refers to itself") from error
-
-
-def _require_small(root: Node, where: str) -> None:
-    """Stop before aliases are written out that stand for more values than any config has.
-
-    Raises:
-        ConfigError: where there are too many of them, or one stands within itself.
-    """
-    sizes: dict[int, int] = {}
-
-    def size(node: Node) -> int:
-        if id(node) not in sizes:
-            sizes[id(node)] = _MOST_VALUES + 1  # met again meanwhile: it stands within itself
-            children = (
-                [part for pair in node.value for part in pair]
-                if isinstance(node, MappingNode)
-                else node.value
-                if isinstance(node, SequenceNode)
-                else []
-            )
-            sizes[id(node)] = 1 + sum(map(size, children))
-        return sizes[id(node)]
-
-    if size(root) > _MOST_VALUES:
-        raise ConfigError(
-            f"{where}: stands for more than {_MOST_VALUES} values, or refers to itself; write out"
-            " what its aliases mean"
-        )
 
 
 def _unshared(value: Any) -> Any:

@@ -29,38 +29,6 @@ _WORDS: dict[str, type | tuple[type, ...]] = {
 """What a file says of itself, and of its `meta` what residnet reads."""
 
 
-def _about(path: Path, text: bytes) -> dict[str, Any]:
-    """Return what a canonical file says of itself.
-
-    Raises:
-        UsageError: where it is no canonical log.
-        DataError: where it is damaged, naming the key.
-    """
-    try:
-        about = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: damaged ({error}); write the file again") from error
-    if not isinstance(about, dict) or about.get("schema") != SCHEMA:
-        raise UsageError(
-            f"{path}: not a residnet log ({SCHEMA}); give a channel map to read a foreign table"
-        )
-    needed = {key: about.get(key) for key in ("name", "manoeuvre", "units", "meta")}
-    meta = needed["meta"] if isinstance(needed["meta"], dict) else {}
-    told = {**needed, **{key: value for key, value in meta.items() if key in _WORDS}}
-    wrong = [key for key, value in told.items() if not isinstance(value, _WORDS[key])]
-    if not wrong and not all(isinstance(unit, str) for unit in about["units"].values()):
-        wrong = ["units"]
-    for found in meta.get("findings", ()) if not wrong else ():
-        known = isinstance(found, dict) and isinstance(found.get("figures", {}), dict)
-        if not known or not all(isinstance(found.get(k), str) for k in ("level", "code", "text")):
-            wrong = ["findings"]
-    if wrong:
-        raise DataError(
-            f"{path}: canonical log whose '{wrong[0]}' is missing or damaged; write the file again"
-        )
-    return about
-
-
 @dataclass(frozen=True)
 class Log:
     """One recorded or simulated manoeuvre.
@@ -228,7 +196,31 @@ class Log:
             raise UsageError(
                 f"{path}: not a Parquet file ({str(error).splitlines()[0]})"
             ) from error
-        about = _about(path, (table.schema.metadata or {}).get(b"residnet", b"{}"))
+        try:
+            about = json.loads((table.schema.metadata or {}).get(b"residnet", b"{}"))
+        except (ValueError, RecursionError) as error:
+            raise DataError(f"{path}: damaged ({error}); write the file again") from error
+        if not isinstance(about, dict) or about.get("schema") != SCHEMA:
+            raise UsageError(
+                f"{path}: not a residnet log ({SCHEMA}); give a channel map to read a foreign table"
+            )
+        needed = {key: about.get(key) for key in ("name", "manoeuvre", "units", "meta")}
+        meta = needed["meta"] if isinstance(needed["meta"], dict) else {}
+        told = {**needed, **{key: value for key, value in meta.items() if key in _WORDS}}
+        wrong = [key for key, value in told.items() if not isinstance(value, _WORDS[key])]
+        if not wrong and not all(isinstance(unit, str) for unit in about["units"].values()):
+            wrong = ["units"]
+        for found in meta.get("findings", ()) if not wrong else ():
+            known = isinstance(found, dict) and isinstance(found.get("figures", {}), dict)
+            if not known or not all(
+                isinstance(found.get(k), str) for k in ("level", "code", "text")
+            ):
+                wrong = ["findings"]
+        if wrong:
+            raise DataError(
+                f"{path}: canonical log whose '{wrong[0]}' is missing or damaged; write the file"
+                " again"
+            )
         columns: dict[str, np.ndarray] = {}
         for name in table.column_names:
             values = table.column(name).to_numpy()

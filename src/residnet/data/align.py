@@ -81,7 +81,13 @@ def align(log: Log, config: GridConfig, needed: Collection[str] | None = None) -
     else:
         out = _resampled(log, config, grid)
     names = [name for name in out.channels if needed is None or name in needed]
-    return _with_gap_mask(out, np.isnan(out.stack(names)).any(axis=1))
+    missing = np.isnan(out.stack(names)).any(axis=1)
+    if not missing.any():
+        return out
+    reason = HARD + "gap"
+    return out.replace(
+        masks={**out.masks, reason: out.masks.get(reason, np.zeros(len(out), dtype=bool)) | missing}
+    )
 
 
 def onto(log: Log, config: GridConfig, times: np.ndarray) -> Log:
@@ -226,12 +232,3 @@ def _rewrapped(original: np.ndarray, continuous: np.ndarray, values: np.ndarray)
         return values
     low = 0.0 if np.nanmin(original) >= 0.0 else -np.pi
     return np.remainder(values - low, 2.0 * np.pi) + low
-
-
-def _with_gap_mask(log: Log, missing: np.ndarray) -> Log:
-    if not missing.any():
-        return log
-    reason = HARD + "gap"
-    return log.replace(
-        masks={**log.masks, reason: log.masks.get(reason, np.zeros(len(log), dtype=bool)) | missing}
-    )

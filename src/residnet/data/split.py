@@ -212,7 +212,17 @@ class SplitConfig(Config):
         parts = {
             name: parts_of(root, wanted, f"{where}: {name}") for name, wanted in entries.items()
         }
-        _require_distinct(parts, where)
+        seen = [
+            (part.path.resolve(), split, part) for split, some in parts.items() for part in some
+        ]
+        for number, (real, split, part) in enumerate(seen):
+            for other, owner, taken in seen[:number]:
+                if other == real and owner != split and part.overlaps(taken):
+                    what = "" if part.whole else "the same stretch of "
+                    raise ConfigError(
+                        f"{where}: {what}{part.path} stands in {owner} and in {split}; a"
+                        f" {'file' if part.whole else 'stretch'} belongs to one split"
+                    )
         return parts
 
     def files(self) -> list[Path]:
@@ -262,19 +272,6 @@ def _from_file(file: Path) -> dict[str, tuple[str | LogPart, ...]]:
             for entry in listed
         )
     return out
-
-
-def _require_distinct(parts: Mapping[str, Sequence[Part]], where: str) -> None:
-    """Stop where two splits name the same stretch."""
-    seen = [(part.path.resolve(), split, part) for split, some in parts.items() for part in some]
-    for number, (real, split, part) in enumerate(seen):
-        for other, owner, taken in seen[:number]:
-            if other == real and owner != split and part.overlaps(taken):
-                what = "" if part.whole else "the same stretch of "
-                raise ConfigError(
-                    f"{where}: {what}{part.path} stands in {owner} and in {split}; a"
-                    f" {'file' if part.whole else 'stretch'} belongs to one split"
-                )
 
 
 def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:

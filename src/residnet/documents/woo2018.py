@@ -156,14 +156,32 @@ def drawings(files: RunFiles) -> list[Figure]:
     of_speed = [window for window in unseen if window.manoeuvre == KINDS[1]]
     of_steering = [window for window in unseen if window.manoeuvre in (KINDS[0], KINDS[2])]
     turning = [(zigzag, "v"), (zigzag, "r"), (steps, "v"), (steps, "r")]
+    notes = files.fit("baseline")
+    states, parts = notes["steady_states"], []
+    for state, (_, _, unit, factor) in _CHANNELS.items():
+        (force, measure), found = _DRIVEN[state], notes["steady_constraints"][state]
+        tau = np.array(states[force])
+        ends = np.array([tau.min(), tau.max()])
+        line = factor * (found["phi"] * ends + found["bias"])
+        curves = {"points": (tau, factor * np.array(states[state])), "line": (ends, line)}
+        panel = Panel(f"steady {state} [{unit}]", f"{force} [{measure}]", height=285)
+        parts.append((panel, curves))
+    looks = {"points": Look("", BLUE, kind="points", size=2.5), "line": Look("", ORANGE)}
+    caption = "Points: means of the settled part of each manoeuvre. Lines: Phi tau + bias (32)."
+    models = (*_SIMPLE, "lstm")
+    start = zigzag.measured[0, 4:6]
+    paths = {"measured": zigzag.measured} | {model: zigzag.predicted[model] for model in models}
+    track = {name: (path[:, 5] - start[1], path[:, 4] - start[0]) for name, path in paths.items()}
+    panel = Panel("north [m]", "east [m]", zigzag.log, kind="map", height=400)
+    words = "A zigzag: track, yaw rate and sway velocity"
     return [
-        _steady(files),
+        _figure(9, "steady states of the constant manoeuvres", caption, looks, parts, 3),
         _histories(13, "Simplified steering models in a zigzag", turning[:2], _SIMPLE),
         _histories(14, "Surge in an acceleration-deceleration test", [(speed, "u")], _COMPARED),
         _histories(15, "Sway and yaw rate in a zigzag and a 3-2-1-1 test", turning, _COMPARED),
         _errors(files, 16, "speed", of_speed, ("u",), _COMPARED),
         _errors(files, 17, "steering", of_steering, ("v", "r"), (*_SIMPLE, *_LEARNED)),
-        _track(zigzag, (*_SIMPLE, "lstm")),
+        _histories(18, words, [(zigzag, "r"), (zigzag, "v")], models, [(panel, track)]),
     ]
 
 
@@ -194,22 +212,6 @@ def _figure(
     return Figure(str(number), title, caption, looks, panels, [Case("", curves)], columns=columns)
 
 
-def _steady(files: RunFiles) -> Figure:
-    notes = files.fit("baseline")
-    states, parts = notes["steady_states"], []
-    for state, (_, _, unit, factor) in _CHANNELS.items():
-        (force, measure), found = _DRIVEN[state], notes["steady_constraints"][state]
-        tau = np.array(states[force])
-        ends = np.array([tau.min(), tau.max()])
-        line = factor * (found["phi"] * ends + found["bias"])
-        curves = {"points": (tau, factor * np.array(states[state])), "line": (ends, line)}
-        panel = Panel(f"steady {state} [{unit}]", f"{force} [{measure}]", height=285)
-        parts.append((panel, curves))
-    looks = {"points": Look("", BLUE, kind="points", size=2.5), "line": Look("", ORANGE)}
-    caption = "Points: means of the settled part of each manoeuvre. Lines: Phi tau + bias (32)."
-    return _figure(9, "steady states of the constant manoeuvres", caption, looks, parts, 3)
-
-
 def _histories(
     number: int,
     words: str,
@@ -234,15 +236,6 @@ def _histories(
         parts += [(above, curves), (below, errors)]
     looks = {"measured": MEASURED, "zero": ZERO} | {model: LOOKS[model] for model in models}
     return _figure(number, words, _CAPTION, looks, parts)
-
-
-def _track(window: StoredWindow, models: Sequence[str]) -> Figure:
-    start = window.measured[0, 4:6]
-    paths = {"measured": window.measured} | {model: window.predicted[model] for model in models}
-    track = {name: (path[:, 5] - start[1], path[:, 4] - start[0]) for name, path in paths.items()}
-    panel = Panel("north [m]", "east [m]", window.log, kind="map", height=400)
-    words = "A zigzag: track, yaw rate and sway velocity"
-    return _histories(18, words, [(window, "r"), (window, "v")], models, [(panel, track)])
 
 
 def _errors(

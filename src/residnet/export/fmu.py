@@ -170,7 +170,13 @@ class FmuExporter(Exporter):
                 _compiled(folder, sources), folder / f"{NAME}{_library_suffix()}"
             )
             loaded = CompiledModel(library, exported, torch.float64)
-            binaries = {self.platform(): library} | self._others(folder, sources)
+            out = {}
+            for tool, platforms, suffix in _CROSS:
+                where = platforms[self.version]
+                if where not in ("", self.platform()) and shutil.which(tool) is not None:
+                    made = folder / f"{where}{suffix}"
+                    out[where] = compile_shared(_compiled(folder, sources), made, tool=tool)
+            binaries = {self.platform(): library} | out
             card |= {
                 "parity": exported.check(loaded, "the FMU's code", torch.float64),
                 "binaries": list(binaries),
@@ -188,16 +194,6 @@ class FmuExporter(Exporter):
                 for where, binary in binaries.items():
                     archive.write(binary, f"binaries/{where}/{NAME}{binary.suffix}")
         return card
-
-    def _others(self, folder: Path, sources: Mapping[str, str]) -> dict[str, Path]:
-        """Return the units of other machines whose compilers are at hand, by platform."""
-        out = {}
-        for tool, platforms, suffix in _CROSS:
-            where = platforms[self.version]
-            if where not in ("", self.platform()) and shutil.which(tool) is not None:
-                made = folder / f"{where}{suffix}"
-                out[where] = compile_shared(_compiled(folder, sources), made, tool=tool)
-        return out
 
     def _sources(self, written: CSource, token: str, dt: float) -> dict[str, str]:
         """Return the source files by name."""

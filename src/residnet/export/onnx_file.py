@@ -102,7 +102,19 @@ class OnnxExporter(Exporter):
 
             def attempt(dtype: torch.dtype) -> dict[str, Any]:
                 try:
-                    return _checked(exported, partial, dtype)
+                    _write(exported, partial, dtype)
+                    loaded = OnnxModel(partial, exported)
+                    random = np.random.default_rng(0)
+                    given = [
+                        random.uniform(0.0, 0.1, (3, count)) for _, count in exported.arguments
+                    ]
+                    together, alone = loaded.rows(*given), Loaded.rows(loaded, *given)
+                    if not all(map(_alike, together, alone)):
+                        raise ExportError(
+                            f"{exported.what}: the ONNX file gives other answers for several rows"
+                            " at once than for each alone"
+                        )
+                    return exported.check(loaded, "the ONNX file", dtype, _TOLERANCE[dtype])
                 except RoundingError as error:
                     said.append(str(error))
                     raise
@@ -128,21 +140,6 @@ class OnnxExporter(Exporter):
             with whole(file) as ready:
                 onnx.save(graph, str(ready))
         return card
-
-
-def _checked(exported: Exported, file: Path, dtype: torch.dtype) -> dict[str, Any]:
-    """Write the graph in a precision and return what a card says of its parity."""
-    _write(exported, file, dtype)
-    loaded = OnnxModel(file, exported)
-    random = np.random.default_rng(0)
-    given = [random.uniform(0.0, 0.1, (3, count)) for _, count in exported.arguments]
-    together, alone = loaded.rows(*given), Loaded.rows(loaded, *given)
-    if not all(map(_alike, together, alone)):
-        raise ExportError(
-            f"{exported.what}: the ONNX file gives other answers for several rows at once than for"
-            " each alone"
-        )
-    return exported.check(loaded, "the ONNX file", dtype, _TOLERANCE[dtype])
 
 
 def _alike(one: Numbers, other: Numbers) -> bool:

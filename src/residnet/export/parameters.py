@@ -166,18 +166,6 @@ class {title}:
 '''
 
 
-def vehicle_python(name: str, found: Coefficients) -> str:
-    """Return a Python module whose class steps as those of PythonVehicleSimulator do."""
-    title = "".join(part.capitalize() for part in name.split("_"))
-    return _VEHICLE.format(
-        name=name,
-        title=title,
-        mass=found.mass.tolist(),
-        linear=found.linear.tolist(),
-        quadratic=found.quadratic.tolist(),
-    )
-
-
 def mss(name: str, found: Coefficients) -> str:
     """Return a MATLAB function with the six-by-six matrices that MSS' vessels have."""
 
@@ -270,10 +258,17 @@ class ParametersExporter(Exporter):
             "terms_left_out": found.terms_left_out,
             "head_left_out": None if spec.head is None else spec.head.kind,
         }
+        title = "".join(part.capitalize() for part in name.split("_"))
         texts = {
             f"{stem}.sdf": gazebo(name, found, rigid),
             f"{name}_parameters.m": mss(name, found),
-            f"{name}_vehicle.py": vehicle_python(name, found),
+            f"{name}_vehicle.py": _VEHICLE.format(
+                name=name,
+                title=title,
+                mass=found.mass.tolist(),
+                linear=found.linear.tolist(),
+                quadratic=found.quadratic.tolist(),
+            ),
             file.name: json.dumps(card, indent=1) + "\n",
         }
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -127,7 +127,17 @@ class TorchScriptExporter(Exporter):
             methods = list(exported.methods)
             scripted = torch.jit.freeze(torch.jit.script(module), preserved_attrs=methods)
             for method in methods:
-                _compute_once(scripted, method)
+                # the executor would do so while it runs, but its settings that make the first call
+                # quick leave graphs as they are
+                graph = scripted._c._get_method(method).graph
+                passes = torch._C
+                passes._jit_pass_inline(graph)
+                # what one round has joined lets the next one join more
+                for _ in range(3):
+                    passes._jit_pass_constant_propagation(graph)
+                    passes._jit_pass_peephole(graph)
+                    passes._jit_pass_cse(graph)
+                    passes._jit_pass_dce(graph)
             # what is checked was saved and read: the file differs from it by the card alone
             stored = ScriptedModel(torch.jit.load(io.BytesIO(_saved(scripted))), dtype)
             parity = exported.check(stored, "the exported module", dtype)
@@ -147,23 +157,6 @@ def _saved(scripted: Any, card: Mapping[str, Any] | None = None) -> bytes:
     extra = {} if card is None else {"card.json": json.dumps(card, indent=1)}
     torch.jit.save(scripted, written, _extra_files=extra)
     return written.getvalue()
-
-
-def _compute_once(scripted: Any, method: str) -> None:
-    """Let a method compute alike expressions once, in the graph that is saved.
-
-    The executor would do so while it runs, but its settings that make the first call quick leave
-    graphs as they are.
-    """
-    graph = scripted._c._get_method(method).graph
-    passes = torch._C
-    passes._jit_pass_inline(graph)
-    # what one round has joined lets the next one join more
-    for _ in range(3):
-        passes._jit_pass_constant_propagation(graph)
-        passes._jit_pass_peephole(graph)
-        passes._jit_pass_cse(graph)
-        passes._jit_pass_dce(graph)
 
 
 class AotiModel(Loaded):

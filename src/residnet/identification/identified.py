@@ -527,7 +527,8 @@ def goodness_rows(
     )
     splits = {}
     for split in SPLITS:
-        taken = _some(logs[split])
+        every = -(-sum(len(log) for log in logs[split]) // paged.LARGE)
+        taken = logs[split][:: max(every, 1)]
         measured = [piece for log in taken for piece in measured_stretches(log)]
         predictions = [
             OneStep(
@@ -542,12 +543,6 @@ def goodness_rows(
         axes = _live(taken) if measured else []
         splits[split] = table(predictions, measured, step, axes) if measured else []
     return splits
-
-
-def _some(logs: Sequence[Prepared]) -> Sequence[Prepared]:
-    """Return the logs, or evenly spread ones of 200,000 samples where there are more."""
-    every = -(-sum(len(log) for log in logs) // paged.LARGE)
-    return logs[:: max(every, 1)]
 
 
 def measured_stretches(log: Prepared) -> list[np.ndarray]:

@@ -271,24 +271,6 @@ def always_wrong(
     return out
 
 
-def run_away(
-    error: np.ndarray, effects: np.ndarray, causes: Sequence[Change], limit: np.ndarray
-) -> np.ndarray:
-    """Return which windows [B] tell nothing, because the free run or a changed one ran away.
-
-    Args:
-        error: innovations [B, n].
-        effects: of a unit of each change [B, C, n].
-        causes: the C changes.
-        limit: largest innovation of each channel [4] that a vessel can have.
-    """
-    most = np.tile(limit, error.shape[1] // len(limit))
-    size = np.array([change.size for change in causes])[:, None]
-    # comparisons with what is no number are false
-    sound = (np.abs(error) <= most).all(axis=1)
-    return np.asarray(~(sound & (np.abs(effects * size) <= most).all(axis=(1, 2))))
-
-
 def whitening(error: np.ndarray, parts: int) -> np.ndarray:
     """Return the matrix [n, n] that makes innovations [B, parts n] of clean logs uncorrelated."""
     # windows that ran away were made nothing of
@@ -727,7 +709,11 @@ class Watch:
         count = len(pieces)
         by_change = effects.reshape(count, parts, len(self.changes), -1).swapaxes(1, 2)
         error, effects = error.reshape(count, -1), by_change.reshape(count, len(self.changes), -1)
-        lost = run_away(error, effects, self.changes, self.limit)
+        most = np.tile(self.limit, error.shape[1] // len(self.limit))
+        size = np.array([change.size for change in self.changes])[:, None]
+        # comparisons with what is no number are false
+        sound = (np.abs(error) <= most).all(axis=1)
+        lost = np.asarray(~(sound & (np.abs(effects * size) <= most).all(axis=(1, 2))))
         error[lost], effects[lost] = 0.0, 0.0
         return error, effects
 

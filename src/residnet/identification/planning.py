@@ -318,16 +318,9 @@ def plan(
             )
         )
     trials.sort(key=lambda trial: -trial.shrinks / trial.minutes)
-    chosen = _greedy(trials, open_.covariance, goal, limits.count)
-    total = sum((trial.moments for trial in chosen), torch.zeros_like(goal))
-    return Plan(trials, chosen, 1.0 - spread(after(open_.covariance, total), goal) / before)
-
-
-def _greedy(trials: Sequence[Trial], covariance: Tensor, goal: Tensor, count: int) -> list[Trial]:
-    """Return so many trials, each the most telling per minute after those before it."""
     chosen: list[Trial] = []
-    now = covariance
-    for _ in range(min(count, len(trials))):
+    now = open_.covariance
+    for _ in range(min(limits.count, len(trials))):
         width = spread(now, goal)
 
         def gain(trial: Trial, now: Tensor = now, width: float = width) -> float:
@@ -336,7 +329,8 @@ def _greedy(trials: Sequence[Trial], covariance: Tensor, goal: Tensor, count: in
         best = max((trial for trial in trials if trial not in chosen), key=gain)
         chosen.append(best)
         now = after(now, best.moments)
-    return chosen
+    total = sum((trial.moments for trial in chosen), torch.zeros_like(goal))
+    return Plan(trials, chosen, 1.0 - spread(after(open_.covariance, total), goal) / before)
 
 
 def _flights(fitted: FittedModel, shares: Mapping[str, InputShare], aim: Aim) -> list[Flight]:

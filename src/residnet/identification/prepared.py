@@ -36,7 +36,30 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
     """
     signals = settings.signals
     if settings.prepare.dead_commands == "mask":
-        splits = _without_dead_commands(splits, signals.columns)
+        # what explains motion is learned from training and validation logs
+        # a config is checked without what only data need
+        from residnet.data.doctor.others import dead_commands
+        from residnet.data.doctor.statistics import Record
+
+        seen = {
+            split: [Record(log, signals.columns) for log in logs] for split, logs in splits.items()
+        }
+        learned = [log for split in ("train", "validation") for log in seen.get(split, ())]
+        further = [log for split in seen.keys() - {"train", "validation"} for log in seen[split]]
+        found = dead_commands(learned, further, signals.columns)
+
+        def masked(log: Log) -> Log:
+            bad = np.zeros(len(log), dtype=bool)
+            for start, stop in found.get(log.name, ()):
+                bad[start : stop + 1] = True
+                say(
+                    f"  {log.name}: t = {log.t[start]:.1f} to {log.t[stop]:.1f} s is left out: all"
+                    " inputs rest, and the other logs do not explain the motion"
+                    " (prepare.dead_commands: keep would keep it)"
+                )
+            return log.replace(masks={**log.masks, DEAD_COMMANDS: bad}) if bad.any() else log
+
+        splits = {split: [masked(log) for log in logs] for split, logs in splits.items()}
     prepared = {
         split: paged.OneByOne(
             prepare(part, split, signals.columns, settings.prepare, signals.live)
@@ -47,40 +70,17 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
     }
     for logs in prepared.values():
         for log in logs:
-            require_length(log, settings)
+            if not log.good.any():
+                seconds = len(log) * settings.prepare.grid.step
+                raise DataError(
+                    f"log {log.log.name}: its {seconds:.1f} s hold no stretch as long as the"
+                    " derivative's window; leave it out or shorten prepare.derivative.window"
+                )
+            if log.split != "train":
+                require_window(log, settings)
     _tell_smoothed([log for logs in prepared.values() for log in logs])
     _tell_spikes([log for logs in prepared.values() for log in logs])
     return prepared
-
-
-def _without_dead_commands(
-    splits: Mapping[str, Sequence[Log]], columns: Sequence[str]
-) -> Mapping[str, Sequence[Log]]:
-    """Return the logs split where motion is explained by no input while all inputs rest.
-
-    What explains motion is learned from training and validation logs.
-    """
-    # a config is checked without what only data need
-    from residnet.data.doctor.others import dead_commands
-    from residnet.data.doctor.statistics import Record
-
-    seen = {split: [Record(log, columns) for log in logs] for split, logs in splits.items()}
-    learned = [log for split in ("train", "validation") for log in seen.get(split, ())]
-    further = [log for split in seen.keys() - {"train", "validation"} for log in seen[split]]
-    found = dead_commands(learned, further, columns)
-
-    def masked(log: Log) -> Log:
-        bad = np.zeros(len(log), dtype=bool)
-        for start, stop in found.get(log.name, ()):
-            bad[start : stop + 1] = True
-            say(
-                f"  {log.name}: t = {log.t[start]:.1f} to {log.t[stop]:.1f} s is left out: all"
-                " inputs rest, and the other logs do not explain the motion"
-                " (prepare.dead_commands: keep would keep it)"
-            )
-        return log.replace(masks={**log.masks, DEAD_COMMANDS: bad}) if bad.any() else log
-
-    return {split: [masked(log) for log in logs] for split, logs in splits.items()}
 
 
 def shortened(log: Log) -> list[Log]:
@@ -113,22 +113,6 @@ def _tell_smoothed(logs: Sequence[Prepared]) -> None:
         made = [", ".join(log.log.meta[key]) for log in logs if key in log.log.meta]
         for names in dict.fromkeys(made):
             say(f"  {names} of {made.count(names)} logs {source}")
-
-
-def require_length(log: Prepared, settings: FitSettings) -> None:
-    """Check that a log can be learned from and, unless it is for training, be judged on.
-
-    Raises:
-        DataError: where it holds no sample to learn from, or no window of any protocol.
-    """
-    if not log.good.any():
-        seconds = len(log) * settings.prepare.grid.step
-        raise DataError(
-            f"log {log.log.name}: its {seconds:.1f} s hold no stretch as long as the derivative's"
-            " window; leave it out or shorten prepare.derivative.window"
-        )
-    if log.split != "train":
-        require_window(log, settings)
 
 
 def require_window(log: Prepared, settings: FitSettings) -> None:

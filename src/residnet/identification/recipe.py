@@ -171,13 +171,6 @@ _MANY = 3
 """Propellers from which a rudder is not told by the race of each."""
 
 
-def linear_terms(facts: Facts) -> list[str]:
-    """Return the terms of a model that is linear in velocities, inputs and wind."""
-    wind = ["wind_u", "wind_v"] if facts.wind else []
-    moving = [name for name in live_of(facts.names).moving if name != "z"]
-    return ["1", *moving, *facts.inputs, *wind]
-
-
 def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
     """Return the terms of a manoeuvring model: hull, propellers, rudders and wind.
 
@@ -376,8 +369,10 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     heads = {"hull_network": network} | ({"network": network} if long(facts) else {})
     terms = full_hull_terms(facts) if long(facts) else hull_terms(facts)
     ridge = 1e-6 if live_of(facts.names).spatial else 1e-4
+    wind = ["wind_u", "wind_v"] if facts.wind else []
+    moving = [name for name in live_of(facts.names).moving if name != "z"]
     return {
-        "baseline": _regressors(1e-6, linear_terms(facts)),
+        "baseline": _regressors(1e-6, ["1", *moving, *facts.inputs, *wind]),
         "baselines": {HULL: _regressors(ridge, terms)},
         "refit": dict.fromkeys(("baseline", HULL), refit_settings(facts)),
         "heads": heads,

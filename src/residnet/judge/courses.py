@@ -183,6 +183,7 @@ def row(
         "split": "simulated",
         "protocol": planned.protocol,
     }
+    rate = np.abs(np.diff(flight.heading)) / flight.dt
     out |= {
         "finished": flight.finished,
         "course_time": time,
@@ -192,7 +193,7 @@ def row(
         "cross_track_rms": float(np.sqrt(np.mean(flight.cross_track**2))),
         "cross_track_max": float(np.abs(flight.cross_track).max()),
         "travel": float(abs(flight.rudder[0]) + np.abs(np.diff(flight.rudder)).sum()),
-        "tightest_turn": _tightest(flight),
+        "tightest_turn": float((flight.speed[:-1] / np.maximum(rate, 1e-9)).min()),
         "distances": [passage.distance for passage in seen],
     }
     if planned.protocol == "enter":
@@ -218,12 +219,6 @@ def row(
             "n": len(seen),
         }
     )
-
-
-def _tightest(flight: CourseFlight) -> float:
-    """Smallest radius in m that the vessel turned with, by its speed and yaw rate."""
-    rate = np.abs(np.diff(flight.heading)) / flight.dt
-    return float((flight.speed[:-1] / np.maximum(rate, 1e-9)).min())
 
 
 def spread_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -320,7 +320,17 @@ def _simulated(
         ]
     )
     with torch.no_grad():
-        s = _memory(model, windows, logs, tables, dtype)
+        s = model.initial_state(len(windows)).to(dtype)
+        if isinstance(model, HybridDynamics):
+            lengths = np.array([window.start - window.past for window in windows])
+            for length in np.unique(lengths):
+                rows = np.flatnonzero(lengths == length)
+                members = [windows[i] for i in rows.tolist()]
+                y = np.stack([logs[window.log].y[window.past : window.start] for window in members])
+                w = np.stack([tables[window.log][window.past : window.start] for window in members])
+                s[torch.from_numpy(rows)] = model.warmup(
+                    torch.from_numpy(y).to(dtype), torch.from_numpy(w).to(dtype)
+                )
         states, _, _ = compiled(Rollout(model), longest)(
             torch.from_numpy(x0).to(dtype), torch.from_numpy(ahead).to(dtype), s
         )
@@ -345,30 +355,6 @@ def _prediction(
         return Prediction(run, bad)
     pose = integrate(logs[window.log].y[window.start, POSE], nu, step)
     return Prediction(np.concatenate((pose, nu), axis=1), bad)
-
-
-def _memory(
-    model: Dynamics,
-    windows: Sequence[Window],
-    logs: Sequence[Prepared],
-    tables: Mapping[int, np.ndarray],
-    dtype: torch.dtype,
-) -> torch.Tensor:
-    """Memory [W, n_state] that each window's own past leaves; windows with pasts of equal length go
-    together.
-    """
-    s = model.initial_state(len(windows)).to(dtype)
-    if isinstance(model, HybridDynamics):
-        lengths = np.array([window.start - window.past for window in windows])
-        for length in np.unique(lengths):
-            rows = np.flatnonzero(lengths == length)
-            members = [windows[i] for i in rows.tolist()]
-            y = np.stack([logs[window.log].y[window.past : window.start] for window in members])
-            w = np.stack([tables[window.log][window.past : window.start] for window in members])
-            s[torch.from_numpy(rows)] = model.warmup(
-                torch.from_numpy(y).to(dtype), torch.from_numpy(w).to(dtype)
-            )
-    return s
 
 
 def _inputs(candidate: Candidate, log: Prepared) -> np.ndarray:

@@ -107,7 +107,10 @@ class Algebra:
         out: Sum = {}
         for p, weight in a.items():
             for q, other in b.items():
-                product = self._product(p, q)
+                key = (p, q)
+                if key not in self._products:
+                    self._products[key] = self._normal([*p, *q])
+                product = self._products[key]
                 out[product] = out.get(product, 0.0) + weight * other
         return self._bounded({product: weight for product, weight in out.items() if weight != 0.0})
 
@@ -125,7 +128,11 @@ class Algebra:
             factor = float(values_of(function, np.array([weight]))[0])
             parts = [self._function(function, {(atom,): 1.0}) for atom in product]
             return {self._normal([atom for part in parts for atom in part]): factor}
-        return self._signed(function, a)
+        if a[min(a)] > 0:
+            return {self._function(function, a): 1.0}
+        turned = {product: -weight for product, weight in a.items()}
+        odd = function in ("sin", "inv")
+        return {self._function(function, turned): -1.0 if odd else 1.0}
 
     def bracket(self, a: Sum) -> Sum:
         """Return a sum of several terms as one factor."""
@@ -174,14 +181,6 @@ class Algebra:
             0.5 + 0.1 * len(self.atoms[i].inner) for i in product if self.atoms[i].inner
         )
 
-    def _signed(self, function: Function, a: Sum) -> Sum:
-        """Return the sum with a positive first weight, where the function is even or odd."""
-        if a[min(a)] > 0:
-            return {self._function(function, a): 1.0}
-        turned = {product: -weight for product, weight in a.items()}
-        odd = function in ("sin", "inv")
-        return {self._function(function, turned): -1.0 if odd else 1.0}
-
     def _function(self, function: Function, a: Sum) -> Product:
         """Return the product that a function of a sum is, a simpler one for a single atom."""
         ((first, weight),) = list(a.items())[:1]
@@ -205,12 +204,6 @@ class Algebra:
         if nesting > self.limits.nesting:
             raise TooLargeError
         return (self.atom(function, a),)
-
-    def _product(self, p: Product, q: Product) -> Product:
-        key = (p, q)
-        if key not in self._products:
-            self._products[key] = self._normal([*p, *q])
-        return self._products[key]
 
     def _normal(self, factors: list[int]) -> Product:
         """Return the product in ascending order, with squares of magnitudes as squares."""

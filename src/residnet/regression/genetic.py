@@ -392,8 +392,27 @@ class _Breeding:
 
         self.gp = gp
         self.algebra, self.fitness, self.config = algebra, fitness, config
-        self.set = self._primitives()
-        self.meaning = _meanings(algebra)
+        made = self.gp.PrimitiveSet("main", 0)
+        for operator in self.config.operators:
+            arity = 2 if operator in BINARY else 1
+            made.addPrimitive(None, arity, name=BINARY.get(operator, operator))
+        for name in self.algebra.channels:
+            made.addTerminal(None, name=f"channel {name}")
+        if self.config.one:
+            made.addTerminal(1.0)
+        if self.config.constants is not None:
+            made.addEphemeralConstant(
+                f"constant {self.config.constants}", partial(random.uniform, *self.config.constants)
+            )
+        self.set = made
+        out: dict[str, Callable[..., Sum]] = {
+            "add": algebra.add,
+            "subtract": partial(algebra.add, sign=-1.0),
+            "multiply": algebra.multiply,
+            "divide": lambda a, b: algebra.multiply(a, algebra.apply("inv", b)),
+        }
+        functions: tuple[Function, ...] = ("abs", "sin", "cos", "sqrt")
+        self.meaning = out | {function: partial(algebra.apply, function) for function in functions}
         limit = self.gp.staticLimit(key=lambda tree: tree.height, max_value=config.depth)
         self.mate = limit(self.gp.cxOnePoint)
         self.mutate = limit(
@@ -444,21 +463,6 @@ class _Breeding:
             tuple(history),
             self.fitness.fitted,
         )
-
-    def _primitives(self) -> Any:
-        made = self.gp.PrimitiveSet("main", 0)
-        for operator in self.config.operators:
-            arity = 2 if operator in BINARY else 1
-            made.addPrimitive(None, arity, name=BINARY.get(operator, operator))
-        for name in self.algebra.channels:
-            made.addTerminal(None, name=f"channel {name}")
-        if self.config.one:
-            made.addTerminal(1.0)
-        if self.config.constants is not None:
-            made.addEphemeralConstant(
-                f"constant {self.config.constants}", partial(random.uniform, *self.config.constants)
-            )
-        return made
 
     def _offspring(self, population: Sequence[Individual]) -> list[Individual]:
         """Return children of parents by tournament: crossover, mutation or a copy."""
@@ -543,17 +547,6 @@ class _Breeding:
                     else {ONE: float(name)}
                 )
         return stack[0]
-
-
-def _meanings(algebra: Algebra) -> dict[str, Callable[..., Sum]]:
-    out: dict[str, Callable[..., Sum]] = {
-        "add": algebra.add,
-        "subtract": partial(algebra.add, sign=-1.0),
-        "multiply": algebra.multiply,
-        "divide": lambda a, b: algebra.multiply(a, algebra.apply("inv", b)),
-    }
-    functions: tuple[Function, ...] = ("abs", "sin", "cos", "sqrt")
-    return out | {function: partial(algebra.apply, function) for function in functions}
 
 
 @final

@@ -185,7 +185,26 @@ def coarser(reduced: Reduced, resolution: float) -> Reduced:
 
     They differ by no more than a share of their length.
     """
-    kept, dependent = _independent(reduced.r, reduced.names, reduced.scale, resolution)
+    kept = list(range(len(reduced.names)))
+    while True:
+        beside = np.abs(np.diagonal(_triangle(reduced.r[:, kept])))
+        lost = [kept[i] for i in np.flatnonzero(beside <= resolution)]
+        if not lost:
+            break
+        kept = [i for i in kept if i not in lost]
+    q, triangle = np.linalg.qr(reduced.r[:, kept])
+    dependent: dict[str, dict[str, float]] = {}
+    for i in sorted({*range(len(reduced.names))} - {*kept}):
+        before = [k for k in kept if k < i]
+        share = scipy.linalg.solve_triangular(
+            triangle[: len(before), : len(before)], q[:, : len(before)].T @ reduced.r[:, i]
+        )
+        parts = {
+            reduced.names[k]: float(s * reduced.scale[i] / reduced.scale[k])
+            for k, s in zip(before, share, strict=True)
+            if abs(s) > max(_NAMED, resolution)
+        }
+        dependent[reduced.names[i]] = parts
     rows = _triangle(np.concatenate((reduced.r[:, kept], reduced.y), axis=1))
     singular = np.linalg.svd(rows[:, : len(kept)], compute_uv=False)
     return replace(
@@ -203,33 +222,6 @@ def coarser(reduced: Reduced, resolution: float) -> Reduced:
 
 def _triangle(x: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(x, mode="r"))
-
-
-def _independent(
-    r: np.ndarray, names: Sequence[str], scale: np.ndarray, least: float
-) -> tuple[list[int], dict[str, dict[str, float]]]:
-    """Return the columns that simpler ones do not make up, and what makes up the others."""
-    kept = list(range(len(names)))
-    while True:
-        beside = np.abs(np.diagonal(_triangle(r[:, kept])))
-        lost = [kept[i] for i in np.flatnonzero(beside <= least)]
-        if not lost:
-            break
-        kept = [i for i in kept if i not in lost]
-    q, triangle = np.linalg.qr(r[:, kept])
-    dependent: dict[str, dict[str, float]] = {}
-    for i in sorted({*range(len(names))} - {*kept}):
-        before = [k for k in kept if k < i]
-        share = scipy.linalg.solve_triangular(
-            triangle[: len(before), : len(before)], q[:, : len(before)].T @ r[:, i]
-        )
-        parts = {
-            names[k]: float(s * scale[i] / scale[k])
-            for k, s in zip(before, share, strict=True)
-            if abs(s) > max(_NAMED, least)
-        }
-        dependent[names[i]] = parts
-    return kept, dependent
 
 
 class Criterion(NamedTuple):

@@ -109,7 +109,12 @@ def still(figure: Figure, cases: Sequence[Case] = (), only: Sequence[int] = ()) 
                 axes.tick_params(labelbottom=False)
                 axes.set_xlabel("")
         if figure.surface:
-            _colors(canvas, figure)
+            from matplotlib.ticker import FuncFormatter
+
+            meshes = [axes.collections[0] for axes in canvas.axes]
+            bar = canvas.colorbar(meshes[0], ax=canvas.axes)
+            bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            bar.set_label(figure.surface.height if figure.surface else "")
         canvas.align_ylabels()
         labels = dict.fromkeys(look.label for look in figure.looks.values())
         _legend_above(canvas, {label: handles[label] for label in labels if label in handles})
@@ -214,15 +219,6 @@ def _cells(axes: Any, figure: Figure, case: Case) -> None:
     norm = (LogNorm if surface.log else Normalize)(*surface.limits)
     axes.pcolormesh(*places, heights, cmap="viridis", norm=norm, shading="nearest")
     axes.grid(visible=False)
-
-
-def _colors(canvas: Any, figure: Figure) -> None:
-    from matplotlib.ticker import FuncFormatter
-
-    meshes = [axes.collections[0] for axes in canvas.axes]
-    bar = canvas.colorbar(meshes[0], ax=canvas.axes)
-    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    bar.set_label(figure.surface.height if figure.surface else "")
 
 
 def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:

@@ -170,13 +170,7 @@ class ArduPilotBackEnd:
         elif self.last >= 0:
             self.missed += frame - self.last - 1
         self.last = frame
-        self._advance(1.0 / rate, pulses)
-        self.reply = self._measured()
-        return self.reply
-
-    def _advance(self, seconds: float, pulses: Sequence[int]) -> None:
-        """Move on in time; the vehicle steps where its own time has come."""
-        self.time += seconds
+        self.time += 1.0 / rate
         dt = self._dt
         while self.steps * dt < self.time - 1e-9:
             commands = torch.tensor(
@@ -192,13 +186,6 @@ class ArduPilotBackEnd:
             if bool(torch.isfinite(after).all()) and bool(torch.isfinite(memory).all()):
                 self.after, self.memory = after, memory
             self.steps += 1
-
-    @property
-    def _dt(self) -> float:
-        return self.vehicle.dynamics.dt
-
-    def _measured(self) -> bytes:
-        """Return what sensors measure now, as the interface has it."""
         share = min(max(self.time / self._dt - (self.steps - 1), 0.0), 1.0)
         state: Tensor = self.before[0] + share * (self.after[0] - self.before[0])
         change = ((self.after[0] - self.before[0]) / self._dt).tolist()
@@ -222,4 +209,9 @@ class ArduPilotBackEnd:
             "attitude": [phi, 0.0, wrapped],
             "velocity": [u * cos - level * sin, u * sin + level * cos, 0.0],
         }
-        return b"\n" + json.dumps(reply, separators=(",", ":")).encode() + b"\n"
+        self.reply = b"\n" + json.dumps(reply, separators=(",", ":")).encode() + b"\n"
+        return self.reply
+
+    @property
+    def _dt(self) -> float:
+        return self.vehicle.dynamics.dt

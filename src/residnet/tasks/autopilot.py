@@ -347,7 +347,28 @@ class AutopilotConfig(ComputingTask):
         except FitError as error:
             raise ConfigError(f"vessel '{self.vessel}' cannot be steered: {error}") from error
         config = self.paced()
-        _check_flights(config, turning, vessel.rate)
+        # a change of depth takes the time of a dive angle, and its way
+        asked = {} if config.test.depth else {"test": (config.test.heading, config.test.duration)}
+        if config.conditions is not None:
+            stated = config.conditions.stated
+            if config.test.depth is None:
+                asked["conditions.stated"] = (stated.heading[0], stated.duration)
+            for name, conditions in config.conditions.flown.items():
+                if conditions.bias + _PUSHED * conditions.push >= config.rudder:
+                    raise ConfigError(
+                        f"conditions.{name}: a bias of {math.degrees(conditions.bias):.3g} deg and"
+                        f" a push of {math.degrees(conditions.push):.3g} deg leave nothing of a"
+                        f" rudder of {math.degrees(config.rudder):.3g} deg to steer with; give more"
+                        " rudder, or less of them"
+                    )
+        for key, (change, duration) in asked.items():
+            least = least_time(turning, config.rudder, vessel.rate, change)
+            if least > duration:
+                raise ConfigError(
+                    f"{key}.duration: a change of heading of {math.degrees(change):.3g} deg takes"
+                    f" this vessel {least:.3g} s at least, given {duration:.3g} s; give more time,"
+                    " or more rudder"
+                )
         for model, dt in learned:
             model.turning(self.rudder, self.turning_time, dt)
 
@@ -438,36 +459,6 @@ class AutopilotConfig(ComputingTask):
 
 _PUSHED = 2.0
 """Standard deviations of the slow push that the rudder must be able to hold."""
-
-
-def _check_flights(config: AutopilotConfig, turning: Turning, rate: float | None) -> None:
-    """Check that changes of heading can end in their time, and that the rudder can hold a course.
-
-    Raises:
-        ConfigError: with the key, what is needed and what is given.
-    """
-    # a change of depth takes the time of a dive angle, and its way
-    asked = {} if config.test.depth else {"test": (config.test.heading, config.test.duration)}
-    if config.conditions is not None:
-        stated = config.conditions.stated
-        if config.test.depth is None:
-            asked["conditions.stated"] = (stated.heading[0], stated.duration)
-        for name, conditions in config.conditions.flown.items():
-            if conditions.bias + _PUSHED * conditions.push >= config.rudder:
-                raise ConfigError(
-                    f"conditions.{name}: a bias of {math.degrees(conditions.bias):.3g} deg and a"
-                    f" push of {math.degrees(conditions.push):.3g} deg leave nothing of a rudder of"
-                    f" {math.degrees(config.rudder):.3g} deg to steer with; give more rudder, or"
-                    " less of them"
-                )
-    for key, (change, duration) in asked.items():
-        least = least_time(turning, config.rudder, rate, change)
-        if least > duration:
-            raise ConfigError(
-                f"{key}.duration: a change of heading of {math.degrees(change):.3g} deg takes this"
-                f" vessel {least:.3g} s at least, given {duration:.3g} s; give more time, or more"
-                " rudder"
-            )
 
 
 _STEP = math.radians(30.0)

@@ -75,7 +75,20 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
     runs = judged_runs(paths)
     pairs = paired(runs)
     tables = [_metrics_table(runs), *([_paired_table(runs, pairs)] if pairs else [])]
-    tables.append(_config_table(runs))
+    found = _differing([run.resolved for run in runs], "")
+    found = [pair for pair in found if pair[0] not in ("name", "description")]
+    more = f" The first {_MOST} of {len(found)} stand here." if len(found) > _MOST else ""
+    told = f"What the runs were asked to do differently; what is alike is left out.{more}"
+    tables.append(
+        table_of(
+            found[:_MOST],
+            [
+                ("setting", lambda pair: pair[0]),
+                *((run.name, lambda pair, i=i: pair[1][i]) for i, run in enumerate(runs)),
+            ],
+            caption=told if found else "The runs were asked to do the same.",
+        )
+    )
     verdict = _sentence(runs, pairs)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -235,22 +248,6 @@ def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, An
         f" {first}; differences to {first}, negative where the run is better.",
         selected=lambda row: row["mean"] == least[row["protocol"]],
         rule=lambda row: row["protocol"],
-    )
-
-
-def _config_table(runs: Sequence[JudgedRun]) -> Table:
-    """Return the settings in which the runs differ; a part that only some have is one line."""
-    found = _differing([run.resolved for run in runs], "")
-    found = [pair for pair in found if pair[0] not in ("name", "description")]
-    more = f" The first {_MOST} of {len(found)} stand here." if len(found) > _MOST else ""
-    told = f"What the runs were asked to do differently; what is alike is left out.{more}"
-    return table_of(
-        found[:_MOST],
-        [
-            ("setting", lambda pair: pair[0]),
-            *((run.name, lambda pair, i=i: pair[1][i]) for i, run in enumerate(runs)),
-        ],
-        caption=told if found else "The runs were asked to do the same.",
     )
 
 

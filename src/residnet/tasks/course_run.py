@@ -76,7 +76,19 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> Outcome:
                 f" radius possible is {circle['smallest']:.2f} m"
             )
     trained = load_policy(known, config.policy)
-    controllers = {config.policy: trained, **load_peers(config, known)}
+    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
+    built: dict[str, Policy] = {}
+    for name in config.peers:
+        if name in known.autopilot.predictive:
+            built[name] = load_predictive(
+                name, known.autopilot.predictive[name], known.steering, known.run
+            )
+        else:
+            built[name] = reader.validate_python(known.controllers[name]["config"]).build(
+                known.steering
+            )
+    built |= {name: law.build(known.steering) for name, law in config.others.items()}
+    controllers = {config.policy: trained, **{name: law.double() for name, law in built.items()}}
     done = _Flown([], [], [])
     plans: list[pd.DataFrame] = []
     exports: dict[str, Callable[[], Path]] = {}
@@ -209,23 +221,6 @@ def guidance_along(
     return CourseGuidance(planned.course, lookahead, steering.vessel.state, drift)
 
 
-def load_peers(config: CourseTaskConfig, known: AutopilotRun) -> dict[str, Policy]:
-    """Return the peers as the autopilot run tuned or trained them, then the others."""
-    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
-    built: dict[str, Policy] = {}
-    for name in config.peers:
-        if name in known.autopilot.predictive:
-            built[name] = load_predictive(
-                name, known.autopilot.predictive[name], known.steering, known.run
-            )
-        else:
-            built[name] = reader.validate_python(known.controllers[name]["config"]).build(
-                known.steering
-            )
-    built |= {name: law.build(known.steering) for name, law in config.others.items()}
-    return {name: law.double() for name, law in built.items()}
-
-
 class _Flown(NamedTuple):
     """The rows of metrics.json, tracks of nominal flights, and flights of the spread."""
 
@@ -261,7 +256,22 @@ def _fly(
 
     flights, rows = flown(NOMINAL)
     done.rows.extend(rows)
-    done.tracks.append(track_table(name, guidance, planned.protocol, flights[0]))
+    flight = flights[0]
+    every = max(round(_KEPT / flight.dt), 1)
+    count = len(flight.track)
+    columns = {
+        "controller": name,
+        "guidance": guidance,
+        "protocol": planned.protocol,
+        "t": flight.dt * np.arange(count)[::every],
+        "north": flight.track[::every, 0],
+        "east": flight.track[::every, 1],
+        "psi": flight.heading[::every],
+        "rudder": np.resize(flight.rudder, count)[::every],
+        "speed": flight.speed[::every],
+        "cross_track": flight.cross_track[::every],
+    }
+    done.tracks.append(pd.DataFrame(columns))
     if config.spread is not None:
         vessels = config.spread.draw()
         rows = flown(vessels)[1]
@@ -381,25 +391,6 @@ def spread_table(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
         {name: [row[name] for row in rows] for name in columns}
         | {name: values.numpy() for name, values in drawn.items()}
     )
-
-
-def track_table(name: str, guidance: str, protocol: str, flight: CourseFlight) -> pd.DataFrame:
-    """Return the track of one flight, a sample every 0.1 s: positions in m, angles in rad."""
-    every = max(round(_KEPT / flight.dt), 1)
-    count = len(flight.track)
-    columns = {
-        "controller": name,
-        "guidance": guidance,
-        "protocol": protocol,
-        "t": flight.dt * np.arange(count)[::every],
-        "north": flight.track[::every, 0],
-        "east": flight.track[::every, 1],
-        "psi": flight.heading[::every],
-        "rudder": np.resize(flight.rudder, count)[::every],
-        "speed": flight.speed[::every],
-        "cross_track": flight.cross_track[::every],
-    }
-    return pd.DataFrame(columns)
 
 
 def plan_table(planned: PlannedCourse) -> pd.DataFrame:

@@ -461,7 +461,19 @@ def check_manoeuvre(
     plant = load_vessel(vessel).build()
     duration = manoeuvre.lasts(duration)
     dynamics = RecordedPlantDynamics(plant, _STEP)
-    _check_batch(manoeuvre, dynamics, duration, who)
+    alone, inputs = _flown([manoeuvre], dynamics, duration)
+    pair, commands = _flown([manoeuvre, manoeuvre], dynamics, duration)
+    require_finite(alone, f"{who}: the motion is not finite")
+    require_finite(inputs, f"{who}: a command is not finite")
+    count = dynamics.plant.commands
+    require(
+        bool((inputs[:, :, count:] == 0.01).all()),
+        f"{who}: changes inputs that are no commands, such as wind and current",
+    )
+    for row in range(2):
+        message = f"{who}: flown beside another one it does something else"
+        require_equal(pair[row], alone[0], 1e-9, message)
+        require_equal(commands[row, :, :count], inputs[0, :, :count], 1e-9, message)
     helm, length = Helm.from_plant(plant), load_vessel(vessel).length.value
     craft = Craft(vessel, dynamics, helm, plant.commands, plant.approach(1))
     sea = Sea(plant, Disturbance(), SensorNoise(), 0)
@@ -492,24 +504,6 @@ def _flown(
     return states, inputs
 
 
-def _check_batch(
-    manoeuvre: Manoeuvre, dynamics: RecordedPlantDynamics, seconds: float, who: str
-) -> None:
-    alone, inputs = _flown([manoeuvre], dynamics, seconds)
-    pair, commands = _flown([manoeuvre, manoeuvre], dynamics, seconds)
-    require_finite(alone, f"{who}: the motion is not finite")
-    require_finite(inputs, f"{who}: a command is not finite")
-    count = dynamics.plant.commands
-    require(
-        bool((inputs[:, :, count:] == 0.01).all()),
-        f"{who}: changes inputs that are no commands, such as wind and current",
-    )
-    for row in range(2):
-        message = f"{who}: flown beside another one it does something else"
-        require_equal(pair[row], alone[0], 1e-9, message)
-        require_equal(commands[row, :, :count], inputs[0, :, :count], 1e-9, message)
-
-
 def _check_indices(indices: dict[str, Any], who: str) -> None:
     for name, value in indices.items():
         numbers = np.atleast_1d(np.asarray(value))
@@ -538,21 +532,6 @@ def check_reader(config: Config, file: Path) -> Log:
     require(isinstance(reader, LogReader), f"{who}: build gives no LogReader")
     file = Path(file)
     log, again = reader.read(file), reader.read(file)
-    _check_log(log, file, who)
-    require(
-        list(log.channels) == list(again.channels)
-        and all(
-            np.array_equal(values, again.channels[name], equal_nan=True)
-            for name, values in log.channels.items()
-        ),
-        f"{who}: reads the same file twice with different results",
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        _check_refusals(reader, Path(folder), file, who)
-    return log
-
-
-def _check_log(log: Log, file: Path, who: str) -> None:
     require(log.name == file.stem, f"{who}: names the log '{log.name}', not '{file.stem}'")
     require(bool(log.channels), f"{who}: the log has no channels")
     require(log.t.dtype == np.float64, f"{who}: time is {log.t.dtype}, not float64")
@@ -567,6 +546,17 @@ def _check_log(log: Log, file: Path, who: str) -> None:
         require(bool((np.abs(np.diff(psi)) < np.pi).all()), f"{who}: psi jumps by half a circle")
     missing = [key for key in ("source", "sha256") if key not in log.meta]
     require(not missing, f"{who}: the log's meta lacks {', '.join(missing)}")
+    require(
+        list(log.channels) == list(again.channels)
+        and all(
+            np.array_equal(values, again.channels[name], equal_nan=True)
+            for name, values in log.channels.items()
+        ),
+        f"{who}: reads the same file twice with different results",
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        _check_refusals(reader, Path(folder), file, who)
+    return log
 
 
 def _check_refusals(reader: LogReader, folder: Path, file: Path, who: str) -> None:
@@ -664,25 +654,18 @@ def check_bad_inputs(
     guard = GuardedDynamics(model.float().eval(), spec)
     random = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        x, w, past, given = _good_samples(guard, cases, random)
+        first, n = PLANAR.pose_columns.stop, guard.dof
+        low, high = guard.low[first:], guard.high[first:]
+        share = 0.05 + 0.9 * torch.rand(cases, _BEFORE + _AFTER, low.numel(), generator=random)
+        seen = low + share * (high - low)
+        pose = 40.0 * torch.rand(cases, _BEFORE + _AFTER, 3, generator=random) - 20.0
+        y, w = torch.cat((pose, seen[..., :n]), dim=-1), seen[..., n:]
+        x, w, past, given = y[:, _BEFORE], w[:, _BEFORE:], y[:, :_BEFORE], w[:, :_BEFORE]
         s = exported.warmup(past, given)
         require_equal(s, model.warmup(past, given), 1e-4, f"{who}: warms up otherwise")
         _check_steps(exported, guard, x, w, s, random, who)
         _check_rollout(exported, x, w, s, random, who)
         _check_histories(exported, past, given, random, who)
-
-
-def _good_samples(
-    guard: GuardedDynamics, rows: int, random: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return states [B, 3 + n] and inputs [B, T, m] in the training range, and a past of both."""
-    first, n = PLANAR.pose_columns.stop, guard.dof
-    low, high = guard.low[first:], guard.high[first:]
-    share = 0.05 + 0.9 * torch.rand(rows, _BEFORE + _AFTER, low.numel(), generator=random)
-    seen = low + share * (high - low)
-    pose = 40.0 * torch.rand(rows, _BEFORE + _AFTER, 3, generator=random) - 20.0
-    y, w = torch.cat((pose, seen[..., :n]), dim=-1), seen[..., n:]
-    return y[:, _BEFORE], w[:, _BEFORE:], y[:, :_BEFORE], w[:, :_BEFORE]
 
 
 def _damage(values: Tensor, edge: Tensor, share: float, random: torch.Generator) -> Tensor:

@@ -308,7 +308,16 @@ class Fit:
         """Choose which pieces of the course must keep clear of which buoys."""
         drawn = self.route(z)
         points, self.others = drawn.points, []
-        pieces = self._pieces(len(points))
+        # of a whole turn about a buoy, the nearest point jumps from its beginning to its end
+        count = len(points)
+        cuts = {0, count - 1, *range(LEG, count, LEG + POINTS)}
+        for k in range(_SHARES):
+            cuts |= set(range(LEG + k * POINTS // _SHARES, count, LEG + POINTS))
+        turns = [self.window(number, count) for number in range(len(self.circles))]
+        pieces = []
+        for i, turn in enumerate(turns):
+            inside = sorted({turn.start, turn.stop - 1, *cuts} & set(range(turn.start, turn.stop)))
+            pieces += [(i, slice(one, two + 1)) for one, two in itertools.pairwise(inside)]
         right = self.sides * self._nearest(drawn, self._parts(points)).abeam > 0
         for j, circle in enumerate(self.circles):
             if circle.side == 0:
@@ -323,21 +332,6 @@ class Fit:
                 and distance[max(part.start, begin) : part.stop].min()
                 < circle.radius + (_BESIDE if i == j else _NEAR) * self.unit
             ]
-
-    def _pieces(self, count: int) -> list[tuple[int, slice]]:
-        """Return pieces of the route and in which buoy's turn each is; turns are several.
-
-        Of a whole turn about a buoy, the nearest point jumps from its beginning to its end.
-        """
-        cuts = {0, count - 1, *range(LEG, count, LEG + POINTS)}
-        for k in range(_SHARES):
-            cuts |= set(range(LEG + k * POINTS // _SHARES, count, LEG + POINTS))
-        turns = [self.window(number, count) for number in range(len(self.circles))]
-        found = []
-        for i, turn in enumerate(turns):
-            inside = sorted({turn.start, turn.stop - 1, *cuts} & set(range(turn.start, turn.stop)))
-            found += [(i, slice(one, two + 1)) for one, two in itertools.pairwise(inside)]
-        return found
 
     def _left(self, points: np.ndarray, circle: Circle) -> int:
         """Return the point from which a circle counts: `course_check.left_behind`."""

@@ -545,7 +545,16 @@ class Channels:
         if {"x", "y", "psi"} <= set(self._names):
             self._settle_axes()
             self._settle_frame()
-            self._settle_still()
+            for name, place in (("u", 1), ("v", 2), ("r", 3)):
+                moved = [motion[place] for motion in self._motions if motion is not None]
+                if name not in self._names or not moved:
+                    continue
+                size = to_si(self._unit(name, mark=False), CHANNEL_UNITS[name])
+                own = size * float(np.nanstd(self._values(name)))
+                if own < STILL * float(np.std(np.concatenate(moved))):
+                    column = self._names.pop(name)
+                    text = f"'{column}' does not move, while position and heading do; left out:"
+                    self._marks.note(CHANNELS, f"{text} {name} follows from them")
         elif "psi" in self._names:
             self._psi_unit = self._unit("psi")
         self._settle_wind()
@@ -582,58 +591,6 @@ class Channels:
         if written is None:
             reason = f"position and heading fit together best in {self._psi_unit}"
             self._marks.guess((*CHANNELS, "psi"), f"the header has no unit; {reason}")
-        self._name_axes(score)
-
-    def _settle_axes(self) -> None:
-        """Leave out velocities along x and y that count along north and east, not along the hull.
-
-        Names such as vx and vy do not say which; position and heading do, without them.
-        """
-        called = [
-            name
-            for name in ("u", "v")
-            if name in self._names and axis_velocity(words_of(self._names[name])) is not None
-        ]
-        if not called:
-            return
-        if self._over_ground(called):
-            columns = ", ".join(self._names.pop(name) for name in called)
-            text = f"{columns} follow the motion along north and east, and not along the vessel's"
-            self._marks.note(CHANNELS, f"{text} axes; left out, for u and v follow from positions")
-            return
-        for name in called:
-            text = "taken along the vessel's own axes, which position and heading do not contradict"
-            self._marks.guess((*CHANNELS, name), text)
-
-    def _over_ground(self, called: Sequence[str]) -> bool:
-        """Return whether velocities along x and y fit those along north and east better."""
-        rest = {name: column for name, column in self._names.items() if name not in called}
-        alone = Channels(rest, self._logs, Marks(), self._fixes, self._frames)
-        alone._settle_frame()
-        still = [Raw(raw.t, {**raw.columns, "psi": np.zeros(raw.t.size)}) for raw in self._logs]
-        ground = [motion_of(raw, "rad", FRAMES[0]) for raw in still]
-
-        def fit(motions: Sequence[Motion | None], along: Mapping[str, str]) -> float:
-            moved = [
-                Raw(raw.t, {along[n]: raw.columns[n] for n in called if n in raw.columns})
-                for raw in self._logs
-            ]
-            return float(np.mean([follows(moved, motions, along[n]).correlation for n in called]))
-
-        same, turned = {"u": "u", "v": "v"}, {"u": "v", "v": "u"}
-        best = max(fit(ground, same), fit(ground, turned))
-        return best > _SURE and best > fit(alone._motions, same) + 0.05
-
-    def _score(self, motions: Sequence[Motion | None]) -> float:
-        """Return how well position, heading and velocities fit together, at most 1."""
-        fits = [follows(self._logs, motions, name) for name in ("u", "v") if name in self._names]
-        if len(fits) == 2:
-            # only the forward component tells how the heading lies; both count
-            return sum(fit.correlation * (fit.factor > 0 or i) for i, fit in enumerate(fits)) / 2
-        return along(motions)
-
-    def _name_axes(self, score: float) -> None:
-        """Say which column is north, and mark what names and motion leave open."""
         x, y = words_of(self._names["x"]), words_of(self._names["y"])
         told = x.has("north") and y.has("east") and not (x.text == "x" or y.text == "y")
         told = told or self._fixes > 0.0
@@ -660,18 +617,49 @@ class Channels:
             self._marks.guess((*CHANNELS, "psi"), f"{text}: check units and axes")
         self._frame = Frame(False, self._frame.from_east)
 
-    def _settle_still(self) -> None:
-        """Leave out velocities that do not move, while position and heading do."""
-        for name, place in (("u", 1), ("v", 2), ("r", 3)):
-            moved = [motion[place] for motion in self._motions if motion is not None]
-            if name not in self._names or not moved:
-                continue
-            size = to_si(self._unit(name, mark=False), CHANNEL_UNITS[name])
-            own = size * float(np.nanstd(self._values(name)))
-            if own < STILL * float(np.std(np.concatenate(moved))):
-                column = self._names.pop(name)
-                text = f"'{column}' does not move, while position and heading do; left out:"
-                self._marks.note(CHANNELS, f"{text} {name} follows from them")
+    def _settle_axes(self) -> None:
+        """Leave out velocities along x and y that count along north and east, not along the hull.
+
+        Names such as vx and vy do not say which; position and heading do, without them.
+        """
+        called = [
+            name
+            for name in ("u", "v")
+            if name in self._names and axis_velocity(words_of(self._names[name])) is not None
+        ]
+        if not called:
+            return
+        rest = {name: column for name, column in self._names.items() if name not in called}
+        alone = Channels(rest, self._logs, Marks(), self._fixes, self._frames)
+        alone._settle_frame()
+        still = [Raw(raw.t, {**raw.columns, "psi": np.zeros(raw.t.size)}) for raw in self._logs]
+        ground = [motion_of(raw, "rad", FRAMES[0]) for raw in still]
+
+        def fit(motions: Sequence[Motion | None], along: Mapping[str, str]) -> float:
+            moved = [
+                Raw(raw.t, {along[n]: raw.columns[n] for n in called if n in raw.columns})
+                for raw in self._logs
+            ]
+            return float(np.mean([follows(moved, motions, along[n]).correlation for n in called]))
+
+        same, turned = {"u": "u", "v": "v"}, {"u": "v", "v": "u"}
+        best = max(fit(ground, same), fit(ground, turned))
+        if best > _SURE and best > fit(alone._motions, same) + 0.05:
+            columns = ", ".join(self._names.pop(name) for name in called)
+            text = f"{columns} follow the motion along north and east, and not along the vessel's"
+            self._marks.note(CHANNELS, f"{text} axes; left out, for u and v follow from positions")
+            return
+        for name in called:
+            text = "taken along the vessel's own axes, which position and heading do not contradict"
+            self._marks.guess((*CHANNELS, name), text)
+
+    def _score(self, motions: Sequence[Motion | None]) -> float:
+        """Return how well position, heading and velocities fit together, at most 1."""
+        fits = [follows(self._logs, motions, name) for name in ("u", "v") if name in self._names]
+        if len(fits) == 2:
+            # only the forward component tells how the heading lies; both count
+            return sum(fit.correlation * (fit.factor > 0 or i) for i, fit in enumerate(fits)) / 2
+        return along(motions)
 
     def _settle_wind(self) -> None:
         """Find whether the wind is told from north or from the bow; one without its half goes."""

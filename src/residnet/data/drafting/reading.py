@@ -127,7 +127,14 @@ def draft_recordings(
         log = None
     plan = standard_plan(some[0], Plan())
     whole = log is not None and {"x", "y", "psi"} <= set(log.channels)
-    sources = _standard(some[0], log, plan)
+    poses = [source for source in (plan.position, plan.heading) if source is not None]
+    taken = {(entry.topic or "", entry.field) for entry in plan.channels.values()}
+    taken |= {(source.topic or "", field) for source in poses for field in source.fields}
+    steps = [_step_of(some[0].series[s.topic]) for s in poses if s.topic in some[0].series]
+    step = max(min(steps), 0.02) if steps else 1.0
+    if not steps and log is not None:
+        step = float(np.median(np.diff(log.t)))
+    sources = _Sources({}, taken, step)
     posed = [source.topic for source in (plan.position, plan.heading) if source is not None]
     settled = any(in_ned(some[0][topic]) for topic in posed)
     if by_name := _named_fields(some, marks):
@@ -163,17 +170,6 @@ def draft_recordings(
 
 def _step_of(series: Series) -> float:
     return float(np.median(np.diff(series.clock))) if len(series) > 1 else float("inf")
-
-
-def _standard(recording: Recording, log: Log | None, plan: Plan) -> _Sources:
-    poses = [source for source in (plan.position, plan.heading) if source is not None]
-    taken = {(entry.topic or "", entry.field) for entry in plan.channels.values()}
-    taken |= {(source.topic or "", field) for source in poses for field in source.fields}
-    steps = [_step_of(recording.series[s.topic]) for s in poses if s.topic in recording.series]
-    step = max(min(steps), 0.02) if steps else 1.0
-    if not steps and log is not None:
-        step = float(np.median(np.diff(log.t)))
-    return _Sources({}, taken, step)
 
 
 def _sound(log: Log, marks: Marks) -> bool:
@@ -559,7 +555,26 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
     loaded: dict[Path, Recording] = {}
     if kind == "table" and (trips := trips_of(paths)):
         alone = set(paths).difference(*trips.values())
-        read.reader, paths, read.left_out = _draft_joined(trips, marks)
+        parts: dict[str, dict[str, Any]] = {}
+        left_out: dict[Path, ResidnetError] = {}
+        for word, files in trips.items():
+            own = Marks()
+            parts[word], lost = draft_tables(files, own, headed=True)
+            left_out |= lost
+            place = (*READER, "parts", word)
+            for told, tell in ((own.guesses, marks.guess), (own.notes, marks.note)):
+                for key, text in told:
+                    tell(
+                        (*place, *key[len(READER) :]) if key[: len(READER)] == READER else key, text
+                    )
+        order = sorted(parts, key=lambda word: -len(_of_motion(parts[word]["channels"])))
+        text = (
+            f"files whose names differ in {' and '.join(order)} alone are taken as one trip; where"
+            " both have no dates, their clocks are brought together by what the commands explain"
+        )
+        marks.guess((*READER, "parts"), text)
+        reader = {"kind": "joined", "parts": {word: parts[word] for word in order}}
+        read.reader, paths, read.left_out = reader, [*trips[order[0]]], left_out
         read.left_out |= {
             path: DataError(f"{path}: no other file of its trip is beside it; leave it out")
             for path in sorted(alone)
@@ -585,32 +600,6 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
         raise next(iter(read.left_out.values()))
     _turn_rudders(read)
     return read
-
-
-def _draft_joined(
-    trips: Mapping[str, Sequence[Path]], marks: Marks
-) -> tuple[dict[str, Any], list[Path], dict[Path, ResidnetError]]:
-    """Return the settings of a reader of files that belong together, those of the motion, and which
-    of them are not read.
-    """
-    parts: dict[str, dict[str, Any]] = {}
-    left_out: dict[Path, ResidnetError] = {}
-    for word, files in trips.items():
-        own = Marks()
-        parts[word], lost = draft_tables(files, own, headed=True)
-        left_out |= lost
-        place = (*READER, "parts", word)
-        for told, tell in ((own.guesses, marks.guess), (own.notes, marks.note)):
-            for key, text in told:
-                tell((*place, *key[len(READER) :]) if key[: len(READER)] == READER else key, text)
-    order = sorted(parts, key=lambda word: -len(_of_motion(parts[word]["channels"])))
-    text = (
-        f"files whose names differ in {' and '.join(order)} alone are taken as one trip; where both"
-        " have no dates, their clocks are brought together by what the commands explain"
-    )
-    marks.guess((*READER, "parts"), text)
-    reader = {"kind": "joined", "parts": {word: parts[word] for word in order}}
-    return reader, [*trips[order[0]]], left_out
 
 
 def trips_of(paths: Sequence[Path]) -> dict[str, list[Path]]:
@@ -672,7 +661,16 @@ def _turn_rudders(read: DraftedLogs) -> None:
     """Turn the sign of rudders whose positive angles turn the vessel to port, of planes those that
     turn it up.
     """
-    channels, places = _entries(read.reader)
+    parts: dict[Key, Mapping[str, Any]] = {
+        (*READER, "parts", word): part for word, part in read.reader.get("parts", {}).items()
+    }
+    parts = parts or {READER: read.reader}
+    channels: dict[str, dict[str, Any]] = {}
+    places: dict[str, Key] = {}
+    for place, part in parts.items():
+        for name, entry in part.get("channels", {}).items():
+            channels.setdefault(name, entry)
+            places.setdefault(name, (*place, "channels", name))
     held = dict.fromkeys(name for log in read.logs.values() for name in log.channels)
     names = [name for name in held if re.match(r"(cmd_)?delta(?!_rate)", name)]
     moving = [moved for log in read.logs.values() if names and (moved := _turning(log))]
@@ -698,21 +696,6 @@ def _turn_rudders(read: DraftedLogs) -> None:
         elif slope < 0.0:
             text = f"positive values of {name} turned the vessel {wrong} in the logs"
             read.marks.guess(key, text)
-
-
-def _entries(reader: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, Key]]:
-    """Return channel -> entry of a drafted reader, and channel -> its key in the config."""
-    parts: dict[Key, Mapping[str, Any]] = {
-        (*READER, "parts", word): part for word, part in reader.get("parts", {}).items()
-    }
-    parts = parts or {READER: reader}
-    entries: dict[str, dict[str, Any]] = {}
-    places: dict[str, Key] = {}
-    for place, part in parts.items():
-        for name, entry in part.get("channels", {}).items():
-            entries.setdefault(name, entry)
-            places.setdefault(name, (*place, "channels", name))
-    return entries, places
 
 
 def _turning(log: Log) -> Log | None:

@@ -248,7 +248,20 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
     """
     parts = _parts(recording, plan, longest_gap)
     times, step = _times(recording, parts, clock)
-    values, units = _values(parts, plan, times, step)
+    derived = plan.velocity if isinstance(plan.velocity, Derived) else None
+    lever = Lever() if plan.position is None else plan.position.antenna
+    values: dict[str, np.ndarray] = {}
+    units = {name: unit for part in parts for name, unit in part.log.units.items()}
+    for part in parts:
+        if derived is None or not part.pose:
+            values |= part.at(times, step)
+    if derived is not None:
+        pose = [part for part in parts if part.pose]
+        values = _derived_motion(pose, derived, lever, times, step) | values
+    else:
+        _move_and_turn(values, plan.velocity, lever)
+    units |= {name: CHANNEL_UNITS[name] for name in ("x", "y", "psi", "u", "v", "r")}
+    units = {name: units[name] for name in values}
     t = times
     if recording.epoch is not None:
         t = times - times[:1]
@@ -518,26 +531,6 @@ def _times(
         first = math.ceil((start + ahead) / clock.step - 1e-6) * clock.step - ahead
     count = math.floor((stop - first) / clock.step + 1e-6) + 1
     return first + clock.step * np.arange(count), clock.step
-
-
-def _values(
-    parts: Sequence[Part], plan: Plan, times: np.ndarray, step: float
-) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return the channels [T] and their units on the log's clock."""
-    derived = plan.velocity if isinstance(plan.velocity, Derived) else None
-    lever = Lever() if plan.position is None else plan.position.antenna
-    values: dict[str, np.ndarray] = {}
-    units = {name: unit for part in parts for name, unit in part.log.units.items()}
-    for part in parts:
-        if derived is None or not part.pose:
-            values |= part.at(times, step)
-    if derived is not None:
-        pose = [part for part in parts if part.pose]
-        values = _derived_motion(pose, derived, lever, times, step) | values
-    else:
-        _move_and_turn(values, plan.velocity, lever)
-    units |= {name: CHANNEL_UNITS[name] for name in ("x", "y", "psi", "u", "v", "r")}
-    return values, {name: units[name] for name in values}
 
 
 def _move_and_turn(

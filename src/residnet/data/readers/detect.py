@@ -91,7 +91,14 @@ class AutoConfig(RecordingConfig):
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
         """Read a recording of any format that describes itself."""
-        return _config_for(path).load(path, wanted)
+        found = format_of(path)
+        if found is None:
+            names = ", ".join(name for config in _RECORDINGS for name in config.formats)
+            raise UsageError(
+                f"{path}: does not say what its columns are; give a channel map with --config"
+                f" (formats that need none: {names}, canonical Parquet)"
+            )
+        return found.config().load(path, wanted)
 
 
 def format_of(path: Path) -> Format | None:
@@ -128,14 +135,3 @@ def kind_of(path: Path) -> str:
     if recording is None and ending not in TABLES and not is_text_table(path):
         raise UsageError(f"{path}: is of no format that residnet knows; {to_table(ending)}")
     return "table" if recording is None else recording.name
-
-
-def _config_for(path: Path) -> RecordingConfig:
-    found = format_of(path)
-    if found is None:
-        names = ", ".join(name for config in _RECORDINGS for name in config.formats)
-        raise UsageError(
-            f"{path}: does not say what its columns are; give a channel map with --config (formats"
-            f" that need none: {names}, canonical Parquet)"
-        )
-    return found.config()

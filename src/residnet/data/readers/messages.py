@@ -348,7 +348,32 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
             )
             remarks.append(remark("will mislead", "several_tables", text, tables=len(alike)))
         for series in sorted(fitting, key=lambda s: (-len(s), s.name)):
-            plan, taken = _joined(plan, message.plan(series))
+            offered = message.plan(series)
+            present = set(plan.channels)
+            present |= {"x", "y"} if plan.position else set()
+            present |= {"psi"} if plan.heading else set()
+            present |= {"u", "v"} if plan.velocity else set()
+            present |= {"r"} if isinstance(plan.velocity, Derived) else set()
+            # a field that is taken under one name is not offered under another
+            used = {(entry.topic, entry.field, entry.sender) for entry in plan.channels.values()}
+            new = {
+                name: entry
+                for name, entry in offered.channels.items()
+                if name not in present and (entry.topic, entry.field, entry.sender) not in used
+            }
+            position = None if {"x", "y"} & present else offered.position
+            heading = None if "psi" in present else offered.heading
+            velocity = None if {"u", "v"} & (present | set(new)) else offered.velocity
+            found = {("x", "y"): position, ("psi",): heading, ("u", "v"): velocity}
+            taken = [name for names, source in found.items() if source for name in names]
+            joined = dataclasses.replace(
+                plan,
+                channels={**plan.channels, **new},
+                position=plan.position or position,
+                heading=plan.heading or heading,
+                velocity=plan.velocity or velocity,
+            )
+            plan, taken = joined, [*taken, *new]
             if taken:
                 of = f"{', '.join(taken)}: {message.name} of {series.name}"
                 conversions.append(f"{of}, {message.conversion}")
@@ -360,32 +385,3 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
         conversions=(*declared.conversions, *conversions),
         remarks=(*declared.remarks, *remarks),
     )
-
-
-def _joined(plan: Plan, offered: Plan) -> tuple[Plan, list[str]]:
-    """Return a plan with what it lacks of another, and the names of that."""
-    present = set(plan.channels)
-    present |= {"x", "y"} if plan.position else set()
-    present |= {"psi"} if plan.heading else set()
-    present |= {"u", "v"} if plan.velocity else set()
-    present |= {"r"} if isinstance(plan.velocity, Derived) else set()
-    # a field that is taken under one name is not offered under another
-    used = {(entry.topic, entry.field, entry.sender) for entry in plan.channels.values()}
-    new = {
-        name: entry
-        for name, entry in offered.channels.items()
-        if name not in present and (entry.topic, entry.field, entry.sender) not in used
-    }
-    position = None if {"x", "y"} & present else offered.position
-    heading = None if "psi" in present else offered.heading
-    velocity = None if {"u", "v"} & (present | set(new)) else offered.velocity
-    found = {("x", "y"): position, ("psi",): heading, ("u", "v"): velocity}
-    taken = [name for names, source in found.items() if source for name in names]
-    joined = dataclasses.replace(
-        plan,
-        channels={**plan.channels, **new},
-        position=plan.position or position,
-        heading=plan.heading or heading,
-        velocity=plan.velocity or velocity,
-    )
-    return joined, [*taken, *new]

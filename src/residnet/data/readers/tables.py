@@ -365,7 +365,12 @@ class TableReader(LogReader):
         units = {name: entry.si(name) for name, entry in maps.items()}
         findings += _placed(path, channels, units)
         _headed(path, channels, units, maps)
-        _angled(channels, units)
+        for name in [one.removesuffix(COSINE) for one in channels if one.endswith(COSINE)]:
+            if name + SINE in channels and name not in channels:
+                sine, cosine = channels.pop(name + SINE), channels.pop(name + COSINE)
+                channels[name] = unwrap(np.arctan2(sine, cosine))
+                del units[name + SINE], units[name + COSINE]
+                units[name] = "rad"
         if cut:
             text = "the file ends within its last line, which is left out"
             findings.append(remark("note", "cut_line", text))
@@ -549,16 +554,6 @@ def _headed(
     units["psi"] = "rad"
 
 
-def _angled(channels: dict[str, np.ndarray], units: dict[str, str]) -> None:
-    """Put angles in place of their cosines and sines."""
-    for name in [one.removesuffix(COSINE) for one in channels if one.endswith(COSINE)]:
-        if name + SINE in channels and name not in channels:
-            sine, cosine = channels.pop(name + SINE), channels.pop(name + COSINE)
-            channels[name] = unwrap(np.arctan2(sine, cosine))
-            del units[name + SINE], units[name + COSINE]
-            units[name] = "rad"
-
-
 @contextmanager
 def _readable(path: Path, what: str) -> Iterator[None]:
     """Damaged files fail in every layer of a library: tell so in one line."""
@@ -694,7 +689,10 @@ class _JsonLines:
                 text = line.decode("utf-8-sig", errors="replace").strip()
                 try:
                     if text:
-                        yield from _rows_of(_object(text))
+                        value = json.loads(text)
+                        if not isinstance(value, dict):
+                            raise ValueError("no object")
+                        yield from _rows_of(value)
                         number += 1
                 except (ValueError, RecursionError) as error:
                     # a recorder that was switched off ends within a line
@@ -750,13 +748,6 @@ def _tables(value: Any, name: str = "") -> Iterator[tuple[str, Sequence[Mapping[
         yield name, [dict(zip(bare, row, strict=True)) for row in zip(*bare.values(), strict=True)]
     for key, inner in value.items():
         yield from _tables(inner, f"{name}.{key}" if name else str(key))
-
-
-def _object(text: str) -> dict[str, Any]:
-    value = json.loads(text)
-    if not isinstance(value, dict):
-        raise ValueError("no object")
-    return value
 
 
 def _rows_of(value: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -630,7 +630,30 @@ def encoding_of(path: Path) -> str:
         if told is not None:
             return told
         stream.seek(0)
-        return _of_bytes(_first_beyond_utf8(stream))
+        block = _first_beyond_utf8(stream)
+        if not block:
+            return "utf-8"
+        beyond = block.translate(None, _ASCII)
+        # words of Cyrillic are runs of such letters; a Latin one stands among plain letters
+        if _CYRILLIC.fullmatch(beyond) and _RUN.search(block):
+            return "cp1251"
+        western = block.decode("cp1252", errors="replace")
+        if _POLISH.search(western):
+            return "cp1250"
+        # a Latin letter and the next one may look like one Japanese sign, but not the other way
+        if _LATIN.fullmatch(western):
+            return "cp1252"
+        for name, likely in (
+            ("cp932", _JAPANESE),
+            ("cp949", _KOREAN),
+            ("gb18030", _CHINESE),
+            ("cp1252", re.compile("")),
+        ):
+            with suppress(UnicodeDecodeError):
+                if likely.search(block.decode(name)):
+                    return name
+        # it gives every byte a sign: numbers can be read, and names stay names
+        return "latin-1"
 
 
 def encoding_of_head(head: bytes) -> str:
@@ -711,30 +734,3 @@ def _first_beyond_utf8(stream: BinaryIO) -> bytes:
         except UnicodeDecodeError:
             return block[: block.rfind(b"\n") + 1] or block
     return b""
-
-
-def _of_bytes(block: bytes) -> str:
-    """Return the encoding of bytes that are no UTF-8; UTF-8 for none."""
-    if not block:
-        return "utf-8"
-    beyond = block.translate(None, _ASCII)
-    # words of Cyrillic are runs of such letters; a Latin one stands among plain letters
-    if _CYRILLIC.fullmatch(beyond) and _RUN.search(block):
-        return "cp1251"
-    western = block.decode("cp1252", errors="replace")
-    if _POLISH.search(western):
-        return "cp1250"
-    # a Latin letter and the next one may look like one Japanese sign, but not the other way
-    if _LATIN.fullmatch(western):
-        return "cp1252"
-    for name, likely in (
-        ("cp932", _JAPANESE),
-        ("cp949", _KOREAN),
-        ("gb18030", _CHINESE),
-        ("cp1252", re.compile("")),
-    ):
-        with suppress(UnicodeDecodeError):
-            if likely.search(block.decode(name)):
-                return name
-    # it gives every byte a sign: numbers can be read, and names stay names
-    return "latin-1"

@@ -42,10 +42,20 @@ def fitted_on_what(run: RunFiles) -> Section | None:
         f"{name} {number(run.unit(name)[1] * value)} {run.unit(name)[0]}"
         for name, value in (run.metrics.get("scales") or {}).items()
     ]
+    signals = run.resolved.get("signals") or {}
+    text = ", ".join(signals.get("inputs") or [])
+    if signals.get("exogenous"):
+        text += "; exogenous: " + ", ".join(signals["exogenous"])
+    if signals.get("forces"):
+        text += (
+            f"; forces from the thrusters of {signals['forces']}"
+            if isinstance(signals["forces"], str)
+            else "; forces from given thrusters"
+        )
     facts = [
         ("data", _data(run)),
         ("splits", "; ".join(splits)),
-        ("inputs", _inputs(run)),
+        ("inputs", text),
         ("velocities", run.live.text),
         *_model(run),
     ]
@@ -114,20 +124,6 @@ def _data(run: RunFiles) -> str:
             f" {number(DEG * noise.get('r', 0), 2)} deg/s"
         )
     return text + f"; data seed {data.get('seed')}"
-
-
-def _inputs(run: RunFiles) -> str:
-    signals = run.resolved.get("signals") or {}
-    text = ", ".join(signals.get("inputs") or [])
-    if signals.get("exogenous"):
-        text += "; exogenous: " + ", ".join(signals["exogenous"])
-    if signals.get("forces"):
-        text += (
-            f"; forces from the thrusters of {signals['forces']}"
-            if isinstance(signals["forces"], str)
-            else "; forces from given thrusters"
-        )
-    return text
 
 
 def _model(run: RunFiles) -> list[tuple[str, str]]:

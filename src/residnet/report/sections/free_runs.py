@@ -210,10 +210,22 @@ def limits(run: RunFiles) -> Section | None:
         row = run.row(lead, run.focus, protocol)
         if row is not None:
             known = (run.limits.get("splits") or {}).get(run.focus, {}).get(protocol, {})
+            out = []
+            if found := known.get("kinematics"):
+                out.append(
+                    "Consistency of the measured channels: the measured velocities, integrated over"
+                    " each window from its measured pose, end"
+                    f" {listed(run.sized(found, '{}_mean'))} from the measured pose on average"
+                    f" (root mean square {', '.join(run.sized(found, '{}_rms'))}). A model that"
+                    f" predicted the measured velocities exactly would be off by as much; {lead} is"
+                    f" off by {listed(run.sized(row, '{}_error_end'))}."
+                )
+            if repeats := (run.limits.get("repeatability") or {}).get(protocol):
+                out.append(_repeatability(run, repeats))
             blocks = [
                 _where(run, lead, protocol, known),
                 None if protocol == run.main else _worst(run, lead, known),
-                Text(_what_limits(run, lead, row, protocol, known)),
+                Text(out),
             ]
             title = f"Protocol {protocol}" + ("" if parts else f", {run.focus} data")
             parts.append(Section(title, blocks, folded=bool(parts)))
@@ -295,6 +307,8 @@ def _worst(run: RunFiles, lead: str, known: Content) -> Table | None:
     if not entries:
         return None
     channels = [name for name in run.channels if name in entries[0]["rmse"]]
+    first = run.ends[0]
+    factor = run.end(first)[2]
     return table_of(
         entries,
         [
@@ -305,32 +319,9 @@ def _worst(run: RunFiles, lead: str, known: Content) -> Table | None:
             ("log time at start [s]", "t", 1),
             ("NRMSE", "nrmse", number),
             *((_quantities(run)[c], f"rmse.{c}", number, run.unit(c)[1]) for c in channels),
-            _worst_end(run),
+            (_quantities(run)[first], lambda e: number(factor * e[f"{first}_error_end"], 2), str),
         ],
     )
-
-
-def _worst_end(run: RunFiles) -> Column:
-    first = run.ends[0]
-    factor = run.end(first)[2]
-    return _quantities(run)[first], lambda e: number(factor * e[f"{first}_error_end"], 2), str
-
-
-def _what_limits(
-    run: RunFiles, lead: str, row: Content, protocol: str, known: Content
-) -> list[str]:
-    out = []
-    if found := known.get("kinematics"):
-        out.append(
-            "Consistency of the measured channels: the measured velocities, integrated over each"
-            f" window from its measured pose, end {listed(run.sized(found, '{}_mean'))} from the"
-            f" measured pose on average (root mean square {', '.join(run.sized(found, '{}_rms'))})."
-            " A model that predicted the measured velocities exactly would be off by as much;"
-            f" {lead} is off by {listed(run.sized(row, '{}_error_end'))}."
-        )
-    if repeats := (run.limits.get("repeatability") or {}).get(protocol):
-        out.append(_repeatability(run, repeats))
-    return out
 
 
 def _repeatability(run: RunFiles, found: Content) -> str:

@@ -33,10 +33,23 @@ def sections(run: RunFiles) -> list[Section]:
     logs = [Log.load(path) for path in sorted((run.path / "logs").glob("*.parquet"))]
     channels = [Section(log.name, [channel_table(log)], folded=True) for log in logs]
     table = log_table(logs, findings)
+    severe = [
+        f"{log}: {finding['level']}: {minus(str(finding['text']))}"
+        for log, found in findings.items()
+        for finding in found
+        if finding["level"] != _NOTE
+    ]
+    blocks: list[Block] = (
+        [Bullets(severe, warning=True)] if severe else [Text("Nothing needs a look.")]
+    )
+    for log, found in findings.items():
+        notes = [minus(str(finding["text"])) for finding in found if finding["level"] == _NOTE]
+        if notes:
+            blocks.append(Section(f"Notes on {log}", [Bullets(notes)], folded=True))
     return [
         Section("", [write_figure(run.path / "figures", motion(logs)), table]),
         Section("Channels", channels),
-        Section("What was noticed on the way in", _noticed(findings)),
+        Section("What was noticed on the way in", blocks),
     ]
 
 
@@ -130,20 +143,3 @@ def channel_table(log: Log) -> Table:
             ("missing [%]", "missing", str),
         ],
     )
-
-
-def _noticed(findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Block]:
-    severe = [
-        f"{log}: {finding['level']}: {minus(str(finding['text']))}"
-        for log, found in findings.items()
-        for finding in found
-        if finding["level"] != _NOTE
-    ]
-    blocks: list[Block] = (
-        [Bullets(severe, warning=True)] if severe else [Text("Nothing needs a look.")]
-    )
-    for log, found in findings.items():
-        notes = [minus(str(finding["text"])) for finding in found if finding["level"] == _NOTE]
-        if notes:
-            blocks.append(Section(f"Notes on {log}", [Bullets(notes)], folded=True))
-    return blocks

@@ -132,7 +132,23 @@ class _Lines:
     def add(self, message: Any, before: str, wanted: Wanted) -> None:
         """Take one more sentence with the text before it."""
         at = self._tick(message)
-        name, values = str(message.sentence_type), _numbers(message)
+        # positions in signed degrees, NaN where the receiver says that there is no fix
+        out: dict[str, float] = {}
+        names = [str(entry[1]) for entry in message.fields]
+        for name, cell in zip(names, message.data, strict=False):
+            if name in ("timestamp", "datestamp", "lat", "lon"):
+                continue
+            try:
+                out[name] = float(cell) * _PER_MINUTE.get(name, 1.0)
+            except ValueError:
+                if not cell:
+                    out[name] = float("nan")
+        if {"lat", "lon"} <= set(names):
+            fix = bool(message.lat and message.lon) and getattr(message, "status", "A") != "V"
+            fix = fix and str(getattr(message, "gps_qual", "1")) != "0"
+            here = (message.latitude, message.longitude) if fix else (float("nan"), float("nan"))
+            out["latitude"], out["longitude"] = here
+        name, values = str(message.sentence_type), out
         if not wanted(name) or not values:
             return
         one = self.series.setdefault(name, _Sentence(list(values)))
@@ -236,26 +252,3 @@ def _date(message: Any) -> datetime.date | None:
     if message.sentence_type == "ZDA":
         return datetime.date(int(message.year), int(message.month), int(message.day))
     return None
-
-
-def _numbers(message: Any) -> dict[str, float]:
-    """Return the numbers in a sentence by name.
-
-    Positions in signed degrees, NaN where the receiver says that there is no fix.
-    """
-    out: dict[str, float] = {}
-    names = [str(entry[1]) for entry in message.fields]
-    for name, cell in zip(names, message.data, strict=False):
-        if name in ("timestamp", "datestamp", "lat", "lon"):
-            continue
-        try:
-            out[name] = float(cell) * _PER_MINUTE.get(name, 1.0)
-        except ValueError:
-            if not cell:
-                out[name] = float("nan")
-    if {"lat", "lon"} <= set(names):
-        fix = bool(message.lat and message.lon) and getattr(message, "status", "A") != "V"
-        fix = fix and str(getattr(message, "gps_qual", "1")) != "0"
-        here = (message.latitude, message.longitude) if fix else (float("nan"), float("nan"))
-        out["latitude"], out["longitude"] = here
-    return out

@@ -286,7 +286,15 @@ class _Topic:
         self._sender: np.ndarray | None = None
         clock, unit = time
         if clock is not None:
-            columns = self._timed(name, columns, clock, unit)
+            try:
+                self._arrival = parse_texts(columns[clock], unit=unit)
+            except DataError:
+                if len(columns[clock]) < 2:
+                    raise
+                columns = {column: cells.iloc[:-1] for column, cells in columns.items()}
+                self._arrival = parse_texts(columns[clock], unit=unit)
+                text = f"topic {name}: the last row is cut short; left out"
+                self._remarks.append(remark("note", "cut_short", text, rows=1.0))
         whole = {}
         for column, cells in columns.items():
             if column != clock and (values := self._numbers(name, column, cells)) is not None:
@@ -318,21 +326,6 @@ class _Topic:
         ]
         remarks = (*self._remarks, *said)
         return Series(name, "", self._fields, stamp, arrival, self._sender, remarks)
-
-    def _timed(
-        self, name: str, columns: dict[str, pd.Series], clock: str, unit: str
-    ) -> dict[str, pd.Series]:
-        """Read the arrival times; a recorder that loses power leaves half a row."""
-        try:
-            self._arrival = parse_texts(columns[clock], unit=unit)
-        except DataError:
-            if len(columns[clock]) < 2:
-                raise
-            columns = {column: cells.iloc[:-1] for column, cells in columns.items()}
-            self._arrival = parse_texts(columns[clock], unit=unit)
-            text = f"topic {name}: the last row is cut short; left out"
-            self._remarks.append(remark("note", "cut_short", text, rows=1.0))
-        return columns
 
     def _numbers(self, name: str, column: str, cells: pd.Series) -> np.ndarray | None:
         """Return a column [T] as numbers; None where it is text, of which senders are kept."""

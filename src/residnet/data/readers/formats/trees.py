@@ -115,7 +115,36 @@ class _TreeConfig(RecordingConfig):
             raise missing_package("hdf5", "h5py", what) from error
         try:
             with h5py.File(path, "r") as file:
-                return _tree_recording(path, _hdf5_leaves(path, file), self.time, wanted)
+                import h5py
+
+                found: dict[str, h5py.Dataset] = {}
+
+                def visit(name: str, node: Any) -> None:
+                    if isinstance(node, h5py.Dataset) and not name.startswith("#"):
+                        found[name] = node
+
+                file.visititems(visit)
+                leaves: dict[str, _Vector] = {}
+                for dataset in found.values():
+                    name, names = dataset.name.strip("/"), dataset.dtype.names
+                    claimed, held = dataset.size * dataset.dtype.itemsize, path.stat().st_size
+                    if claimed > max(_ALWAYS_HELD, _MOST_COMPRESSED * held):
+                        # a size is only a number in the file
+                        raise DataError(
+                            f"{path}: {dataset.name} claims {claimed / 1e9:.3g} GB in a file of"
+                            f" {held / 1e6:.3g} MB; the file is damaged, or was made and never"
+                            " filled"
+                        )
+                    if names and dataset.ndim == 1:
+                        for column in names:
+                            if not dataset.dtype[column].shape:
+                                leaves[f"{name}/{column}"] = _Column(dataset, column)
+                        continue
+                    text = dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
+                    if not names and dataset.ndim and dataset.size and not text:
+                        words = dataset.dtype.kind in "SO" and dataset.ndim == 1
+                        leaves[name] = _plain(dataset[()]) if words else dataset
+                return _tree_recording(path, leaves, self.time, wanted)
         except (OSError, RuntimeError, KeyError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
             raise DataError(f"{path}: damaged or not an HDF5 file ({reason})") from error
@@ -183,39 +212,6 @@ def _below(node: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
         yield prefix, node
 
 
-def _hdf5_leaves(path: Path, file: h5py.File) -> dict[str, _Vector]:
-    """Return the arrays of a file by path, not yet read; a table gives one for each column."""
-    import h5py
-
-    found: dict[str, h5py.Dataset] = {}
-
-    def visit(name: str, node: Any) -> None:
-        if isinstance(node, h5py.Dataset) and not name.startswith("#"):
-            found[name] = node
-
-    file.visititems(visit)
-    leaves: dict[str, _Vector] = {}
-    for dataset in found.values():
-        name, names = dataset.name.strip("/"), dataset.dtype.names
-        claimed, held = dataset.size * dataset.dtype.itemsize, path.stat().st_size
-        if claimed > max(_ALWAYS_HELD, _MOST_COMPRESSED * held):
-            # a size is only a number in the file
-            raise DataError(
-                f"{path}: {dataset.name} claims {claimed / 1e9:.3g} GB in a file of"
-                f" {held / 1e6:.3g} MB; the file is damaged, or was made and never filled"
-            )
-        if names and dataset.ndim == 1:
-            for column in names:
-                if not dataset.dtype[column].shape:
-                    leaves[f"{name}/{column}"] = _Column(dataset, column)
-            continue
-        text = dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
-        if not names and dataset.ndim and dataset.size and not text:
-            words = dataset.dtype.kind in "SO" and dataset.ndim == 1
-            leaves[name] = _plain(dataset[()]) if words else dataset
-    return leaves
-
-
 @final
 class _Column:
     """One column of a table, read when it is used."""
@@ -269,7 +265,12 @@ def _tree_recording(
             left.append(f"{name} {list(values.shape)}")
             continue
         clock, t = clocks[group]
-        inside = _path_in(group, name)
+        shared, parts = 0, name.split("/")
+        for mine, other in zip(parts[:-1], group.split("/") if group else [], strict=False):
+            if mine != other:
+                break
+            shared += 1
+        inside = "/".join(parts[shared:])
         if name != clock and wanted(group or "/") and wanted.field(group or "/", inside):
             fields[group] |= _columns(inside, values, len(t))
             if not name.startswith(f"{group}/" if group else ""):
@@ -336,16 +337,6 @@ def _home(path: str, values: _Vector, clocks: Mapping[str, tuple[str, np.ndarray
         return None
     same = all(np.array_equal(clocks[name][1], clocks[alike[0]][1]) for name in alike)
     return alike[0] if same else None
-
-
-def _path_in(group: str, name: str) -> str:
-    """Return the path of a vector below what it has in common with the group of its time."""
-    shared, parts = 0, name.split("/")
-    for mine, other in zip(parts[:-1], group.split("/") if group else [], strict=False):
-        if mine != other:
-            break
-        shared += 1
-    return "/".join(parts[shared:])
 
 
 def _time_axis(values: _Vector, length: int) -> int | None:
