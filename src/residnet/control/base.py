@@ -61,7 +61,6 @@ class Reference(nn.Module, ABC):
 
         Args:
             x: state [B, nx].
-            k: number of the step.
             s: memory [B, n_state].
         """
 
@@ -120,7 +119,6 @@ class Followed(Source):
     What does not count steps can be compiled. Its commands take the first columns of the m.
 
     Args:
-        policy: the controller.
         inputs: number m of the vessel's inputs.
     """
 

@@ -51,7 +51,6 @@ class WheelOver(nn.Module):
     circle.
 
     Args:
-        turning: K, T and speed.
         limit: of the rudder in rad.
         acceptance: radius of the circle in m.
         share: of that radius that the track keeps within.
@@ -158,8 +157,6 @@ class WaypointGuidance(Reference):
     Args:
         points: way-points (north, east) in m, in their order.
         acceptance: radius of the circle in m.
-        sight: law of the line of sight.
-        state: names of the vessel's state.
         wheel_over: how far before a way-point the leg changes; None for in its circle.
     """
 
@@ -461,9 +458,7 @@ class CourseGuidance(Reference):
     the course in its bends. Memory [B, 1 or 3]: place along the course in m, and D.
 
     Args:
-        course: to follow.
         lookahead: distance in m.
-        state: names of the vessel's state.
         drift: integral action against a steady current, at the same look-ahead; None for none.
     """
 
@@ -564,8 +559,6 @@ class TrackKeeping(Policy):
     [rad] as the steering gear follows, then the law's.
 
     Args:
-        law: heading controller.
-        state: names of the vessel's state.
         limit: of the rudder in rad.
         dt: step in s.
         rate: of the rudder in rad/s; None where it stands at its command at once.

@@ -338,8 +338,6 @@ def needed_force(model: ForceModel, motion: Derivatives, lag: Lag | None, held: 
     Its first and second derivative stand behind it.
 
     Args:
-        model: of the vessel.
-        motion: desired.
         lag: of the actuators; None commands the force itself, now and without derivatives.
         held: seconds that a command is held; on average it comes late by half of them.
     """

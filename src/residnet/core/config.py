@@ -173,7 +173,6 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
     """Build a config of type `model` from a YAML file and overrides.
 
     Args:
-        path: YAML file.
         overrides: `dotted.key=value`, value in YAML, in order; an element of a list is addressed by
             its index. `~dotted.key` takes a key away.
         model: config class, or a union of them (`Annotated[A | B, Field(discriminator="kind")]`).
@@ -203,7 +202,6 @@ def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> A
 
     Args:
         data: what JSON can hold, for example a mapping from `load_mapping`.
-        model: config class or union of them.
         where: what errors name as the source.
         folder: folder that relative paths are looked for in first.
 
@@ -524,8 +522,6 @@ def describe(error: ValidationError, model: Any, where: Callable[[KeyPath], str]
     """Return the first fault of a validation error as one line.
 
     Args:
-        error: what pydantic raised.
-        model: the type that was validated against.
         where: file (with line) or override in which the value at a key path was set.
     """
     faults = [_fault(details, model) for details in error.errors(include_url=False)]

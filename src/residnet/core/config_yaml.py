@@ -132,7 +132,6 @@ def parse(text: str, where: str, *, located: bool = True) -> tuple[Any, Node | N
     holds no document.
 
     Args:
-        text: the document.
         where: file or override that errors name.
         located: whether errors give the line and column.
 

@@ -65,11 +65,6 @@ class WithheldError(ExportError):
 def require_package(package: str, what: str, extra: str) -> None:
     """Refuse to go on without an optional package.
 
-    Args:
-        package: as it is imported.
-        what: needs it.
-        extra: of residnet that installs it.
-
     Raises:
         MissingPackageError: where it is not installed.
     """

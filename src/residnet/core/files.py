@@ -34,9 +34,6 @@ def whole(path: Path) -> Iterator[Path]:
 
     A process that is killed meanwhile leaves the old file, or none. The file's folder is made.
 
-    Args:
-        path: of the file.
-
     Raises:
         UsageError: where the file cannot be written.
     """

@@ -161,10 +161,6 @@ def begin_worker(begin: Callable[..., None] | None = None, given: tuple[Any, ...
     """Leave Ctrl-C to the process that began this one, and end with it, however it ends.
 
     Ctrl-C reaches every process of a terminal; a process that is killed cannot tell its children.
-
-    Args:
-        begin: is called then.
-        given: to it.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()

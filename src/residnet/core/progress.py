@@ -48,10 +48,8 @@ def report(
     """Tell the callback that listens, if there is one, how far a stage is.
 
     Args:
-        stage: what is being done.
         done: how much of it is done, in any unit; None where the work cannot be counted.
         total: how much there is to do in the same unit; None where it is not known.
-        message: a line for the log.
         score: best validation error in free run of a training by then.
     """
     callback = _callback.get()

@@ -164,7 +164,6 @@ def known_unit(unit: str, expected: str | None = None) -> str:
     """Return residnet's own name of a unit, whatever its spelling.
 
     Args:
-        unit: as somebody wrote it.
         expected: SI unit of the dimension that is wanted; None takes any.
 
     Raises:

@@ -43,7 +43,6 @@ def align(log: Log, config: GridConfig, needed: Collection[str] | None = None) -
 
     Args:
         log: with an increasing clock.
-        config: grid.
         needed: channels without which a sample is missing; all where None. What nobody uses must
             cost no sample.
 

@@ -96,7 +96,6 @@ class SavitzkyGolay(Derivative):
         return round(self.window / step) // 2 * 2 + 1
 
     def shortest(self, step: float) -> int:
-        """Return the samples in the window; see `Derivative.shortest`."""
         if self.samples(step) <= self.order:
             needed = (self.order + 1 | 1) * step
             raise ConfigError(
@@ -107,7 +106,6 @@ class SavitzkyGolay(Derivative):
         return self.samples(step)
 
     def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        """See `Derivative.piece`."""
         return local_polynomials(values, self.samples(step), self.order, step)
 
 
@@ -174,7 +172,6 @@ class Butterworth(Derivative):
     cutoff: Hertz = Field(gt=0.0)
 
     def shortest(self, step: float) -> int:
-        """Return more than the filter's padding; see `Derivative.shortest`."""
         if self.cutoff >= 0.5 / step:
             raise ConfigError(
                 f"butterworth: cutoff {self.cutoff:g} Hz is not below the Nyquist frequency"
@@ -183,7 +180,6 @@ class Butterworth(Derivative):
         return 3 * (self.order + 1) + 2
 
     def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        """See `Derivative.piece`."""
         from scipy.signal import butter, filtfilt
 
         low_pass = butter(self.order, self.cutoff, fs=1.0 / step)

@@ -80,7 +80,6 @@ class Frozen(Mask):
     after: Seconds = Field(default=2.0, ge=0.0)
 
     def apply(self, log: Log) -> np.ndarray:
-        """Return [T] bool; see `Mask.apply`."""
         values = log.stack(self.channels)
         starts, stops = stretches((np.diff(values, axis=0) == 0.0).all(axis=1))
         long = stops - starts >= self.samples * usual_interval(values)
@@ -103,7 +102,6 @@ class Gap(Mask):
     longest: Seconds = Field(gt=0.0)
 
     def apply(self, log: Log) -> np.ndarray:
-        """Return [T] bool; see `Mask.apply`."""
         return np.append(False, np.diff(log.t) > self.longest * (1.0 + 1e-9))
 
 
@@ -120,7 +118,6 @@ class Missing(Mask):
     channels: tuple[str, ...] = ()
 
     def apply(self, log: Log) -> np.ndarray:
-        """Return [T] bool; see `Mask.apply`."""
         missing: np.ndarray = np.isnan(log.stack(self.channels or tuple(log.channels))).any(axis=1)
         return missing
 
@@ -145,7 +142,6 @@ class Jump(Mask):
     after: int = Field(default=1, ge=0)
 
     def apply(self, log: Log) -> np.ndarray:
-        """Return [T] bool; see `Mask.apply`."""
         landed = steps_above(log, self.channel, self.limit)
         return _cover(len(log), landed - self.before, landed + self.after)
 
@@ -174,7 +170,6 @@ class Outlier(Mask):
     samples: int = Field(default=10, ge=4)
 
     def apply(self, log: Log) -> np.ndarray:
-        """Return [T] bool; see `Mask.apply`."""
         return _each(log, self.channels, self._outliers)
 
     def _outliers(self, channel: np.ndarray) -> np.ndarray:
@@ -222,7 +217,6 @@ class Hampel(Mask):
     samples: int = Field(default=11, ge=5)
 
     def apply(self, log: Log) -> np.ndarray:
-        """Return [T] bool; see `Mask.apply`."""
         return _each(
             log, self.channels, lambda values: far_from_median(values, self.sigmas, self.samples)
         )
@@ -238,7 +232,6 @@ class Spike(Mask):
     kind: Literal["spike"] = "spike"
 
     def apply(self, log: Log) -> np.ndarray:
-        """Return [T] bool; see `Mask.apply`."""
         cells = spike_cells(log)
         return np.asarray(np.logical_or.reduce([np.zeros(len(log), dtype=bool), *cells.values()]))
 
@@ -265,7 +258,6 @@ class InputJump(Mask):
     after: Seconds = Field(ge=0.0)
 
     def apply(self, log: Log) -> np.ndarray:
-        """Return [T] bool; see `Mask.apply`."""
         landed = np.concatenate([steps_above(log, name, self.limit) for name in self.channels])
         margin = 1e-6 * _step(log.t)
         starts = np.searchsorted(log.t, log.t[landed] - self.before - margin)

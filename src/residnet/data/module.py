@@ -23,7 +23,6 @@ class EpochDataModule(L.LightningDataModule, ABC):
     every batch draws them in a subclass of its own.
 
     Args:
-        seed: of the batches.
         epoch: returns the number of the present epoch; None asks the trainer.
     """
 
@@ -116,10 +115,7 @@ class WindowsDataModule(EpochDataModule):
     A training in stages gives one entry for each and says which stage an epoch belongs to.
 
     Args:
-        store: logs.
         stages: windows of each stage; None for a stage without epochs.
-        steps: batches in an epoch.
-        seed: of the batches.
         stage: epoch -> number of its stage; None where there is one.
         epoch: as for `EpochDataModule`.
 
@@ -151,7 +147,6 @@ class WindowsDataModule(EpochDataModule):
 
     @property
     def steps(self) -> int:
-        """Batches in an epoch."""
         return self._steps
 
     def batches(self, epoch: int) -> Iterator[tuple[Windows, ...]]:
@@ -200,11 +195,9 @@ class RowsDataModule(EpochDataModule):
 
     @property
     def steps(self) -> int:
-        """Batches in an epoch."""
         return -(-self.tensors[0].shape[0] // self.batch)
 
     def batches(self, epoch: int) -> Iterator[tuple[Tensor, ...]]:
-        """Yield the batches of an epoch."""
         rank, world = self.share
         generator = torch.Generator().manual_seed(epoch_seed(self.seed, epoch))
         order = torch.randperm(self.tensors[0].shape[0], generator=generator)

@@ -76,7 +76,6 @@ def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
 
     Args:
         log: in SI.
-        config: settings of the smoother.
         live: velocities that the log tells; the others are zero, and so is what of the pose they
             alone would move. With p the roll angle is told, and p by it where it is not measured.
 
@@ -317,9 +316,7 @@ def _turned_by(log: Log, angle: np.ndarray, name: str) -> tuple[np.ndarray, np.n
     """Return a smoothed angle [T] in rad and its rate [T] in rad/s, from both or the first.
 
     Args:
-        log: that may hold the rate.
         angle: as measured, [T].
-        name: channel of the rate.
     """
     rate = log.channels.get(name, np.full(angle.size, np.nan))
     ratio = max(noise_of(rate), 1e-7) / max(noise_of(angle), 1e-7)

@@ -123,9 +123,7 @@ def prepare(
     Args:
         log: canonical log; needs the channels x, y, psi and `columns`; u, v, r come from a
             smoother where it lacks them. A roll needs phi.
-        split: which split it belongs to.
         columns: input channels, in the order of w.
-        config: grid, masks, derivative.
         live: velocities that the model moves (`SignalsConfig.live`); the others are zero.
 
     Raises:

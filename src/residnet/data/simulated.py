@@ -119,7 +119,6 @@ def fly(
     Args:
         craft: plant or learned model.
         manoeuvres: in the order of the result; rows that reach their stop condition end there.
-        sea: disturbance and sensors.
         duration: of manoeuvres that give none, in s.
         step: of the logs in s.
         about: what the meta of the logs shall say.

@@ -400,8 +400,6 @@ def sampled_hashes(log: Log, channels: Sequence[str], one_of: int) -> np.ndarray
     """Return the hashes of a log's rows that are compared: of equal rows all are, or none.
 
     Args:
-        log: whose rows.
-        channels: that count.
         one_of: of how many hashes one is kept, by its own number.
     """
     hashes = row_hashes(log, channels)

@@ -98,7 +98,6 @@ class WindowStore:
         States are sampled; inputs over a long step are the mean of those over its short ones.
 
         Args:
-            steps: short ones in a long one.
             turning: columns of w that are angles, whose means keep to the circle.
         """
         if steps == 1:

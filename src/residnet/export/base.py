@@ -136,9 +136,6 @@ class Exported(ABC):
         """Return what the card says of the parity, once a file answers as it must.
 
         Args:
-            loaded: the file.
-            what: it is, for messages.
-            dtype: its precision.
             tolerance: largest difference; None for what the precision allows.
 
         Raises:
@@ -185,7 +182,6 @@ def released(exported: Made, objections: Sequence[str], *, anyway: bool) -> Made
     """Return what may be exported, with all that speaks against it in its card.
 
     Args:
-        exported: that is to be written.
         objections: sentences without a full stop on why one should do without it: it is worse than
             `zero`, than the believed model or than the law that it stands beside.
         anyway: whether it is wanted all the same.

@@ -87,9 +87,7 @@ def c_source(
     """Return source and header.
 
     Args:
-        exported: what they are of.
         card: stands as a comment in the header.
-        header: name of the header file.
         double_only: whether single precision is not offered.
 
     Raises:
@@ -179,13 +177,7 @@ def _vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, 
 
 
 class CompiledModel(Loaded):
-    """An exported C file as a library.
-
-    Args:
-        library: compiled.
-        exported: what the file is of.
-        dtype: precision that it was compiled for.
-    """
+    """An exported C file as a library."""
 
     def __init__(self, library: Path, exported: Exported, dtype: torch.dtype) -> None:
         self.real: Any = np.float64 if dtype == torch.float64 else np.float32

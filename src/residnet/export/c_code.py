@@ -163,7 +163,6 @@ def c_files(
         extra: comment, prototype and body of further functions that call those.
         sizes: value and comment of each constant, by name without prefix.
         about: comment at the top of the header, which tells how to use it.
-        header: name of the header file.
         double_only: whether single precision is not offered.
     """
     tables = Tables(f"{prefix}_")
@@ -197,8 +196,6 @@ def compile_shared(
     """Compile C files to a shared library, without a single warning.
 
     Args:
-        sources: of the library.
-        out: the library.
         flags: of the compiler, beside its usual ones.
         tool: the compiler; empty for that of this machine.
 

@@ -53,7 +53,6 @@ class GuardedDynamics(Dynamics):
 
     Args:
         model: in the precision that it shall run in, float32 in exports.
-        spec: its description.
     """
 
     def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:

@@ -55,7 +55,6 @@ class _Controller(nn.Module):
     Args:
         limits: [low, high] in which each measurement is accepted.
         memory: [low, high] of the memory without the last command.
-        policy: whose rudder is commanded.
         safe: command while inputs are wrong.
         dtype: of all numbers.
     """
@@ -289,7 +288,6 @@ class ExportedController(Exported):
     """A policy that is exported: what heading policies and policies along a course share.
 
     Args:
-        name: of the policy.
         policy: at the step that it shall run with.
         safe: command while inputs are wrong.
         about: of the vessel, the training or the course, for the card.
@@ -458,12 +456,7 @@ class ExportedHeading(ExportedController):
 
 @final
 class ExportedCoursePolicy(ExportedController):
-    """A heading policy with the guidance of a planned course.
-
-    Args:
-        guidance: of the course.
-        course: that parity is checked along.
-    """
+    """A heading policy with the guidance of a planned course."""
 
     schema = "residnet.course_card/1"
     kind = "course of"

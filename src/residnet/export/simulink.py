@@ -80,8 +80,6 @@ def s_function(exported: Exported, prefix: str, name: str, sizes: Mapping[str, i
     Args:
         exported: with its step.
         prefix: of the functions in the C file.
-        name: of the S-function.
-        sizes: of what a step gives.
     """
     given = dict(exported.arguments)
     vessel = isinstance(exported, ExportedVessel)

@@ -176,8 +176,6 @@ class ExportedVessel(Exported):
     """A vessel model, whose own numbers are left alone.
 
     Args:
-        spec: the model's description.
-        model: the model.
         metrics: rows of metrics.json of this model, for the card.
     """
 

@@ -40,9 +40,7 @@ def fold_numbers(kinds: Sequence[str], folds: int, seed: int) -> np.ndarray:
     """Return the number of the fold of each log [L]; logs of a kind are spread over the folds.
 
     Args:
-        kinds: of manoeuvre, by log.
         folds: at most; fewer where there are fewer logs.
-        seed: of the division.
     """
     random = np.random.default_rng([seed, 3])
     order = [
@@ -63,7 +61,6 @@ class FoldModels:
     ensembles are not here.
 
     Args:
-        identified: the fit.
         fold: number of the fold of each training log [L].
     """
 
@@ -161,11 +158,6 @@ def calibrate_bands(
     themselves. A model that is not fitted again without logs takes the form of its reference's
     band, with the level that its own errors on the validation logs ask for. Where these were fitted
     too, means take the band of their reference as it is, and networks have none.
-
-    Args:
-        identified: the fit.
-        validation: logs that chose between models.
-        config: level, folds and starts.
     """
     begin("calibrating bands")
     fold = fold_numbers([log.log.manoeuvre for log in identified.train], config.folds, config.seed)
@@ -199,9 +191,6 @@ class _Calibration:
     """The free runs that calibrate the bands under one protocol.
 
     Args:
-        identified: the fit.
-        protocol: its name.
-        config: level, folds and starts.
         failed: why a model cannot be fitted without some of the logs, by its name.
     """
 

@@ -147,10 +147,8 @@ class ChangedDynamics(Dynamics):
     """A model with a change of its own for every block of rows.
 
     Args:
-        model: as it was fitted.
         changes: C of them; rows [C * B] are blocks of B.
         rows: B.
-        inputs: number of the model's inputs.
     """
 
     def __init__(

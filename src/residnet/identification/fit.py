@@ -39,7 +39,6 @@ def fit(logs: Logs, settings: FitSettings, *, store: FitStore | None = None) -> 
 
     Args:
         logs: prepared logs by split; `train` is fitted, `validation` chooses and stops early.
-        settings: of the fit.
         store: keeps every model as it is done and hands finished heads back; None to keep none.
 
     Raises:

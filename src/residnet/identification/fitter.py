@@ -60,7 +60,6 @@ class ValidationScore:
     """The free-run score of a model on the validation logs; the windows are laid out once.
 
     Args:
-        logs: of the validation split.
         config: its `selection` protocol and scales are used.
         step: of the grid in s.
         limit: size of what moves [n] beyond which a free run has diverged.
@@ -134,7 +133,6 @@ def choose_solution(
     What lies around the best is tried for as long as it gains.
 
     Args:
-        model: the model that runs.
         part: its baseline or head, which the solutions belong to.
         solutions: at least one; a single one is taken as it is.
         score: of a model's free runs on validation data; fewer divergences come before less error.
@@ -185,11 +183,6 @@ def settled(settings: FitSettings, samples: Samples, logs: Sequence[Prepared]) -
     """Return settings whose parts are those of the recipe for these logs.
 
     Settings without a recipe are returned as they are.
-
-    Args:
-        settings: of the fit.
-        samples: of the training logs.
-        logs: for training.
     """
     if settings.recipe is None:
         return settings
@@ -202,7 +195,6 @@ class Fitter:
 
     Args:
         logs: prepared logs by split; `train` and `validation` are used.
-        settings: of the fit.
         store: keeps every model as it is done.
         settle: whether the recipe's parts are yet to follow from the logs.
         seen: the validation logs are among those of training, and judge nothing.
@@ -240,9 +232,7 @@ class Fitter:
         """Return the description of a model of this fit.
 
         Args:
-            name: of the model.
             role: zero, baseline, head or ensemble.
-            baseline: that it is or stands on.
         """
         settings = self.settings
         return ModelSpec.model_validate(
@@ -310,7 +300,6 @@ class Fitter:
         """Fit one head on top of a baseline, or take it from the store where it is finished there.
 
         Args:
-            name: of the head in the settings.
             baseline: the fitted model that the head stands on.
 
         Raises:

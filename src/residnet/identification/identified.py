@@ -81,7 +81,6 @@ def evaluate(
     Args:
         models: to be judged, see `candidates`.
         logs: of one split, at least one.
-        config: protocols, scales and groups.
         step: of the grid in s.
         limit: size of what moves [n] beyond which a free run has diverged.
     """
@@ -100,7 +99,6 @@ def evaluate_splits(
     Args:
         models: to be judged, see `candidates`.
         splits: their logs, at least one each.
-        config: protocols, scales and groups.
         step: of the grid in s.
         limit: size of what moves [n] beyond which a free run has diverged.
     """
@@ -145,7 +143,6 @@ def candidates(
     """Return the models to judge, each with the one that it is compared with.
 
     Args:
-        fitted: models of one fit.
         data: where the logs came from; simulated trials add the plant that made them as `truth`.
     """
     models = {entry.name: entry for entry in fitted}
@@ -429,7 +426,6 @@ def residual_table(
 
     Args:
         fitted: models; those without a head are left out.
-        logs: of one split.
         most: about how many samples of each model and axis are kept, evenly spaced.
 
     Returns:
@@ -516,7 +512,6 @@ def goodness_rows(
     Of very many logs as many are taken, evenly spread, as have 200,000 samples.
 
     Args:
-        fitted: models of one fit.
         logs: by split; training and test logs are used.
         step: of the grid in s.
     """

@@ -143,7 +143,6 @@ def pieces(log: Prepared, steps: int, past: int) -> list[Piece]:
 
     Args:
         log: prepared as those of the fit.
-        steps: length of a window.
         past: samples before a window that warm a memory up; the first windows go without.
     """
     out, start = [], past
@@ -441,7 +440,6 @@ def wider(held: Sequence[Sequence[Group]], size: int) -> float:
     Args:
         held: groups of clean windows in the order of time, those that are left out together by
             themselves.
-        size: number of groups in a stretch.
     """
     found = []
     for fold, own in enumerate(held):
@@ -583,10 +581,7 @@ class Watch:
     """What is known of clean logs, and the tests against it.
 
     Args:
-        spec: of the model.
-        model: that is watched.
         clean: windows of clean logs, those of one log together; all of one length.
-        config: settings.
 
     Raises:
         DataError: where the clean logs are too few.
@@ -721,7 +716,6 @@ class Watch:
         """Return what innovations [B, n] are of clean logs, by their effects [B, C, n].
 
         Args:
-            effects: of a unit of each change.
             i: number of the look: whole windows, or their parts.
             always: what the model has always got wrong [Q, 4]; by all clean logs where None.
         """
@@ -750,7 +744,6 @@ class Watch:
 
         Args:
             logs: number of the log that each group is of.
-            sums: of the groups.
         """
         groups = [self._group(log, one, self.bias) for log, one in zip(logs, sums, strict=True)]
         size, error, explains = self.scatter.together(groups)
@@ -778,7 +771,6 @@ class Watcher:
     the threshold.
 
     Args:
-        watch: over a model.
         past: samples before a window that warm a memory up.
     """
 

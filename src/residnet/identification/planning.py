@@ -258,13 +258,10 @@ def plan(
     after the other, each given those before it.
 
     Args:
-        fitted: a refitted baseline.
         open_: what its refit has left open.
-        refit: settings of the refit.
         scales: of what moves [n].
         shares: of the inputs in drive and steer.
         limit: of what moves [n] beyond which a flight has diverged.
-        limits: of the trials.
         aim: what is to be predicted; None for all candidates alike.
 
     Raises:

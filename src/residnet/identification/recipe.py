@@ -74,9 +74,6 @@ class Facts:
         """Return what training logs and the protocol that chooses say.
 
         Args:
-            samples: of the training logs.
-            logs: for training.
-            evaluation: protocols.
             step: of the grid, s.
         """
         z, names = samples.z, samples.names
@@ -485,7 +482,6 @@ def judging(
     Args:
         splits: `train`, `validation` and `test`.
         memory: how long the vessel remembers, s.
-        live: velocities of the models.
     """
     length = window_length(splits["validation"] or splits["train"], memory)
     laid = protocols(length)

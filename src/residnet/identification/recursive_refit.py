@@ -208,7 +208,6 @@ class _Filter:
     """An extended information filter for the sizes of changes.
 
     Args:
-        watch: over the old model.
         changes: Q of them, causes of the watch.
     """
 

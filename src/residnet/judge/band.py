@@ -146,8 +146,6 @@ def independent(
     Args:
         inside: share of each run's samples that a quantile holds [W]; NaN where nothing is scored.
         weight: of each run [W].
-        names: of its log.
-        level: of the quantile.
     """
     _, place = np.unique(names, return_inverse=True)
     count = int(place.max()) + 1
@@ -225,7 +223,6 @@ class Band:
         lie farther apart than they usually do, a prediction errs besides: variances add up.
 
         Args:
-            states: predicted.
             spread: standard deviation between unlike models [L, c]; None where there are none.
         """
         z = self.activity.of_run(states, self.step)
@@ -336,7 +333,6 @@ def disagreement(
         spread: standard deviations between unlike models; that of the position is per axis.
         usual: their root mean square over runs.
         level: share of normal errors that the widths are to hold.
-        channels: their names.
     """
     radial = np.array([name == "position" for name in channels])
     normal = NormalDist().inv_cdf(0.5 + level / 2.0)
@@ -384,7 +380,6 @@ def bands_content(run: str, bands: Bands) -> dict[str, Any]:
     """Return the contents of bands.json.
 
     Args:
-        run: name of the run.
         bands: by model and protocol; models without any are left out.
     """
     return {

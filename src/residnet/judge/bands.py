@@ -149,8 +149,6 @@ def count_bands(
     Args:
         run: free runs of all models.
         candidates: the models; those without a band under this protocol are left out.
-        logs: that the windows belong to.
-        found: errors by model.
     """
     return {
         one.name: _counted(

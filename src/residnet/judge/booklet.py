@@ -113,12 +113,7 @@ def contents(
     `ship` beside an index is its value for the ship.
 
     Args:
-        model: its name.
         length: of the hull in the scale of the logs, m.
-        scale: of the ship to it.
-        draws: of the parameters.
-        level: of the intervals.
-        pages: manoeuvres.
     """
     rows = [_row(page, length, scale, level) for page in pages]
     used = sorted({name for row in rows for name in row["indices"]})
@@ -185,8 +180,6 @@ def index_rows(
     Indices in SI and rad; each limit with whether it is kept.
 
     Args:
-        craft: what flew.
-        flights: of that craft.
         length: of the hull in m; None where unknown, then there are neither lengths nor limits.
     """
     out = []

@@ -146,7 +146,6 @@ def passes(
     The moments follow each other, and the sum of the distances then is least.
 
     Args:
-        places: of the buoys.
         within: radii in m; a vessel that starts in a circle first leaves it.
     """
     asked = [Asked(*place, radius, "") for place, radius in zip(places, within, strict=True)]

@@ -285,7 +285,6 @@ def _batches(windows: Sequence[Window], width: int) -> Iterator[list[int]]:
     as long as none is kept going for far more than its own length and memory suffices.
 
     Args:
-        windows: of any lengths.
         width: numbers that each row keeps for each step.
     """
     order = sorted(range(len(windows)), key=lambda row: -_length(windows[row]))
@@ -376,7 +375,6 @@ def sizes_of(error: np.ndarray, live: Live, turned: np.ndarray | None) -> dict[s
 
     Args:
         error: of states [W, 3 + n], psi within half a turn.
-        live: what moves.
         turned: angles between attitudes [W]; None on the surface.
     """
     out = {"position": np.hypot(*error[:, POSITION].T), "heading": np.abs(error[:, HEADING])}
@@ -392,7 +390,6 @@ def drift(y: np.ndarray, live: Live, step: float) -> dict[str, np.ndarray]:
 
     Args:
         y: measured states [W, L, 3 + n].
-        live: what moves.
         step: between samples in s.
     """
     error = np.zeros_like(y[:, -1])

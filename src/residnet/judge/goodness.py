@@ -52,10 +52,8 @@ def repeatability(
     stretch of a log counts.
 
     Args:
-        protocol: whose windows.
         logs: on one grid.
         commands: number of columns of the inputs that are commanded.
-        scales: of what moves.
         step: of the grid in s.
 
     Returns:
@@ -395,7 +393,6 @@ def measures(
     Args:
         residual: measured minus predicted, [m].
         target: measured, [m].
-        parameters: number of parameters d.
         variance: of the noise, sigma^2, by `noise_variance` of the richest model that is compared:
             from each model's own the criteria tell nothing apart.
 
@@ -510,7 +507,6 @@ def paired(
     Args:
         pieces: residuals of the model, piece by piece.
         reference: residuals of the other at the same samples.
-        to: its name.
     """
     found = block_interval([np.abs(a) - np.abs(b) for a, b in zip(pieces, reference, strict=True)])
     level = float(np.abs(np.concatenate(list(reference))).mean())

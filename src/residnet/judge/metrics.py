@@ -166,8 +166,6 @@ def difference(
     Args:
         model: error of each window, [W].
         reference: error of the reference model over the same windows, [W].
-        to: its name.
-        blocks: what is drawn together.
 
     Returns:
         to; nrmse_mean, the mean of model minus reference (negative where the model is better), with
@@ -203,8 +201,6 @@ class Judged:
 
     Args:
         run: free runs of all models.
-        candidates: the models.
-        logs: that the windows belong to.
         scales: of what moves, which nrmse divides by.
     """
 
@@ -542,9 +538,6 @@ def metrics_content(
     """Return the contents of metrics.json.
 
     Args:
-        run: name of the run.
-        units: unit of each state.
-        scales: what nrmse divides by.
         selected: name of the single model that the validation data chose.
         selected_ensemble: name of the best ensemble; None where there is none.
         predictor: name of the model that is reported first and exported where none is named.
@@ -616,9 +609,6 @@ def write_rollouts(
     about the circle that holds the position, and a model without a band has NaN.
 
     Args:
-        folder: for the files.
-        runs: protocols of a split.
-        logs: of the split.
         inputs: names of the inputs, in the order of their columns.
         bands: by model and protocol; None for none.
     """

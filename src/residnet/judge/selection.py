@@ -179,7 +179,6 @@ def choose(contenders: Iterable[Contender], blocks: Blocks) -> Selection:
 
     Args:
         contenders: `zero` and at least one other.
-        blocks: of the validation data.
     """
     everyone = tuple(contenders)
     chosen, reason = _simplest([one for one in everyone if one.family != "ensemble"], blocks)
@@ -264,11 +263,7 @@ def shares(
 
     Args:
         run: free runs over the windows.
-        model: name of the model.
-        logs: that the windows belong to.
-        scales: of what moves.
         labels: number of the block of each sample of each window.
-        count: number of blocks.
     """
     found = Errors.of(run.windows, run.predictions[model], logs)
     divisor = found.rmse * np.add.reduceat(found.scored, found.begins, dtype=float)

@@ -24,8 +24,6 @@ def by_windows(rows: Sequence[Content], split: str, deciding: str) -> list[str]:
     It is the one that chose between the models, unless the split is too short for it.
 
     Args:
-        rows: of metrics.json.
-        split: that is judged.
         deciding: protocol that chose; empty where nothing was chosen.
     """
     names = dict.fromkeys(row["protocol"] for row in rows)

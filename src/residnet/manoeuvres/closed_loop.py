@@ -210,7 +210,6 @@ class TurningCircle(RudderSteering, ClosedLoop):
         return f"{turned} and a steady pull-out" if self.pull_out else turned
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return the advance, transfer, diameters and the steady turn; see `indices.turning`."""
         found = indices.turning(log, self.start, self.side, self.until, length)
         if self.pull_out and "advance" in found:
             found["pull_out_yaw_rate"] = self.side * float(log["r"][np.isfinite(log["r"])][-1])
@@ -308,7 +307,6 @@ class Stopping(ClosedLoop):
         return "a surge velocity of zero"
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return the track reach, head reach, deviation, time; see `indices.stopping`."""
         return indices.stopping(log, self.start, length)
 
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:

@@ -540,8 +540,6 @@ def equation(
 
     Args:
         name: left side, for example `u_dot`.
-        text: right side in plain text.
-        value: right side.
         channels: channels that may appear, in the order of a function's arguments.
         comment: what stands above the function in C.
 

@@ -346,7 +346,6 @@ def evolve(
         data: channels [N] by name.
         target: what the equation is to give, [N].
         train: which samples [N] train; the others validate.
-        config: how to breed.
         seed: of all random choices.
 
     Raises:
@@ -557,7 +556,6 @@ class GeneticEquations(Estimator):
     coefficients of its terms [P, n], `weights.values`.
 
     Args:
-        config: how to search.
         known: factors (function, channel, power) of terms that the final choice has beside those
             that are bred, by output; none where empty.
     """
@@ -655,8 +653,6 @@ def breed(
         data: channels [N] by name.
         target: [N].
         train: which samples train the search; the others validate.
-        config: how to search.
-        seed: of the random choices.
         known: terms that the final choice has beside those that are bred.
 
     Raises:

@@ -64,7 +64,6 @@ def dual_path(
         kernel: K of all samples with each other, [N, N].
         y: targets [N, 3].
         fold: number of each sample's fold [N].
-        folds: how many there are.
         penalties: lambda, absolute, positive.
     """
     values, vectors = torch.linalg.eigh(kernel)
@@ -107,7 +106,6 @@ def primal_path(
         x: inputs [N, F].
         y: targets [N, 3].
         fold: number of each sample's fold [N].
-        folds: how many there are.
         penalties: lambda, absolute, positive.
 
     Returns:
@@ -173,7 +171,6 @@ class Kernel(nn.Module, ABC):
             x: inputs [N, F].
             y: outputs [N, n].
             fold: number of each sample's fold [N].
-            folds: how many there are.
             penalties: lambda, absolute, positive.
         """
 
@@ -326,7 +323,6 @@ class PolynomialKernel(Kernel):
     def paths(
         self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
     ) -> list[Path]:
-        """Return a single path, exact for any number of samples; see `Kernel.paths`."""
         identity = torch.eye(len(self.coefficients), dtype=torch.float64)
         return [primal_path(self.products, identity, x, y, fold, folds, penalties)]
 
@@ -465,7 +461,6 @@ class Recursion:
         baseline, is taken as it was.
 
         Args:
-            output: number of the output.
             predicted: from inputs [C, G, nz] to each fit's output [C, G].
             count: number of fits C.
         """

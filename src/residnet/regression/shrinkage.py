@@ -175,7 +175,6 @@ class _PathEstimator(Estimator):
         Args:
             errors: cross-validated mean squared errors [C, n]; None where there are no folds.
             variance: of each output [n]; infinite for one that is constant but for rounding.
-            count: complexities that there are.
         """
 
     @abstractmethod

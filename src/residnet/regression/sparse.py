@@ -128,7 +128,6 @@ def reduce(
     Args:
         x: candidate columns [N, J].
         y: targets [N, K].
-        names: of the columns.
         degree: of the columns: the stages of the search.
         effort: how complicated each column is, within its degree; the order given where empty.
 
@@ -408,11 +407,6 @@ def find(reduced: Reduced, target: int, config: SearchConfig) -> tuple[Equation,
     """Return the equation of one target, and the candidates that it was searched in.
 
     These are fewer where noise hides what sets some apart.
-
-    Args:
-        reduced: candidates and targets.
-        target: which target.
-        config: how far the search goes.
     """
     fine = _search(reduced, target, config)
     if fine.share <= _NOISY:
@@ -524,7 +518,6 @@ class SparseRegression(Estimator):
     The notes of a solution have, under `equations`, what the data say about each output.
 
     Args:
-        search: how far the search goes.
         degrees: degree of each candidate, [J]: the stages of the search; one stage where empty.
         efforts: how complicated each candidate is within its degree, [J]; the order given where
             empty.

@@ -85,7 +85,6 @@ def family(names: Iterable[str], **given: Any) -> dict[str, Look]:
     """Return looks of equal rank by name, told apart by colour and by line.
 
     Args:
-        names: what they are labelled with.
         given: further attributes of all looks.
     """
     most = len(COLORS)

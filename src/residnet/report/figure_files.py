@@ -52,8 +52,6 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
     """Write a figure of a run: a PNG for each case that has one, and the figure itself beside them.
 
     Args:
-        folder: for the files.
-        figure: what they show.
         name: of the files, that of the figure where empty.
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -67,8 +67,6 @@ def write_page(
     `resolved.yaml`.
 
     Args:
-        run: run folder.
-        title: of the page.
         description: what the run was made for, empty where nothing is to be said.
         verdict: sentences that stand first, the first of them in bold.
         sections: from top to bottom. One without a title is the rest of the first screen: its

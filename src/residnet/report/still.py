@@ -56,7 +56,6 @@ def still(figure: Figure, cases: Sequence[Case] = (), only: Sequence[int] = ()) 
     """Return a matplotlib figure of a case: maps beside each other, other panels below.
 
     Args:
-        figure: what is drawn.
         cases: one of them, the first where empty; several of a surface stand side by side.
         only: numbers of the panels that are drawn, all where empty.
     """

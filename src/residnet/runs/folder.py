@@ -101,10 +101,8 @@ class RunFolder:
         A folder that an earlier run left without any result is used again.
 
         Args:
-            path: the folder.
             resolved: text of the complete configuration.
             resume: continue a run of the same configuration.
-            overwrite: remove what an earlier run left.
 
         Raises:
             UsageError: where the folder exists and may not be used, or holds a run of another

@@ -252,8 +252,6 @@ class Task(Config):
         """Carry the task out, from an empty folder to the finished mark.
 
         Args:
-            source: the config's file, for the record.
-            overrides: of its keys, likewise.
             out: run folder; runs/<name> where not given.
             resume: continue an interrupted run in its folder.
             overwrite: replace an earlier run in its folder.

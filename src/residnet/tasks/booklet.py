@@ -38,10 +38,7 @@ def write_booklet(
     """Fly, and write booklet.json and booklet.parquet; returns a line for the log.
 
     Args:
-        folder: of the run.
         config: what to fly.
-        fitted: the refitted baseline.
-        logs: of the run by split.
         limit: [n] of what moves beyond which a free run has diverged.
 
     Raises:

@@ -67,7 +67,6 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
 
     Args:
         paths: folders of the runs; the first is what the others are compared with.
-        out: folder of the page.
 
     Raises:
         UsageError: where a folder holds no finished fit, or the page cannot be written.

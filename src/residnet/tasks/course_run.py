@@ -316,9 +316,6 @@ def fly(
     """Fly each vessel once, from the plan's first point and heading.
 
     Args:
-        steering: vessel and step.
-        policy: that steers.
-        reference: what it follows.
         planned: course that cross-track errors are measured from.
         lookahead: of the plan's guidance in m.
         duration: in s, after which a flight that has not ended is given up.

@@ -73,7 +73,6 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
 
     Args:
         folder: that a folder for each layout is made in.
-        overwrite: replace them.
 
     Raises:
         UsageError: where they exist already, or cannot be written.

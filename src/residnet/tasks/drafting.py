@@ -82,10 +82,7 @@ def new_config(
     """Write a config for logs; returns what the terminal shows.
 
     Args:
-        logs: files, folders and bags.
-        out: file to write.
         answer: asks the user; None takes every default.
-        overwrite: replace the file.
 
     Raises:
         UsageError: where the file exists already, or a path does not.
@@ -117,9 +114,7 @@ def drafted(
     """Return a config for logs that the task `fit` runs as it is.
 
     Args:
-        paths: files, folders and bags.
         folder: where the config will lie; its paths start from there.
-        name: of the run.
         answer: answers questions; None takes every default and marks it.
 
     Raises:

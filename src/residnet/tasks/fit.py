@@ -136,7 +136,6 @@ class FitConfig(FitSettings, ComputingTask):
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Draw the figures, those of a published study too, and return the sections."""
         from residnet.documents import study_sections
         from residnet.report.fit import fit_sections, write_fit_figures
         from residnet.report.run_reader import RunFiles
@@ -165,7 +164,6 @@ class FitConfig(FitSettings, ComputingTask):
         """Watch new logs with a model of a finished fit, and refit it to them where that is asked.
 
         Args:
-            run: the fit.
             logs: new logs, in the order of time.
             model: name of the model; `selected` for the one chosen on validation data.
             settings: of `MonitorConfig`.
@@ -186,7 +184,6 @@ class FitConfig(FitSettings, ComputingTask):
         """Plan the next trials for a refitted baseline of a finished fit.
 
         Args:
-            run: the fit.
             model: name of the baseline; empty for the booklet's, else the first that was refitted.
             limits: of `TrialLimits`.
 

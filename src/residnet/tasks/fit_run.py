@@ -145,7 +145,6 @@ def write_judged(
 
     Args:
         folder: of the run, or of an evaluation.
-        config: of the fit.
         judged: free runs by split.
         names: of the selected model, of the selected mean of models, and of the predictor.
         logs: by split, those that were not judged too.
@@ -265,9 +264,6 @@ def evaluate_on(
     Its reader, masks, protocols and scales are used; `zero` comes first, then the config's order.
 
     Args:
-        config: of the finished fit.
-        run: its folder.
-        paths: files and folders.
         out: folder of the results; RUN/external-<time> where none is given.
 
     Raises:

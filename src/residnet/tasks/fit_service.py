@@ -117,8 +117,6 @@ class Service:
     """A model in service, the watch over it, and the logs that are new.
 
     Args:
-        config: of the finished fit.
-        run: its folder.
         paths: logs, in the order of time.
         model: name of the model; `selected` for the one chosen on validation data.
         settings: of `MonitorConfig`.
@@ -188,7 +186,6 @@ def write_watched(folder: Path, logs: Sequence[WatchedLog]) -> Path:
     """Write the page of what a monitor found: which logs raise an alarm, and the scores over time.
 
     Args:
-        folder: for the page.
         logs: in the order of time.
     """
     step = logs[0].window / 60.0
@@ -338,7 +335,6 @@ def refit_run(service: Service, out: Path) -> RefitRun:
 
     Args:
         service: the model, the watch over it and the new logs.
-        out: folder of the new run.
 
     Raises:
         UsageError: where the folder may not be used, or the model has no parameters to move.

@@ -66,7 +66,6 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
     """Return what the doctor finds in each log and between them.
 
     Args:
-        paths: files and folders.
         config: a run or import whose channel map reads them; None where they describe themselves,
             or to have a map drafted.
 

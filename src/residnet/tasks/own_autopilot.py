@@ -107,7 +107,6 @@ def draft_autopilot(
             hold, and 20 deg without logs.
         rate: of the steering gear, with its unit; by default what the logs show.
         speed: at which K and T hold, with its unit; by default the mean of the logs.
-        overwrite: replace earlier files.
 
     Raises:
         UsageError: where the source is neither, or a file stands there already.

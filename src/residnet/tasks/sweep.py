@@ -483,7 +483,6 @@ class SweepConfig(Task):
 
         Args:
             values: by key, as the distributions know them.
-            name: of the trial's run.
 
         Raises:
             ConfigError: where they do not make a valid config.
@@ -592,12 +591,7 @@ def open_study(config: SweepConfig, folder: Path) -> optuna.Study:
 
 
 class Trials:
-    """The trials of a sweep that have still to be carried out, in their order.
-
-    Args:
-        config: of the sweep.
-        study: that keeps them.
-    """
+    """The trials of a sweep that have still to be carried out, in their order."""
 
     def __init__(self, config: SweepConfig, study: optuna.Study) -> None:
         from optuna.trial import TrialState
@@ -687,10 +681,6 @@ def carry_out_trial(
     """Carry out a trial unless its run is finished.
 
     Args:
-        config: of the sweep.
-        folder: of the sweep.
-        trial: the trial's mark in the journal.
-        number: of the trial.
         values: by key, as the distributions know them.
     """
     import optuna

@@ -121,7 +121,6 @@ def first_fault(
     Args:
         track: north, east in m.
         buoys: in their order.
-        protocol: see there.
         turn: least radius of its turns in m.
         missed: by which circles may be missed, in m.
     """

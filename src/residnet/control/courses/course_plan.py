@@ -65,7 +65,6 @@ def joined(
     Args:
         turns: that the courses were found with, each from straight ahead.
         found: the courses, quickest first.
-        make: makes turns from any motion.
     """
     if turns.settled:
         yield from found
@@ -204,7 +203,6 @@ def plan(
     It ends abeam of the last buoy, or in its circle where that is entered.
 
     Args:
-        request: see there.
         step: between the points of the course in m.
         beyond: how far the points go on behind the end, in m.
         make: makes each turn of the course found anew, from the motion that the one before it

@@ -256,7 +256,6 @@ class Fit:
     """A route past circles as a problem of least time.
 
     Args:
-        route: as a function of z.
         circles: in their order.
         at: points of the route [N] at which each is passed.
         free: whether the first heading is free.

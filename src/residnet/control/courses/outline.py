@@ -110,9 +110,6 @@ def clear(
 
     Args:
         places: of the beginnings [K], as are the following.
-        headings: there.
-        ends: of the paths.
-        courses: there.
         kinds: numbers in `SIDES`.
         found: the paths, [K] each.
         radius: of the turns in m.
@@ -236,7 +233,6 @@ class Outlines:
         start: complex, in m.
         heading: at the start in rad; None for any.
         circles: of the buoys in their order.
-        room: what turns need.
         rooms: the same for the turns round each buoy.
         unit: the turning radius in m.
     """

@@ -79,8 +79,6 @@ class TurnMaker:
     smoothly with its time.
 
     Args:
-        vessel: that turns.
-        turning: its K and T.
         dt: step of the simulations in s, shorter while a steering gear moves the rudder.
     """
 
@@ -419,7 +417,6 @@ def simulated_turns(make: TurnMaker, rudder: Array, radius: float) -> Turns:
     is bent towards it.
 
     Args:
-        make: the simulated turns.
         rudder: angles, the largest first.
         radius: the vessel's smallest turning radius in m.
     """
@@ -459,7 +456,6 @@ def following_turns(
     """Return tables of n turns, each from a motion of its own, and the middle one of each.
 
     Args:
-        make: the simulated turns.
         holds: [n, K] in s, K odd.
         rudder: [n] in rad, positive to starboard.
         begin: state of the vessel [nx] that each begins with.

@@ -25,7 +25,6 @@ class HeadingPID(Policy):
     error enters it.
 
     Args:
-        state: names of the vessel's state.
         kp: rad of rudder per rad of error.
         kd: rad of rudder per rad/s of yaw.
         limit: of the rudder command in rad.
@@ -96,7 +95,6 @@ class BangBangHeading(Policy):
     kd r, which brings them to zero.
 
     Args:
-        state: names of the vessel's state.
         gain, time: K [1/s] and T [s], both positive.
         limit: d [rad].
         layer: of the heading error about the curve [rad].
@@ -298,7 +296,6 @@ def braking(
         force: yaw acceleration that is counted on, in rad/s^2.
         decay: 1/T in 1/s.
         stiffness: yaw acceleration per heading error near the reference in 1/s^2.
-        stiff: relative damping there.
         swing: time in s that the rudder takes from amidships to its limit.
     """
     line = ((2.0 * stiff * torch.sqrt(stiffness) - decay) / stiffness).clamp(min=1e-3)

@@ -165,7 +165,6 @@ class ConditionsConfig(Config):
         """Draw heading changes for a number of flights, float32.
 
         Args:
-            rows: number of flights.
             dt: step in s.
             random: source of all that is drawn.
             share: part of all departures from the nominal vessel in calm water, 0 to 1.
@@ -241,9 +240,7 @@ def wave_motion(period: Tensor, steps: int, dt: float, random: torch.Generator) 
 
     Args:
         period: at the peak in s, [B].
-        steps: number T of steps.
         dt: step in s.
-        random: source of phases and frequencies.
     """
     ratios = torch.linspace(0.7, 1.8, _SINES + 1)
     # somewhere within its band each, so that the sum does not repeat itself
@@ -353,7 +350,6 @@ class ConditionedLoop(Source):
     controller.
 
     Args:
-        policy: the controller.
         columns: of what is measured in the state, k of them.
         inputs: number m of the vessel's inputs.
         longest: delay in steps that the memory holds.
@@ -457,11 +453,7 @@ class ConditionedRun:
     """A vessel and a controller ready to fly heading changes at one step.
 
     Args:
-        vessel: see there.
-        policy: the controller, at this step.
         dt: step in s.
-        integrator: of the vessel.
-        dtype: of the flights.
         compiler: of flights without gradients; None to fly them as they are, as are those that it
             cannot compile.
         longest: delay in steps that there is room for; None for that of each call's changes.
@@ -528,7 +520,6 @@ def quickly(
     """Return the flights of a closed loop, compiled where a compiler is given and works.
 
     Args:
-        rollout: of the closed loop.
         compiler: None to fly as it is.
         given: states, inputs and memory that it is flown with, an example of two rows.
         failed: is told why a loop is not compiled.
@@ -624,9 +615,7 @@ class SteadyTest:
     """Counts flights without noise that a policy should not make; no training sees them.
 
     Args:
-        limits: of swing and overshoot.
         conditions: with noise, those of the training.
-        seed: of the flights.
 
     Attributes:
         flights: number of all, those of the nominal vessel included.

@@ -69,7 +69,6 @@ class LinearLaw(AnglePolicy):
     Memory [B, 3]: I [rad s], and the filtered heading [rad] and yaw rate [rad/s].
 
     Args:
-        steering: the controller's task.
         gains: kp, kd [s], ki [1/s] and the filter's time constant [s]; [B] or one number each.
     """
 
@@ -658,10 +657,6 @@ RecurrentPolicy = ObservedPolicy | NetworkPolicy | DepthPolicy
 
 def load_recurrent(folder: Path, kind: type[RecurrentSpec]) -> RecurrentPolicy:
     """Read a trained recurrent policy, frozen and in float64.
-
-    Args:
-        folder: of the policy.
-        kind: of its description.
 
     Raises:
         UsageError: where the folder holds none, or one that is not as it was written.

@@ -93,8 +93,6 @@ class OddCell(nn.Module):
     training moves the memory by as much per second.
 
     Args:
-        features: number of features.
-        units: number of units.
         dt: step of training in s.
         hidden: units of an odd layer between memory and output; 0 for none.
     """
@@ -276,9 +274,7 @@ class ObservedPolicy(HeadingPolicy):
     act, the oldest first, and the network's units.
 
     Args:
-        state: names of the vessel's state.
         turning: K, T and speed of the vessel about straight ahead.
-        law: on the estimates.
         constants: of the law, then `observer.CONSTANTS`, all positive.
         limit: of the rudder in rad.
         dt: step of the controller in s; `at` changes it.
@@ -428,7 +424,6 @@ class NetworkPolicy(HeadingPolicy):
     Memory s [B, 2 + units]: rudder and last command in rad, then the network's units.
 
     Args:
-        state: names of the vessel's state.
         turning: K, T and speed of the vessel about straight ahead.
         limit: of the rudder in rad.
         dt: step of the controller in s; `at` changes it.
@@ -515,9 +510,7 @@ class DepthPolicy(HeadingPolicy):
     Memory s [B, 2 + k]: z expected [m], d [m/s], then that of the law.
 
     Args:
-        state: names of the vessel's state.
         turning: K, T, c and speed of the dive angle.
-        law: on the dive angle.
         constants: `SIGHT`, all positive.
         steepest: largest dive angle wanted in rad.
         limit, rate, dt: as of a heading policy, of the planes.

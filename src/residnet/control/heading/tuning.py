@@ -129,10 +129,8 @@ class Trials:
     """Flights of candidates for the parameters of a controller, all over the same changes.
 
     Args:
-        config: of the controller.
         steering: its task, at the step of the changes.
         conditions: with the cost.
-        changes: what every candidate flies.
         compiler: of the flights; None to fly them as they are.
     """
 

@@ -310,7 +310,6 @@ def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
     angle that comes to rest under the held rudder tells c, and the zigzag K and T.
 
     Args:
-        steered: the vessel.
         angle: of the rudder in rad.
         duration: until the turn is steady, in s.
 

@@ -292,7 +292,6 @@ class SteeredModel(SteeredVessel):
     """A learned model with the steering gear and straight courses of the vessel that it models.
 
     Args:
-        model: hybrid model of the hull.
         columns: names of its inputs; the rudder's is `delta` or `cmd_delta`, the others are
             commands of the vessel.
         hold: whether its inputs are those at a step's start or means over the step.

@@ -133,7 +133,6 @@ def motion_of(raw: Raw, unit: str, frame: Frame) -> Motion | None:
 
     Args:
         raw: with the columns x, y, psi.
-        unit: of the heading.
         frame: that is tried.
     """
     psi = heading_of(raw, unit, frame)
@@ -220,7 +219,6 @@ def turns_to(
 
     Args:
         logs: with the column.
-        channel: of the rudder or the planes.
         rate: yaw or pitch rate [T] of each log by its number, rad/s.
         angle: column of the angle that the vessel is righted by; None for none.
     """
@@ -317,7 +315,6 @@ def submerged(columns: Sequence[str], named: Collection[str]) -> dict[str, str]:
     They do with depth, pitch and roll, and where nothing turns them.
 
     Args:
-        columns: names.
         named: channels that are known already.
     """
     deep = {column: deep_channel(words_of(column)) for column in columns}
@@ -412,7 +409,6 @@ def drafted_channels(
 
     Args:
         names: channel -> column.
-        logs: their columns by channel.
         marks: is told what is not sure.
         texts: names of columns and cells that may tell a frame.
     """
@@ -807,8 +803,6 @@ class Channels:
         """Return unit and sign of a velocity, checked against what it is the rate of.
 
         Args:
-            name: of the velocity.
-            fit: how it follows that.
             who: what that is, for a reader.
         """
         key, column = (*CHANNELS, name), self._names[name]

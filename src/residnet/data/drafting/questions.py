@@ -110,7 +110,6 @@ def commented(content: Mapping[str, Any], comments: Comments, head: Sequence[str
     """Return a mapping as YAML, with comments above its keys.
 
     Args:
-        content: of the config.
         comments: path of a key -> lines about it.
         head: lines at the top.
     """

@@ -108,7 +108,6 @@ def draft_recordings(
     frames. Inputs are found by names.
 
     Args:
-        paths: files and folders.
         marks: is told what is not sure.
 
     Raises:
@@ -478,9 +477,6 @@ def log_files(paths: Sequence[Path]) -> list[Path]:
     A folder may itself be a log, as a ROS 2 bag is, and where a folder holds neither such nor
     tables, logs of any other format are taken.
 
-    Args:
-        paths: files and folders.
-
     Raises:
         UsageError: where a path does not exist or a folder holds no log.
     """
@@ -534,7 +530,6 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
     """Return the logs in files of one format, by a reader that is drafted from them.
 
     Args:
-        paths: files and recordings.
         marks: is told what is not sure.
         gridded: recordings come on a uniform clock, and else on that of their positions.
 

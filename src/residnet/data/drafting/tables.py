@@ -269,7 +269,6 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
     A speed is that forward where no position and heading tell it.
 
     Args:
-        columns: their names.
         marks: is told what is not sure.
         headed: whether something else may tell the heading.
     """

@@ -27,7 +27,6 @@ def written_unit(column: str, expected: str | None) -> str | None:
     """Return the unit that a column's name holds, in brackets or at its end; None for none.
 
     Args:
-        column: its name.
         expected: SI unit of the dimension; None takes any, in brackets only.
     """
     texts = [text.strip() for text in _IN_BRACKETS.findall(column)]
@@ -103,8 +102,6 @@ def thrown(channel: str, column: str, values: np.ndarray) -> Throw | None:
     """Return how pulses, per cent or shares become a channel; None where its unit is a plain one.
 
     Args:
-        channel: of an actuator.
-        column: its name.
         values: of the column [T], of all logs together.
     """
     rudder = channel.removeprefix("cmd_").startswith("delta")

@@ -184,7 +184,6 @@ def progress(name: str, size: int, total: float) -> Iterator[Advance]:
     """Report the reading of a large recording to whoever listens to progress.
 
     Args:
-        name: of the file.
         size: its bytes; nothing is reported of a small recording.
         total: what the reader counts to.
     """

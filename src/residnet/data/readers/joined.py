@@ -239,7 +239,6 @@ def clock_shift(log: Log, other: Log) -> Shift:
 
     Args:
         log: of the motion, measured or by position and heading.
-        other: channels that drive the vessel.
 
     Raises:
         DataError: where the log holds no motion.

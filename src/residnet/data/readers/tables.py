@@ -579,7 +579,6 @@ def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.Da
     lines between names and values.
 
     Args:
-        path: the file.
         sheet: its name; None takes the first.
         rows: how many are read; None for all.
 

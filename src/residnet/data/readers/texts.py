@@ -122,10 +122,7 @@ def read_csv(
     column.
 
     Args:
-        path: the file.
         columns: names of the wanted columns.
-        delimiter: between cells.
-        decimal: sign of the decimals.
         encoding: of the text; None finds it.
         advance: is told the share that is read.
 
@@ -669,7 +666,6 @@ def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
     bytes at its end, with which recorders fill what they have not written, are left out.
 
     Args:
-        path: of the text.
         encoding: its name; None finds it.
 
     Raises:

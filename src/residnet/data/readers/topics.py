@@ -50,7 +50,6 @@ def align_clocks(
     """Return the recording with one clock for all: offsets removed, rows of every series in order.
 
     Args:
-        recording: as read.
         delays: topic -> time in s by which its rows are older than their time says; they are moved
             back by it. None takes the usual latency of the topics that have stamps and arrivals,
             for one that has arrivals only.

@@ -399,7 +399,6 @@ def degrees_of(
     NaN stands for empty cells.
 
     Args:
-        cells: of one column.
         name: of the channel: a latitude has no east.
         form: of a number that stands alone.
         letter_o: what O stands for; None refuses it.

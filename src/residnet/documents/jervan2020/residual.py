@@ -234,7 +234,6 @@ class SurfaceRegression(RegressionKind):
     choose: Literal["test", "simplest", "least"] = "simplest"
 
     def fit(self, data: Regression) -> Fit:
-        """Return the chosen model of each axis; see `RegressionKind.fit`."""
         x, y, groups = data.x, data.y, data.fold
         estimator = SurfacePLSR("simplest" if self.choose == "simplest" else "least")
         if self.choose == "test":

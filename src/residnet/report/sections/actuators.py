@@ -95,7 +95,6 @@ def actuator_tests(
     """Draw measurements as dots and the fits over them, a panel for each test (Figs. 4, 6, 7).
 
     Args:
-        name: of the run.
         throttle: throttle [N], revolutions [N] in 1/s, and the fitted map.
         steps: measured step responses, and the fitted one.
         bollard: revolutions [N] in 1/s, thrust [N] of one thruster in N, and the fitted curves.

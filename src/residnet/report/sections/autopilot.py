@@ -289,9 +289,7 @@ def settling_table(rows: Sequence[Content], floor: str | None, words: Words) -> 
     """Return settling time, overshoot and steady errors, a row for each controller.
 
     Args:
-        rows: of metrics.json.
         floor: the controller whose nominal settling time the others are divided by.
-        words: of what is steered.
     """
     found = _by_model(rows, "nominal")
 

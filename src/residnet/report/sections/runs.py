@@ -309,7 +309,6 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
 
     Args:
         windows: free runs of one protocol.
-        model: whose errors are taken.
 
     Returns:
         Middles of time bins [K] in s, and errors [K, 2 + n] of u, v, r, position, heading and the

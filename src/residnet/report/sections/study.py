@@ -37,9 +37,7 @@ def window_nrmse(run: Path, model: str, split: str) -> dict[str, WindowErrors]:
     """Return the errors of one model of a finished run by protocol, from its stored rollouts.
 
     Args:
-        run: run folder.
         model: name of a model, `selected` for the one chosen on validation data.
-        split: whose windows.
 
     Raises:
         DataError: where the run holds no such model or split.
@@ -96,7 +94,6 @@ def table(
     95 % interval by blocks of windows.
 
     Args:
-        variants: what was run.
         keys: windows of each protocol, in the order of the errors' columns.
         reference: name of the variant that differences are taken to.
     """
@@ -133,7 +130,6 @@ def differences(rows: Sequence[Content], reference: str) -> Figure:
     """Draw the differences to the reference with their intervals, a panel for each protocol.
 
     Args:
-        rows: of study.json.
         reference: name of the variant that differences are taken to.
     """
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
@@ -197,7 +193,6 @@ def variants_table(rows: Sequence[Content], reference: str) -> Table:
     """Return a row for each variant with its error and difference under each protocol.
 
     Args:
-        rows: of study.json.
         reference: name of the variant that differences are taken to.
     """
     by_variant: dict[str, dict[str, Content]] = {}

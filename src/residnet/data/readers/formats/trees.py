@@ -242,10 +242,8 @@ def _tree_recording(
     time of the file that has it.
 
     Args:
-        path: the file.
         leaves: path -> array [T], [T, 1], [1, T] or [T, k] (whose columns become `name.0`,
             `name.1`, ...).
-        time: how time is found.
         wanted: whether a group is to be read.
     """
     clocks = _clocks(leaves, time)
