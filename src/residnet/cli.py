@@ -249,8 +249,7 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _common(
     version: Annotated[
-        bool,
-        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Options of all commands."""
@@ -338,8 +337,7 @@ def run(
 @app.command()
 def new(
     logs: Annotated[
-        list[Path],
-        typer.Argument(metavar="LOGS...", help="Files, folders and bags of any format."),
+        list[Path], typer.Argument(metavar="LOGS...", help="Files, folders and bags of any format.")
     ],
     out: Annotated[
         Path | None,
@@ -583,8 +581,7 @@ def export(
         ),
     ] = "predictor",
     file_format: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMAT", help="One of `residnet list formats`."),
+        str, typer.Option("--format", metavar="FORMAT", help="One of `residnet list formats`.")
     ] = "torchscript",
     out: Annotated[
         Path | None,
@@ -595,8 +592,7 @@ def export(
     anyway: Annotated[
         bool,
         typer.Option(
-            "--anyway",
-            help="Write what is worse than doing without it, too; its card says so.",
+            "--anyway", help="Write what is worse than doing without it, too; its card says so."
         ),
     ] = False,
     quiet: Quiet = False,
@@ -730,14 +726,7 @@ def runs(
 def list_names(
     what: Annotated[
         Literal[
-            "vessels",
-            "heads",
-            "manoeuvres",
-            "readers",
-            "tasks",
-            "baselines",
-            "formats",
-            "configs",
+            "vessels", "heads", "manoeuvres", "readers", "tasks", "baselines", "formats", "configs"
         ],
         typer.Argument(help="Kind of part to list."),
     ],

@@ -110,11 +110,7 @@ class Prepared:
 
 
 def prepare(
-    log: Log,
-    split: str,
-    columns: Sequence[str],
-    config: PrepareConfig,
-    live: Live = ALIVE,
+    log: Log, split: str, columns: Sequence[str], config: PrepareConfig, live: Live = ALIVE
 ) -> Prepared:
     """Align, mask, smooth and differentiate one log.
 

@@ -146,9 +146,7 @@ class ExportedModel(nn.Module):
         start = torch.cat((self.guarded.accept_state(x0), torch.zeros_like(x0[:, :1])), dim=-1)
         # the first step sees x0 as it was given, for its flag
         states, _, s = self.simulate(
-            torch.cat((x0, torch.zeros_like(x0[:, :1])), dim=-1),
-            w.float(),
-            s.float(),
+            torch.cat((x0, torch.zeros_like(x0[:, :1])), dim=-1), w.float(), s.float()
         )
         states = torch.cat((start.unsqueeze(1), states[:, 1:]), dim=1)
         return states[..., : self.states], s, states[:, 1:, self.states] > 0

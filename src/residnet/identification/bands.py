@@ -21,12 +21,7 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ClosedFormHead
 from residnet.identification.fitter import residual_samples
-from residnet.identification.identified import (
-    Identified,
-    closed_form,
-    members_of,
-    unlike_models,
-)
+from residnet.identification.identified import Identified, closed_form, members_of, unlike_models
 from residnet.identification.models import FittedModel, references
 from residnet.judge.band import Band, BandsConfig, corrected, independent, quantile, run_weights
 from residnet.judge.bands import RunErrors, calibrate, few, run_errors
@@ -195,11 +190,7 @@ class _Calibration:
     """
 
     def __init__(
-        self,
-        identified: Identified,
-        protocol: str,
-        config: BandsConfig,
-        failed: Mapping[str, str],
+        self, identified: Identified, protocol: str, config: BandsConfig, failed: Mapping[str, str]
     ) -> None:
         self.failed = failed
         self.identified = identified

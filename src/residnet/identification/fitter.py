@@ -170,9 +170,7 @@ def _score(tried: tuple[Solution, Score]) -> Score:
     return tried[1]
 
 
-def _best_with_neighbours(
-    tried: Sequence[tuple[Solution, Score]],
-) -> tuple[Solution, Score] | None:
+def _best_with_neighbours(tried: Sequence[tuple[Solution, Score]]) -> tuple[Solution, Score] | None:
     """The best of those that have neighbours; one that has none, such as no residual at all, does
     not end the search.
     """

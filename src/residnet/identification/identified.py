@@ -29,14 +29,7 @@ from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.goodness import OneStep, table
 from residnet.judge.metrics import Judged, metrics_table
 from residnet.judge.protocol import EvaluationConfig
-from residnet.judge.selection import (
-    Contender,
-    Selection,
-    blocks_of,
-    choose,
-    log_errors,
-    shares,
-)
+from residnet.judge.selection import Contender, Selection, blocks_of, choose, log_errors, shares
 from residnet.judge.soundness import Finding, Recorded, check_model
 
 if TYPE_CHECKING:

@@ -195,9 +195,7 @@ class Sums:
 
 
 def weighed(
-    found: Sequence[tuple[np.ndarray, np.ndarray]],
-    whiten: Sequence[np.ndarray],
-    belief: np.ndarray,
+    found: Sequence[tuple[np.ndarray, np.ndarray]], whiten: Sequence[np.ndarray], belief: np.ndarray
 ) -> Sums:
     """Return the sums over windows that were looked at as a whole, then in parts.
 
@@ -803,10 +801,7 @@ class Watcher:
             return None
         known, given = np.stack(self.y), np.stack(self.w)
         piece = Piece(
-            known[self.past :],
-            given[self.past : -1],
-            known[: self.past],
-            given[: self.past],
+            known[self.past :], given[self.past : -1], known[: self.past], given[: self.past]
         )
         # the next window begins where this one ends
         keep = self.past + 1

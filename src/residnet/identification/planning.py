@@ -274,9 +274,7 @@ def plan(
     flown = [
         (flight, _path(flight, spec.signals))
         for flight in _flights(
-            fitted,
-            shares,
-            Aim(sorted(offered, key=lambda one: one.kind), limits.time, {}),
+            fitted, shares, Aim(sorted(offered, key=lambda one: one.kind), limits.time, {})
         )
     ]
     kept = [(flight, states, w) for flight, (states, w) in flown if _allowed(states, limit, limits)]

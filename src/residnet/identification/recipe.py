@@ -65,11 +65,7 @@ class Facts:
 
     @classmethod
     def of(
-        cls,
-        samples: Samples,
-        logs: Sequence[Prepared],
-        evaluation: EvaluationConfig,
-        step: float,
+        cls, samples: Samples, logs: Sequence[Prepared], evaluation: EvaluationConfig, step: float
     ) -> Facts:
         """Return what training logs and the protocol that chooses say.
 

@@ -8,15 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.layout import (
-    ALIVE,
-    BESIDE,
-    HEADING,
-    PLANAR,
-    POSITION,
-    VELOCITIES,
-    Live,
-)
+from residnet.core.layout import ALIVE, BESIDE, HEADING, PLANAR, POSITION, VELOCITIES, Live
 from residnet.data.prepare import Prepared
 from residnet.judge.band import (
     Activity,
@@ -84,12 +76,7 @@ def run_errors(
     parts = np.split(channels, found.begins[1:])
     return [
         RunErrors(
-            log.log.name,
-            log.log.manoeuvre,
-            error[1:],
-            prediction.states,
-            prediction.spread,
-            live,
+            log.log.name, log.log.manoeuvre, error[1:], prediction.states, prediction.spread, live
         )
         for log, error, prediction in zip(
             (logs[window.log] for window in windows), parts, predictions, strict=True

@@ -212,11 +212,7 @@ def row(
     return (
         out
         | passed
-        | {
-            "passed": right == clear == len(seen),
-            "margin": min(outside),
-            "n": len(seen),
-        }
+        | {"passed": right == clear == len(seen), "margin": min(outside), "n": len(seen)}
     )
 
 

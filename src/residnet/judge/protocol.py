@@ -9,14 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.config import (
-    Config,
-    Metres,
-    MetresPerSecond,
-    Radians,
-    RadiansPerSecond,
-    Seconds,
-)
+from residnet.core.config import Config, Metres, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import DataError
 from residnet.core.layout import PLANAR, ROLL, SIX
 from residnet.core.names import nearest

@@ -12,15 +12,7 @@ from torch import Tensor
 
 from residnet.core.config import Metres, Seconds
 from residnet.core.frames import upright
-from residnet.manoeuvres.base import (
-    ClosedLoop,
-    Family,
-    Manoeuvre,
-    Numbers,
-    Range,
-    Scheduled,
-    drawn,
-)
+from residnet.manoeuvres.base import ClosedLoop, Family, Manoeuvre, Numbers, Range, Scheduled, drawn
 
 
 class Helix(Scheduled):

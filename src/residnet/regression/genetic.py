@@ -22,13 +22,7 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError, require_package
-from residnet.regression.estimator import (
-    Coefficient,
-    Data,
-    Estimator,
-    Solution,
-    whole,
-)
+from residnet.regression.estimator import Coefficient, Data, Estimator, Solution, whole
 from residnet.regression.expressions import (
     ONE,
     Algebra,
@@ -560,11 +554,7 @@ class GeneticEquations(Estimator):
             that are bred, by output; none where empty.
     """
 
-    def __init__(
-        self,
-        config: EquationSearchConfig,
-        known: Sequence[Sequence[Term]] = (),
-    ) -> None:
+    def __init__(self, config: EquationSearchConfig, known: Sequence[Sequence[Term]] = ()) -> None:
         self.config, self.known = config, known
 
     def solve(self, data: Data) -> list[Solution]:

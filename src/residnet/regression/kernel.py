@@ -15,13 +15,7 @@ from torch import Tensor, nn
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError
-from residnet.regression.estimator import (
-    Data,
-    Estimator,
-    Solution,
-    fold_numbers,
-    whole,
-)
+from residnet.regression.estimator import Data, Estimator, Solution, fold_numbers, whole
 
 _RANK = 1e-12
 """Eigenvalues of the landmarks' kernel below this share of the largest are rounding."""

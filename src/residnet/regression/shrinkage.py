@@ -343,12 +343,7 @@ class PLSR(_PathEstimator):
 
 
 def pls_path(
-    xx: Tensor,
-    xy: Tensor,
-    orders: int | Tensor,
-    *,
-    joint: bool = True,
-    mask: Tensor | None = None,
+    xx: Tensor, xy: Tensor, orders: int | Tensor, *, joint: bool = True, mask: Tensor | None = None
 ) -> Tensor:
     """Return coefficients of partial least squares for every order, [A, ..., J, K].
 

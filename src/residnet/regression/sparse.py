@@ -24,13 +24,7 @@ from torch import Tensor
 from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.regression.equation_rows import correlation_time
-from residnet.regression.estimator import (
-    Coefficient,
-    Data,
-    Estimator,
-    Solution,
-    whole,
-)
+from residnet.regression.estimator import Coefficient, Data, Estimator, Solution, whole
 
 _DEPENDENT = 1e-12
 """Share of a column's length that must be left beside simpler columns; below it rounding decides.

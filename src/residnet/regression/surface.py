@@ -249,8 +249,5 @@ class SurfacePLSR(Estimator):
             best = pls_path(e.T @ e, e.T @ f, order)[-1, :, 0]
             coefficients[kept, output] = best / std_x[kept] * std_y[output]
         choice = {"order": [order for order, _ in picks], "terms": [count for _, count in picks]}
-        state = {
-            "coefficients": coefficients,
-            "intercept": y.mean(0) - x.mean(0) @ coefficients,
-        }
+        state = {"coefficients": coefficients, "intercept": y.mean(0) - x.mean(0) @ coefficients}
         return Solution(choice, state)

@@ -154,12 +154,7 @@ class Table:
         self.rows: list[Row] = []
 
     def add(
-        self,
-        label: str,
-        cells: Iterable[Cell | str],
-        *,
-        rule: bool = False,
-        selected: bool = False,
+        self, label: str, cells: Iterable[Cell | str], *, rule: bool = False, selected: bool = False
     ) -> None:
         """Add a row; plain strings become cells."""
         made = [cell if isinstance(cell, Cell) else Cell(cell) for cell in cells]

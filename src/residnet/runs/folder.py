@@ -33,13 +33,7 @@ CHECKSUMS = "checksums.json"
 _RESULTS = {".json", ".yaml", ".parquet", ".safetensors"}
 _ELSEWHERE = {"figures", "exports", "tensorboard", "checkpoints"}
 """Folders that have no checksums: nothing reads them back as a result."""
-_BEFORE_RESULTS = {
-    "resolved.yaml",
-    "provenance.json",
-    "doctor.json",
-    "data_quality.json",
-    LOG,
-}
+_BEFORE_RESULTS = {"resolved.yaml", "provenance.json", "doctor.json", "data_quality.json", LOG}
 """Files that a run writes before its first result; a folder of these alone may be used again."""
 
 

@@ -15,13 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
 from pydantic import Field
 
 from residnet.core.config import Config, dump_config, load_mapping
-from residnet.core.errors import (
-    DataError,
-    ExportError,
-    ResidnetError,
-    UsageError,
-    WithheldError,
-)
+from residnet.core.errors import DataError, ExportError, ResidnetError, UsageError, WithheldError
 from residnet.core.names import nearest
 from residnet.core.processes import keep_freed_memory
 from residnet.report.blocks import EXPORTS

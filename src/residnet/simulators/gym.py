@@ -228,11 +228,7 @@ class Episodes:
         reward = reward - 0.05 * (action - self.last).square().mean(dim=-1) - 10.0 * lost
         self.x, self.s, self.last = after, memory, action
         self.count += 1
-        return (
-            reward.double().numpy(),
-            lost.numpy(),
-            (self.count >= self.steps).numpy(),
-        )
+        return (reward.double().numpy(), lost.numpy(), (self.count >= self.steps).numpy())
 
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
         """Return the spaces of one observation and of one action."""

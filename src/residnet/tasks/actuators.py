@@ -14,12 +14,7 @@ from residnet.core.config import Config, ExistingPath
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, to_si
 from residnet.data.readers.texts import as_utf8
-from residnet.physics.actuators.identify import (
-    Estimate,
-    fit_step,
-    fit_throttle,
-    fit_thrust,
-)
+from residnet.physics.actuators.identify import Estimate, fit_step, fit_throttle, fit_thrust
 from residnet.report.figure_files import write_figures
 from residnet.report.sections.actuators import actuator_tests
 from residnet.runs.folder import RunFolder

@@ -25,13 +25,7 @@ from residnet.control.heading.controllers import (
 from residnet.control.heading.tuning import TuningConfig
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredModel, SteeredPlant
-from residnet.core.config import (
-    Config,
-    Metres,
-    MetresPerSecond,
-    Radians,
-    Seconds,
-)
+from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.progress import say
 from residnet.data.sea import Disturbance, WindField

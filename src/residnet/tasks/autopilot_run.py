@@ -11,12 +11,7 @@ import pandas as pd
 import torch
 
 from residnet.control.base import Policy
-from residnet.control.heading.conditions import (
-    ConditionedRun,
-    ConditionsConfig,
-    quiet,
-    quiet_after,
-)
+from residnet.control.heading.conditions import ConditionedRun, ConditionsConfig, quiet, quiet_after
 from residnet.control.heading.controllers import (
     DepthConfig,
     ObservedConfig,

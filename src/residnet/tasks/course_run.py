@@ -168,12 +168,7 @@ def ready(config: CourseTaskConfig, folder: RunFolder) -> AutopilotRun:
         config.autopilot if config.autopilot.is_dir() else folder.path / "autopilot"
     )
     notes = read_json(run.path / "controllers.json")
-    steering = Steering(
-        autopilot.steered,
-        Turning(**notes["turning"]),
-        autopilot.rudder,
-        config.dt,
-    )
+    steering = Steering(autopilot.steered, Turning(**notes["turning"]), autopilot.rudder, config.dt)
     return AutopilotRun(
         autopilot,
         run,

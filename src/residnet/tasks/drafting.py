@@ -73,11 +73,7 @@ class Draft:
 
 
 def new_config(
-    logs: Sequence[Path],
-    out: Path,
-    answer: Answer | None,
-    *,
-    overwrite: bool,
+    logs: Sequence[Path], out: Path, answer: Answer | None, *, overwrite: bool
 ) -> list[str]:
     """Write a config for logs; returns what the terminal shows.
 
@@ -105,12 +101,7 @@ def new_config(
     return [*lines, *draft.unused, f"config: {file}", f"next: residnet run {file}"]
 
 
-def drafted(
-    paths: Sequence[Path],
-    folder: Path,
-    name: str,
-    answer: Answer | None = None,
-) -> Draft:
+def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | None = None) -> Draft:
     """Return a config for logs that the task `fit` runs as it is.
 
     Args:

@@ -157,10 +157,7 @@ def write_judged(
     states = config.signals.live.states
     units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in states}
     rows = [row for part in judged.values() for row in part.rows]
-    folder.write_json(
-        folder.metrics,
-        metrics_content(config.name, units, scales, *names, rows),
-    )
+    folder.write_json(folder.metrics, metrics_content(config.name, units, scales, *names, rows))
     commands, step = len(config.signals.inputs), config.prepare.grid.step
     seen = [log for part in judged.values() for log in part.logs]
     limits = {
@@ -225,12 +222,7 @@ def fit_outcome(
         }
     sentences = [sentence for sentence in verdict(files) if sentence]
     return Outcome(
-        sentences,
-        figures,
-        errors_table(files, split).text(),
-        failure,
-        exports or {},
-        level(files),
+        sentences, figures, errors_table(files, split).text(), failure, exports or {}, level(files)
     )
 
 
@@ -327,8 +319,5 @@ def external_logs(
 def limit_of(spec: ModelSpec, config: FitConfig) -> np.ndarray:
     """Return the |u, v, r| [3] beyond which a free run of a model has diverged."""
     return velocity_limit(
-        np.array(spec.low),
-        np.array(spec.high),
-        config.evaluation.divergence,
-        spec.signals.live,
+        np.array(spec.low), np.array(spec.high), config.evaluation.divergence, spec.signals.live
     )

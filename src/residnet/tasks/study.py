@@ -17,12 +17,7 @@ from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.core.processes import processes
 from residnet.core.progress import report
-from residnet.report.sections.study import (
-    Variant,
-    table,
-    variants_table,
-    window_nrmse,
-)
+from residnet.report.sections.study import Variant, table, variants_table, window_nrmse
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, PartName, Task
 from residnet.tasks.fit import FitConfig

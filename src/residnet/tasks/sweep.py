@@ -21,13 +21,7 @@ import numpy as np
 from pydantic import Field, JsonValue, model_validator
 
 from residnet.core.config import BaseConfig, Config, dump_config, load_config
-from residnet.core.errors import (
-    DataError,
-    FitError,
-    ResidnetError,
-    UsageError,
-    require_package,
-)
+from residnet.core.errors import DataError, FitError, ResidnetError, UsageError, require_package
 from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.core.processes import ApartProcesses, ThisProcess, spread

@@ -317,10 +317,7 @@ def plan_course(
     make = TurnMaker(vessel, reached, steady.step)
     turns = simulated_turns(make, rudder, steady.radius)
     course = plan(
-        _asked(config, protocol, buoys, circles, turns, aside),
-        step,
-        5.0 * config.lookahead,
-        make,
+        _asked(config, protocol, buoys, circles, turns, aside), step, 5.0 * config.lookahead, make
     )
     reference = _reference(config, protocol, buoys, steady, turning.speed)
     return PlannedCourse(protocol, course, buoys, steady, reference)

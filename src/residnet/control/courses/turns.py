@@ -584,12 +584,7 @@ class Sketch:
             passed=(*one.passed, *self.passed[k + 1], *two.passed),
         )
         half = 0.5 * self.legs[k + 1]
-        legs = (
-            *self.legs[:k],
-            self.legs[k] + half,
-            self.legs[k + 2] + half,
-            *self.legs[k + 3 :],
-        )
+        legs = (*self.legs[:k], self.legs[k] + half, self.legs[k + 2] + half, *self.legs[k + 3 :])
         passed = (*self.passed[: k + 1], *self.passed[k + 2 :])
         return Sketch(self.heading, legs, (*self.bends[:k], bend, *self.bends[k + 2 :]), passed)
 
@@ -746,11 +741,7 @@ class Route:
             ([self.start], self.start + first * along[0] * shares, parts.ravel())
         )
         inner = np.concatenate(
-            (
-                along[:-1, None] * change.points,
-                shares * beyond[:, None] * onward.points,
-            ),
-            axis=1,
+            (along[:-1, None] * change.points, shares * beyond[:, None] * onward.points), axis=1
         )
         shift, turn, pivot = np.zeros(size, complex), np.zeros(size), np.full(size, self.start)
         turn[0], shift[1], pivot[1] = 1.0, along[0], at

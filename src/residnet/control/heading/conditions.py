@@ -13,14 +13,7 @@ from torch import Tensor
 
 from residnet.control.base import Policy
 from residnet.control.heading.vessels import SteeredVessel, lacking
-from residnet.core.config import (
-    Config,
-    Metres,
-    MetresPerSecond,
-    Radians,
-    RadiansPerSecond,
-    Seconds,
-)
+from residnet.core.config import Config, Metres, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ExportError
 from residnet.dynamics.rollout import FreeRun, Rollout, Source
 from residnet.dynamics.simulated import check_steps
@@ -326,13 +319,7 @@ class HeadingChanges:
         )
 
 
-QUANTITIES = {
-    "cost": "s",
-    "time_outside": "s",
-    "overshoot": "rad",
-    "travel": "rad",
-    "iae": "rad s",
-}
+QUANTITIES = {"cost": "s", "time_outside": "s", "overshoot": "rad", "travel": "rad", "iae": "rad s"}
 """Of a flight, with units: the cost, its three parts, and the integral of the absolute error."""
 
 Compiler = Callable[[Rollout, Tensor, Tensor, Tensor], FreeRun]

@@ -394,10 +394,7 @@ def _agreement(pose: Raw, motion: Motion, series: Series, first: str, second: st
 
 
 def _renamed(
-    recordings: Sequence[Recording],
-    standard: Mapping[str, FieldMap],
-    known: set[str],
-    marks: Marks,
+    recordings: Sequence[Recording], standard: Mapping[str, FieldMap], known: set[str], marks: Marks
 ) -> dict[str, dict[str, Any]]:
     """Return entries of plain numbers whose topic or joint is named as an actuator is.
 

@@ -305,10 +305,7 @@ MESSAGES = (
         "NmeaFix",
         ("GGA", "GNS", "RMC", "GLL"),
         lambda s: Plan(
-            {},
-            Geodetic(topic=s.name),
-            None,
-            _over_ground(s, "true_course", "spd_over_grnd", "kn"),
+            {}, Geodetic(topic=s.name), None, _over_ground(s, "true_course", "spd_over_grnd", "kn")
         ),
     ),
     Message(

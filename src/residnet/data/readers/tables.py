@@ -49,14 +49,7 @@ from residnet.data.readers.quantities import (
     yaw_of,
 )
 from residnet.data.readers.recording import Remark, remark
-from residnet.data.readers.texts import (
-    as_utf8,
-    found_header,
-    numbered,
-    plain,
-    positions,
-    read_csv,
-)
+from residnet.data.readers.texts import as_utf8, found_header, numbered, plain, positions, read_csv
 from residnet.data.readers.written import (
     Order,
     degrees_of,

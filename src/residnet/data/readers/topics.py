@@ -13,14 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.data.readers.recording import (
-    Recording,
-    Remark,
-    Series,
-    key_of,
-    remark,
-    same_topic,
-)
+from residnet.data.readers.recording import Recording, Remark, Series, key_of, remark, same_topic
 
 # zones differ by whole quarters of an hour
 _QUARTER = 900.0

@@ -98,11 +98,7 @@ class PredictorFit(EpochTraining):
     """
 
     def __init__(
-        self,
-        predictor: NetworkPredictor,
-        kept: Answers,
-        settings: PredictorTraining,
-        seed: int,
+        self, predictor: NetworkPredictor, kept: Answers, settings: PredictorTraining, seed: int
     ) -> None:
         super().__init__(settings, seed)
         self.predictor = predictor

@@ -774,10 +774,7 @@ def _about(trial: Results) -> str:
 
 
 def _goodness(
-    where: str,
-    rows: Sequence[Results],
-    printed: Mapping[str, Any],
-    absolute: Mapping[str, Any],
+    where: str, rows: Sequence[Results], printed: Mapping[str, Any], absolute: Mapping[str, Any]
 ) -> Table:
     """Return the goodness of fit of all models on one set (Tables 7.3 to 7.5)."""
     shown = []

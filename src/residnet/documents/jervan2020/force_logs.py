@@ -20,10 +20,7 @@ from residnet.core.layout import ACCELERATIONS, PLANAR, POSE, VELOCITIES
 from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers import ReaderConfig
 from residnet.data.split import check_leaks, log_names, matches
-from residnet.documents.jervan2020.residual import (
-    AXES,
-    Record,
-)
+from residnet.documents.jervan2020.residual import AXES, Record
 from residnet.judge.metrics import Blocks, blocks, intervals
 from residnet.training.lag import fit_lag, followed
 

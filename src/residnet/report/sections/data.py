@@ -77,9 +77,7 @@ def fitted_on_what(run: RunFiles) -> Section | None:
             "Scored: share of the samples on which u and v are compared. Learned from: share on"
             " which smoothed states and accelerations are defined."
         )
-        blocks += [
-            Section("Data quality", [short, Section("Log by log", [full], folded=True)]),
-        ]
+        blocks += [Section("Data quality", [short, Section("Log by log", [full], folded=True)])]
     if found := run.json("currents.json"):
         blocks.append(Section("Currents", [_currents(run, found)], folded=True))
     return Section("What was fitted on what", blocks) if blocks else None

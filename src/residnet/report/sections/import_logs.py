@@ -10,16 +10,7 @@ import numpy as np
 
 from residnet.core.format import minus, number, shown_unit, whole
 from residnet.core.log import Log
-from residnet.report.blocks import (
-    Block,
-    Bullets,
-    Cell,
-    Section,
-    Table,
-    Text,
-    bad_where,
-    table_of,
-)
+from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text, bad_where, table_of
 from residnet.report.figure import GLANCE, SOLID, START, Case, Curve, Figure, Panel
 from residnet.report.figure_files import write_figure
 from residnet.report.run_reader import RunFiles

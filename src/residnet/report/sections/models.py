@@ -17,16 +17,7 @@ from residnet.core.format import whole as whole_number
 from residnet.core.names import CHANNEL_UNITS
 from residnet.judge.verdict import diverged_note
 from residnet.physics.terms import parse_term
-from residnet.report.blocks import (
-    Block,
-    Cell,
-    Code,
-    Mark,
-    Section,
-    Table,
-    Text,
-    table_of,
-)
+from residnet.report.blocks import Block, Cell, Code, Mark, Section, Table, Text, table_of
 from residnet.report.figure import BLUE, Case, Curve, Figure, Look, Panel, family
 from residnet.report.run_reader import Content, RunFiles
 from residnet.report.sections.runs import model_looks, short_label

@@ -218,11 +218,7 @@ def sanity(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
     of: dict[str, dict[str, Finding]] = {}
     for finding in findings:
         of.setdefault(finding.model, {})[finding.check] = finding
-    looks = {
-        None: Cell("n/a", mark="weak"),
-        True: Cell("✓ ok"),
-        False: Cell("✗ look", mark="bad"),
-    }
+    looks = {None: Cell("n/a", mark="weak"), True: Cell("✓ ok"), False: Cell("✗ look", mark="bad")}
     table = table_of(
         of,
         [
