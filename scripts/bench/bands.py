@@ -106,7 +106,7 @@ def crossed(
         }
         held = [log for log, own in zip(logs, number, strict=True) if own == k]
         identified = fit(parts, config)
-        judged = identified.evaluate(held)
+        judged = identified.evaluate({"test": held})["test"]
         for run in judged.runs:
             found = run_errors(run.windows, run.predictions[model], held)
             band = identified[model].bands[run.protocol]

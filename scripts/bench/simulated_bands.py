@@ -164,7 +164,7 @@ def main() -> None:
         )
         found = [
             {**row, "draw": number, "vessel": vessel}
-            for row in models.evaluate(test).rows
+            for row in models.evaluate({"test": test})["test"].rows
             if "band_coverage" in row and row["model"] != "zero"
         ]
         rows += found
@@ -189,7 +189,7 @@ def scatter(models: Identified, test: Sequence[Prepared], calibrate: int) -> lis
     """Return the standard deviation of each model's mean coverage, by how single logs differ."""
     by_log: dict[tuple[str, str], list[float]] = {}
     for log in test:
-        for row in models.evaluate([log]).rows:
+        for row in models.evaluate({"test": [log]})["test"].rows:
             if "band_coverage" in row and row["model"] != "zero" and row["manoeuvre"] == "all":
                 held = by_log.setdefault((row["model"], row["protocol"]), [])
                 held.append(row["band_coverage"]["mean"])

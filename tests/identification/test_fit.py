@@ -18,7 +18,7 @@ from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.identification.fit import fit
 from residnet.identification.identified import Identified
-from residnet.identification.models import FittedModel
+from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
 
@@ -30,12 +30,11 @@ SETTINGS = {
 }
 
 
-class MemoryStore:
+class MemoryStore(FitStore):
     """Keeps models in memory and hands heads back."""
 
-    training_folder: Path | None = None
-
     def __init__(self) -> None:
+        super().__init__()
         self.models: dict[str, FittedModel] = {}
 
     def finished(self, name: str) -> FittedModel | None:
@@ -93,7 +92,7 @@ def test_python_and_command_line_give_the_same_metrics(
     assert call(monkeypatch, "run", path, "--out", tmp_path / "run") == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     splits = settings.evaluation.splits
-    judged = identified.evaluate_splits({str(split): logs[split] for split in splits}, DATA)
+    judged = identified.evaluate({str(split): logs[split] for split in splits}, DATA)
     rows: list[dict[str, Any]] = [row for part in judged.values() for row in part.rows]
     chosen = identified.select(judged)
     assert chosen.selected == metrics["selected"]

@@ -18,7 +18,7 @@ from residnet.data.sources import read_logs
 from residnet.identification import fit as parts
 from residnet.identification.fit import fit
 from residnet.identification.fitter import Fitter
-from residnet.identification.models import NoStore
+from residnet.identification.models import FitStore
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
 
@@ -89,7 +89,7 @@ def test_what_ends_soon_stays_in_this_process(
     logs: PreparedSplits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = _settings()
-    fitter = Fitter(logs, settings, NoStore())
+    fitter = Fitter(logs, settings, FitStore())
     with spread(8):
         assert parts.side_by_side(fitter) == 1
         monkeypatch.setattr(parts, "_LONG_TRAINING", 1)
@@ -99,4 +99,4 @@ def test_what_ends_soon_stays_in_this_process(
     assert parts.side_by_side(fitter) == 1
     with spread(8):
         gpu = _settings(device="cuda")
-        assert parts.side_by_side(Fitter(logs, gpu, NoStore())) == 1
+        assert parts.side_by_side(Fitter(logs, gpu, FitStore())) == 1

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any, cast
 
-from residnet.identification.models import references
+from residnet.identification.models import FittedModel
+from residnet.identification.models import references as compared
 
 ROLES = {
     "zero": "zero",
@@ -24,6 +27,14 @@ NOTES: dict[str, dict[str, Any]] = {
     "ridge": {"validation": 0.2},
     "mean": {"validation": 0.1},
 }
+
+
+def references(roles: Mapping[str, str], notes: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    found = [
+        SimpleNamespace(name=name, spec=SimpleNamespace(role=role), notes=notes.get(name, {}))
+        for name, role in roles.items()
+    ]
+    return compared(cast(list[FittedModel], found))
 
 
 def test_each_model_has_its_reference() -> None:

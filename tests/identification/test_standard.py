@@ -22,7 +22,7 @@ from residnet.dynamics.hybrid import Missed
 from residnet.heads.lstm import LstmConfig
 from residnet.identification.fit import Identified, fit
 from residnet.identification.fitter import Fitter, burden
-from residnet.identification.models import NoStore
+from residnet.identification.models import FitStore
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.recipe import PARTS, Facts, portfolio
 from residnet.identification.settings import FitSettings
@@ -90,7 +90,7 @@ def test_a_portfolio_stands_in_place_of_the_parts(identified: Identified) -> Non
 def test_the_mean_is_reported_first_and_a_single_model_is_chosen_beside_it(
     identified: Identified, logs: PreparedSplits
 ) -> None:
-    judged = {split: identified.evaluate(logs[split]) for split in ("train", "validation")}
+    judged = identified.evaluate({split: logs[split] for split in ("train", "validation")})
     chosen = identified.select(judged)
     families = {entry.name: entry.family for entry in chosen.contenders}
     assert chosen.predictor == chosen.selected_ensemble == "mean"
@@ -103,7 +103,7 @@ def test_the_mean_is_reported_first_and_a_single_model_is_chosen_beside_it(
 def test_a_hull_that_runs_away_is_not_the_single_model(
     identified: Identified, logs: PreparedSplits
 ) -> None:
-    judged = {"validation": identified.evaluate(logs["validation"])}
+    judged = identified.evaluate({"validation": logs["validation"]})
     found = judged["validation"].runs[0].predictions
     found["hull"] = [replace(one, diverged=True) for one in found["hull"]]
     assert identified.select(judged).selected == "baseline"
@@ -133,7 +133,7 @@ def test_the_mean_is_that_of_the_trajectories_of_its_members(
     members = identified["mean"].notes["members"]
     every = [Candidate(name, "", identified[name].model) for name in [*members, "mean"]]
     found = free_run(every, windows, logs["test"], step, identified.limit)
-    beside = identified.evaluate(logs["test"]).runs[0].predictions["mean"]
+    beside = identified.evaluate({"test": logs["test"]})["test"].runs[0].predictions["mean"]
     for place, mean in enumerate(found["mean"]):
         states = [found[name][place].states[:, 3:] for name in members]
         np.testing.assert_allclose(mean.states[:, 3:], np.mean(states, axis=0), atol=1e-6)
@@ -144,7 +144,7 @@ def test_the_mean_is_that_of_the_trajectories_of_its_members(
 def test_members_that_run_away_are_left_out_of_the_mean(
     identified: Identified, logs: PreparedSplits
 ) -> None:
-    fitter = Fitter(logs, settings(), NoStore())
+    fitter = Fitter(logs, settings(), FitStore())
     lost = replace(identified["baseline"], notes={"validation_diverged": 1})
     members = [identified["hull"], identified["hull_network"], lost]
     assert fitter.mean("mean", members).notes["members"] == ["hull", "hull_network"]
@@ -156,7 +156,7 @@ def test_members_that_run_away_are_left_out_of_the_mean(
 def test_members_that_harm_the_mean_are_left_out(
     identified: Identified, logs: PreparedSplits
 ) -> None:
-    fitter = Fitter(logs, settings(), NoStore())
+    fitter = Fitter(logs, settings(), FitStore())
     zero, hull = identified["zero"], identified["hull"]
     zero = replace(zero, notes={"validation": fitter.validate(zero.model).error})
     found = fitter.mean("mean", [hull, identified["hull_network"], zero])

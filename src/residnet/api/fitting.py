@@ -214,12 +214,18 @@ def free_run(
                 f"free_run: model {model.name} steps by {model.dt:g} s, the data by {step:g} s;"
                 f" prepare them with step={model.dt:g}"
             )
-    logs = data.logs(split or ("test" if "test" in data.splits else next(iter(data.splits))))
+    split = split or ("test" if "test" in data.splits else next(iter(data.splits)))
     spec, divergence = found[0].spec, data.evaluation.divergence
     limit = velocity_limit(np.array(spec.low), np.array(spec.high), divergence, spec.signals.live)
     with hearing(progress):
-        judged = candidates([model.fitted for model in found], data.source)
-        return FreeRuns(evaluate(judged, logs, data.evaluation, step, limit))
+        judged = evaluate(
+            candidates([model.fitted for model in found], data.source),
+            {split: data.logs(split)},
+            data.evaluation,
+            step,
+            limit,
+        )
+        return FreeRuns(judged[split])
 
 
 @final

@@ -244,10 +244,7 @@ class _Calibration:
         for name in self.crossed:
             runs = self.crossed[name] + self.validated.get(name, [])
             out[name] = calibrate(runs, self.config.level, self.step, unit)
-        compared = references(
-            {name: entry.spec.role for name, entry in self.identified.items()},
-            {name: entry.notes for name, entry in self.identified.items()},
-        )
+        compared = references(self.identified.values())
         for name, entry in self.identified.items():
             reference = compared.get(name, "baseline")
             if name not in out and self.validated.get(name):

@@ -24,7 +24,7 @@ from residnet.heads.genetic import GeneticConfig
 from residnet.identification.bands import calibrate_bands
 from residnet.identification.fitter import Fitter
 from residnet.identification.identified import Identified
-from residnet.identification.models import FitStore, FittedModel, NoStore
+from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.recipe import LONG
 from residnet.identification.settings import FitSettings
 from residnet.training.config import TrainingConfig
@@ -45,7 +45,7 @@ def fit(logs: Logs, settings: FitSettings, *, store: FitStore | None = None) -> 
         FitError: where the data do not determine a part, or a training never ran freely.
         DataError: where a split holds no sample or no window.
     """
-    store = store or NoStore()
+    store = store or FitStore()
     fitter = Fitter(logs, settings, store)
     if not final_fit(fitter.settings, logs["train"]):
         return _fitted(fitter, logs)
@@ -190,13 +190,6 @@ def _opened(sent: _Sent) -> FittedModel:
     return FittedModel(spec, model, notes, covariance)
 
 
-class _Trainings(NoStore):
-    """Keeps no model, but the checkpoints of trainings."""
-
-    def __init__(self, folder: Path | None) -> None:
-        self.training_folder = folder
-
-
 _work: Callable[[str, _Sent], _Sent]
 """Fits a head on a baseline, in a process that `_begin` has prepared."""
 
@@ -210,7 +203,7 @@ def _begin(logs: Logs, settings: FitSettings, folder: Path | None, threads: int,
     def work(name: str, base: _Sent) -> _Sent:
         with listen(wire.put):
             if not made:
-                made.append(Fitter(logs, settings, _Trainings(folder), settle=False))
+                made.append(Fitter(logs, settings, FitStore(folder), settle=False))
             return _sent(made[0].head(name, _opened(base)))
 
     _work = work

@@ -25,7 +25,7 @@ from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
 from residnet.heads.base import ClosedFormHead
-from residnet.identification.models import FitStore, FittedModel, NoStore
+from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import PreparedSplits, velocity_limit
 from residnet.identification.recipe import Facts
 from residnet.identification.settings import FitSettings
@@ -177,17 +177,6 @@ def _best_with_neighbours(tried: Sequence[tuple[Solution, Score]]) -> tuple[Solu
     return min((pair for pair in tried if pair[0].neighbours is not None), key=_score, default=None)
 
 
-def settled(settings: FitSettings, samples: Samples, logs: Sequence[Prepared]) -> FitSettings:
-    """Return settings whose parts are those of the recipe for these logs.
-
-    Settings without a recipe are returned as they are.
-    """
-    if settings.recipe is None:
-        return settings
-    step = settings.prepare.grid.step
-    return settings.with_parts(Facts.of(samples, logs, settings.evaluation, step))
-
-
 class Fitter:
     """The single steps of a fit on one set of logs.
 
@@ -216,7 +205,11 @@ class Fitter:
         )
         self.samples = samples(self.train, self.signals)
         self.held_back = samples(logs["validation"], self.signals)
-        self.settings = settled(settings, self.samples, self.train) if settle else settings
+        if settle and settings.recipe is not None:
+            step = settings.prepare.grid.step
+            facts = Facts.of(self.samples, self.train, settings.evaluation, step)
+            settings = settings.with_parts(facts)
+        self.settings = settings
         self.scales = torch.from_numpy(settings.evaluation.scales.array())
         self.validate = ValidationScore(
             logs["validation"],
@@ -333,15 +326,7 @@ class Fitter:
 
     def ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         """Return the mean acceleration of fitted models as one model."""
-        spec = self.spec(name, "ensemble", StillConfig()).model_copy(
-            update={"members": tuple(member.spec for member in members)}
-        )
-        model = mean_of([copy.deepcopy(member.model).to(torch.float64) for member in members])
-        notes: dict[str, Any] = {
-            "members": [member.name for member in members],
-            **self._validated(model),
-        }
-        return self._kept(FittedModel(spec, model, notes))
+        return self._kept(self._mean_of(name, members, "accelerations"))
 
     def mean(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         """Return the mean of what fitted models predict, each running by itself.
@@ -371,13 +356,15 @@ class Fitter:
         found.notes["left_out"] = left
         return self._kept(found)
 
-    def _mean_of(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
+    def _mean_of(
+        self, name: str, members: Sequence[FittedModel], of: str = "trajectories"
+    ) -> FittedModel:
         spec = self.spec(name, "ensemble", StillConfig()).model_copy(
-            update={"members": tuple(one.spec for one in members), "of": "trajectories"}
+            update={"members": tuple(one.spec for one in members), "of": of}
         )
         parts = [copy.deepcopy(one.model).to(torch.float64) for one in members]
         single = [p.members[0] if isinstance(p, MeanOfTrajectories) else p for p in parts]
-        model = spec.mean(single)
+        model = spec.mean(single) if of == "trajectories" else mean_of(parts)
         notes = {"members": [one.name for one in members], **self._validated(model)}
         return FittedModel(spec, model, notes)
 
@@ -425,7 +412,7 @@ def require_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
         FitError: where manoeuvres are missing that a baseline is fitted on, are too few for the
             folds of a head, or too short for a refit.
     """
-    fitter = Fitter(logs, settings, NoStore())
+    fitter = Fitter(logs, settings, FitStore())
     # with the parts of the recipe for these logs, where it is asked for
     settings = fitter.settings
     step, windows = settings.prepare.grid.step, WindowStore.gather(fitter.train)

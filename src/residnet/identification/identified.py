@@ -64,24 +64,6 @@ class Evaluation:
 
 def evaluate(
     models: Sequence[Candidate],
-    logs: Sequence[Prepared],
-    config: EvaluationConfig,
-    step: float,
-    limit: np.ndarray,
-) -> Evaluation:
-    """Free-run models over all protocols of one split.
-
-    Args:
-        models: to be judged, see `candidates`.
-        logs: of one split, at least one.
-        step: of the grid in s.
-        limit: size of what moves [n] beyond which a free run has diverged.
-    """
-    return evaluate_splits(models, {logs[0].split: logs}, config, step, limit)[logs[0].split]
-
-
-def evaluate_splits(
-    models: Sequence[Candidate],
     splits: Mapping[str, Sequence[Prepared]],
     config: EvaluationConfig,
     step: float,
@@ -139,10 +121,7 @@ def candidates(
         data: where the logs came from; simulated trials add the plant that made them as `truth`.
     """
     models = {entry.name: entry for entry in fitted}
-    compared_with = references(
-        {name: entry.spec.role for name, entry in models.items()},
-        {name: entry.notes for name, entry in models.items()},
-    )
+    compared_with = references(models.values())
     unlike = unlike_models(models.values())
     out = [
         Candidate(
@@ -300,17 +279,6 @@ class Identified(Mapping[str, FittedModel]):
     seen: bool = False
 
     def evaluate(
-        self, logs: Sequence[Prepared], data: MeasuredLogs | SimulatedTrials | None = None
-    ) -> Evaluation:
-        """Free-run all models over the logs of one split.
-
-        Args:
-            logs: of one split, prepared as those of the fit.
-            data: where the logs came from; simulated trials add the plant as `truth`.
-        """
-        return self.evaluate_splits({logs[0].split: logs}, data)[logs[0].split]
-
-    def evaluate_splits(
         self,
         splits: Mapping[str, Sequence[Prepared]],
         data: MeasuredLogs | SimulatedTrials | None = None,
@@ -322,7 +290,7 @@ class Identified(Mapping[str, FittedModel]):
             data: where the logs came from; simulated trials add the plant as `truth`.
         """
         settings = self.settings
-        return evaluate_splits(
+        return evaluate(
             candidates(self.values(), data),
             splits,
             settings.evaluation,
@@ -509,21 +477,24 @@ def goodness_rows(
         step: of the grid in s.
     """
     models = {entry.name: entry for entry in fitted}
-    compared_with = references(
-        {name: entry.spec.role for name, entry in models.items()},
-        {name: entry.notes for name, entry in models.items()},
-    )
+    compared_with = references(models.values())
     splits = {}
     for split in SPLITS:
         every = -(-sum(len(log) for log in logs[split]) // paged.LARGE)
         taken = logs[split][:: max(every, 1)]
-        measured = [piece for log in taken for piece in measured_stretches(log)]
+        measured = [piece for log in taken for piece in _learned(log, log.nu_dot)]
         predictions = [
             OneStep(
                 name,
                 entry.spec.role,
                 _parameter_counts(entry.model),
-                [part for log in taken for part in _residuals(entry.model, log)],
+                [
+                    piece
+                    for log in taken
+                    for piece in _learned(
+                        log, log.nu_dot - teacher_forced(entry.model, log).predicted
+                    )
+                ],
                 compared_with.get(name),
             )
             for name, entry in models.items()
@@ -533,9 +504,9 @@ def goodness_rows(
     return splits
 
 
-def measured_stretches(log: Prepared) -> list[np.ndarray]:
-    """Return the measured accelerations [T, n] of each stretch that may be learned from."""
-    return [log.nu_dot[begin:end] for begin, end in zip(*stretches(log.good), strict=True)]
+def _learned(log: Prepared, values: np.ndarray) -> list[np.ndarray]:
+    """Return values [T, n] of each stretch that may be learned from."""
+    return [values[begin:end] for begin, end in zip(*stretches(log.good), strict=True)]
 
 
 def _parameter_counts(model: HybridDynamics) -> list[float]:
@@ -548,15 +519,4 @@ def _parameter_counts(model: HybridDynamics) -> list[float]:
         for of_baseline, of_head in zip(
             model.baseline.parameter_count(), model.head.parameter_count(), strict=True
         )
-    ]
-
-
-def _residuals(model: HybridDynamics, log: Prepared) -> list[np.ndarray]:
-    """Measured minus predicted acceleration [T, n] of each stretch; a head runs along the whole
-    log, as its memory needs.
-    """
-    predicted = teacher_forced(model, log).predicted
-    return [
-        log.nu_dot[begin:end] - predicted[begin:end]
-        for begin, end in zip(*stretches(log.good), strict=True)
     ]

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from torch import nn
 
 from residnet.core.files import read_json
 from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
-from residnet.identification.models import FittedModel
+from residnet.identification.models import FitStore, FittedModel
 from residnet.judge.band import read_bands
 from residnet.runs.folder import RunFolder, require_sealed, seal
 
 
-class FolderStore:
+class FolderStore(FitStore):
     """Vessel models and policies in `models/<name>` of a run folder.
 
     Attributes:
@@ -23,8 +22,8 @@ class FolderStore:
     """
 
     def __init__(self, folder: RunFolder) -> None:
+        super().__init__(folder.path)
         self.folder = folder
-        self.training_folder: Path | None = folder.path
 
     def names(self) -> list[str]:
         """Return the names of the models that are there."""

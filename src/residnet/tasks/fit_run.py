@@ -84,7 +84,7 @@ def run_fit(config: FitConfig, folder: RunFolder) -> Outcome:
         bands = {entry.name: entry.bands for entry in fitted}
         folder.write_json(folder.bands, bands_content(config.name, bands))
     held = {str(split): logs[split] for split in config.evaluation.splits}
-    judged = identified.evaluate_splits(held, config.data)
+    judged = identified.evaluate(held, config.data)
     chosen = identified.select(judged)
     told = "" if chosen.leading is None else f"; predictor: {chosen.leading}"
     say(f"  selected: {chosen.selected}{told}")
@@ -280,7 +280,7 @@ def evaluate_on(
         )
         models = [c for c in candidates(fitted, config.data) if c.kind != "truth" or simulated]
         limit = limit_of(fitted[0].spec, config)
-        judged = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit)
+        judged = evaluate(models, {SPLIT: logs}, config.evaluation, config.prepare.grid.step, limit)
         # bands, and why the model was selected, are the fit's own; the report shows them
         for own, copy in ((run.bands, folder.bands), (run.selection, folder.selection)):
             if own.is_file():
@@ -289,7 +289,7 @@ def evaluate_on(
         selected = str(chosen["selected"])
         predictor = str(chosen.get("predictor", selected))
         names = (selected, chosen.get("selected_ensemble"), predictor)
-        write_judged(folder, config, {SPLIT: judged}, names, {SPLIT: logs})
+        write_judged(folder, config, judged, names, {SPLIT: logs})
         return fit_outcome(folder, SPLIT)
 
     return config.conduct(folder, made_from, judge)

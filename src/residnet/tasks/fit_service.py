@@ -371,19 +371,19 @@ def refit_run(service: Service, out: Path) -> RefitRun:
                 replace(one, reference=old.name) if one.name == new.name else one
                 for one in candidates([store.load(name) for name in (*beside, new.name)])
             ],
-            kept,
+            {SPLIT: kept},
             config.evaluation,
             config.prepare.grid.step,
             limit_of(old.spec, config),
         )
-        row = find(judged.rows, model=new.name, **asked)
+        row = find(judged[SPLIT].rows, model=new.name, **asked)
         gain = row["difference"]
         upper = gain["nrmse_mean"] if gain["ci95"] is None else gain["ci95"][1]
         worth = bool(row["diverged"] == 0 and upper < 0.0)
-        before = find(judged.rows, model=old.name, **asked)
+        before = find(judged[SPLIT].rows, model=old.name, **asked)
         errors.update(old=before["nrmse"]["mean"], new=row["nrmse"]["mean"], worth=worth)
         chosen = new.name if worth else old.name
-        write_judged(folder, config, {SPLIT: judged}, (chosen, None, chosen), {SPLIT: kept})
+        write_judged(folder, config, judged, (chosen, None, chosen), {SPLIT: kept})
         changes = [f"{one['cause']} {one['size']:+.3g}" for one in new.notes["refit_changes"]]
         sentence = (
             f"The recursive refit ({', '.join(changes)}) is {'' if worth else 'not '}worth taking"
