@@ -35,7 +35,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "simulators": (355, 42),
     "tasks": (3100, 254),
     "testing": (481, 30),
-    "training": (1325, 154),
+    "training": (1372, 157),
     "": (458, 52),
 }
 

@@ -28,7 +28,7 @@ from residnet.identification.prepared import prepare_logs
 from residnet.tasks.fit import FitConfig
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-_DETERMINED, _ASKED = 2.5, 5.0
+_DETERMINED, _ASKED, _NOTHING = 2.5, 5.0, 1e-9
 
 
 def true_rows(
@@ -40,8 +40,7 @@ def true_rows(
     moved = [flight.motion for flight in flights]
     columns = [list(plant.state), list(plant.inputs[: plant.commands])]
     x, w = (
-        torch.cat([torch.from_numpy(log.stack(tuple(names))) for log in moved])
-        for names in columns
+        torch.cat([torch.from_numpy(log.stack(tuple(names))) for log in moved]) for names in columns
     )
     live = baseline.axes
     own = torch.cat([torch.from_numpy(log.stack(("x", "y", "psi", *live))) for log in moved])
@@ -105,13 +104,17 @@ def main() -> None:
         draws = [drawn(vessel, seed, given.overrides) for seed in given.seeds]
         names, found = draws[0][0], torch.stack([part for _, part in draws])
         true = found[:, :, 1].mean(0)
-        off = 100.0 * (found[:, :, 0] - found[:, :, 1]) / true.abs()
-        spread, told = off.std(0), 100.0 * found[:, :, 2].mean(0) / true.abs()
-        print(f"{vessel}: coefficient, truth; in %: mean error, its spread, standard error told")
+        size = torch.where(true.abs() > _NOTHING, true.abs() / 100.0, 1.0)
+        off = (found[:, :, 0] - found[:, :, 1]) / size
+        spread, told = off.std(0), found[:, :, 2].mean(0) / size
+        print(
+            f"{vessel}: coefficient, truth; mean error, spread, standard error told,"
+            " in % where the truth is not nothing"
+        )
         counts = [0, 0, 0]
         for k, name in enumerate(names):
             near = int((off[:, k].abs() <= _ASKED).sum())
-            known = bool(spread[k] <= _DETERMINED)
+            known = bool(spread[k] <= _DETERMINED and true[k].abs() > _NOTHING)
             if known:
                 counts = [a + b for a, b in zip(counts, (1, len(off), near), strict=True)]
             print(

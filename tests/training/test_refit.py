@@ -38,7 +38,7 @@ from residnet.dynamics.rollout import Rollout
 from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training import refit as module
-from residnet.training.refit import Problem, RefitConfig, refit, step_sensitivities
+from residnet.training.refit import Problem, RefitConfig, refit, sensitivities, step_sensitivities
 
 
 def fitted(
@@ -201,6 +201,37 @@ def test_sensitivities_are_those_of_the_rollout(
         for place in range(count):
             central = (rolled(place, 1e-5) - rolled(place, -1e-5))[:, -1, HEADING:] / 2e-5
             torch.testing.assert_close(found[:, :, place], central, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("velocities", [ROLLS[:3], ROLLS])
+def test_sensitivities_to_the_start_are_those_of_the_rollout(velocities: tuple[str, ...]) -> None:
+    model, problem = windy(velocities=velocities)
+    baseline, memory = model.baseline, model.initial_state(len(problem.x0)).double()
+    assert isinstance(baseline, RegressorBaseline)
+
+    def rolled(place: int, change: float) -> Tensor:
+        x0 = problem.x0.clone()
+        x0[:, HEADING + place] += change
+        with torch.no_grad():
+            return Rollout(model)(x0, problem.w, memory)[0]
+
+    run = rolled(0, 0.0)[:, :-1]
+    whole = sensitivities(model, baseline, run, problem.w, to_start=True)
+    found = torch.cat([part for _, part in whole]).transpose(0, 1).detach()
+    for place in range(1 + model.dof):
+        central = (rolled(place, 1e-5) - rolled(place, -1e-5))[:, 1:, HEADING:] / 2e-5
+        torch.testing.assert_close(found[..., place], central, rtol=1e-6, atol=1e-8)
+
+
+def test_noisy_starts_teach_no_damping_where_they_are_estimated() -> None:
+    """Free runs from exact starts, of models refitted to free runs from noisy ones."""
+    logs, off = trials(count=8, noise=0.06), {}
+    for starts in ("measured", "estimated"):
+        model, known, store = fitted(QUADRATIC, logs)
+        content = {"horizon": 4.0, "every": 4.0, "prior": 0.0, "starts": starts}
+        refit(model, known, store, RefitConfig.model_validate(content), SCALES)
+        off[starts] = free_run_error(model)
+    assert off["estimated"] < 0.7 * off["measured"]
 
 
 def normal_equations(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:

@@ -26,6 +26,7 @@ from residnet.training.refit import (
     normal_equations,
     place,
     problem_of,
+    started,
 )
 
 
@@ -62,6 +63,7 @@ def left_open(
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
     problem = problem_of(model, baseline, samples, store, config, scales).at_rest(still)
+    problem = started(model, problem)
     level, states = level_of(model, problem)
     hessian, _ = normal_equations(model, problem, baseline, level, states)
     covariance = problem.share(level) * problem.inverse(hessian)
@@ -99,6 +101,7 @@ def without_logs(
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
     problem = problem_of(model, baseline, samples, store, config, scales).at_rest(still)
+    problem = started(model, problem)
     level, states = level_of(model, problem)
     fitted = baseline.theta.detach().clone()
     parameters = fitted.flatten()[problem.active]
@@ -153,7 +156,7 @@ def _best_share(model: HybridDynamics, others: Problem, parameters: Tensor, step
 
 
 def _rows(problem: Problem, chosen: Tensor) -> Problem:
-    """Return the problem of some of its windows."""
+    """Return the problem of some of its windows, whose starts are as they are."""
     return replace(
         problem,
         x0=problem.x0[chosen],
@@ -161,6 +164,7 @@ def _rows(problem: Problem, chosen: Tensor) -> Problem:
         nu=problem.nu[chosen],
         weight=problem.weight[chosen],
         log=problem.log[chosen],
+        begins=None,
     )
 
 

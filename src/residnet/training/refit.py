@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from pydantic import Field
@@ -31,6 +31,7 @@ from residnet.core.errors import FitError
 from residnet.core.frames import cross
 from residnet.core.layout import ATTITUDE, HEADING, SIX, YAW_RATE
 from residnet.core.samples import Samples
+from residnet.data.channels import noise_of
 from residnet.data.windows import WindowStore
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
@@ -99,11 +100,17 @@ _AT_ONCE = 1_024
 
 
 def sensitivities(
-    model: HybridDynamics, baseline: ParametricBaseline, x: Tensor, w: Tensor
+    model: HybridDynamics,
+    baseline: ParametricBaseline,
+    x: Tensor,
+    w: Tensor,
+    *,
+    to_start: bool = False,
 ) -> Iterator[tuple[slice, Tensor]]:
     """Yield sensitivities of free runs after some steps, and which: [K, B, 1 + n, P].
 
-    What a step does to them does not depend on them, and is found for many steps at once.
+    What a step does to them does not depend on them, and is found for many steps at once. Those
+    `to_start` are to heading and what moves at the start, [K, B, 1 + n, 1 + n].
 
     Args:
         model: that ran.
@@ -113,7 +120,8 @@ def sensitivities(
     """
     batch, total = w.shape[:2]
     count, own = int(baseline.free_indices().numel()), 1 + model.dof
-    s, start = x.new_zeros(batch, own, count), torch.eye(own, own + count, dtype=x.dtype)
+    start = torch.eye(own, own + count, dtype=x.dtype)
+    s = start[:, :own].expand(batch, -1, -1) if to_start else x.new_zeros(batch, own, count)
     length = max(_AT_ONCE // max(batch, 1), 1)
     for begin in range(0, total, length):
         steps, found = slice(begin, min(begin + length, total)), []
@@ -121,7 +129,8 @@ def sensitivities(
         p = model.signals.prepare(rows[1])
         each = step_sensitivities(model, baseline, rows[0], p, start.expand(len(p), -1, -1))
         for one in each.unflatten(0, (-1, batch)):
-            s = torch.baddbmm(one[..., own:], one[..., :own], s)
+            ahead, more = one[..., :own], one[..., own:]
+            s = ahead @ s if to_start else torch.baddbmm(more, ahead, s)
             found.append(s)
         yield steps, torch.stack(found)
 
@@ -239,13 +248,21 @@ all others were known; it says where a parameter stays that the data leave open.
 """
 
 
+class Begins(NamedTuple):
+    """What moves at the starts of free runs as it was measured [B, n], and its noise [n], SI."""
+
+    measured: Tensor
+    noise: Tensor
+
+
 @dataclass(frozen=True)
 class Problem:
     """Windows x0 [B, 3 + n], w [B, T, m], measured nu [B, T, n], weights [B, T, n] (0 or 1/scale);
     numbers of the free parameters [P]; precision [P, P] about where least squares put them, the
     part of it that each parameter has for itself, whatever the data say, and that point [P];
     pull to the mirror symmetry [P, P]; beliefs, mean and precision [P]; which parameters stay at
-    zero [P]; count of independent errors per channel; log of each window [B].
+    zero [P]; count of independent errors per channel; log of each window [B]; what is known of
+    the starts, where they are estimated, too.
     """
 
     x0: Tensor
@@ -263,6 +280,7 @@ class Problem:
     count: float
     robust: float
     log: Tensor
+    begins: Begins | None = None
 
     def at_rest(self, numbers: Sequence[int]) -> Problem:
         """Return the problem with further free parameters, by their numbers, that stay at zero."""
@@ -373,7 +391,21 @@ def problem_of(
         max(covered * model.dt / config.correlation, 1.0) * float(model.living.mean()),
         config.robust,
         store.log[starts],
+        None
+        if config.starts == "measured"
+        else Begins(velocities_on(store.y[starts]), _noise(store)),
     )
+
+
+_LEAST = 1e-9
+"""Noise, in SI, of what shows none."""
+
+
+def _noise(store: WindowStore) -> Tensor:
+    """Return the noise [n] of what moves, the median over the logs."""
+    logs = [velocities_on(store.y[store.log == k]).numpy().T for k in store.log.unique()]
+    each = torch.tensor([[noise_of(values) for values in log] for log in logs])
+    return each.to(store.y.dtype).median(0).values.clamp(min=_LEAST)
 
 
 class RefitConfig(Config):
@@ -390,7 +422,11 @@ class RefitConfig(Config):
         correlation: time over which errors of a free run hang together; the logs hold so many
             independent errors, which says how much beliefs weigh beside them, and how large the
             standard errors are.
-        iterations: at most.
+        iterations: at most, for each estimate of the starts.
+        starts: of free runs. `measured`: as measured, and as free runs are judged from. Their noise
+            lasts in a vessel that is damped little, so that the minimum is one damped more.
+            `estimated`: as the course after them and the measurement tell, each as far as its noise
+            lets it, for coefficients that are to be those of the vessel.
     """
 
     horizon: Seconds = Field(default=20.0, gt=0)
@@ -400,6 +436,7 @@ class RefitConfig(Config):
     robust: float = Field(default=0.05, gt=0)
     correlation: Seconds = Field(default=10.0, gt=0)
     iterations: int = Field(default=10, ge=1, le=10_000)
+    starts: Literal["measured", "estimated"] = "measured"
 
     def with_prior(self, prior: float) -> RefitConfig:
         """Return the same settings with one strength of the prior."""
@@ -482,7 +519,7 @@ def refit(
         level, _ = level_of(model, problem)
     first = level
     for _round in range(_ROUNDS):
-        found = _minimised(model, problem, baseline, config.iterations)
+        problem, found = _with_starts(model, problem, baseline, config.iterations)
         level, count = found.point.level, count + found.steps
         if feeding := baseline.feeding():
             problem = problem.at_rest(feeding)
@@ -585,6 +622,53 @@ def _minimised(
     found = descend(begin, near, iterations, gain=_GAIN)
     place(baseline, found.point.values, problem.active)
     return found
+
+
+def _with_starts(
+    model: HybridDynamics, problem: Problem, baseline: ParametricBaseline, iterations: int
+) -> tuple[Problem, Descent[_Reached]]:
+    """Move the parameters to the minimum, by turns with the starts until these gain no more."""
+    found = _minimised(model, problem, baseline, iterations)
+    steps = found.steps
+    for _ in range(iterations if problem.begins else 0):
+        moved = started(model, problem)
+        if not level_of(model, moved)[0] < (1.0 - _GAIN) * found.point.level:
+            break
+        problem, found = moved, _minimised(model, moved, baseline, iterations)
+        steps += found.steps
+    return problem, replace(found, steps=steps)
+
+
+@torch.no_grad()
+def started(model: HybridDynamics, problem: Problem) -> Problem:
+    """Return the problem with the starts that measurement and course tell, where they are wanted.
+
+    It is one step of Gauss-Newton. Of the error of a free run, what the sensor's noise explains is
+    another at each sample; the rest may last from start to end, so that all samples together tell
+    no more of it than one does.
+    """
+    if problem.begins is None:
+        return problem
+    baseline, states = model.baseline, level_of(model, problem)[1]
+    assert isinstance(baseline, ParametricBaseline)
+    error, seen = velocities_on(states[:, 1:]) - problem.nu, problem.weight > 0.0
+    noise = problem.begins.noise.square()
+    square = (error.square() * seen).sum((0, 1)) / seen.sum((0, 1)).clamp(min=1)
+    # windows count as they do in the cost
+    size = torch.sqrt(problem.squares(states) + problem.robust**2)
+    variance = noise + (square - noise).clamp(min=0.0) * error.shape[1]
+    root = seen / (variance * (size / size.mean())[:, None]).sqrt()[:, None]
+    moving = velocities_on(problem.x0)
+    hessian = torch.diag(1.0 / noise).repeat(len(states), 1, 1)
+    gradient = (moving - problem.begins.measured) / noise
+    for part, found in sensitivities(model, baseline, states[:, :-1], problem.w, to_start=True):
+        weight = root[:, part].transpose(0, 1)
+        slopes = found[:, :, 1:, 1:] * weight.unsqueeze(-1)
+        off = error[:, part].transpose(0, 1) * weight
+        hessian += torch.einsum("kbij,kbil->bjl", slopes, slopes)
+        gradient += torch.einsum("kbij,kbi->bj", slopes, off)
+    x0 = torch.cat((pose(problem.x0), moving - torch.linalg.solve(hessian, gradient)), dim=1)
+    return replace(problem, x0=x0)
 
 
 def place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
