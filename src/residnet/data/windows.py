@@ -169,10 +169,9 @@ class WindowStore:
 
     def take(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
         """Return the windows [B, length, ...] of one of the tensors, from rows `starts` [B] on."""
-        index = starts[:, None] + torch.arange(length, device=starts.device)
-        return values.index_select(0, index.reshape(-1)).reshape(
-            starts.numel(), length, *values.shape[1:]
-        )
+        # all windows that there are, which lie in one another
+        shape = (len(values) - length + 1, length, *values.shape[1:])
+        return values.as_strided(shape, (values.stride(0), *values.stride()))[starts]
 
     def history(self, starts: Tensor, length: int) -> tuple[Tensor, Tensor]:
         """Return the measured states and inputs of the `length` samples before each start.

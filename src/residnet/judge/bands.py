@@ -405,7 +405,7 @@ def _slopes(given: _Runs, shape: np.ndarray, slope: np.ndarray) -> np.ndarray:
     rows = slice(None, None, _THINNED)
     error, z, shape = given.error[:, rows], given.measures[:, rows], shape[rows]
     weight = given.weight[:, None] / error.shape[1]
-    pull = _RIDGE * np.eye(z.shape[2])
+    pull, flat = _RIDGE * np.eye(z.shape[2]), z.reshape(-1, z.shape[2])
     for channel in range(error.shape[2]):
         ratio = error[:, :, channel] / shape[:, channel]
         seen = np.isfinite(ratio)
@@ -417,8 +417,8 @@ def _slopes(given: _Runs, shape: np.ndarray, slope: np.ndarray) -> np.ndarray:
             mean = np.exp(np.clip(z @ own, -20.0, 20.0))
             mean *= (w * y).sum() / max((w * mean).sum(), 1e-300)
             part = w * y / np.maximum(mean, 1e-300)
-            gradient = np.einsum("wg,wgf->f", part - w, z) - pull @ own
-            hessian = np.einsum("wg,wgf,wgh->fh", part, z, z) + pull
+            gradient = flat.T @ (part - w).ravel() - pull @ own
+            hessian = flat.T @ (part.reshape(-1, 1) * flat) + pull
             own = own + np.clip(np.linalg.solve(hessian, gradient), -1.0, 1.0)
         out[:, channel] = own
     return out

@@ -662,7 +662,8 @@ def write_rollouts(
         columns |= {f"{INPUT}{name}": w[:, place] for place, name in enumerate(inputs)}
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
         with whole(folder / f"{file_stem(log.log.name)}.parquet") as file:
-            pq.write_table(table, file, compression="zstd")
+            # dictionaries of numbers that do not repeat take time and room
+            pq.write_table(table, file, compression="zstd", use_dictionary=["protocol", "model"])
 
 
 def _limits(

@@ -213,7 +213,7 @@ class HeadTraining(EpochTraining):
             {"params": [p for p in head if p.ndim > 1], "weight_decay": self.settings.weight_decay},
             {"params": [p for p in head if p.ndim <= 1], "weight_decay": 0.0},
         ]
-        return torch.optim.AdamW(groups, lr=1e-3)
+        return torch.optim.AdamW(groups, lr=1e-3, fused=True)
 
     def on_fit_start(self) -> None:
         """Reset the losses."""
