@@ -27,7 +27,7 @@ from residnet.core.log import Log
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.identification.fit import fit
-from residnet.identification.models import FittedModel
+from residnet.identification.fitter import FittedModel
 from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher, pieces
 from residnet.identification.prepared import prepare_logs, through_currents
 from residnet.identification.settings import FitSettings

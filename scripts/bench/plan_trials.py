@@ -30,7 +30,7 @@ from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.data.windows import WindowStore
 from residnet.dynamics.actuated import InputShare
 from residnet.identification.fit import fit
-from residnet.identification.models import FittedModel
+from residnet.identification.fitter import FittedModel
 from residnet.identification.planning import Aim, TrialLimits, candidates, moments, plan, spread
 from residnet.identification.prepared import prepare_logs, velocity_limit
 from residnet.identification.settings import FitSettings

@@ -19,8 +19,7 @@ from residnet.core.layout import ROLL, Live, levelled
 from residnet.core.log import Log
 from residnet.core.registry import kinds
 from residnet.data.doctor import inspect
-from residnet.data.sea import Disturbance, SensorNoise
-from residnet.data.simulated import Craft, Sea, fly
+from residnet.data.simulated import Craft, Disturbance, Sea, SensorNoise, fly
 from residnet.dynamics.actuated import ActuatedDynamics, PlantActuators
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.rollout import Rollout, scripted

@@ -17,12 +17,13 @@ from residnet.control.heading.conditions import (
     ConditionedRun,
     ConditionsConfig,
     HeadingChanges,
+    TuningConfig,
     gauss_markov,
     quiet,
+    tune,
     wave_motion,
 )
 from residnet.control.heading.controllers import PdConfig, PidConfig, Steering
-from residnet.control.heading.tuning import TuningConfig, tune
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.physics.vessel import load_vessel

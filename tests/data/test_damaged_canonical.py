@@ -17,7 +17,7 @@ from residnet.api.data import read_logs
 from residnet.core.errors import DataError, ResidnetError
 from residnet.core.log import Log
 from residnet.data.doctor import inspect
-from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.readers.base import CanonicalConfig
 
 STRANGE: list[Any] = [None, 3, -1.5, True, "", "x", [], [1, None], {}, {"a": []}, [[{}]], 1e400]
 

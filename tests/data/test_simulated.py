@@ -16,8 +16,18 @@ from torch import Tensor
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
-from residnet.data.sea import Disturbance, SensorNoise, WindField, gusty_wind, ornstein_uhlenbeck
-from residnet.data.simulated import Craft, Sea, SimulatedTrials, fly, simulate
+from residnet.data.simulated import (
+    Craft,
+    Disturbance,
+    Sea,
+    SensorNoise,
+    SimulatedTrials,
+    WindField,
+    fly,
+    gusty_wind,
+    ornstein_uhlenbeck,
+    simulate,
+)
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres.base import Helm, Manoeuvre

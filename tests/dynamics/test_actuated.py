@@ -17,8 +17,16 @@ from residnet.core.config import validate
 from residnet.core.errors import ConfigError, ExportError
 from residnet.data.align import GridConfig
 from residnet.data.prepare import PrepareConfig, prepare, samples
-from residnet.data.sea import Disturbance, SensorNoise
-from residnet.data.simulated import Craft, Flight, Sea, SimulatedTrials, fly, simulate
+from residnet.data.simulated import (
+    Craft,
+    Disturbance,
+    Flight,
+    Sea,
+    SensorNoise,
+    SimulatedTrials,
+    fly,
+    simulate,
+)
 from residnet.dynamics import lowering
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
 from residnet.dynamics.hybrid import HybridDynamics

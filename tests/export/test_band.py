@@ -11,7 +11,7 @@ import torch
 
 from residnet.dynamics.store import BandTable
 from residnet.export import exporter, vessel
-from residnet.export.c_code import compile_shared
+from residnet.export.c import compile_shared
 from residnet.export.vessel import ExportedModel, ExportedVessel
 from residnet.physics.signals import SignalsConfig
 from residnet.testing.checks import ROLLING, SIGNALS, SUBMERGED, example_model, example_spec

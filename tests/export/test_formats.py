@@ -27,8 +27,7 @@ from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.lowering import lowered
 from residnet.export import base, exporter, torchscript, vessel
 from residnet.export.base import Loaded, RoundingError, released
-from residnet.export.c import CasadiModel, CompiledModel
-from residnet.export.c_code import STRICT, CFunction, c_files, compile_shared
+from residnet.export.c import STRICT, CasadiModel, CFunction, CompiledModel, c_files, compile_shared
 from residnet.export.onnx_file import OnnxModel
 from residnet.export.torchscript import AotiModel, ScriptedModel
 from residnet.export.vessel import ExportedVessel

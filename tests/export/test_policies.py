@@ -26,8 +26,7 @@ from residnet.control.heading.policies import FIXED, ObservedPolicy
 from residnet.core.errors import ExportError, UsageError
 from residnet.export import exporter, policy
 from residnet.export.base import Loaded
-from residnet.export.c import CompiledModel
-from residnet.export.c_code import compile_shared
+from residnet.export.c import CompiledModel, compile_shared
 from residnet.export.policy import COURSE, ExportedController, ExportedCoursePolicy, ExportedHeading
 from residnet.testing.checks import check_bad_measurements
 

@@ -13,7 +13,7 @@ import torch
 
 from residnet.control.heading.controllers import ObservedPolicySpec, PtosConfig
 from residnet.export import exporter, policy
-from residnet.export.c_code import compile_shared
+from residnet.export.c import compile_shared
 from residnet.export.policy import ExportedHeading
 
 ROOT = Path(__file__).parents[2]

@@ -12,7 +12,7 @@ from residnet.data.sources import read_logs
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.identification.bands import FoldModels
 from residnet.identification.fit import fit
-from residnet.identification.models import FittedModel
+from residnet.identification.fitter import FittedModel
 from residnet.identification.prepared import prepare_logs
 from residnet.identification.settings import FitSettings
 

@@ -17,8 +17,8 @@ from residnet.core.progress import Progress, listen
 from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.identification.fit import fit
+from residnet.identification.fitter import FitStore, FittedModel
 from residnet.identification.identified import Identified
-from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
 

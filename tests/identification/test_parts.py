@@ -17,8 +17,7 @@ from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.identification import fit as parts
 from residnet.identification.fit import fit
-from residnet.identification.fitter import Fitter
-from residnet.identification.models import FitStore
+from residnet.identification.fitter import FitStore, Fitter
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
 

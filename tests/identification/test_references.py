@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any, cast
 
-from residnet.identification.models import FittedModel
-from residnet.identification.models import references as compared
+from residnet.identification.fitter import FittedModel
+from residnet.identification.fitter import references as compared
 
 ROLES = {
     "zero": "zero",

@@ -21,8 +21,7 @@ from residnet.data.prepare import samples
 from residnet.dynamics.hybrid import Missed
 from residnet.heads.lstm import LstmConfig
 from residnet.identification.fit import Identified, fit
-from residnet.identification.fitter import Fitter, burden
-from residnet.identification.models import FitStore
+from residnet.identification.fitter import FitStore, Fitter, burden
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.recipe import PARTS, Facts, portfolio
 from residnet.identification.settings import FitSettings

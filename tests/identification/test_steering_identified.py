@@ -9,7 +9,7 @@ import pytest
 
 from residnet.core.errors import DataError, FitError
 from residnet.core.log import Log
-from residnet.identification.steering import identify_steering
+from residnet.tasks.own_autopilot import identify_steering
 
 
 def sailed(

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from residnet.judge.courses import CourseFlight, passes
+from residnet.judge.autopilots import CourseFlight, passes
 
 
 def straight(*corners: tuple[float, float]) -> CourseFlight:

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from residnet.control.motion import MotionPIDConfig
 from residnet.core.errors import UsageError
-from residnet.data.sea import Disturbance, SensorNoise
-from residnet.data.simulated import Craft, Sea, fly
+from residnet.data.simulated import Craft, Disturbance, Sea, SensorNoise, fly
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import RecordedPlantDynamics

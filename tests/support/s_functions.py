@@ -10,7 +10,7 @@ import numpy as np
 
 from residnet.export import exporter
 from residnet.export.base import Exported
-from residnet.export.c_code import compile_shared
+from residnet.export.c import compile_shared
 
 HARNESS = Path(__file__).parent / "simstruct"
 

@@ -18,8 +18,7 @@ from scipy.io import savemat
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.data.readers.base import LogReader
-from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.readers.base import CanonicalConfig, LogReader
 from residnet.data.readers.detect import AutoConfig
 from residnet.data.readers.recording import EVERYTHING, Recording
 from residnet.data.readers.topics import align_clocks

@@ -14,7 +14,7 @@ import yaml
 from tiny import call
 
 from residnet.core.log import Log
-from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.readers.base import CanonicalConfig
 
 
 def config(folder: Path, **keys: object) -> Path:

@@ -15,7 +15,7 @@ from read_page import plain
 from tiny import TINY, call
 
 from residnet.core.log import Log
-from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.readers.base import CanonicalConfig
 from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.tasks.registry import load_task
 

@@ -23,7 +23,7 @@ from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_mo
 from residnet.export import exporter
 from residnet.export.base import released
 from residnet.export.vessel import ExportedVessel
-from residnet.identification.models import FittedModel
+from residnet.identification.fitter import FittedModel
 from residnet.identification.monitoring import (
     MonitorConfig,
     Verdict,

@@ -21,7 +21,7 @@ FORMATS = Kinds(
         "casadi": "residnet.export.c:CasadiExporter",
         "fmu": "residnet.export.fmu:Fmu3Exporter",
         "fmu2": "residnet.export.fmu:Fmu2Exporter",
-        "simulink": "residnet.export.simulink:SimulinkExporter",
+        "simulink": "residnet.export.c:SimulinkExporter",
         "aoti": "residnet.export.torchscript:AotiExporter",
         "parameters": "residnet.export.parameters:ParametersExporter",
         "feed_forward": "residnet.export.feed_forward:FeedForwardExporter",

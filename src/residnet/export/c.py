@@ -1,20 +1,30 @@
-"""The formats `c`, one C99 source file and its header without a runtime, and `casadi`, for MPC."""
+"""Formats as C: `c`, one C99 source file and its header without a runtime; `casadi`, for MPC; and
+`simulink`, a level-2 S-function around the exported C.
+
+Source: MathWorks, "S-Function Callback Methods" and "Guidelines for Writing C MEX S-Functions".
+"""
 
 from __future__ import annotations
 
 import ctypes
 import json
 import math
+import platform
+import re
+import shutil
+import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, Final, NamedTuple, final
 
 import casadi as ca
 import numpy as np
 import torch
 
-from residnet.dynamics.c_code import literal
+from residnet.core.errors import ExportError, UsageError
+from residnet.dynamics.c_code import Body, Tables, compiler, literal
 from residnet.dynamics.lowering import in_numbers, lowered
 from residnet.dynamics.store import BandTable
 from residnet.export.base import (
@@ -26,9 +36,227 @@ from residnet.export.base import (
     name_of,
     write_card,
 )
-from residnet.export.c_code import CFunction, c_files, compile_shared, footprint, identifier
 from residnet.export.policy import ExportedController
 from residnet.export.vessel import ExportedVessel
+
+_SCALAR: Final = 1100
+"""Most operations of a function that is taken apart into operations on single numbers."""
+
+
+def taken_apart(function: ca.Function) -> ca.Function:
+    """Return a function of single numbers where it is small; networks keep their matrices."""
+    count = 0
+    for k in range(function.n_instructions()):
+        if function.instruction_id(k) == ca.OP_MTIMES:
+            product = function.instruction_MX(k)
+            count += product.numel() * product.dep(1).shape[1]
+    if count > _SCALAR:
+        return function
+    alone = in_numbers(function)
+    return alone if alone.n_instructions() <= _SCALAR else function
+
+
+def identifier(text: str) -> str:
+    """Return a name as an identifier of C."""
+    plain = re.sub(r"\W", "_", text.lower(), flags=re.ASCII)
+    return plain if re.match(r"[a-z]", plain) else f"m_{plain}"
+
+
+@dataclass(frozen=True)
+class CFunction:
+    """A function of a C file.
+
+    Attributes:
+        name: without the file's prefix.
+        about: its comment in the header.
+        function: what it does.
+        flags: which of its results are truth values; the first is what the C function returns.
+    """
+
+    name: str
+    about: str
+    function: ca.Function
+    flags: Sequence[str] = ()
+
+    def prototype(self, prefix: str) -> str:
+        """Return the prototype; arguments first, then where the results go."""
+        given = [f"const {prefix}_real *{name}" for name in self.function.name_in()]
+        taken = [
+            f"{'int' if name in self.flags else f'{prefix}_real'} *{name}"
+            for name in self.function.name_out()
+            if name not in self.flags[:1]
+        ]
+        kind = "int" if self.flags else "void"
+        return f"{kind} {prefix}_{self.name}({', '.join(given + taken) or 'void'})"
+
+    def definition(self, prefix: str, tables: Tables) -> str:
+        """Return the function in C."""
+        body = Body(taken_apart(self.function), tables, f"{prefix}_{self.name}")
+        names = self.function.name_out()
+        ends = [
+            f"{name}[{i}] = {cell};"
+            for name, cells in zip(names, body.results, strict=True)
+            for i, cell in enumerate(cells)
+            if name not in self.flags[:1]
+        ]
+        if self.flags:
+            ends.append(f"return {body.results[names.index(self.flags[0])][0]} != ZERO;")
+        statements = body.read(ends)
+        words = set(re.findall(r"\w+", "\n".join(statements)))
+        unread = [
+            f"(void){name};"
+            for name in (*body.names, *names)
+            if name not in words and name not in self.flags[:1]
+        ]
+        counters = [name for name in "hij" if name in words]
+        lines = [*([f"int {', '.join(counters)};"] if counters else []), *unread, *statements]
+        inside = "".join(f"    {line}\n" for line in lines)
+        return f"{self.prototype(prefix)} {{\n{inside}}}\n"
+
+
+_HEADER = """/*
+{comment}
+ */
+#ifndef {guard}
+#define {guard}
+
+#include <stddef.h>
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+{precision}
+{numbers}
+
+{prototypes}
+
+#ifdef __cplusplus
+}}
+#endif
+
+#endif
+"""
+_EITHER = """/* define {macro} for double precision, here and in the source file */
+#ifdef {macro}
+typedef double {prefix}_real;
+#else
+typedef float {prefix}_real;
+#endif
+"""
+_DOUBLE_ALONE = """/* in double precision alone: single would not follow it closely enough */
+#ifndef {macro}
+#define {macro}
+#endif
+typedef double {prefix}_real;
+"""
+_SOURCE = """#include "{header}"
+
+#include <math.h>
+
+#define REAL {prefix}_real
+#define ZERO ((REAL)0)
+#define ONE ((REAL)1)
+#ifdef {macro}
+#define R(name) name
+#else
+#define R(name) name##f
+#endif
+
+"""
+
+
+def c_files(
+    prefix: str,
+    functions: Sequence[CFunction],
+    extra: Sequence[tuple[str, str, str]],
+    sizes: Mapping[str, tuple[int | str, str]],
+    about: str,
+    header: str,
+    *,
+    double_only: bool = False,
+) -> tuple[str, str]:
+    """Return the source and the header of functions.
+
+    Args:
+        prefix: stands before every name of the file.
+        functions: in the order in which they stand there.
+        extra: comment, prototype and body of further functions that call those.
+        sizes: value and comment of each constant, by name without prefix.
+        about: comment at the top of the header, which tells how to use it.
+        double_only: whether single precision is not offered.
+    """
+    tables = Tables(f"{prefix}_")
+    bodies = [function.definition(prefix, tables) for function in functions]
+    bodies += [f"{prototype} {{\n{body}}}\n" for _, prototype, body in extra]
+    names = {"prefix": prefix, "macro": f"{prefix.upper()}_DOUBLE"}
+    words = set(re.findall(r"\w+", "\n".join(bodies)))
+    used = [text for name, text in tables.lines.items() if name in words]
+    source = _SOURCE.format(header=header, **names) + "\n".join((*used, *bodies))
+    told = [(function.about, function.prototype(prefix)) for function in functions]
+    told += [(comment, prototype) for comment, prototype, _ in extra]
+    return source, _HEADER.format(
+        comment="\n".join(f" * {x}".rstrip() for x in about.replace("*/", "* /").splitlines()),
+        guard=f"{prefix.upper()}_H",
+        precision=(_DOUBLE_ALONE if double_only else _EITHER).format(**names),
+        numbers="\n".join(
+            f"#define {prefix.upper()}_{name} {value} /* {text} */"
+            for name, (value, text) in sizes.items()
+        ),
+        prototypes="\n\n".join(f"/* {text} */\n{line};" for text, line in told),
+    )
+
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+"""Flags under which every exported file compiles without a warning."""
+
+
+def compile_shared(
+    sources: Sequence[Path], out: Path, flags: Sequence[str] = (), tool: str = ""
+) -> Path:
+    """Compile C files to a shared library, without a single warning.
+
+    Args:
+        flags: of the compiler, beside its usual ones.
+        tool: the compiler; empty for that of this machine.
+
+    Raises:
+        ExportError: with the compiler's first complaint.
+    """
+    # all code for Windows is independent of its position, and the flag a warning there
+    own = () if out.suffix == ".dll" else ("-fPIC",)
+    call = [tool or compiler(), "-O2", *STRICT, "-shared", *own, *flags, *map(str, sources)]
+    done = subprocess.run([*call, "-o", str(out), "-lm"], capture_output=True, text=True)
+    if done.returncode:
+        lines = done.stderr.strip().splitlines()
+        said = next((line for line in lines if "error" in line), "no message")
+        raise ExportError(f"{sources[0].name}: does not compile ({said})")
+    return out
+
+
+def footprint(source: Path, flags: Sequence[str] = ()) -> dict[str, Any]:
+    """Return what a C file takes on this machine, built for size, by the compiler's own account.
+
+    That is the bytes of each function's stack, without those of the C library that it calls, and of
+    code and constants. What the tools here do not tell is left out: a compiler without
+    `-fstack-usage`, or no `size`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "made.o"
+        call = [compiler(), "-std=c99", "-Os", "-fstack-usage", "-c", *flags, str(source)]
+        if subprocess.run([*call, "-o", str(made)], capture_output=True).returncode:
+            return {}
+        out: dict[str, Any] = {"machine": f"{platform.machine()}, -Os"}
+        usage = made.with_suffix(".su")
+        if usage.is_file():
+            rows = (line.split("\t") for line in usage.read_text().splitlines())
+            out["stack_bytes"] = {name.rsplit(":", 1)[-1]: int(size) for name, size, *_ in rows}
+        if (tool := shutil.which("size")) is not None:
+            told = subprocess.run([tool, str(made)], capture_output=True, text=True).stdout
+            # the first column of Berkeley's format holds code and constants
+            out["code_bytes"] = int(told.splitlines()[1].split()[0])
+        return out
+
 
 _WARMUP = """    {p}_real after[{P}_STATES];
     size_t k, good = count;
@@ -320,4 +548,178 @@ class CasadiExporter(Exporter):
             file.parent.mkdir(parents=True, exist_ok=True)
             write_card(file, card)
             file.write_bytes(partial.read_bytes())
+        return card
+
+
+_S_FUNCTION = """/* {about}, as a level-2 S-function; written by residnet.
+   In MATLAB, with the files beside it: mex {name}.c {name}_model.c
+   {ports}
+   Sample time {dt} s. SI units and radians. {parameter} */
+#define S_FUNCTION_NAME {name}
+#define S_FUNCTION_LEVEL 2
+#include "simstruc.h"
+#include "{name}_model.h"
+
+#define KEPT {kept}
+
+static void mdlInitializeSizes(SimStruct *S) {{
+    ssSetNumSFcnParams(S, {parameters});
+    if (ssGetNumSFcnParams(S) != ssGetSFcnParamsCount(S)) return;
+    ssSetNumContStates(S, 0);
+    ssSetNumDiscStates(S, KEPT);
+    if (!ssSetNumInputPorts(S, {inputs})) return;
+{input_ports}    if (!ssSetNumOutputPorts(S, {outputs})) return;
+{output_ports}    ssSetNumSampleTimes(S, 1);
+    ssSetNumRWork(S, {next});
+    ssSetOptions(S, SS_OPTION_EXCEPTION_FREE_CODE);
+}}
+
+static void mdlInitializeSampleTimes(SimStruct *S) {{
+    ssSetSampleTime(S, 0, {dt});
+    ssSetOffsetTime(S, 0, 0.0);
+}}
+
+#define MDL_INITIALIZE_CONDITIONS
+static void mdlInitializeConditions(SimStruct *S) {{
+    real_T *kept = ssGetRealDiscStates(S);
+    int k;
+    for (k = 0; k < KEPT; k++) kept[k] = 0.0;
+{begin}}}
+
+static void mdlOutputs(SimStruct *S, int_T tid) {{
+    real_T *kept = ssGetRealDiscStates(S);
+{given}{taken}    (void)tid;
+{answer}}}
+
+#define MDL_UPDATE
+static void mdlUpdate(SimStruct *S, int_T tid) {{
+    real_T *kept = ssGetRealDiscStates(S);
+{update}    (void)tid;
+}}
+
+static void mdlTerminate(SimStruct *S) {{ (void)S; }}
+
+#ifdef MATLAB_MEX_FILE
+#include "simulink.c"
+#else
+#include "cg_sfun.h"
+#endif
+"""
+
+
+def s_function(exported: Exported, prefix: str, name: str, sizes: Mapping[str, int]) -> str:
+    """Return the source of the S-function of a vessel or a controller.
+
+    Args:
+        exported: with its step.
+        prefix: of the functions in the C file.
+    """
+    given = dict(exported.arguments)
+    vessel = isinstance(exported, ExportedVessel)
+    held = ["x", "s"] if vessel else ["s"]
+    ports = [part for part in given if part not in held]
+    out = ["x"] if vessel else [one for one in exported.results if one in sizes][:1]
+    widths = [given["x"]] if vessel else [sizes[one] for one in out]
+    at, place = {}, 0
+    for one in held:
+        at[one], place = place, place + given[one]
+    flags = len(exported.flags)
+    kept = place + (flags if vessel else 1)
+    read = "".join(
+        f"    const real_T *{one} = (const real_T *)ssGetInputPortSignal(S, {k});\n"
+        for k, one in enumerate(ports)
+    )
+    begin = f"    {prefix}_initial_state(kept + {at['s']});\n"
+    if vessel:
+        step = ", ".join(["kept", "w", f"kept + {at['s']}", "kept", f"kept + {at['s']}"])
+        begin = (
+            f"    for (k = 0; k < {given['x']}; k++) kept[k] = mxGetPr(ssGetSFcnParam(S, 0))[k];\n"
+            + begin
+        )
+        answer = (
+            f"    int k;\n    for (k = 0; k < {given['x']}; k++) x[k] = kept[k];\n"
+            f"    flags[0] = kept[{place}];\n"
+        )
+        update = f"{read}    kept[{place}] = {prefix}_step({step});\n"
+        read, work = "", 0
+    else:
+        begin, work = "", given["s"]
+        named = {"s": f"kept + {at['s']}"}
+        called = [*(named.get(one, one) for one in given), out[0], "ssGetRWork(S)"]
+        more = "".join(f"    flags[{k}] = flag_{k};\n" for k in range(1, flags))
+        declared = "".join(f"    int flag_{k};\n" for k in range(1, flags))
+        called += [f"&flag_{k}" for k in range(1, flags)]
+        answer = (
+            f"{declared}    if (kept[{place}] == 0.0) {prefix}_initial_state("
+            f"{ports[0]}, kept + {at['s']});\n"
+            f"    flags[0] = {prefix}_step({', '.join(called)});\n{more}"
+        )
+        update = (
+            f"    int k;\n    for (k = 0; k < {given['s']}; k++) kept[k] = ssGetRWork(S)[k];\n"
+            f"    kept[{place}] = 1.0;\n"
+        )
+    told = [f"{one} [{given[one]}]" for one in ports]
+    return _S_FUNCTION.format(
+        about=exported.what,
+        name=name,
+        ports=f"Inputs: {', '.join(told)}. Outputs: {out[0]} [{widths[0]}],"
+        f" {', '.join(exported.flags)}.",
+        dt=repr(float(exported.dt or 0.0)),
+        parameter=f"Parameter: the state [{given['x']}] to start from." if vessel else "",
+        parameters=int(vessel),
+        kept=kept,
+        inputs=len(ports),
+        input_ports="".join(
+            f"    ssSetInputPortWidth(S, {k}, {given[one]});\n"
+            f"    ssSetInputPortRequiredContiguous(S, {k}, 1);\n"
+            f"    ssSetInputPortDirectFeedThrough(S, {k}, {int(not vessel)});\n"
+            for k, one in enumerate(ports)
+        ),
+        outputs=2,
+        output_ports=f"    ssSetOutputPortWidth(S, 0, {widths[0]});\n"
+        f"    ssSetOutputPortWidth(S, 1, {flags});\n",
+        next=work,
+        begin=begin,
+        given=read,
+        taken=f"    real_T *{out[0]} = ssGetOutputPortRealSignal(S, 0);\n"
+        "    real_T *flags = ssGetOutputPortRealSignal(S, 1);\n",
+        answer=answer,
+        update=update,
+    )
+
+
+@final
+class SimulinkExporter(Exporter):
+    """A level-2 S-function in double precision, with the C that it calls."""
+
+    name: ClassVar[str] = "simulink"
+    suffix: ClassVar[str] = "_sfun.c"
+    about: ClassVar[str] = "A level-2 S-function for Simulink around the C code."
+
+    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+        """Write the S-function, the C file and header that it calls, and the card."""
+        if exported.dt is None:
+            raise UsageError(f"{exported.what}: has no step of its own; export it as c")
+        exported.require_numbers()
+        name = identifier(file.stem)
+        file = file.with_name(f"{name}.c")
+        card = exported.card() | {
+            "format": self.name,
+            "dtype": "float64",
+            "safety": "The file is source code: compile only what you trust.",
+        }
+        written = c_source(exported, card, f"{name}_model.h", double_only=True)
+        with tempfile.TemporaryDirectory() as folder:
+            partial = Path(folder) / f"{name}_model.c"
+            partial.write_text(written.source)
+            partial.with_suffix(".h").write_text(written.header)
+            library = compile_shared([partial], partial.with_suffix(".so"))
+            loaded = CompiledModel(library, exported, torch.float64)
+            card |= {"parity": exported.check(loaded, "the S-function's code", torch.float64)}
+        text = s_function(exported, written.prefix, name, loaded.outputs)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.with_name(f"{name}_model.c").write_text(written.source)
+        file.with_name(f"{name}_model.h").write_text(written.header)
+        write_card(file, card)
+        file.write_text(text)
         return card

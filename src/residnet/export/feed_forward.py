@@ -104,7 +104,7 @@ class GuardedForce(nn.Module):
     Outside the training range the correction fades out over a quarter of the range's width, and no
     axis commands more than 1.2 times the believed model's force; that limit sets in over the
     outermost twentieth of the range, so that nothing jumps. The answer is finite whatever it is
-    given: motions are treated as `residnet.export.guard` says, not a number becomes the middle of
+    given: motions are treated as `residnet.export.base` says, not a number becomes the middle of
     the training range, what is farther off than the accepted range its nearest value. Such a motion
     commands no more than 1.2 times the believed force of itself either, where that is a number.
 

@@ -25,8 +25,7 @@ import torch
 from residnet.core.errors import ExportError, UsageError
 from residnet.core.files import whole
 from residnet.export.base import Exported, Exporter
-from residnet.export.c import CompiledModel, CSource, c_source
-from residnet.export.c_code import compile_shared
+from residnet.export.c import CompiledModel, CSource, c_source, compile_shared
 from residnet.export.vessel import ExportedVessel
 
 INPUT, STATE, START, OUTSIDE = 1, 101, 201, 300

@@ -26,7 +26,7 @@ from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exported, Exporter
-from residnet.export.c_code import identifier
+from residnet.export.c import identifier
 from residnet.export.vessel import ExportedVessel
 from residnet.physics.signals import FORCE_CHANNELS
 

@@ -57,7 +57,7 @@ _BAND = (
 class ExportedModel(nn.Module):
     """What a controller sees; all tensors are float32, SI and radians.
 
-    Bad inputs and memories are treated as `residnet.export.guard` says: a flag and a finite answer.
+    Bad inputs and memories are treated as `residnet.export.base` says: a flag and a finite answer.
     Tensors of a wrong shape are refused, never broadcast; other precisions are converted.
     """
 

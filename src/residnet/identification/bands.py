@@ -20,9 +20,8 @@ from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ClosedFormHead
-from residnet.identification.fitter import residual_samples
+from residnet.identification.fitter import FittedModel, references, residual_samples
 from residnet.identification.identified import Identified, closed_form, members_of, unlike_models
-from residnet.identification.models import FittedModel, references
 from residnet.judge.band import Band, BandsConfig, corrected, independent, quantile, run_weights
 from residnet.judge.bands import RunErrors, calibrate, few, run_errors
 from residnet.judge.freerun import Candidate, free_run

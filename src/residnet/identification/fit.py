@@ -22,9 +22,8 @@ from residnet.dynamics.store import ModelSpec, restored
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
 from residnet.identification.bands import calibrate_bands
-from residnet.identification.fitter import Fitter
+from residnet.identification.fitter import FitStore, FittedModel, Fitter
 from residnet.identification.identified import Identified
-from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.recipe import LONG
 from residnet.identification.settings import FitSettings
 from residnet.training.config import TrainingConfig

@@ -1,16 +1,20 @@
-"""The single steps of a fit: zero, a baseline, a head on a baseline, the mean of models."""
+"""Fitted models, who keeps them, and the single steps of a fit: zero, a baseline, a head on a
+baseline, the mean of models.
+"""
 
 from __future__ import annotations
 
 import copy
+import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
 from residnet.baselines.base import ParametricBaseline
@@ -25,10 +29,10 @@ from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
 from residnet.heads.base import ClosedFormHead
-from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import PreparedSplits, velocity_limit
 from residnet.identification.recipe import Facts
 from residnet.identification.settings import FitSettings
+from residnet.judge.band import Band
 from residnet.judge.freerun import Candidate, Errors, free_run
 from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
 from residnet.regression.estimator import Coefficient, Solution
@@ -36,6 +40,81 @@ from residnet.regression.sparse import coefficient_row
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import free_run_starts, refit
 from residnet.training.score import Score, Shown
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A model with the notes of its fit.
+
+    Attributes:
+        spec: everything that determines the model but its numbers.
+        model: with its numbers filled in.
+        notes: about the fit, as JSON takes them: coefficients, validation error, seconds, ...
+        covariance: of the coefficients of a baseline that was refitted through rollouts, [P, P];
+            None where there was no refit.
+        bands: of its free runs by protocol; empty where none were calibrated.
+    """
+
+    spec: ModelSpec
+    model: HybridDynamics
+    notes: dict[str, Any]
+    covariance: Tensor | None = None
+    bands: Mapping[str, Band] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+        return self.spec.name
+
+
+class FitStore:
+    """Where the models of a fit are kept as they are done, so that a broken fit can go on.
+
+    This one keeps no model.
+
+    Args:
+        training_folder: for checkpoints and the TensorBoard log; None for neither.
+    """
+
+    def __init__(self, training_folder: Path | None = None) -> None:
+        self.training_folder = training_folder
+
+    def finished(self, name: str) -> FittedModel | None:
+        """Return a head that an earlier, interrupted fit had finished; None where it had not."""
+        return None
+
+    def keep(self, fitted: FittedModel) -> None:
+        """Keep a model that is done."""
+
+
+_FIRST = "baseline"
+
+
+def references(models: Iterable[FittedModel]) -> dict[str, str]:
+    """Return the name of each model's reference.
+
+    A head is compared with the baseline that it was fitted on; an ensemble, which stands on none,
+    with the baseline of the run that does best on the validation data; any other model with the
+    run's first baseline, which itself has no reference.
+    """
+    known = {one.name: one for one in models}
+    # a baseline that diverged is the worse one, whatever its error
+    validated = {
+        name: (
+            int(one.notes.get("validation_diverged", 0)),
+            float(one.notes.get("validation", math.inf)),
+        )
+        for name, one in known.items()
+        if one.spec.role == "baseline"
+    }
+    best = min(validated, key=lambda name: validated[name], default=_FIRST)
+    out = {}
+    for name, one in known.items():
+        named = {"head": str(one.notes.get("baseline", _FIRST)), "ensemble": best}
+        reference = named.get(one.spec.role, _FIRST)
+        if name != reference and reference in known:
+            out[name] = reference
+    return out
 
 
 def residual_samples(model: HybridDynamics, known: Samples) -> Samples:

@@ -21,7 +21,7 @@ from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.heads.base import ClosedFormHead, EquationHead
-from residnet.identification.models import FittedModel, references
+from residnet.identification.fitter import FittedModel, references
 from residnet.identification.recipe import HULL, MEAN
 from residnet.identification.settings import FitSettings
 from residnet.judge.band import Bands

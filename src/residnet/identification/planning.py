@@ -16,12 +16,11 @@ from residnet.baselines.base import ParametricBaseline
 from residnet.core.config import Config, Metres, MetresPerSecond, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import ALIVE, MOVING, POSITION, SURGE, SWAY, Live
-from residnet.data.sea import Disturbance, SensorNoise
-from residnet.data.simulated import Craft, Flight, Sea, fly
+from residnet.data.simulated import Craft, Disturbance, Flight, Sea, SensorNoise, fly
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, commanded
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.identification.models import FittedModel
+from residnet.identification.fitter import FittedModel
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
 from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne

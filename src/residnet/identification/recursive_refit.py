@@ -24,7 +24,7 @@ from residnet.core.errors import UsageError
 from residnet.core.layout import MOVING
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.identification.changes import Change, ChangedDynamics
-from residnet.identification.models import FittedModel
+from residnet.identification.fitter import FittedModel
 from residnet.identification.monitoring import (
     BELIEVED,
     Piece,

@@ -8,8 +8,13 @@ from residnet.core.registry import Kinds
 
 if TYPE_CHECKING:
     from residnet.manoeuvres.base import Manoeuvre
-    from residnet.manoeuvres.closed_loop import TurningCircleFamily, ZigzagFamily
-    from residnet.manoeuvres.diving import DepthStepFamily, HelixFamily, VerticalZigzagFamily
+    from residnet.manoeuvres.closed_loop import (
+        DepthStepFamily,
+        HelixFamily,
+        TurningCircleFamily,
+        VerticalZigzagFamily,
+        ZigzagFamily,
+    )
     from residnet.manoeuvres.open_loop import (
         AccelerationDecelerationFamily,
         ConstantFamily,
@@ -32,8 +37,8 @@ if TYPE_CHECKING:
         | DepthStepFamily
     )
 else:
-    _OPEN, _CLOSED, _COURSES, _DIVING = (
-        f"residnet.manoeuvres.{name}" for name in ("open_loop", "closed_loop", "courses", "diving")
+    _OPEN, _CLOSED, _COURSES = (
+        f"residnet.manoeuvres.{name}" for name in ("open_loop", "closed_loop", "courses")
     )
     ManoeuvreConfig = Annotated[
         Any,
@@ -48,9 +53,9 @@ else:
                 "three_two_one_one": f"{_OPEN}:ThreeTwoOneOne",
                 "random_steps": f"{_OPEN}:RandomSteps",
                 "multi_sine": f"{_OPEN}:MultiSine",
-                "helix": f"{_DIVING}:Helix",
-                "vertical_zigzag": f"{_DIVING}:VerticalZigzag",
-                "depth_step": f"{_DIVING}:DepthStep",
+                "helix": f"{_CLOSED}:Helix",
+                "vertical_zigzag": f"{_CLOSED}:VerticalZigzag",
+                "depth_step": f"{_CLOSED}:DepthStep",
                 "spiral": f"{_CLOSED}:Spiral",
                 "stopping": f"{_CLOSED}:Stopping",
                 "waypoints": f"{_COURSES}:Waypoints",
@@ -72,9 +77,9 @@ else:
                 "three_two_one_one": f"{_OPEN}:ThreeTwoOneOneFamily",
                 "random_steps": f"{_OPEN}:RandomStepsFamily",
                 "multi_sine": f"{_OPEN}:MultiSineFamily",
-                "helix": f"{_DIVING}:HelixFamily",
-                "vertical_zigzag": f"{_DIVING}:VerticalZigzagFamily",
-                "depth_step": f"{_DIVING}:DepthStepFamily",
+                "helix": f"{_CLOSED}:HelixFamily",
+                "vertical_zigzag": f"{_CLOSED}:VerticalZigzagFamily",
+                "depth_step": f"{_CLOSED}:DepthStepFamily",
             },
         ),
     ]

@@ -9,7 +9,7 @@ from torch import nn
 
 from residnet.core.files import read_json
 from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
-from residnet.identification.models import FitStore, FittedModel
+from residnet.identification.fitter import FitStore, FittedModel
 from residnet.judge.band import read_bands
 from residnet.runs.folder import RunFolder, require_sealed, seal
 

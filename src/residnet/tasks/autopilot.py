@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, final
 import torch
 from pydantic import Field, model_validator
 
-from residnet.control.heading.conditions import ConditionsConfig
+from residnet.control.heading.conditions import ConditionsConfig, TuningConfig
 from residnet.control.heading.controllers import (
     BangBangConfig,
     ClassicalController,
@@ -22,13 +22,12 @@ from residnet.control.heading.controllers import (
     TunableConfig,
     observed_of,
 )
-from residnet.control.heading.tuning import TuningConfig
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredModel, SteeredPlant
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.progress import say
-from residnet.data.sea import Disturbance, WindField
+from residnet.data.simulated import Disturbance, WindField
 from residnet.documents.gouletas2020.law import DocumentConfig, PredictiveConfig
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis

@@ -11,7 +11,13 @@ import pandas as pd
 import torch
 
 from residnet.control.base import Policy
-from residnet.control.heading.conditions import ConditionedRun, ConditionsConfig, quiet, quiet_after
+from residnet.control.heading.conditions import (
+    ConditionedRun,
+    ConditionsConfig,
+    quiet,
+    quiet_after,
+    tune,
+)
 from residnet.control.heading.controllers import (
     DepthConfig,
     ObservedConfig,
@@ -22,7 +28,6 @@ from residnet.control.heading.controllers import (
     observed_of,
 )
 from residnet.control.heading.policies import SIGHT, DepthPolicy, ObservedPolicy
-from residnet.control.heading.tuning import tune
 from residnet.control.heading.vessels import SteeredPlant, fly
 from residnet.core.progress import begin, report, say
 from residnet.documents.gouletas2020.autopilot import predictive

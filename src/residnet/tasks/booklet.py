@@ -14,11 +14,10 @@ from residnet.core.layout import ROLL
 from residnet.core.log import Log
 from residnet.core.names import STATE, nearest
 from residnet.data.prepare import Prepared
-from residnet.data.sea import Disturbance, SensorNoise
-from residnet.data.simulated import Craft, Flight, Sea, fly, source_of
+from residnet.data.simulated import Craft, Disturbance, Flight, Sea, SensorNoise, fly, source_of
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare
 from residnet.dynamics.ensemble import SampledDynamics
-from residnet.identification.models import FittedModel
+from residnet.identification.fitter import FittedModel
 from residnet.judge.booklet import BookletConfig, Page, contents
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import Zigzag

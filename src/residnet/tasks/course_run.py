@@ -36,7 +36,7 @@ from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.dynamics.steering_variation import NOMINAL, Vessels
 from residnet.export.policy import ExportedCoursePolicy
-from residnet.judge.courses import CourseFlight, row, spread_row
+from residnet.judge.autopilots import CourseFlight, row, spread_row
 from residnet.judge.metrics import SCHEMA
 from residnet.report.sections.course import COURSES, SPREAD, TRACKS, text_of
 from residnet.runs.folder import RunFolder

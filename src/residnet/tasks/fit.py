@@ -102,8 +102,7 @@ class FitConfig(FitSettings, ComputingTask):
             ResidnetError: what the run itself would refuse before it fits anything.
         """
         from residnet.data.simulated import stand_ins
-        from residnet.identification.fitter import require_fit
-        from residnet.identification.models import FittedModel
+        from residnet.identification.fitter import FittedModel, require_fit
         from residnet.identification.prepared import prepare_logs
         from residnet.tasks.booklet import require_flyable
 

@@ -19,7 +19,7 @@ from residnet.data.doctor import inspect, inspect_together, inspection, summary
 from residnet.data.drafting.reading import log_files
 from residnet.data.masks import Spike
 from residnet.data.prepare import Prepared, prepare
-from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.readers.base import CanonicalConfig
 from residnet.data.simulated import SimulatedTrials
 from residnet.data.split import log_names
 from residnet.dynamics.store import ModelSpec, load_model, model_names

@@ -18,12 +18,13 @@ from residnet.core.files import file_stem
 from residnet.core.names import CHANNEL_UNITS, nearest
 from residnet.core.progress import say
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.canonical import CanonicalConfig
-from residnet.data.sea import Disturbance, SensorNoise
+from residnet.data.readers.base import CanonicalConfig
 from residnet.data.simulated import (
     Craft,
+    Disturbance,
     Flight,
     Sea,
+    SensorNoise,
     SimulatedTrials,
     fly,
     fly_trials,

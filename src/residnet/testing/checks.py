@@ -30,8 +30,17 @@ from residnet.core.registry import kind_of
 from residnet.core.samples import Samples
 from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.readers.base import LogReader
-from residnet.data.sea import Disturbance, SensorNoise
-from residnet.data.simulated import Craft, Flight, Sea, SimulatedTrials, fly, fly_trials, source_of
+from residnet.data.simulated import (
+    Craft,
+    Disturbance,
+    Flight,
+    Sea,
+    SensorNoise,
+    SimulatedTrials,
+    fly,
+    fly_trials,
+    source_of,
+)
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics

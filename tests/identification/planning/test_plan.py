@@ -13,7 +13,7 @@ from residnet.data.prepare import envelope, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.actuated import InputShare
 from residnet.dynamics.store import ModelSpec
-from residnet.identification.models import FittedModel
+from residnet.identification.fitter import FittedModel
 from residnet.identification.planning import (
     Aim,
     Plan,

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 from residnet.core.registry import Kinds
 
 if TYPE_CHECKING:
-    from residnet.data.readers.base import ReaderKind
-    from residnet.data.readers.canonical import CanonicalConfig
+    from residnet.data.readers.base import CanonicalConfig, ReaderKind
 
     ReaderConfig: TypeAlias = ReaderKind | CanonicalConfig
 else:
@@ -23,7 +22,7 @@ else:
                 "excel": "residnet.data.readers.tables:ExcelConfig",
                 "json_lines": "residnet.data.readers.tables:JsonLinesConfig",
                 "joined": "residnet.data.readers.joined:JoinedConfig",
-                "canonical": "residnet.data.readers.canonical:CanonicalConfig",
+                "canonical": "residnet.data.readers.base:CanonicalConfig",
                 "csv_topics": "residnet.data.readers.formats.topic_folder:TopicFolderConfig",
                 "rosbag": "residnet.data.readers.formats.rosbag:RosbagConfig",
                 "mat": "residnet.data.readers.formats.trees:MatConfig",

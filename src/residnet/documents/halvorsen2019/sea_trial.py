@@ -24,8 +24,7 @@ from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, VELOCITY, nearest
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
-from residnet.data.sea import Disturbance, SensorNoise
-from residnet.data.simulated import Craft, Sea, fly
+from residnet.data.simulated import Craft, Disturbance, Sea, SensorNoise, fly
 from residnet.documents import published
 from residnet.documents.halvorsen2019.standard_model import (
     NAMES,

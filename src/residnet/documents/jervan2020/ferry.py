@@ -56,7 +56,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.heads.zero import ZeroHead
-from residnet.judge.courses import mse
+from residnet.judge.autopilots import mse
 from residnet.manoeuvres import FamilyConfig
 from residnet.manoeuvres.closed_loop import ZigzagFamily
 from residnet.physics.force_model import Correction, ForceModel

@@ -44,7 +44,7 @@ from residnet.core.layout import ACTUATORS, MOTION, POSE, VELOCITIES
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.rollout import FreeRun, Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
-from residnet.judge.courses import Tracking, tracking
+from residnet.judge.autopilots import Tracking, tracking
 from residnet.physics.actuators import ForceActuators
 from residnet.physics.force_model import ForceModel
 from residnet.physics.hull import HullConfig

@@ -29,7 +29,7 @@ from residnet.core.frames import to_body
 from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.documents.study import Results, notes_text, pictures
-from residnet.judge.courses import mse
+from residnet.judge.autopilots import mse
 from residnet.physics.force_model import (
     FERRY_TERMS,
     MOTION,
