@@ -22,8 +22,7 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import load_config
 from residnet.core.log import Log
 from residnet.data.simulated import Flight, SimulatedTrials, fly_trials, surrounded
-from residnet.identification.fitter import Fitter
-from residnet.identification.models import NoStore
+from residnet.identification.fitter import FitStore, Fitter
 from residnet.identification.prepared import prepare_logs
 from residnet.tasks.fit import FitConfig
 
@@ -74,7 +73,7 @@ def drawn(vessel: str, seed: int, overrides: Sequence[str]) -> tuple[list[str], 
         logs[split].append(flight.log)
     prepared = prepare_logs(logs, config)
     begun = time.process_time()
-    fitted = Fitter(prepared, config, NoStore()).baseline("hull")
+    fitted = Fitter(prepared, config, FitStore()).baseline("hull")
     seconds, baseline = time.process_time() - begun, fitted.model.baseline
     assert isinstance(baseline, RegressorBaseline)
     true, left = true_rows(flights, config, baseline)
