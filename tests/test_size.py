@@ -16,7 +16,7 @@ import residnet
 
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
-    "api": (724, 84),
+    "api": (723, 84),
     "baselines": (890, 129),
     "control": (3373, 387),
     "core": (1617, 250),
@@ -25,7 +25,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "dynamics": (2229, 279),
     "export": (1568, 173),
     "heads": (1311, 191),
-    "identification": (2127, 209),
+    "identification": (2130, 210),
     "judge": (2057, 221),
     "manoeuvres": (987, 148),
     "physics": (2209, 267),
@@ -35,7 +35,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "simulators": (355, 42),
     "tasks": (3135, 257),
     "testing": (480, 30),
-    "training": (1372, 157),
+    "training": (1362, 156),
     "": (458, 52),
 }
 

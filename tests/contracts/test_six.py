@@ -29,6 +29,7 @@ from residnet.heads import HeadConfig
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
 from residnet.identification.changes import causes
+from residnet.identification.recipe import integrator
 from residnet.judge.freerun import drift
 from residnet.physics.hull import SubmergedConfig
 from residnet.physics.signals import SignalsConfig
@@ -144,6 +145,24 @@ def test_sensitivities_are_the_derivatives_of_the_step(integrator: Integrator) -
                 ends.append(refit._ahead(model, moved, p)[:, 2:])
         wanted = (ends[0] - ends[1]) / (2.0 * size)
         torch.testing.assert_close(found[:, :, j].detach(), wanted, rtol=1e-6, atol=1e-6)
+
+
+def test_a_drafted_model_swings_as_its_vessel() -> None:
+    """The roll of a torpedo has a period of ten steps of its logs."""
+    rate, none = 6.3, ("u v",)
+    rows = dict.fromkeys(("u", "v", "r", "w", "q"), none) | {"p": ("cos(theta) sin(phi)",)}
+    swing = RegressorsConfig.model_validate({"terms": rows})
+    changes = {"integrator": integrator(SUBMERGED.live), "baseline": swing, "dt": 0.1}
+    model = example_spec(None, SUBMERGED).model_copy(update=changes).build().double()
+    baseline: Any = model.baseline
+    with torch.no_grad():
+        row = baseline.outputs.index("p_dot")
+        baseline.theta[row, baseline.library.terms.index("cos(theta) sin(phi)")] = -(rate**2)
+        x = torch.zeros(1, 12, dtype=torch.float64)
+        x[0, ATTITUDE[0]] = 0.05
+        run = Rollout(model)(x, torch.zeros(1, 50, 3).double(), model.initial_state(1).double())[0]
+    wanted = 0.05 * np.cos(rate * 0.1 * np.arange(51))
+    np.testing.assert_allclose(run[0, :, ATTITUDE[0]].numpy(), wanted, atol=0.1 * 0.05)
 
 
 def test_zero_goes_on_level() -> None:

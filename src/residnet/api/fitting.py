@@ -23,6 +23,7 @@ from residnet.core.progress import ProgressCallback
 from residnet.identification.fit import fit as identify
 from residnet.identification.identified import Evaluation, Identified, candidates, evaluate
 from residnet.identification.prepared import require_window, through_currents, velocity_limit
+from residnet.identification.recipe import integrator
 from residnet.identification.settings import FitSettings, Parts
 from residnet.judge.metrics import columns_of, metrics_table
 from residnet.judge.selection import Selection
@@ -356,7 +357,7 @@ def fit(
         progress: is told what is being fitted, and how far it is.
         settings: further keys of a fit, as YAML has them: recipe, effort, base_of, forces,
             ensembles, means, training, refit, current, bands, seed, and integrator, which is
-            `semi_implicit_euler` for the recipe where it is not given.
+            that of `residnet new` for the recipe where it is not given.
 
     Raises:
         ConfigError: where a setting is wrong.
@@ -367,7 +368,9 @@ def fit(
         models = residnet.fit(logs); models.selected, models.metrics
     """
     given = {
-        key: value for key, value in settings.items() if key not in Parts.model_fields or value
+        key: value
+        for key, value in settings.items()
+        if (value or key not in Parts.model_fields) and (key, value) != ("integrator", None)
     }
     given |= {"baselines": named_parts(baselines, "baseline")} if baselines else {}
     if not (isinstance(heads, list | tuple | Mapping) and not heads):
@@ -378,14 +381,12 @@ def fit(
         given["recipe"] = "standard"
     if given.get("recipe") is None:
         given.setdefault("baseline", part("regressors", "baseline"))
-    elif given.get("integrator") is None:
-        given["integrator"] = "semi_implicit_euler"
-    if given.get("integrator", "") is None:
-        del given["integrator"]
     if not isinstance(data, Data):
         logs = (str, PathLike, Log, list, tuple, Mapping)
         require(data, logs, "fit: expected logs, or data from residnet.prepare")
         data = prepare(data)
+    if given.get("recipe") is not None:
+        given.setdefault("integrator", integrator(data.signals.live))
     sections = {"prepare": data.prepare, "signals": data.signals, "evaluation": data.evaluation}
     config: FitSettings = validate(plain({**sections, **given}), FitSettings, "fit")
     before = torch.get_num_threads()

@@ -18,6 +18,7 @@ from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
 from residnet.data.motion import BRIDGED, without_pauses
 from residnet.data.prepare import Prepared
+from residnet.dynamics.base import Integrator
 from residnet.judge.protocol import EvaluationConfig, Windows
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
 from residnet.physics.symmetry import live_of, mirrored_channels, wrong_parity
@@ -465,6 +466,16 @@ class Preparation:
 def _rests(logs: Sequence[Log], name: str) -> bool:
     resting = [float(np.mean(np.diff(log[name]) == 0.0)) for log in logs if len(log) > 1]
     return bool(resting) and float(np.median(resting)) > 0.9
+
+
+def integrator(live: Live) -> Integrator:
+    """Return how a drafted model steps.
+
+    A vessel in six degrees of freedom swings in few steps of its logs, which a scheme of first
+    order takes for a damping of its own: the hull of a BlueROV2 erred 2.0 to 2.8 times as much as
+    the vessel itself with `semi_implicit_euler`, and 1.1 to 1.4 times with `rk4`.
+    """
+    return "rk4" if live.spatial else "semi_implicit_euler"
 
 
 def judging(

@@ -29,7 +29,13 @@ from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
 from residnet.data.split import SPLITS, called_splits, divided, without_copies
-from residnet.identification.recipe import Preparation, judging, protocols, window_length
+from residnet.identification.recipe import (
+    Preparation,
+    integrator,
+    judging,
+    protocols,
+    window_length,
+)
 from residnet.tasks.fit import FitConfig
 
 _UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
@@ -170,7 +176,7 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
         "data": {"kind": "measured", "reader": read.reader, "split": split},
         "prepare": preparation,
         "signals": signals,
-        "integrator": "semi_implicit_euler",
+        "integrator": integrator(live),
         "recipe": "standard",
         "export": {"models": []},
         "evaluation": judged,
