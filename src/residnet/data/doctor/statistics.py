@@ -214,10 +214,10 @@ def smoothed(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def averaged(values: np.ndarray, samples: int) -> np.ndarray:
     """Return the moving average [T] over so many samples, NaN left out; NaN where none is known."""
     size, known = min(samples, values.size), np.isfinite(values)
-    at, sums = np.arange(values.size), np.zeros((2, values.size + 1))
-    np.cumsum((known, np.where(known, values, 0.0)), axis=1, out=sums[:, 1:])
-    ends = np.minimum(at + (size - 1) // 2 + 1, values.size), np.maximum(at - size // 2, 0)
-    count, total = sums[:, ends[0]] - sums[:, ends[1]]
+    ends = size // 2, (size - 1) // 2
+    sums = (np.cumsum(part) for part in (known, np.where(known, values, 0.0)))
+    padded = (np.pad(np.append(0.0, part), ends, mode="edge") for part in sums)
+    count, total = (part[size:] - part[:-size] for part in padded)
     return np.where(count > 0.5, total / np.maximum(count, 1.0), np.nan)
 
 
