@@ -465,7 +465,7 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     linear = len(driving) > 4
 
     def integrals(columns: Sequence[np.ndarray]) -> np.ndarray:
-        return blocks.integrals(np.stack(columns, axis=-1))(0)
+        return np.stack([blocks.integrals(one)(0) for one in columns], axis=-1)
 
     def given(part: Sequence[str], shifts: Sequence[int] | np.ndarray) -> list[np.ndarray]:
         """Return terms [T, S] of inputs that are shifted by so many samples each."""

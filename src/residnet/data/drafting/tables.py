@@ -502,8 +502,9 @@ def peek(path: Path, rows: int = 20_000) -> Sheet:
         table, about = _FIRST_ROWS[kind](path, rows), {"kind": kind}
     else:
         table, about = _excel(path, rows) if kind == "excel" else first_rows(path, rows)
-    columns = _described(table)
-    table.columns = pd.Index(list(columns))
+    columns, others = _described(table), table.attrs.get("others", ())
+    # pandas copies all that is told of a table for each of its columns
+    table.columns, table.attrs = pd.Index(list(columns)), {}
     if table.empty:
         raise DataError(f"{path}: holds a header and no rows; leave it out")
     numbers: dict[str, np.ndarray] = {}
@@ -511,18 +512,18 @@ def peek(path: Path, rows: int = 20_000) -> Sheet:
     empty = []
     for i, name in enumerate(table.columns):
         column = table.iloc[:, i]
-        if column.isna().all():
+        unknown = column.isna().to_numpy()
+        if unknown.all():
             empty.append(name)
             continue
         values = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
-        spoilt = np.isnan(values).sum() > column.isna().sum()
+        spoilt = np.isnan(values).sum() > unknown.sum()
         values = without_fills(values)
         if spoilt or column.dtype == bool or pd.api.types.is_datetime64_any_dtype(column):
             texts[name] = column
         else:
             numbers[name] = values
     renamed = {name: column for name, column in columns.items() if name != column}
-    others = table.attrs.get("others", ())
     return Sheet(path, about, tuple(table.columns), numbers, texts, tuple(empty), renamed, others)
 
 

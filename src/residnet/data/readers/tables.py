@@ -301,13 +301,14 @@ class TableReader(LogReader):
         sides = [entry.hemisphere for entry in maps.values() if entry.hemisphere]
         with progress(path.name, path.stat().st_size, 1.0) as advance:
             table = config.load(path, [*columns, *sides], advance)
-        above = table.attrs.get("above", 0)
-        rows = len(table) + bool(table.attrs.get("cut"))
+        # pandas copies all that is told of a table for each of its columns
+        about, table.attrs = table.attrs, {}
+        above, cut = about.get("above", 0), bool(about.get("cut"))
+        rows = len(table) + cut
         cells = {name: table.iloc[:, i] for i, name in enumerate([*columns, *sides])}
-        self._require_units(path, table.attrs.get("units", ()))
+        self._require_units(path, about.get("units", ()))
         t, start, findings = self._times(path, cells, above)
         raw = {name: self._values(path, name, cells, above) for name in maps}
-        cut = bool(table.attrs.get("cut"))
         # each column is let go where its channel is made
         del table, cells
         measured = np.zeros(t.size, dtype=bool)
