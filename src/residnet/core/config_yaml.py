@@ -55,7 +55,21 @@ class _Loader(yaml.SafeLoader):
             raise yaml.constructor.ConstructorError(
                 None, None, "expected a mapping", node.start_mark
             )
-        _reject_duplicates(node)
+        # before merge keys are resolved: a key that overrides a merged one is what merging is for
+        lines: dict[str, int] = {}
+        for key, _ in node.value:
+            if not isinstance(key, ScalarNode):
+                raise yaml.constructor.ConstructorError(
+                    None, None, "a key must be plain text", key.start_mark
+                )
+            if key.value in lines and key.tag != _PREFIX + "merge":
+                raise _DuplicateKey(
+                    None,
+                    None,
+                    f"duplicate key '{key.value}', first on line {lines[key.value]}",
+                    key.start_mark,
+                )
+            lines.setdefault(key.value, key.start_mark.line + 1)
         self.flatten_mapping(node)
         return {key.value: self.construct_object(value, deep=deep) for key, value in node.value}
 
@@ -81,24 +95,6 @@ class _Loader(yaml.SafeLoader):
                 None, None, f"a whole number of {len(text)} digits", node.start_mark
             )
         return int(text, 0) if text.startswith(("0x", "0o")) else int(text)
-
-
-def _reject_duplicates(node: MappingNode) -> None:
-    # before merge keys are resolved: a key that overrides a merged one is what merging is for
-    lines: dict[str, int] = {}
-    for key, _ in node.value:
-        if not isinstance(key, ScalarNode):
-            raise yaml.constructor.ConstructorError(
-                None, None, "a key must be plain text", key.start_mark
-            )
-        if key.value in lines and key.tag != _PREFIX + "merge":
-            raise _DuplicateKey(
-                None,
-                None,
-                f"duplicate key '{key.value}', first on line {lines[key.value]}",
-                key.start_mark,
-            )
-        lines.setdefault(key.value, key.start_mark.line + 1)
 
 
 # other tags of YAML 1.1 (dates, sets, binary) are refused rather than turned into objects that no

@@ -126,7 +126,13 @@ def require_room(folder: Path) -> None:
         there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
         if not there.is_dir():
             raise UsageError(f"{there}: exists already and is no folder; give another place")
-        _require_short(folder.absolute(), there)
+        path = folder.absolute()
+        longest = os.pathconf(there, "PC_PATH_MAX")
+        if len(os.fsencode(path)) + _DEEPER > longest:
+            raise OSError(errno.ENAMETOOLONG, "path too long")
+        name = max((len(os.fsencode(part)) for part in path.parts), default=0)
+        if name > os.pathconf(there, "PC_NAME_MAX"):
+            raise OSError(errno.ENAMETOOLONG, "name too long")
         with tempfile.TemporaryFile(dir=there) as file:
             file.write(bytes(_PROBE))
             file.flush()
@@ -157,16 +163,6 @@ def require_file_place(file: Path) -> None:
     except ValueError as error:
         raise UsageError(f"{file}: is no path ({error})") from error
     require_room(file.parent)
-
-
-def _require_short(path: Path, there: Path) -> None:
-    """Check the lengths of names, with those in mind that a run adds to them."""
-    longest = os.pathconf(there, "PC_PATH_MAX")
-    if len(os.fsencode(path)) + _DEEPER > longest:
-        raise OSError(errno.ENAMETOOLONG, "path too long")
-    name = max((len(os.fsencode(part)) for part in path.parts), default=0)
-    if name > os.pathconf(there, "PC_NAME_MAX"):
-        raise OSError(errno.ENAMETOOLONG, "name too long")
 
 
 def not_written(path: Path, error: OSError) -> UsageError:

@@ -129,8 +129,26 @@ def prepare(
     large = paged.lies_on_disk(log.t)
     # a channel that the model does not use changes nothing
     needed = {*live.states, *columns}
-    log = without_spikes(_plausible(log, columns, live), needed)
-    log = align(_masked(log, columns, config, live), config.grid, needed)
+    for name in (*live.states, *columns):
+        if name in log.channels:
+            bad = np.flatnonzero(beyond_belief(log[name], log.units[name]))
+            if bad.size:
+                raise DataError(
+                    f"log {log.name}: {name} is {log[name][bad[0]]:g} {log.units[name]} at t ="
+                    f" {log.t[bad[0]]:.2f} s, which no vessel reaches ({bad.size} such samples);"
+                    " correct them, or set them to NaN"
+                )
+    log = without_spikes(log, needed)
+    moving = complete_motion(log, config.motion, live)
+    filled = fill_sparse(moving, (*live.states, *columns), config.grid.held)
+    # masks look at the samples as recorded: interpolation hides a frozen sensor
+    sensors = filled if moving is log else moving.replace(channels=moving.channels | log.channels)
+    # what is zero at all times, or follows from it, is no sensor that stands still
+    asked = {*(live.states if live.whole else live.channels), *columns}
+    asked |= {name for mask in config.masks for name in mask.model_dump().get("channels", ())}
+    sensed = {name: cells for name, cells in sensors.channels.items() if name in asked}
+    masks = apply_masks(sensors.replace(channels=sensed), config.masks).masks
+    log = align(filled.replace(masks=masks), config.grid, needed)
     y, w = log.stack(live.states), log.stack(tuple(columns))
     piece = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), segments(log), -1)
     usable = scored(log) & (piece >= 0)
@@ -174,38 +192,6 @@ def prepare(
     good = usable & valid & trimmed
     prepared = Prepared(log, split, y, smooth, nu_dot, held, recorded, piece, usable, good, live)
     return prepared.on_disk() if large else prepared
-
-
-def _plausible(log: Log, columns: Sequence[str], live: Live) -> Log:
-    """Return the log.
-
-    Raises:
-        DataError: where a channel that a model needs has a value that no vessel can have.
-    """
-    for name in (*live.states, *columns):
-        if name in log.channels:
-            bad = np.flatnonzero(beyond_belief(log[name], log.units[name]))
-            if bad.size:
-                raise DataError(
-                    f"log {log.name}: {name} is {log[name][bad[0]]:g} {log.units[name]} at t ="
-                    f" {log.t[bad[0]]:.2f} s, which no vessel reaches ({bad.size} such samples);"
-                    " correct them, or set them to NaN"
-                )
-    return log
-
-
-def _masked(log: Log, columns: Sequence[str], config: PrepareConfig, live: Live) -> Log:
-    """Return the log with its whole motion and the masks of the config."""
-    whole = complete_motion(log, config.motion, live)
-    filled = fill_sparse(whole, (*live.states, *columns), config.grid.held)
-    # masks look at the samples as recorded: interpolation hides a frozen sensor
-    recorded = filled if whole is log else whole.replace(channels=whole.channels | log.channels)
-    # what is zero at all times, or follows from it, is no sensor that stands still
-    asked = {*(live.states if live.whole else live.channels), *columns}
-    asked |= {name for mask in config.masks for name in mask.model_dump().get("channels", ())}
-    seen = {name: values for name, values in recorded.channels.items() if name in asked}
-    masks = apply_masks(recorded.replace(channels=seen), config.masks).masks
-    return filled.replace(masks=masks)
 
 
 def _means(w: np.ndarray, piece: np.ndarray) -> np.ndarray:

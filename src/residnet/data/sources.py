@@ -48,7 +48,16 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
         for log, split in zip(simulate(manoeuvres, config), config.splits(manoeuvres), strict=True):
             splits[split].append(log)
         return splits
-    read = _all_logs(config)
+    reader, files = config.reader.build(), config.split.files()
+    names = log_names(files)
+    read: dict[Path, Log] = {}
+    samples = 0
+    for number, path in enumerate(files):
+        report("reading logs", number, len(files))
+        one = reader.read(path).replace(name=names[path])
+        samples += len(one)
+        read[path] = one if samples <= paged.LARGE else one.on_disk()
+    report("reading logs", len(files), len(files))
     if config.split.auto:
         splits = divided(list(read.values()))
     else:
@@ -62,21 +71,6 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
                 raise DataError(f"split: no log of {split} is of its manoeuvre (there are {kinds})")
     check_leaks(splits)
     return splits
-
-
-def _all_logs(config: MeasuredLogs) -> dict[Path, Log]:
-    """Return every log of the splits, each read once; after 200,000 samples they lie on disk."""
-    reader, files = config.reader.build(), config.split.files()
-    names = log_names(files)
-    out: dict[Path, Log] = {}
-    samples = 0
-    for number, path in enumerate(files):
-        report("reading logs", number, len(files))
-        log = reader.read(path).replace(name=names[path])
-        samples += len(log)
-        out[path] = log if samples <= paged.LARGE else log.on_disk()
-    report("reading logs", len(files), len(files))
-    return out
 
 
 def input_files(config: MeasuredLogs | SimulatedTrials) -> list[Path]:

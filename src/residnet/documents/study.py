@@ -118,12 +118,6 @@ def joined(values: Sequence[float], digits: int = 3) -> str:
     return " / ".join(number(value, digits) for value in values)
 
 
-def listed(names: Sequence[str]) -> str:
-    """Return names as a list in a sentence, as in "a, b and c"."""
-    *first, last = names
-    return f"{', '.join(first)} and {last}" if first else last
-
-
 def notes_text(notes: Mapping[str, Any]) -> str:
     """Return what an estimator chose in one line, such as "penalty 0.1; order 3/3/1"."""
 

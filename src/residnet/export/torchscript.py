@@ -192,7 +192,21 @@ class AotiExporter(Exporter):
             partial = Path(folder) / "model.pt2"
 
             def attempt(dtype: torch.dtype) -> dict[str, Any]:
-                _compile(exported, partial, dtype)
+                examples = tuple(
+                    torch.zeros(1, count, dtype=dtype) for _, count in exported.arguments
+                )
+                try:
+                    with warnings.catch_warnings(), torch.no_grad():
+                        warnings.simplefilter("ignore")
+                        program = torch.export.export(exported.graph(dtype), examples)
+                        torch._inductor.aoti_compile_and_package(program, package_path=str(partial))
+                except (RuntimeError, OSError) as error:
+                    # what torch raises here has no class of its own
+                    first = str(error).strip().splitlines() or [type(error).__name__]
+                    raise ExportError(
+                        f"{exported.what}: cannot be compiled ahead of time ({first[0]}); export it"
+                        " as c or torchscript"
+                    ) from None
                 return exported.check(AotiModel(partial, dtype), "the compiled package", dtype)
 
             dtype, parity = in_precision(exported, attempt)
@@ -210,24 +224,3 @@ class AotiExporter(Exporter):
             write_card(file, card)
             file.write_bytes(partial.read_bytes())
         return card
-
-
-def _compile(exported: Exported, file: Path, dtype: torch.dtype) -> None:
-    """Write the package.
-
-    Raises:
-        ExportError: where torch cannot compile the step, or there is no C++ compiler.
-    """
-    examples = tuple(torch.zeros(1, count, dtype=dtype) for _, count in exported.arguments)
-    try:
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")
-            program = torch.export.export(exported.graph(dtype), examples)
-            torch._inductor.aoti_compile_and_package(program, package_path=str(file))
-    except (RuntimeError, OSError) as error:
-        # what torch raises here has no class of its own
-        first = str(error).strip().splitlines() or [type(error).__name__]
-        raise ExportError(
-            f"{exported.what}: cannot be compiled ahead of time ({first[0]}); export it as c or"
-            " torchscript"
-        ) from None

@@ -87,33 +87,36 @@ class FoldModels:
         if role == "zero":
             return [copy.deepcopy(fitted.model) for _ in range(self.count)]
         if role == "baseline":
-            settings = self.identified.settings
-            refit = settings.refit.get(fitted.name)
-            whole = copy.deepcopy(fitted.model).to(torch.float64)
-            out = [copy.deepcopy(whole) for _ in range(self.count)]
-            if refit is None or "refit" not in fitted.notes:
-                for k, model in enumerate(out):
-                    config, kept = fitted.spec.baseline, self._kept(k)
-                    _fill(model.baseline, config.solutions(model.baseline, kept), fitted)
-                return out
-            found = without_logs(
-                whole,
-                self.samples,
-                WindowStore.gather(self.identified.train, torch.float64),
-                refit.with_prior(float(fitted.notes["prior"])),
-                torch.from_numpy(settings.evaluation.scales.array()),
-                self.fold,
-                fitted.notes["refit"]["at_rest"],
-            )
-            for model, theta in zip(out, found, strict=True):
-                assert isinstance(model.baseline, ParametricBaseline)
-                with torch.no_grad():
-                    model.baseline.theta.copy_(theta)
-            return out
+            return self._baseline(fitted)
         name = self.identified.settings.baseline_name_of(fitted.name)
         if not closed_form(fitted) or name not in before[0]:
             return []
         return [self._head(fitted, before[k][name], k) for k in range(self.count)]
+
+    def _baseline(self, fitted: FittedModel) -> list[HybridDynamics]:
+        settings = self.identified.settings
+        refit = settings.refit.get(fitted.name)
+        whole = copy.deepcopy(fitted.model).to(torch.float64)
+        out = [copy.deepcopy(whole) for _ in range(self.count)]
+        if refit is None or "refit" not in fitted.notes:
+            for k, model in enumerate(out):
+                config, kept = fitted.spec.baseline, self._kept(k)
+                _fill(model.baseline, config.solutions(model.baseline, kept), fitted)
+            return out
+        found = without_logs(
+            whole,
+            self.samples,
+            WindowStore.gather(self.identified.train, torch.float64),
+            refit.with_prior(float(fitted.notes["prior"])),
+            torch.from_numpy(settings.evaluation.scales.array()),
+            self.fold,
+            fitted.notes["refit"]["at_rest"],
+        )
+        for model, theta in zip(out, found, strict=True):
+            assert isinstance(model.baseline, ParametricBaseline)
+            with torch.no_grad():
+                model.baseline.theta.copy_(theta)
+        return out
 
     def _head(self, fitted: FittedModel, baseline: HybridDynamics, k: int) -> HybridDynamics:
         model = fitted.spec.build()

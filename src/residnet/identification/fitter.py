@@ -395,7 +395,19 @@ class Fitter:
                 raise FitError(f"head {name}: {error}") from None
             notes = solution.choice | solution.notes | tried
         else:
-            notes = self._train(name, model, residual, seed)
+            # its module imports Lightning, which a fit without networks must not wait for
+            from residnet.training.heads import train
+
+            settings = self.settings.training.get(name, TrainingConfig())
+            dtype = torch.float64 if settings.double else torch.float32
+            windows, folder = WindowStore.gather(self.train, dtype), self.store.training_folder
+
+            def validate(trained: HybridDynamics) -> Score:
+                return self.validate(spec.as_one(trained))
+
+            notes = train(
+                name, model, residual, windows, settings, self.scales, validate, seed, folder
+            )
         notes |= {
             "baseline": self.settings.baseline_name_of(name),
             "seconds": round(time.perf_counter() - started, 1),
@@ -446,22 +458,6 @@ class Fitter:
         model = spec.mean(single) if of == "trajectories" else mean_of(parts)
         notes = {"members": [one.name for one in members], **self._validated(model)}
         return FittedModel(spec, model, notes)
-
-    def _train(
-        self, name: str, model: HybridDynamics, residual: Samples, seed: int
-    ) -> dict[str, Any]:
-        # its module imports Lightning, which a fit without networks must not wait for
-        from residnet.training.heads import train
-
-        settings = self.settings.training.get(name, TrainingConfig())
-        dtype = torch.float64 if settings.double else torch.float32
-        windows, folder = WindowStore.gather(self.train, dtype), self.store.training_folder
-        spec = self.spec(name, "head", self.settings.baseline_of(name))
-
-        def validate(trained: HybridDynamics) -> Score:
-            return self.validate(spec.as_one(trained))
-
-        return train(name, model, residual, windows, settings, self.scales, validate, seed, folder)
 
     def _validated(self, model: HybridDynamics) -> dict[str, Any]:
         """Notes on a model's free runs over the validation logs."""

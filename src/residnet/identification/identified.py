@@ -301,10 +301,7 @@ class Identified(Mapping[str, FittedModel]):
     @cached_property
     def findings(self) -> dict[str, list[Finding]]:
         """What the checks for physical sanity find, by model; `zero` is left out."""
-        return self.findings_of(list(self.values()))
-
-    def findings_of(self, fitted: Sequence[FittedModel]) -> dict[str, list[Finding]]:
-        """Return what the checks for physical sanity find of some models."""
+        fitted = list(self.values())
         settings = self.settings
         recorded = Recorded.of(self.train, settings.prepare.grid.step)
         return {

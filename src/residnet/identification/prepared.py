@@ -78,8 +78,19 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
                 )
             if log.split != "train":
                 require_window(log, settings)
-    _tell_smoothed([log for logs in prepared.values() for log in logs])
-    _tell_spikes([log for logs in prepared.values() for log in logs])
+    every = [log for logs in prepared.values() for log in logs]
+    for key, source in (
+        ("smoothed", "come from a smoother of the measured motion"),
+        ("integrated", "are integrated from the velocities: their errors are those of no place"),
+    ):
+        made = [", ".join(log.log.meta[key]) for log in every if key in log.log.meta]
+        for names in dict.fromkeys(made):
+            say(f"  {names} of {made.count(names)} logs {source}")
+    for log in every:
+        spikes = log.log.meta.get("spikes", {})
+        if spikes:
+            counts = ", ".join(f"{name} {count}" for name, count in spikes.items())
+            say(f"  {log.log.name}: spikes are bridged and left out (samples: {counts})")
     return prepared
 
 
@@ -93,26 +104,6 @@ def shortened(log: Log) -> list[Log]:
         log.rows(slice(begin, end)).replace(name=f"{log.name}_{number + 1}_of_{count}")
         for number, (begin, end) in enumerate(pairwise(bounds))
     ]
-
-
-def _tell_spikes(logs: Sequence[Prepared]) -> None:
-    """Say how many single samples of which logs were left out because they stand far out."""
-    for log in logs:
-        spikes = log.log.meta.get("spikes", {})
-        if spikes:
-            counts = ", ".join(f"{name} {count}" for name, count in spikes.items())
-            say(f"  {log.log.name}: spikes are bridged and left out (samples: {counts})")
-
-
-def _tell_smoothed(logs: Sequence[Prepared]) -> None:
-    """Say which channels of how many logs were made from others, and how."""
-    for key, source in (
-        ("smoothed", "come from a smoother of the measured motion"),
-        ("integrated", "are integrated from the velocities: their errors are those of no place"),
-    ):
-        made = [", ".join(log.log.meta[key]) for log in logs if key in log.log.meta]
-        for names in dict.fromkeys(made):
-            say(f"  {names} of {made.count(names)} logs {source}")
 
 
 def require_window(log: Prepared, settings: FitSettings) -> None:

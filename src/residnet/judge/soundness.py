@@ -526,7 +526,14 @@ def check_bounded(
     """
     largest = spec.signals.live.largest(np.array(spec.low), np.array(spec.high))
     limit = torch.from_numpy(largest).clamp(min=1e-9)
-    corners = _corners(spec)
+    low, high = (_ranges(ends)[spec.signals.live.size :] for ends in (spec.low, spec.high))
+    count = low.numel()
+    if 2**count <= _CORNERS:
+        pick = (torch.arange(2**count)[:, None] >> torch.arange(count)) & 1
+    else:
+        random = torch.Generator().manual_seed(0)
+        pick = torch.randint(0, 2, (_CORNERS, count), generator=random)
+    corners = low + pick.double() * (high - low)
     known = len(recorded.x)
     x = torch.cat((recorded.x, recorded.x.new_zeros(len(corners), recorded.x.shape[1])))
     w = torch.cat((recorded.w, corners))
@@ -569,18 +576,6 @@ def check_bounded(
         return _found(spec, BOUNDED, False, beyond.strip("()"), fault)
     text = f"runs away within {float(away[row]):.0f} s with {inputs} held from rest {beyond}"
     return _found(spec, BOUNDED, False, text, "")
-
-
-def _corners(spec: ModelSpec) -> Tensor:
-    """Inputs [K, m] at the edges of their ranges, every combination or 64 drawn ones."""
-    low, high = (_ranges(ends)[spec.signals.live.size :] for ends in (spec.low, spec.high))
-    count = low.numel()
-    if 2**count <= _CORNERS:
-        pick = (torch.arange(2**count)[:, None] >> torch.arange(count)) & 1
-    else:
-        random = torch.Generator().manual_seed(0)
-        pick = torch.randint(0, 2, (_CORNERS, count), generator=random)
-    return low + pick.double() * (high - low)
 
 
 def sanity_content(findings: Mapping[str, Sequence[Finding]]) -> dict[str, Any]:

@@ -215,7 +215,18 @@ class Fitness:
             if terms is not None and terms not in self._known
         ]
         if new:
-            self._fit(new)
+            self._cache({product for terms in new for product in terms})
+            by_width: dict[int, list[Terms]] = {}
+            for terms in new:
+                if not terms or not bool(self._usable[[self._rows[p] for p in terms]].all()):
+                    self._known[terms] = (np.inf, np.inf, ())
+                else:
+                    by_width.setdefault(len(terms), []).append(terms)
+            for width, group in by_width.items():
+                step = max(1, _CHUNK // (width * self._values.shape[1]))
+                for start in range(0, len(group), step):
+                    self._batch(group[start : start + step])
+            self.fitted += len(new)
         nothing = (np.inf, np.inf, ())
         return [nothing if terms is None else self._known[terms] for terms in individuals]
 
@@ -223,20 +234,6 @@ class Fitness:
         self._rows: dict[Product, int] = {}
         self._values = torch.zeros(0, len(self.y) + len(self.y_validation), dtype=torch.float64)
         self._usable = torch.zeros(0, dtype=torch.bool)
-
-    def _fit(self, sets: Sequence[Terms]) -> None:
-        self._cache({product for terms in sets for product in terms})
-        by_width: dict[int, list[Terms]] = {}
-        for terms in sets:
-            if not terms or not bool(self._usable[[self._rows[p] for p in terms]].all()):
-                self._known[terms] = (np.inf, np.inf, ())
-            else:
-                by_width.setdefault(len(terms), []).append(terms)
-        for width, group in by_width.items():
-            step = max(1, _CHUNK // (width * self._values.shape[1]))
-            for start in range(0, len(group), step):
-                self._batch(group[start : start + step])
-        self.fitted += len(sets)
 
     def _cache(self, wanted: set[Product]) -> None:
         """Keep columns of unit mean square over the training samples."""

@@ -77,7 +77,16 @@ class LeastSquares(Estimator):
             )
         gram = _sum(x, lambda _, part: (part / scale).T @ (part / scale)) / n
         cross = _sum(x, lambda rows, part: (part / scale).T @ y[rows]) / n
-        condition = _condition(gram, min(self.penalties), names)
+        values, vectors = torch.linalg.eigh(gram)
+        condition = float(torch.sqrt(values[-1] / values[0].clamp(min=_TINY)))
+        rounding = _ROUNDING * len(names) * torch.finfo(gram.dtype).eps * float(values[-1])
+        if float(values[0]) + min(self.penalties) < rounding:
+            worst = [names[i] for i in vectors[:, 0].abs().argsort(descending=True)[:2].tolist()]
+            raise FitError(
+                f"the data cannot tell apart regressors '{worst[0]}' and '{worst[1]}' (condition"
+                f" {condition:.1e}); leave one out, excite them separately, or give a ridge penalty"
+            )
+        condition = condition
         solutions = []
         for penalty in self.penalties:
             inverse = torch.linalg.inv(gram + penalty * torch.eye(j, dtype=y.dtype))
@@ -193,24 +202,6 @@ def linear_solution(
         for j, name in enumerate(names)
     )
     return Solution(choice, found.state, table, notes, covariance=covariance)
-
-
-def _condition(gram: Tensor, ridge: float, names: Sequence[str]) -> float:
-    """Return the condition number of the scaled regressors.
-
-    Raises:
-        FitError: where nothing tells two of them apart.
-    """
-    values, vectors = torch.linalg.eigh(gram)
-    condition = float(torch.sqrt(values[-1] / values[0].clamp(min=_TINY)))
-    rounding = _ROUNDING * len(names) * torch.finfo(gram.dtype).eps * float(values[-1])
-    if float(values[0]) + ridge < rounding:
-        worst = [names[i] for i in vectors[:, 0].abs().argsort(descending=True)[:2].tolist()]
-        raise FitError(
-            f"the data cannot tell apart regressors '{worst[0]}' and '{worst[1]}' (condition"
-            f" {condition:.1e}); leave one out, excite them separately, or give a ridge penalty"
-        )
-    return condition
 
 
 def _score_spreads(

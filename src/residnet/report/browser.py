@@ -50,28 +50,6 @@ def draw(figures: Sequence[Figure]) -> Drawn | None:
     return Drawn({one.key: _json(one) for one in figures}, "\n".join(library))
 
 
-def _document(figure: Figure) -> dict[str, Any]:
-    """Return the panels as Bokeh's JSON, and in which part of the page each is to stand."""
-    from bokeh.document import Document
-
-    # models are numbered in their order, so that the same run has the same page
-    document, panels = Document(), _panels(figure)
-    for panel in panels:
-        document.add_root(panel)
-    names: dict[str, str] = {}
-    text = json.dumps(document.to_json(deferred=False))
-    for number, panel in enumerate(panels):
-        names[panel.id] = f"{figure.key}-root-{number}"
-    text = re.sub(
-        r"(?<=\")p\d{4,}(?=\")",
-        lambda found: names.setdefault(found[0], f"{figure.key}-{len(names)}"),
-        text,
-    )
-    places = {f"{figure.key}-root-{i}": f"{figure.key}-{i}-panel" for i in range(len(panels))}
-    item = {"docid": figure.key, "roots": places, "root_ids": list(places)}
-    return {"documents": {figure.key: json.loads(text)}, "items": [item]}
-
-
 def _panels(figure: Figure) -> list[Canvas]:
     """Return the panels; those of curves share their horizontal axis and a cursor."""
     from bokeh import models
@@ -253,8 +231,25 @@ def _columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarray]:
 def _json(figure: Figure) -> str:
     """Return a figure as the page's script takes it."""
     surface = figure.surface
+    from bokeh.document import Document
+
+    # models are numbered in their order, so that the same run has the same page
+    document, panels = Document(), _panels(figure)
+    for panel in panels:
+        document.add_root(panel)
+    names: dict[str, str] = {}
+    text = json.dumps(document.to_json(deferred=False))
+    for number, panel in enumerate(panels):
+        names[panel.id] = f"{figure.key}-root-{number}"
+    text = re.sub(
+        r"(?<=\")p\d{4,}(?=\")",
+        lambda found: names.setdefault(found[0], f"{figure.key}-{len(names)}"),
+        text,
+    )
+    places = {f"{figure.key}-root-{i}": f"{figure.key}-{i}-panel" for i in range(len(panels))}
+    item = {"docid": figure.key, "roots": places, "root_ids": list(places)}
     content = {
-        **_document(figure),
+        **{"documents": {figure.key: json.loads(text)}, "items": [item]},
         "looks": {
             name: {"color": look.color, "shown": look.shown} for name, look in figure.looks.items()
         },

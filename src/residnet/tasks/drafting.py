@@ -153,7 +153,21 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
     ):
         marks.note(CHANNELS, "the wind is left out: its loads need u, v, r and a measured heading")
     preparation = chosen.content()
-    if "frozen" in _findings(list(read.logs.values()), inputs, marks):
+    logs = list(read.logs.values())
+    told: dict[str, list[str]] = {}
+    for log in logs[:: max(1, len(logs) // _INSPECTED)]:
+        try:
+            found = inspect(log, [name for name in inputs if name in log.channels])
+        except ResidnetError as error:
+            marks.note(("data",), f"data doctor: {log.name}: {error}")
+            continue
+        for finding in found.findings:
+            if finding.level != "note" or finding.code == "roll":
+                told.setdefault(finding.code, []).append(f"{log.name}: {finding.text}")
+    for texts in told.values():
+        more = f" (and {len(texts) - 1} more logs)" if len(texts) > 1 else ""
+        marks.note(("data",), f"data doctor: {texts[0][:300]}{more}")
+    if "frozen" in told:
         where = {"channels": list(live.channels)} if live.dead else {}
         preparation |= {"masks": [{"kind": "frozen", **where}]}
     usable = read.usable((*inputs, *chosen.exogenous), preparation)
@@ -303,24 +317,6 @@ class _Read:
             )
         say(f"{len(self.logs)} logs were read, {len(self.left_out)} left out")
         return lines
-
-
-def _findings(logs: Sequence[Log], inputs: Sequence[str], marks: Marks) -> set[str]:
-    """Return the codes of what the data doctor finds, and write its findings down."""
-    told: dict[str, list[str]] = {}
-    for log in logs[:: max(1, len(logs) // _INSPECTED)]:
-        try:
-            found = inspect(log, [name for name in inputs if name in log.channels])
-        except ResidnetError as error:
-            marks.note(("data",), f"data doctor: {log.name}: {error}")
-            continue
-        for finding in found.findings:
-            if finding.level != "note" or finding.code == "roll":
-                told.setdefault(finding.code, []).append(f"{log.name}: {finding.text}")
-    for texts in told.values():
-        more = f" (and {len(texts) - 1} more logs)" if len(texts) > 1 else ""
-        marks.note(("data",), f"data doctor: {texts[0][:300]}{more}")
-    return set(told)
 
 
 def _split(

@@ -25,6 +25,7 @@ from residnet.core.config import (
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.progress import say
+from residnet.data.channels import noise_of
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.reading import log_files, read_drafted
 from residnet.tasks.autopilot import REFERENCE, least_time
@@ -91,14 +92,9 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
 
 
 def _noise(logs: Sequence[Log], name: str) -> float:
-    """Return the standard deviation of white noise, from what no motion does within two samples.
-
-    The second difference of white noise has six times its variance; half of its sizes are below
-    .6745 standard deviations.
-    """
-    bends = [np.abs(np.diff(log[name][log.usable], 2)) for log in logs if name in log.channels]
-    finite = np.concatenate([np.zeros(0), *(bend[np.isfinite(bend)] for bend in bends)])
-    return float(np.median(finite) / (0.6745 * np.sqrt(6.0))) if len(finite) else float("nan")
+    """Return the standard deviation of a channel's white noise; NaN where no log has it."""
+    found = [log[name][log.usable] for log in logs if name in log.channels]
+    return noise_of(np.concatenate(found)) if found else float("nan")
 
 
 def _record(log: Log) -> tuple[Record, str]:

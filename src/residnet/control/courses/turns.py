@@ -129,17 +129,6 @@ class TurnMaker:
         ]
         return [turns[k * i : k * i + k] for i in range(n)]
 
-    def _steps(self, swing: float, duration: float) -> list[tuple[float, int]]:
-        """Return the lengths of steps in s, and how many of each, after a rudder is laid."""
-        found, rest = [], max(duration, 3.0 * self.dt)
-        if self.vessel.rate is not None:
-            moving = swing / self.vessel.rate
-            # the rudder moves between steps, and lags behind by half of one
-            fine = min(self.dt, 4.0 * _ALIKE / (self.turning.gain * swing))
-            count = math.ceil(min(1.1 * moving, rest) / fine)
-            found, rest = [(fine, count)], rest - count * fine
-        return [*found, (self.dt, math.ceil(rest / self.dt))] if rest > 0 else found
-
     def _phase(self, x: Array, rudder: Array, duration: float, swing: float) -> CubicSpline:
         """Return the states [B, nx] by the time from x [B, nx] on, under rudder angles [B].
 
@@ -149,7 +138,14 @@ class TurnMaker:
         w[:, 0, 0] = torch.from_numpy(rudder)
         nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(len(x), -1)
         at, parts = [np.zeros(1)], [torch.from_numpy(x).unsqueeze(1)]
-        for dt, count in self._steps(swing, duration):
+        found, rest = [], max(duration, 3.0 * self.dt)
+        if self.vessel.rate is not None:
+            moving = swing / self.vessel.rate
+            # the rudder moves between steps, and lags behind by half of one
+            fine = min(self.dt, 4.0 * _ALIKE / (self.turning.gain * swing))
+            count = math.ceil(min(1.1 * moving, rest) / fine)
+            found, rest = [(fine, count)], rest - count * fine
+        for dt, count in [*found, (self.dt, math.ceil(rest / self.dt))] if rest > 0 else found:
             if dt not in self.loops:
                 self.loops[dt] = Rollout(self.vessel.model(dt))
             with torch.no_grad():

@@ -684,21 +684,18 @@ class Channels:
         felt = best.startswith("felt")
         side = " to port" if best.endswith("port") else ""
         new = BOW_WIND[1:] if felt else ("wind_speed", BOW_WIND[0])
-        self._rename(dict(zip(old, new, strict=True)))
+        names = dict(zip(old, new, strict=True))
+        self._names = {names.get(name, name): column for name, column in self._names.items()}
+        self._logs = [
+            Raw(raw.t, {names.get(name, name): values for name, values in raw.columns.items()})
+            for raw in self._logs
+        ]
         self._flipped |= {new[1]} if side else set()
         wind = "apparent" if felt else "true"
         text = f"taken from the bow{side}, where the {wind} wind comes from:"
         ratio = spread.get(best, 1.0) / max(spread.get("north", 1.0), 1e-9)
         text += f" so the true wind is steadiest ({ratio:.2f} of its spread if told from north)"
         self._marks.guess((*CHANNELS, new[1]), text)
-
-    def _rename(self, new: Mapping[str, str]) -> None:
-        """Give channels other names."""
-        self._names = {new.get(name, name): column for name, column in self._names.items()}
-        self._logs = [
-            Raw(raw.t, {new.get(name, name): values for name, values in raw.columns.items()})
-            for raw in self._logs
-        ]
 
     def _spreads(self, speed: str, angle: str) -> dict[str, float]:
         """Return how a wind may be told -> spread in m/s of the true wind within a log.

@@ -339,7 +339,9 @@ class TableReader(LogReader):
             kept = kept[fresh]
         held = [name for name in raw if maps[name].hold]
         for name in held:
-            raw[name] = raw[name][_last_known(raw[name])]
+            at = np.arange(raw[name].size)
+            last = np.maximum.accumulate(np.where(np.isfinite(raw[name]), at, -1))
+            raw[name] = raw[name][np.where(last < 0, at, last)]
         if held and len(held) < len(raw):
             # a row of commands alone belongs to the next sample of the motion
             moving = [values[kept] for name, values in raw.items() if name not in held]
@@ -485,13 +487,6 @@ def _at(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return values [T] at rows [K]; themselves, and no copy, where these are all in order."""
     every = rows.size == values.size and rows[0] == 0
     return values if every else np.asarray(values[rows])
-
-
-def _last_known(values: np.ndarray) -> np.ndarray:
-    """Return for each sample [T] that of the last number at or before it; its own for none."""
-    at = np.arange(values.size)
-    last = np.maximum.accumulate(np.where(np.isfinite(values), at, -1))
-    return np.where(last < 0, at, last)
 
 
 def _placed(path: Path, channels: dict[str, np.ndarray], units: dict[str, str]) -> list[Remark]:

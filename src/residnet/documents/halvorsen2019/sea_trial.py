@@ -18,7 +18,7 @@ from pydantic import Field, field_validator, model_validator
 
 from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import ConfigError
-from residnet.core.format import DASH, DEG, interval, number
+from residnet.core.format import DASH, DEG, interval, listed, number
 from residnet.core.layout import RANGE_INPUTS, RANGE_VELOCITIES
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, VELOCITY, nearest
@@ -35,7 +35,7 @@ from residnet.documents.halvorsen2019.standard_model import (
     fit,
     truth,
 )
-from residnet.documents.study import Results, Study, compared, histories, listed, pictures
+from residnet.documents.study import Results, Study, compared, histories, pictures
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.format import fixed, interval, number, plural, signed
+from residnet.core.format import fixed, interval, listed, number, plural, signed
 from residnet.core.layout import HEADING
 from residnet.core.stretches import stretches
 from residnet.data.prepare import PrepareConfig
@@ -40,15 +40,7 @@ from residnet.documents.jervan2020.residual import (
     model_figures,
     model_sections,
 )
-from residnet.documents.study import (
-    Results,
-    Study,
-    compared,
-    histories,
-    listed,
-    notes_text,
-    pictures,
-)
+from residnet.documents.study import Results, Study, compared, histories, notes_text, pictures
 from residnet.judge.metrics import intervals
 from residnet.physics.force_model import ForceModel
 from residnet.physics.hull import HullConfig
