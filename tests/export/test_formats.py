@@ -28,7 +28,7 @@ from residnet.dynamics.lowering import lowered
 from residnet.export import base, exporter, torchscript, vessel
 from residnet.export.base import Loaded, RoundingError, released
 from residnet.export.c import STRICT, CasadiModel, CFunction, CompiledModel, c_files, compile_shared
-from residnet.export.onnx_file import OnnxModel
+from residnet.export.onnx_file import OnnxModel, _arctangent
 from residnet.export.torchscript import AotiModel, ScriptedModel
 from residnet.export.vessel import ExportedVessel
 from residnet.testing import check_bad_inputs
@@ -276,6 +276,30 @@ def test_what_single_precision_does_not_determine_is_written_in_double(
         else CompiledModel(compile_shared([file], tmp_path / "boat.so"), made, torch.float64)
     )
     assert max(made.require_parity(loaded, "the file", torch.float64, 1e-7).values()) < 1e-7
+
+
+class Angle(torch.nn.Module):
+    def forward(self, y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        return torch.atan2(y, x)
+
+
+@pytest.mark.exporters
+def test_onnx_has_the_angles_of_doubles(tmp_path: Path) -> None:
+    points = torch.randn(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    axes = [[0, 0], [0, 1], [0, -1], [1, 0], [-1, 0], [1e-9, -1], [1, 1e-9], [-1, -1e-9]]
+    points = torch.cat((points, torch.tensor(axes, dtype=torch.float64)))
+    torch.onnx.export(
+        Angle(),
+        tuple(points.T.contiguous()),
+        str(file := tmp_path / "angle.onnx"),
+        optimize=False,
+        verbose=False,
+        input_names=["y", "x"],
+        custom_translation_table={torch.ops.aten.atan2.default: _arctangent},
+    )
+    given = dict(zip(("y", "x"), points.T.contiguous().numpy(), strict=True))
+    (found,) = onnxruntime.InferenceSession(str(file)).run(None, given)
+    np.testing.assert_allclose(found, np.arctan2(*points.T.numpy()), rtol=0, atol=1e-14)
 
 
 def test_an_operation_that_is_not_known_is_refused_by_name() -> None:
