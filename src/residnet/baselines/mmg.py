@@ -177,11 +177,7 @@ class MMGForces(nn.Module):
     """
 
     def __init__(
-        self,
-        hull: MMGHull,
-        propeller: MMGPropeller,
-        rudder: MMGRudder,
-        columns: Sequence[int],
+        self, hull: MMGHull, propeller: MMGPropeller, rudder: MMGRudder, columns: Sequence[int]
     ) -> None:
         super().__init__()
         self.columns = list(columns)

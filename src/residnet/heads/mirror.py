@@ -68,9 +68,7 @@ class MirroredHead(ResidualHead):
         self.register_buffer("index", torch.tensor(mirror[0], dtype=torch.long), persistent=False)
         self.register_buffer("sign", torch.tensor(mirror[1], dtype=torch.float64), persistent=False)
         self.register_buffer(
-            "turned",
-            torch.tensor(axis_parities(names), dtype=torch.float64),
-            persistent=False,
+            "turned", torch.tensor(axis_parities(names), dtype=torch.float64), persistent=False
         )
         self.index: Tensor
         self.sign: Tensor

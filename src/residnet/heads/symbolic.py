@@ -384,11 +384,7 @@ class SymbolicHead(EquationHead):
             table = self._fit(past.delayed(steps, self.line.index.numpy()))[0].table
             found = [[c.term for c in table if c.axis == name] for name in self.outputs]
             terms = [list(dict.fromkeys((*row, *simple))) for row in found]
-        notes = {
-            "steps": tried[-1],
-            "seconds": tried[-1] * past.step,
-            "profile": profile.tolist(),
-        }
+        notes = {"steps": tried[-1], "seconds": tried[-1] * past.step, "profile": profile.tolist()}
         return tried[-1], {"delay": notes}
 
     def _complete(self, solution: Solution, steps: int, delay: dict[str, Any]) -> Solution:

@@ -455,12 +455,7 @@ class PatrolConfig(HullVessel):
         roll_row = [-(down + added.K_vdot.value), body.I_x.value - added.K_pdot.value]
         mass = [
             [m - added.X_udot.value, 0.0, 0.0, 0.0],
-            [
-                0.0,
-                m - added.Y_vdot.value,
-                -(down + added.Y_pdot.value),
-                along - added.Y_rdot.value,
-            ],
+            [0.0, m - added.Y_vdot.value, -(down + added.Y_pdot.value), along - added.Y_rdot.value],
             [0.0, *roll_row, -added.K_rdot.value],
             [
                 0.0,

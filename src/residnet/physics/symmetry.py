@@ -27,10 +27,7 @@ class ChannelNames(tuple[str, ...]):
     live: Live
 
     def __new__(
-        cls,
-        names: Iterable[str],
-        pairs: Iterable[tuple[str, str]] = (),
-        live: Live = ALIVE,
+        cls, names: Iterable[str], pairs: Iterable[tuple[str, str]] = (), live: Live = ALIVE
     ) -> ChannelNames:
         """From the names, the pairs that are declared, and the velocities that live."""
         made = super().__new__(cls, names)

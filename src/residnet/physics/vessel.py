@@ -21,13 +21,7 @@ from residnet.physics.hull import (
 )
 from residnet.physics.nomoto import NomotoConfig, SecondOrderNomotoConfig, SideslipNomotoConfig
 
-__all__ = [
-    "AnyVessel",
-    "VesselConfig",
-    "VesselName",
-    "load_vessel",
-    "vessel_files",
-]
+__all__ = ["AnyVessel", "VesselConfig", "VesselName", "load_vessel", "vessel_files"]
 
 AnyVessel = (
     FossenConfig

@@ -32,13 +32,7 @@ from residnet.physics.actuators.base import (
     ThrustCurve,
     require_range,
 )
-from residnet.physics.parameters import (
-    Density,
-    Parameter,
-    SquareMetres,
-    above_zero,
-    of_dimension,
-)
+from residnet.physics.parameters import Density, Parameter, SquareMetres, above_zero, of_dimension
 
 
 class SteeringGearConfig(ServoConfig):
