@@ -32,7 +32,6 @@ class GivenBaseline(Baseline):
 
     Args:
         rows: coefficients of u_dot, v_dot and r_dot by term; what else moves has none.
-        names: channels of the model.
         fitted: whether the numbers were fitted, if to other data (correction E9 of document 000).
     """
 
@@ -62,12 +61,10 @@ class GivenBaseline(Baseline):
         return phi @ self.theta.to(z.dtype).T
 
     def ahead(self, p: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return what velocities do not decide; see `Baseline.ahead`."""
         row, own = self.split.ahead(p, self.theta.to(p.dtype).T)
         return row, [own]
 
     def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
-        """Return nu_dot [B, n] at velocities nu [B, n], by what `ahead` found."""
         found: Tensor = self.split(nu, row, held[0])
         return found
 

@@ -172,7 +172,6 @@ class MMGForces(nn.Module):
     L^2 d U^2, with v' = v/U and r' = r L/U.
 
     Args:
-        hull, propeller, rudder: particulars.
         columns: of u, v, r, propeller revolutions and rudder angle among the channels z.
     """
 

@@ -91,7 +91,6 @@ class RegressorBaseline(ParametricBaseline):
         return known @ weights.T
 
     def ahead(self, p: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return what velocities do not decide; see `Baseline.ahead`."""
         weights = (self.theta * self.allowed).to(p.dtype).T
         if self.bound is None:
             row, own = self.split.ahead(p, weights)
@@ -102,7 +101,6 @@ class RegressorBaseline(ParametricBaseline):
         return row, [own, low[:n], high[:n], self.bound.rate.to(p.dtype)]
 
     def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
-        """Return nu_dot [B, n] at velocities nu [B, n], by what `ahead` found."""
         if self.bound is None:
             free: Tensor = self.split(nu, row, held[0])
             return free

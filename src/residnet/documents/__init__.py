@@ -29,10 +29,6 @@ STUDY_MODELS: dict[StudyName, tuple[str, ...]] = {
 def study_sections(name: StudyName, run: Path) -> Sequence[Section]:
     """Draw a document's figures into a finished run and return its sections of the report.
 
-    Args:
-        name: name of the document's study.
-        run: folder of a finished fit.
-
     Raises:
         UsageError: where the run lacks a model or a manoeuvre of the study.
     """

@@ -74,7 +74,6 @@ def beside_published(value: float | None, published: float | None, digits: int =
     Args:
         value: number of the run; None where there is none.
         published: number that the document prints; None where it prints none.
-        digits: significant digits.
     """
     # the document's number keeps the digits that it is printed with
     note = "" if published is None else f"published {minus(f'{published:.{digits}g}')}"
@@ -90,7 +89,6 @@ def compared(
         key: of the numbers in a row; those of the document stand under it in `published`, a part of
             the row.
         titles: of one number, or of each of several.
-        digits: significant digits.
         factor: from our number to its unit in the table, in which the document prints its own.
     """
 
@@ -157,14 +155,10 @@ def histories(
     """Return a figure of one panel beneath the other, each with one column of all paths over time.
 
     Args:
-        name: of the figure.
-        words: its title and its caption.
         looks: of the paths and of what all panels share, by name.
         t: time [T].
         paths: columns [T, n] by name.
         units: label of each column with its unit, and the factor to that unit.
-        height: of a panel.
-        x_label: of the time.
         shared: curves of all panels by name.
     """
     curves = [

@@ -106,7 +106,6 @@ class BasisHead(ClosedFormHead):
         return self.basis(z) @ self.coefficients.to(z.dtype) + self.intercept.to(z.dtype), s
 
     def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return what velocities do not decide; see `ResidualHead.ahead`."""
         std, far = self.features.std.to(p.dtype), self.features.far
         row, own = self.split.ahead(
             self.features.inputs(p) / std.index_select(0, far), self.coefficients.to(p.dtype)

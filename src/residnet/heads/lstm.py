@@ -323,7 +323,6 @@ class LstmHead(ResidualHead):
         return rho, memory[0] if len(memory) == 1 else torch.cat(memory, dim=-1)
 
     def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return what velocities do not decide of each network; see `ResidualHead.ahead`."""
         rows: list[Tensor] = []
         held: list[Tensor] = []
         for i, network in enumerate(self.networks):
@@ -333,7 +332,6 @@ class LstmHead(ResidualHead):
         return rows[0] if len(rows) == 1 else torch.cat(rows, dim=-1), held
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, n] and the memory for the next step, by what `ahead` found."""
         out: list[Tensor] = []
         memory: list[Tensor] = []
         rows, many = row.shape[-1] // len(self.networks), len(held) // len(self.networks)

@@ -80,7 +80,6 @@ class MlpHead(ResidualHead):
         return self.scale(self.net(self.features(z))), s
 
     def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return what velocities do not decide of the first layer; see `ResidualHead.ahead`."""
         weight: Tensor = self.net[0].weight  # type: ignore[assignment]
         bias: Tensor = self.net[0].bias  # type: ignore[assignment]
         row, own = self.features.layer(p, weight, bias)

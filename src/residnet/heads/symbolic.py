@@ -171,9 +171,6 @@ def best_delay(
 
     Args:
         past: samples.
-        terms: of each target.
-        names: of the features.
-        late: features that are delayed.
         longest: longest delay, in steps.
 
     Raises:

@@ -262,7 +262,6 @@ class Manoeuvre(Config, ABC):
 
         Args:
             manoeuvres: of this kind, one for each row.
-            helm: of the vessel.
             t: times [T] of the steps in s.
         """
 
@@ -280,7 +279,6 @@ class Manoeuvre(Config, ABC):
 
         Args:
             x: state [nx] that trials of the vessel start from.
-            state: names of its entries.
         """
         return x
 
@@ -299,7 +297,6 @@ class Manoeuvre(Config, ABC):
         """Return the largest values of indices that IMO resolution MSC.137(76) allows, by index.
 
         Args:
-            helm: of the vessel.
             length: of the ship in m.
             speed: approach speed in m/s.
         """

@@ -118,7 +118,6 @@ class Hull(nn.Module):
         rows: for each axis the coefficients C of its force by term; terms that brake are negative.
         channels: of the motion: the velocities through the water, then phi where the hull rolls,
             and theta where it pitches.
-        vessel: name for messages.
 
     Raises:
         ConfigError: where the mass matrix is not positive definite or is singular.
@@ -186,7 +185,6 @@ class HullPlant(Plant):
 
     Args:
         hull: of 3, 4 or 6 degrees of freedom.
-        actuators: that push it.
         wind: loads of the air; None where it feels none.
         start: states that trials start from, where not at rest, by name.
     """

@@ -275,7 +275,6 @@ class VelocityBound(nn.Module):
         margin: share of the training range by which it is widened on either side.
         channels: number of channels, the velocities first, that `held` keeps in their range: what
             an input does far beyond it is as little known.
-        dof: number n of what moves.
     """
 
     def __init__(

@@ -180,9 +180,7 @@ def dissipates(term: str, axis: int, names: Sequence[str]) -> bool:
     goes with the speed.
 
     Args:
-        term: a product of channels.
         axis: of what moves (`Live.moving`): 0 surge, 1 sway, 2 yaw.
-        names: channels that may appear.
     """
     parts = meaning(term, names, {})
     odd = {thing.name for thing, _, changes in parts if changes}

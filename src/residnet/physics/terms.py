@@ -63,7 +63,6 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
         term: product of channels; factors stand apart by spaces, `*` or the bars of a magnitude;
             `^2` is a power; `1` the constant; `^-1` divides, for channels that stay away from zero,
             such as `wind_mag`; `sin(delta)` is one of `FUNCTIONS`.
-        names: channels that may appear.
         functions: whether functions may appear.
 
     Raises:
@@ -223,7 +222,6 @@ class SplitTerms(nn.Module):
     """A weighted sum of terms by what moves: velocities, or all the other channels.
 
     Args:
-        terms: of the sum.
         names: other channels than velocities that appear in them.
         moves: the velocities, and what else moves with them.
 
@@ -393,8 +391,6 @@ class CandidatesConfig(Config):
         """Return which terms [J] divide by nothing near zero, or are named under `extra`.
 
         Args:
-            terms: names of the terms.
-            names: of the channels.
             z: channels in the data [N, nz].
         """
         far = z.amin(0) * z.amax(0) > 0

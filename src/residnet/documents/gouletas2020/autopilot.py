@@ -57,11 +57,7 @@ def simulate_answers(
 
     Args:
         vessel: in calm water.
-        exact: simulates the vessel over the horizon.
         rudder: angles [C] in rad.
-        settings: of the states.
-        states: how many.
-        seed: of them.
     """
     random = torch.Generator().manual_seed(seed)
     dt = min(settings.hold / 10.0, 0.25)
@@ -92,9 +88,6 @@ class PredictorFit(EpochTraining):
 
     Args:
         predictor: what is trained, float64.
-        kept: what it is validated on.
-        settings: of the training.
-        seed: of the batches.
     """
 
     def __init__(
@@ -144,12 +137,8 @@ def train_predictor(
     `checkpoints/<name>/last.ckpt` is resumed where it exists.
 
     Args:
-        name: of the controller.
-        predictor: untrained.
         config: of the controller and of the training.
         steering: the vessel in calm water and the limit of its rudder.
-        seed: of states and batches.
-        folder: of the run.
 
     Returns:
         The curve by epoch, the best score, the number of parameters, and on states kept back the
@@ -180,11 +169,9 @@ def predictive(
     """Train a controller, or take up the one that an interrupted run has trained.
 
     Args:
-        name: name of the controller.
         config: how it predicts and how it is trained.
         steering: the vessel in calm water and the limit of its rudder.
         seed: seed of the weights, the states and the batches.
-        folder: run folder, which keeps the weights.
 
     Returns:
         The controller, and notes on its config and on the errors of its predictions.

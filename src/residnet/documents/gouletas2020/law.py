@@ -53,7 +53,6 @@ class SimulatedPredictor(Predictor):
     Args:
         model: with the columns of the controlled vessel's state; its commands begin with the rudder
             angle.
-        state: names of these columns.
         steps: of the model, which make the horizon.
         others: its inputs beside the rudder command [m - 1], held over the horizon.
     """
@@ -96,9 +95,6 @@ class NetworkPredictor(Predictor):
     for Nomoto's model, and no more than a tangent to the 4-DOF vessel (correction G21).
 
     Args:
-        state: names of the columns of x.
-        candidates: how many rudder angles.
-        hidden: widths of the layers.
         linear: without activations.
     """
 
@@ -162,7 +158,6 @@ class DocumentAutopilot(Policy):
     deg/s (corrections of document 004); a horizon of seconds repairs it.
 
     Args:
-        predictor: of heading error and yaw rate.
         limit: of the candidates in rad, either side.
         candidates: how many, evenly spaced, both limits included; an odd number has the rudder
             amidships among them.

@@ -376,7 +376,6 @@ def attempt(
     Args:
         record: record that the equation is searched in.
         noise: noise on the record.
-        head: how the equation is searched.
         seed: seed of the noise and of the search.
 
     Returns:

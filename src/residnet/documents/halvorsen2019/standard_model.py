@@ -192,7 +192,6 @@ def fit(
         nu: velocities [N, 3].
         tau: forces [N, 3] in N, N, N m.
         nu_dot: accelerations [N, 3].
-        config: weights, bounds and starting points.
 
     Raises:
         FitError: with fewer samples than parameters, or where no start leads to finite errors.

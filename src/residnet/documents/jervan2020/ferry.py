@@ -117,7 +117,6 @@ def still_fits(
     """Return whether a model still fits, by comparing residuals.
 
     Args:
-        config: limits.
         then: residual on data that the model was accepted on [N, 3].
         now: residual on new data [M, 3].
         force: of the new data [M, 3].

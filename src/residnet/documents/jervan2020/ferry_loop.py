@@ -224,11 +224,7 @@ class Ferry:
     """The true plant, the believed hull and the control loop between them.
 
     Args:
-        true: vessel that is simulated.
-        believed: vessel that the controller believes in.
-        loop: feedback and sampling.
         noise: on what is measured; None for none.
-        disturbance: constant force.
         seed: of the noise.
 
     Raises:

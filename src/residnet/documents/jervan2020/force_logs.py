@@ -121,7 +121,6 @@ class Measured:
         """Return the record without a fold for training, and the samples [N] of the fold.
 
         Args:
-            part: number of the fold.
             gap: time in s around the fold that is left out of training too.
 
         Raises:

@@ -403,7 +403,6 @@ def better(row: Mapping[str, Any], than: str) -> list[bool]:
     """Return whether a model's error lies below another's with 95 % confidence.
 
     Args:
-        row: row of the model.
         than: `zero`, `believed`, or `reference`, the better of the two on each axis.
 
     Returns:

@@ -428,8 +428,6 @@ def fit_model(
     """Fit one model of the residual force of `base` on the training samples of a record.
 
     Args:
-        config: basis functions and estimator.
-        record: motion and commanded force.
         base: the known model, F_base(nu_dot, nu).
         lag: where the config asks for one and it is known; None to find it.
 
@@ -689,10 +687,8 @@ def model_sections(
     """Return what both studies tell of fitted models: refusals, coefficients, and their figures.
 
     Args:
-        title: of the section of coefficients.
         models: entries of the results (`fit_as_json`) by name.
         run: folder that holds `model_figures`.
-        notes: key of what the estimator chose.
         others: coefficients [3] by basis function to stand beside those of a model, by its name and
             by what they are, such as `true` and `published`.
     """
@@ -738,9 +734,6 @@ def model_figures(
     Figures 4.6, 4.20, 4.22 and 4.25 of the document.
 
     Args:
-        name: name of the model.
-        config: its basis functions and estimator.
-        fit: its coefficients.
         unmodelled: mean square of the believed model's residual by axis.
     """
     at, weights, names = np.arange(len(config.terms)), fit.pre.abs().numpy(), names_of(config.terms)
@@ -772,7 +765,6 @@ def _orders(
     """Return the error that is left over the order of a PLSR.
 
     Args:
-        name: name of the model.
         curves: mean square error by order and axis [A, 3], by the samples that it is of.
         unmodelled: mean square of the residual of each axis.
         chosen: order of the model.

@@ -212,7 +212,6 @@ def fit_thrust(n: np.ndarray, pull: np.ndarray, thrusters: int) -> tuple[ThrustF
     Args:
         n: revolutions [N] in 1/s.
         pull: pull [N] in N of all thrusters together.
-        thrusters: how many there are.
 
     Raises:
         FitError: where a direction has fewer than five points or four revolutions, or pulls the
