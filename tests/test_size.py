@@ -19,7 +19,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "api": (723, 84),
     "baselines": (890, 129),
     "control": (3371, 386),
-    "core": (1614, 248),
+    "core": (1610, 248),
     "data": (9814, 857),
     "documents": (2602, 239),
     "dynamics": (2229, 279),

@@ -24,7 +24,7 @@ from residnet.baselines.given import EquationsConfig
 from residnet.core.config import load_mapping
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs/studies/moreno2019/moreno2019.yaml"

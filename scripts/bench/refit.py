@@ -30,7 +30,7 @@ from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training.refit import RefitConfig, level_of, place, problem_of, refit
 

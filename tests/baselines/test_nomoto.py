@@ -17,7 +17,7 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 NAMES = ("u", "v", "r", "n", "delta")

@@ -32,9 +32,8 @@ from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputSh
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
-from residnet.heads.base import ResidualHead
+from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.linear import RidgeConfig
-from residnet.heads.zero import ZeroHead
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.signals import SignalsConfig

@@ -6,7 +6,7 @@ from kinds import of_kind
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.ensemble import SampledDynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 TERMS = ["1", "u", "v", "r", "u v", "tau_x", "tau_n"]

@@ -14,9 +14,8 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.heads.base import ResidualHead
+from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.lstm import LstmConfig
-from residnet.heads.zero import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 A = np.array([[-0.5, 0.0, 0.0], [0.0, -0.6, -0.4], [0.0, 0.2, -0.9]])

@@ -22,7 +22,7 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import RecordedPlantDynamics
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.manoeuvres.open_loop import AccelerationDeceleration, ConstantInput, ThreeTwoOneOne

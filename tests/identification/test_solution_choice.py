@@ -9,7 +9,7 @@ import torch
 
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.identification.fitter import choose_solution
 from residnet.physics.signals import SignalsConfig
 from residnet.regression.estimator import Solution

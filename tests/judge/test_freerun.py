@@ -17,9 +17,8 @@ from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.heads.base import ResidualHead
+from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.lstm import LstmConfig
-from residnet.heads.zero import ZeroHead
 from residnet.judge import freerun
 from residnet.judge.freerun import Candidate, free_run, integrate
 from residnet.judge.protocol import Window

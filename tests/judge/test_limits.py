@@ -11,7 +11,7 @@ from made_logs import made
 from residnet.baselines.given import StillConfig
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
 from residnet.judge.metrics import Judged
 from residnet.judge.protocol import Window

@@ -10,7 +10,7 @@ from made_logs import made, random_states
 
 from residnet.baselines.given import StillConfig
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction
 from residnet.judge.metrics import Judged, find, new_trials
 from residnet.judge.protocol import Window

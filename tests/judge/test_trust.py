@@ -9,7 +9,7 @@ from residnet.baselines.given import StillConfig
 from residnet.core.log import Log
 from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
 from residnet.judge.metrics import Judged
 from residnet.judge.protocol import Windows

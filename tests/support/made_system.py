@@ -17,8 +17,7 @@ from residnet.core.names import STATE
 from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads.base import ResidualHead
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 STEP = 0.1

@@ -35,7 +35,7 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training import refit as module
 from residnet.training.refit import Problem, RefitConfig, refit, sensitivities, step_sensitivities

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.config import Config
-from residnet.core.derivatives import derivatives_along
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.samples import Samples
+from residnet.core.samples import Samples, derivatives_along
 from residnet.physics.symmetry import live_of
 from residnet.regression.estimator import Coefficient, Solution
 

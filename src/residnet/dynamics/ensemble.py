@@ -18,8 +18,7 @@ from residnet.baselines.given import StillConfig
 from residnet.core.columns import pose, velocities, zero_acceleration
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import FARTHEST, HybridDynamics
-from residnet.heads.base import ResidualHead
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ResidualHead, ZeroHead
 
 
 @final

@@ -27,7 +27,7 @@ from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import HeadConfig
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.arrays import paged
+from residnet.core.columns import zero_acceleration
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.layout import PLANAR
@@ -378,3 +379,11 @@ class ResidualScale(nn.Module):
     def forward(self, out: Tensor) -> Tensor:
         """Return residual accelerations [..., n] for outputs [..., n] near one."""
         return out * self.spread.to(out.dtype)
+
+
+@final
+class ZeroHead(ResidualHead):
+    """A head without a residual, rho = 0: the baseline alone."""
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        return zero_acceleration(z, self.dof), s

@@ -17,9 +17,9 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.config import Config
-from residnet.core.derivatives import derivatives_along
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY, nearest
+from residnet.core.samples import derivatives_along
 
 FUNCTIONS = ("sin", "cos", "sqrt", "ssqrt", "inv")
 """Functions of one channel: sine, cosine, the protected square root sqrt|x|, the sign-preserving

@@ -55,7 +55,7 @@ from residnet.documents.study import Results, Study, compared, joined, notes_tex
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.export.feed_forward import ExportedForce, RequiredForce
-from residnet.heads.zero import ZeroHead
+from residnet.heads.base import ZeroHead
 from residnet.judge.autopilots import mse
 from residnet.manoeuvres import FamilyConfig
 from residnet.manoeuvres.closed_loop import ZigzagFamily
