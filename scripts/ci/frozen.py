@@ -128,18 +128,22 @@ def doctor(out: Path, kept: Path) -> None:
     """Keep what `inspect` prints of every sample."""
     for number, path in enumerate(recordings(kept / "samples")):
         done = python("-m", "residnet.cli", "inspect", str(path))
-        text = f"exit {done.returncode}\n{done.stdout}\n{done.stderr}".replace(str(path), "PATH")
+        said = "".join(line for line in done.stderr.splitlines(True) if "so far" not in line)
+        text = f"exit {done.returncode}\n{done.stdout}\n{said}".replace(str(path), "PATH")
         (out / f"{number:02d}_{path.parent.name}_{path.name}.txt").write_text(text)
 
 
 def page_words(page: str) -> list[str]:
-    """Return the sentences of a page, numbers masked, in alphabetical order."""
+    """Return the sentences of a page, numbers and folders masked, in alphabetical order."""
     page = re.sub(r"<(script|style)\b.*?</\1>", " ", page, flags=re.DOTALL)
     blocks = re.split(
         r"</?(?:p|li|td|th|tr|h\d|figcaption|div|summary|caption|table)\b[^>]*>", page
     )
     words = (" ".join(re.sub(r"<[^>]+>", " ", block).split()) for block in blocks)
-    return sorted({re.sub(r"[-+]?\d[\d.,e+-]*", "#", text) for text in words if len(text) > 12})
+    # revisions and checksums, then this state's folder, which a page may break after any slash
+    masked = (re.sub(r"\b[0-9a-f]{12,64}\b", "#", text) for text in words if len(text) > 12)
+    here = re.compile("/ ?".join(map(re.escape, str(ROOT).split("/"))))
+    return sorted({re.sub(r"[-+]?\d[\d.,e+-]*", "#", here.sub("", text)) for text in masked})
 
 
 def runs(out: Path, kept: Path) -> None:
