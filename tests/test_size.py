@@ -18,11 +18,11 @@ ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
     "api": (723, 84),
     "baselines": (890, 129),
-    "control": (3371, 386),
+    "control": (3372, 386),
     "core": (1610, 248),
     "data": (9814, 857),
     "documents": (2602, 239),
-    "dynamics": (2229, 279),
+    "dynamics": (2233, 279),
     "export": (1583, 174),
     "heads": (1310, 191),
     "identification": (2125, 207),

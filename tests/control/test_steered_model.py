@@ -5,16 +5,20 @@ alike.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 from made_models import nomoto_model
 
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.control.heading.controllers import PdConfig, Steering
 from residnet.control.heading.vessels import SteeredModel, SteeredPlant, fly
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.steering_variation import DEPTH
 from residnet.physics.vessel import load_vessel
+from residnet.testing.checks import SUBMERGED, example_spec
 
 DEG = math.pi / 180
 GAIN, TIME = 3.47, 3.94
@@ -59,6 +63,37 @@ def test_a_rudder_that_lags_is_part_of_the_answer() -> None:
     turning = learned.turning(5 * DEG, 60.0)
     assert turning.gain == pytest.approx(GAIN, rel=1e-6)
     assert turning.time == pytest.approx(TIME + 1.0, rel=1e-2)
+
+
+def test_planes_of_a_learned_torpedo_pitch_it_as_the_vessel_does() -> None:
+    vessel = SteeredPlant(load_vessel("remus_100").build(), axis=DEPTH)
+    # accelerations as the parameters of the vessel have them
+    known = {
+        "u": {
+            "u|u|": -0.192,
+            "n|n|": 0.00508,
+            "|n| u": -0.0312,
+            "w q": -1.9,
+            "u^2 delta_s^2": -0.113,
+        },
+        "w": {"u w": -0.48, "w|w|": -2.58, "u q": 0.527, "u^2 delta_s": -0.0594},
+        "q": {"q": -1.44, "q|q|": -2.7, "sin(theta)": -0.81, "u^2 delta_s": -0.383},
+    }
+    rows = {axis: tuple(known.get(axis, ("u v",))) for axis in SUBMERGED.live.velocities}
+    changes = {"baseline": RegressorsConfig.model_validate({"terms": rows}), "integrator": "rk4"}
+    model = example_spec(None, SUBMERGED).model_copy(update=changes).build().double()
+    baseline: Any = model.baseline
+    with torch.no_grad():
+        for axis, row in known.items():
+            for term, value in row.items():
+                place = baseline.outputs.index(f"{axis}_dot"), baseline.library.terms.index(term)
+                baseline.theta[place] = value
+    learned = SteeredModel(model, SUBMERGED.columns, "start", vessel)
+    found, wanted = (one.turning(5 * DEG, 20.0, 0.1) for one in (learned, vessel))
+    assert found.gain == pytest.approx(wanted.gain, rel=0.05)
+    assert found.time == pytest.approx(wanted.time, rel=0.1)
+    with pytest.raises(ConfigError, match="depth control needs a model that tells z"):
+        SteeredModel(nomoto_model(GAIN, TIME, 0.1)[1], ("delta",), "start", vessel)
 
 
 def test_gradients_pass_through_the_model_in_single_precision() -> None:

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from residnet.core.columns import actuators, motion
 from residnet.core.errors import ConfigError
-from residnet.core.layout import LATERAL, SWAY
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.plant import Plant
+from residnet.physics.symmetry import live_of
 
 
 class Axis(NamedTuple):
@@ -166,7 +166,7 @@ class VariedModel(Dynamics):
 
     State x [B, 3 + n or one more]: that of the model, and the rudder angle where it has either.
     Memory s [B, 3 + k]: the variation, then the head's. `effect` multiplies the rudder angle that
-    the model is given, `time` divides what a step changes in sway and yaw.
+    the model is given, `time` divides what a step changes in the velocities that the axis names.
 
     Args:
         model: of the hull.
@@ -175,6 +175,7 @@ class VariedModel(Dynamics):
         mean: whether the model's inputs are means over the step.
         rate: of the rudder in rad/s; None where it has none.
         lag: time constant in s with which the rudder follows; None where it has none.
+        axis: that is steered.
 
     Raises:
         ConfigError: where the model has a memory and steps of another length.
@@ -188,8 +189,13 @@ class VariedModel(Dynamics):
         mean: bool,
         rate: float | None,
         lag: float | None = None,
+        axis: Axis = HEADING,
     ) -> None:
         super().__init__(dt, model.integrator)
+        states = live_of(model.signals.names).states
+        slowed = torch.tensor([name in axis.slowed for name in states])
+        self.register_buffer("slowed", slowed, persistent=False)
+        self.slowed: Tensor
         if model.n_state > 0 and not math.isclose(model.dt, dt, rel_tol=1e-9):
             raise ConfigError(
                 f"the learned model has a memory and steps of {model.dt:g} s; give the policy's"
@@ -226,9 +232,9 @@ class VariedModel(Dynamics):
         effect, time_share, bias = s[:, : len(VARIATION)].split(1, dim=1)
         effective = effect * held + bias
         given = torch.cat((effective, w[:, 1:]), dim=1)[:, self.take]
-        moved, memory = self._of(x).step(motion(x, self.dof), given, s[:, len(VARIATION) :])
-        slowed = x[:, LATERAL] + (moved[:, LATERAL] - x[:, LATERAL]) / time_share
-        parts = [moved[:, :SWAY], slowed, moved[:, LATERAL.stop :]]
+        own = motion(x, self.dof)
+        moved, memory = self._of(x).step(own, given, s[:, len(VARIATION) :])
+        parts = [torch.where(self.slowed, own + (moved - own) / time_share, moved)]
         parts += [angle_after] if self.geared else []
         return torch.cat(parts, dim=1), torch.cat((s[:, : len(VARIATION)], memory), dim=1)
 

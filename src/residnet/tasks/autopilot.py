@@ -262,11 +262,8 @@ class AutopilotConfig(ComputingTask):
                     f" must be {wanted}"
                 )
         for name, policy in self.policies.items():
-            if dives and (policy.start is None or policy.learned is not None):
-                raise ValueError(
-                    f"policies.{name}: a depth policy begins with a peer (start), and is trained on"
-                    " the vessel, not on a learned model"
-                )
+            if dives and policy.start is None:
+                raise ValueError(f"policies.{name}: a depth policy begins with a peer (start)")
         if dives and (self.predictive or self.pace != 1.0):
             raise ValueError("test.depth: leave out 'predictive' and 'pace', which turn headings")
 

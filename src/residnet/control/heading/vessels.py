@@ -292,13 +292,13 @@ class SteeredModel(SteeredVessel):
     """A learned model with the steering gear and straight courses of the vessel that it models.
 
     Args:
-        columns: names of its inputs; the rudder's is `delta` or `cmd_delta`, the others are
+        columns: names of its inputs; of what steers the angle or its command, the others are
             commands of the vessel.
         hold: whether its inputs are those at a step's start or means over the step.
         vessel: in calm water.
 
     Raises:
-        ConfigError: where the model has no rudder, or an input that the vessel does not command.
+        ConfigError: where nothing steers the model, or an input that the vessel does not command.
     """
 
     def __init__(
@@ -306,13 +306,15 @@ class SteeredModel(SteeredVessel):
     ) -> None:
         states = live_of(model.signals.names).states
         self.hull, self.vessel, self.mean = model, vessel, hold == "mean"
+        self.axis = axis = vessel.axis
         geared = vessel.rate is not None or vessel.lag is not None
-        self.state = (*states, "delta") if geared else states
+        self.state = (*states, axis.gear) if geared else states
         self.inputs, self.rate = vessel.inputs, vessel.rate
-        if not {"delta", "cmd_delta"} & set(columns):
+        if not {axis.gear, axis.command} & set(columns) or axis.value not in states:
             raise ConfigError(
-                "heading control needs a model that is driven by 'delta' or 'cmd_delta'; its"
-                f" inputs are {', '.join(columns)}"
+                f"{axis.name} control needs a model that tells {axis.value} and is driven by"
+                f" '{axis.gear}' or '{axis.command}'; it tells {', '.join(states)}, and its inputs"
+                f" are {', '.join(columns)}"
             )
         self.any_step = model.n_state == 0
         self.take: list[int] = []
@@ -330,7 +332,9 @@ class SteeredModel(SteeredVessel):
 
         One without memory takes steps of any length.
         """
-        return VariedModel(self.hull, dt, self.take, self.mean, self.rate, self.vessel.lag)
+        return VariedModel(
+            self.hull, dt, self.take, self.mean, self.rate, self.vessel.lag, self.axis
+        )
 
     def memory(self, variation: Tensor) -> Tensor:
         """Return the variation, then the head's memory without a past."""
