@@ -33,7 +33,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2922, 318),
     "runs": (384, 50),
     "simulators": (355, 42),
-    "tasks": (3134, 256),
+    "tasks": (3140, 257),
     "testing": (480, 30),
     "training": (1362, 156),
     "": (458, 52),

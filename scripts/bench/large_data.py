@@ -20,9 +20,7 @@ start-up included, and the largest resident memory.
 from __future__ import annotations
 
 import argparse
-import os
 import platform
-import resource
 import subprocess
 import sys
 import tempfile
@@ -155,24 +153,34 @@ def carried_out(file: Path, out: Path, in_memory: bool = False) -> tuple[float, 
     started = time.perf_counter()
     module = ["-c", _IN_MEMORY] if in_memory else ["-m", "residnet"]
     argument = [*module, "run", str(file), "--out", str(out), "--workers", "1"]
-    usage = _called(argument, out.with_suffix(".log"))
-    return time.perf_counter() - started, usage.ru_maxrss * 1024.0
+    _, peak = _called(argument, out.with_suffix(".log"))
+    return time.perf_counter() - started, peak
 
 
-def _called(argument: list[str], said: Path, most: int = 0) -> resource.struct_rusage:
-    """Run Python with arguments, and return what it used; what it says goes to a file.
+_ALONE = """
+import os, subprocess, sys
+with open(sys.argv[1], "w") as stream:
+    process = subprocess.Popen(sys.argv[2:], stdout=stream, stderr=subprocess.STDOUT)
+    _, status, usage = os.wait4(process.pid, 0)
+code = os.waitstatus_to_exitcode(status)
+print(code, usage.ru_utime + usage.ru_stime, 1024 * usage.ru_maxrss)
+"""
+"""Carries out a command from a small process: one that this large one starts has its peak too."""
+
+
+def _called(argument: list[str], said: Path, most: int = 0) -> tuple[float, float]:
+    """Run Python with arguments; return its processor time in s and its largest memory in bytes.
+
+    What it says goes to a file.
 
     Raises:
         RuntimeError: where it ends with a code above `most`, with the end of what it said.
     """
-    with said.open("w") as stream:
-        call = [sys.executable, *argument]
-        process = subprocess.Popen(call, stdout=stream, stderr=subprocess.STDOUT)
-        _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if not 0 <= process.returncode <= most:
+    call = [sys.executable, "-c", _ALONE, str(said), sys.executable, *argument]
+    code, seconds, peak = subprocess.run(call, capture_output=True, check=True).stdout.split()
+    if not 0 <= int(code) <= most:
         raise RuntimeError("\n".join(said.read_text().splitlines()[-12:]))
-    return usage
+    return float(seconds), float(peak)
 
 
 def write_csv(folder: Path, logs: list[Log]) -> None:
@@ -190,8 +198,7 @@ def looked_at(folder: Path, commands: tuple[str, ...], count: int, what: str) ->
         further = ["--defaults", "--out", str(folder / "drafted.yaml")] if command == "new" else []
         argument = ["-m", "residnet", command, str(folder), "--quiet", *further]
         # a fault that is found is no failure
-        usage = _called(argument, folder.with_suffix(".log"), most=1)
-        seconds, peak = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024.0
+        seconds, peak = _called(argument, folder.with_suffix(".log"), most=1)
         each = f"{1e3 * seconds / count:.1f} ms a log, " if what == "logs" else ""
         print(
             f"{command} on {count} {what}: {seconds:.1f} s of processor time, {each}"

@@ -26,17 +26,8 @@ from residnet.data.drafting.questions import Answer, Marks, commented
 from residnet.data.drafting.reading import INPUTS, log_files, read_drafted
 from residnet.data.drafting.words import PLANES, input_channel, state_channel, words_of
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
 from residnet.data.split import SPLITS, called_splits, divided, without_copies
-from residnet.identification.recipe import (
-    Preparation,
-    integrator,
-    judging,
-    protocols,
-    window_length,
-)
-from residnet.tasks.fit import FitConfig
 
 _UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
 _INSPECTED = 12
@@ -137,6 +128,11 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
         )
     inputs = read.keep(inputs, marks)
     live = read.live
+    told, doubts = _doubts(list(read.logs.values()), inputs)
+    # torch takes 190 MB, which do not stand beside what the doctor takes of a long log
+    from residnet.identification.recipe import Preparation, integrator, judging
+    from residnet.tasks.fit import FitConfig
+
     chosen = Preparation.of(list(read.whole.values()), inputs, live)
     signals = {"inputs": list(inputs)}
     if not live.planar:
@@ -153,20 +149,8 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
     ):
         marks.note(CHANNELS, "the wind is left out: its loads need u, v, r and a measured heading")
     preparation = chosen.content()
-    logs = list(read.logs.values())
-    told: dict[str, list[str]] = {}
-    for log in logs[:: max(1, len(logs) // _INSPECTED)]:
-        try:
-            found = inspect(log, [name for name in inputs if name in log.channels])
-        except ResidnetError as error:
-            marks.note(("data",), f"data doctor: {log.name}: {error}")
-            continue
-        for finding in found.findings:
-            if finding.level != "note" or finding.code == "roll":
-                told.setdefault(finding.code, []).append(f"{log.name}: {finding.text}")
-    for texts in told.values():
-        more = f" (and {len(texts) - 1} more logs)" if len(texts) > 1 else ""
-        marks.note(("data",), f"data doctor: {texts[0][:300]}{more}")
+    for text in doubts:
+        marks.note(("data",), f"data doctor: {text}")
     if "frozen" in told:
         where = {"channels": list(live.channels)} if live.dead else {}
         preparation |= {"masks": [{"kind": "frozen", **where}]}
@@ -201,6 +185,25 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
     left_out = [f"left out: {path.name}: {why}" for path, why in read.left_out.items()]
     text = commented(config, marks.comments, read.head())
     return Draft(config, guesses, text, (*left_out, *unused))
+
+
+def _doubts(logs: Sequence[Log], inputs: Sequence[str]) -> tuple[set[str], list[str]]:
+    """Return the codes of what the data doctor finds in some of the logs, and its words."""
+    told: dict[str, list[str]] = {}
+    doubts = []
+    for log in logs[:: max(1, len(logs) // _INSPECTED)]:
+        try:
+            found = inspect(log, [name for name in inputs if name in log.channels])
+        except ResidnetError as error:
+            doubts.append(f"{log.name}: {error}")
+            continue
+        for finding in found.findings:
+            if finding.level != "note" or finding.code == "roll":
+                told.setdefault(finding.code, []).append(f"{log.name}: {finding.text}")
+    for texts in told.values():
+        more = f" (and {len(texts) - 1} more logs)" if len(texts) > 1 else ""
+        doubts.append(f"{texts[0][:300]}{more}")
+    return {*told}, doubts
 
 
 class _Read:
@@ -276,6 +279,8 @@ class _Read:
 
     def usable(self, columns: Sequence[str], preparation: Mapping[str, Any]) -> dict[Path, Log]:
         """Return the logs that can be prepared; the others are left out with the reason."""
+        from residnet.data.prepare import PrepareConfig, prepare
+
         config = validate(dict(preparation), PrepareConfig, "draft")
         out: dict[Path, Log] = {}
         for path, log in self.logs.items():
@@ -357,6 +362,8 @@ def _judge_long_ones(
     split: dict[str, Any], splits: dict[str, list[Log]], memory: float, marks: Marks
 ) -> None:
     """Learn from the logs that are too short to be judged on, but for the last one of a split."""
+    from residnet.identification.recipe import protocols, window_length
+
     for name in SPLITS[1:]:
         laid = protocols(window_length(splits[name], memory)).values()
         shortest = 1.2 * min(float(entry["length"].split()[0]) for entry in laid)
