@@ -152,7 +152,7 @@ def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     )
     assert said[1].startswith("Beside it: zero 30 m (27 to 33) and 40 deg (36 to 44); the baseline")
     assert said[1].endswith("floor (measured velocities, integrated) 0.10 m and 0.20 deg.")
-    assert said[2] == "At other times: 0.50 m and 2.0 deg after 10 s."
+    assert said[2] == "At other times of these free runs: 0.50 m and 2.0 deg after 10 s."
     assert said[3] == "It holds for 12 free runs (T30) of 4 logs at mean speeds of 1.5 to 2.5 m/s."
 
 

@@ -133,7 +133,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("baseline.manoeuvres=[zigzag]", "no sample is of the manoeuvres"),
         ("training.mlp.one_step.window=99.0", "no training log holds a window of 990 samples"),
         ("refit.baseline.horizon=200.0", "no training log holds a window of 2001 samples"),
-        ("evaluation.protocols.T5.length=900", "shorter than a window of every protocol"),
+        ("evaluation.protocols.T5.length=900", "no window of a protocol"),
     ],
     "ferry": [
         ("heads.ridge.space=forces", "did you mean 'force'"),
@@ -333,5 +333,5 @@ def test_a_log_for_judging_is_as_long_as_a_window(
         assert call(monkeypatch, "check", file) == 1
         line = capsys.readouterr().err
         assert name in line
-        assert "shorter than a window" in line
+        assert "no window of a protocol" in line
         short.write_text(whole)

@@ -17,6 +17,7 @@ from residnet.core.progress import say
 from residnet.data.masks import DEAD_COMMANDS
 from residnet.data.prepare import Prepared, prepare
 from residnet.identification.settings import FitSettings
+from residnet.judge.protocol import longest_stretch
 from residnet.training.current import estimate_currents, through_water
 
 _LONGEST = 500_000
@@ -115,8 +116,10 @@ def require_window(log: Prepared, settings: FitSettings) -> None:
     step, protocols = settings.prepare.grid.step, settings.evaluation.protocols
     if not any(protocol.windows(log, 0, step) for protocol in protocols.values()):
         raise DataError(
-            f"log {log.log.name}: its {len(log) * step:.1f} s are shorter than a window of every"
-            f" protocol ({', '.join(protocols)}); leave it out or shorten evaluation.protocols"
+            f"log {log.log.name}: lasts {len(log) * step:.1f} s, its longest stretch without a gap"
+            f" {longest_stretch(log) * step:.1f} s: no window of a protocol"
+            f" ({', '.join(protocols)}) fits; fill gaps that may be interpolated, leave it out or"
+            " shorten evaluation.protocols"
         )
 
 

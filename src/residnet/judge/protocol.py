@@ -153,6 +153,11 @@ class Overlapping(Windows):
         return self.overlapping(log, number, step, self.length / 4)
 
 
+def longest_stretch(log: Prepared) -> int:
+    """Return the samples of the longest stretch without a gap, which no free run goes across."""
+    return int((stretch_bounds(log.piece)[1] - np.arange(len(log))).max())
+
+
 def all_windows(
     protocol: Windows | WholeManoeuvre, logs: Sequence[Prepared], step: float, name: str
 ) -> list[Window]:
@@ -166,7 +171,7 @@ def all_windows(
     ]
     if not out:
         longest = max(logs, key=len)
-        whole = max((stretch_bounds(log.piece)[1] - np.arange(len(log))).max() for log in logs)
+        whole = max(map(longest_stretch, logs))
         raise DataError(
             f"protocol {name}: none of {len(logs)} '{logs[0].split}' logs holds a window; the"
             f" longest, {longest.log.name}, lasts {len(longest) * step:.1f} s, and the longest"

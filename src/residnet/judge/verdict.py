@@ -224,7 +224,7 @@ def ahead(evidence: Evidence) -> list[str]:
         start,
         f"Beside it: {'; '.join([*beside, *([floor] if known else [])])}.",
         *wanted,
-        *([f"At other times: {'; '.join(rest)}."] if rest else []),
+        *([f"At other times of these free runs: {'; '.join(rest)}."] if rest else []),
         holds,
         compared(evidence),
     ]

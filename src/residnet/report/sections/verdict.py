@@ -103,9 +103,12 @@ def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
             return Cell("✗", diverged_note(row), "text")
         return Cell("✓" if row["model"] in known else DASH, mark="text")
 
+    elsewhere = run.main != run.protocols[0]
     told = [
         f"Mean of {plural(rows[run.lead]['windows'], 'free run')} on {run.focus} data"
-        f" ({run.main})"
+        f" ({run.main}"
+        + f", which start elsewhere than those of {run.protocols[0]} above" * elsewhere
+        + ")"
         + (
             "; small: 95 % interval of this mean (above: of as many new runs)."
             if rows[run.lead].get(f"{run.ends[0]}_error_end_ci95")
