@@ -16,7 +16,6 @@ from residnet.control.courses.course_plan import Course
 from residnet.control.guidance import (
     CourseGuidance,
     DriftEstimate,
-    IntegralLookAhead,
     LineOfSight,
     LookAhead,
     TrackKeeping,
@@ -80,7 +79,7 @@ CROSS = [0.8, -1.6, 0.0]
 @pytest.mark.long
 def test_a_leg_is_kept_at_the_crab_angle_of_the_current() -> None:
     for reference, policy in (
-        (legs(IntegralLookAhead(12.0, 0.8, DT)), LAW),
+        (legs(LookAhead(12.0, DriftEstimate(12.0, 0.8, DT))), LAW),
         (along(DriftEstimate(12.0, 0.8, DT)), FOLLOWER),
     ):
         heading, error = sailed(reference, policy, CROSS, 120.0)
@@ -114,7 +113,7 @@ def test_a_quarter_of_the_speed_returns_to_the_leg_as_two_equal_poles_do() -> No
     turns at once.
     """
     drift, a = DriftEstimate(12.0, 0.8, 0.01), SPEED / 24.0
-    sight = IntegralLookAhead(12.0, 0.8, 0.01)
+    sight = LookAhead(12.0, drift)
     assert sight.n_state == 2
     error, s, direction = (
         torch.tensor([0.1], dtype=torch.float64),
@@ -147,7 +146,10 @@ def test_what_one_leg_has_taught_is_known_on_the_next() -> None:
 
 
 def test_guidance_with_integral_action_compiles() -> None:
-    for module in (along(DriftEstimate(12.0, 0.8, DT)), legs(IntegralLookAhead(12.0, 0.8, DT))):
+    for module in (
+        along(DriftEstimate(12.0, 0.8, DT)),
+        legs(LookAhead(12.0, DriftEstimate(12.0, 0.8, DT))),
+    ):
         x, _ = VESSEL.start(torch.ones(1, dtype=torch.float64))
         s = module.initial_state(x)
         for mine, theirs in zip(module(x, 0, s), torch.jit.script(module)(x, 0, s), strict=True):

@@ -322,20 +322,28 @@ class LineOfSight(nn.Module, ABC):
 
 @final
 class LookAhead(LineOfSight):
-    """Steering for the point of the leg a distance ahead of the vessel: -atan(error / distance).
+    """Steering for the point of the leg a distance ahead: -atan(error / distance).
 
-    Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section 12.3.
+    With an estimate of the drift D across the leg, -atan(error / distance + D), the crab angle that
+    a steady current needs. Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion
+    Control, section 12.3. Memory: of `DriftEstimate`, where there is one.
 
     Args:
         distance: along the leg in m.
+        drift: None for none.
     """
 
-    def __init__(self, distance: float) -> None:
+    def __init__(self, distance: float, drift: DriftEstimate | None = None) -> None:
         super().__init__()
-        self.distance = distance
+        self.distance, self.drift = distance, drift
+        self.n_state = 0 if drift is None else 2
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return -torch.atan(error / self.distance), s
+        slope = error / self.distance
+        if self.drift is not None:
+            slope = slope + self.drift.across(direction, s)
+            s = self.drift(error, direction, s)
+        return -torch.atan(slope), s
 
 
 @final
@@ -356,32 +364,6 @@ class Enclosure(LineOfSight):
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         return -torch.asin((error / self.radius).clamp(-1.0, 1.0)), s
-
-
-@final
-class IntegralLookAhead(LineOfSight):
-    """Look-ahead steering with the crab angle that a steady current needs.
-
-    The angle is -atan(error / distance + D).
-
-    Memory [B, 2]: of `DriftEstimate`, whose D across the leg this is.
-
-    Args:
-        distance: along the leg in m.
-        gain: of the estimate in m/s.
-        dt: step of the guidance in s.
-    """
-
-    def __init__(self, distance: float, gain: float, dt: float) -> None:
-        super().__init__()
-        self.drift = DriftEstimate(distance, gain, dt)
-        self.distance = distance
-        self.n_state = 2
-
-    def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return -torch.atan(error / self.distance + self.drift.across(direction, s)), self.drift(
-            error, direction, s
-        )
 
 
 class LookAheadConfig(Config):
@@ -429,7 +411,7 @@ class IntegralLookAheadConfig(Config):
 
     def build(self, dt: float) -> LineOfSight:
         """Return the law, for steps of dt seconds."""
-        return IntegralLookAhead(self.distance, self.gain, dt)
+        return LookAhead(self.distance, DriftEstimate(self.distance, self.gain, dt))
 
 
 AnyLineOfSight = Annotated[
