@@ -212,7 +212,7 @@ def test_allocated_to_azimuth_thrusters() -> None:
     point[0, 0, :3] = torch.tensor([0.5, -0.3, 0.2], dtype=torch.float64)
     x0 = plant.approach(1)
     asked_for = controller(x0, point[:, 0], torch.zeros(1, 3, dtype=torch.float64))[0]
-    command = Allocated(controller, plant.actuators)(
+    command = Allocated(controller, plant.actuators.allocate)(
         x0, point[:, 0], torch.zeros(1, 3, dtype=torch.float64)
     )[0]
     torch.testing.assert_close(
@@ -220,7 +220,7 @@ def test_allocated_to_azimuth_thrusters() -> None:
     )
     w = torch.zeros(1, 600, len(plant.inputs), dtype=torch.float64)
     w[..., plant.inputs.index("force_north")] = 40.0
-    loop = ClosedLoop(Allocated(controller, plant.actuators), GivenReference(point))
+    loop = ClosedLoop(Allocated(controller, plant.actuators.allocate), GivenReference(point))
     with torch.no_grad():
         states, _, _ = Rollout(RecordedPlantDynamics(plant, dt), loop)(x0, w, x0[:, :0])
     torch.testing.assert_close(states[0, -1, :3], point[0, 0, :3], atol=0.02, rtol=0)

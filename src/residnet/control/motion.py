@@ -6,7 +6,7 @@ Source: document 002 sections 2.2 and 2.2.1, eq. (2.15), corrections J7, J9, J13
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal, NamedTuple, final
 
 import torch
@@ -19,7 +19,6 @@ from residnet.core.columns import accelerations, pose, velocities
 from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body, wrap
-from residnet.physics.actuators import ForceActuators
 from residnet.physics.force_model import ForceModel
 from residnet.physics.plant import Hull
 
@@ -237,23 +236,25 @@ class MotionPID(Policy):
 
 @final
 class Allocated(Policy):
-    """A controller of forces for a vessel whose actuators can make them.
+    """A controller whose demands are turned into the commands of a vessel.
 
-    Its tau is allocated to their commands, such as revolutions and angles of azimuth thrusters.
+    Its forces, for example, are allocated to revolutions and angles of azimuth thrusters.
+
+    Args:
+        allocate: returns commands [B, c] for what the controller demands, [B, d].
     """
 
-    def __init__(self, policy: Policy, thrusters: ForceActuators) -> None:
+    def __init__(self, policy: Policy, allocate: Callable[[Tensor], Tensor]) -> None:
         super().__init__()
-        self.policy = policy
-        self.thrusters = thrusters
+        self.policy, self.allocate = policy, allocate
         self.n_state = policy.n_state
 
     def initial_state(self, x: Tensor) -> Tensor:
         return self.policy.initial_state(x)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        tau, s = self.policy(x, reference, s)
-        return self.thrusters.allocate(tau), s
+        demanded, s = self.policy(x, reference, s)
+        return self.allocate(demanded), s
 
 
 _STEP = 0.05

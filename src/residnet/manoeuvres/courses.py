@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, final
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
 
+from residnet.control.base import ClosedLoop
 from residnet.control.guidance import LookAhead, WaypointGuidance
 from residnet.control.heading.classical import HeadingPID
-from residnet.control.motion import MotionPIDConfig, ReferenceFilterConfig, Waypoint
+from residnet.control.motion import Allocated, MotionPIDConfig, ReferenceFilterConfig, Waypoint
 from residnet.core.config import Metres, RadiansPerSecond, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.frames import wrap_array
 from residnet.core.layout import HEADING, MOTION, PLANAR, POSE
 from residnet.core.log import Log
 from residnet.dynamics.rollout import Source
-from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, commanded
+from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 
 _POSE = PLANAR.pose
 
@@ -54,8 +55,18 @@ class Waypoints(Manoeuvre):
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Return the closed loop on position and heading; each row has a course of its own."""
-        sources = [WaypointSource(m, helm) for m in manoeuvres if isinstance(m, Waypoints)]
+        for name in (*_POSE, "r"):
+            helm.column(name)
+        sources = [m._loop(helm) for m in manoeuvres if isinstance(m, Waypoints)]
         return StackedSource(sources, [1] * len(sources))
+
+    def _loop(self, helm: Helm) -> ClosedLoop:
+        autopilot = HeadingPID(helm.state, kp=self.gain, kd=self.rate_gain, limit=1.0)
+
+        def commands(steer: Tensor) -> Tensor:
+            return helm.demand(torch.full_like(steer[:, 0], self.drive), steer[:, 0])
+
+        return ClosedLoop(Allocated(autopilot, commands), self.guidance(helm.state))
 
     @property
     def goal(self) -> str:
@@ -77,36 +88,6 @@ class Waypoints(Manoeuvre):
             "rms_cross_track_error": math.sqrt(np.mean(np.square(errors))),
             "course_time": float(log.t[min(len(errors), len(log) - 1)] - log.t[0]),
         }
-
-
-@final
-class WaypointSource(Source):
-    """The source of one way-point course; its memory is the guidance's."""
-
-    def __init__(self, manoeuvre: Waypoints, helm: Helm) -> None:
-        super().__init__()
-        for name in (*_POSE, "r"):
-            helm.column(name)
-        self.guidance = manoeuvre.guidance(helm.state)
-        self.autopilot = HeadingPID(
-            helm.state, kp=manoeuvre.gain, kd=manoeuvre.rate_gain, limit=1.0
-        )
-        self.drive = manoeuvre.drive
-        self.demand = helm.demand
-        self.may_stop = True
-
-    def initial(self, x: Tensor) -> Tensor:
-        return self.guidance.initial_state(x)
-
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        heading, memory = self.guidance(x, k, memory)
-        steer, _ = self.autopilot(x, heading, x[:, :0])
-        command = self.demand(torch.full_like(steer[:, 0], self.drive), steer[:, 0])
-        return commanded(command, w), memory
-
-    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return which rows [B] have arrived at the last way-point."""
-        return self.guidance.finished(x, k, memory)
 
 
 _H, _D = math.pi / 2, math.pi / 4
@@ -160,8 +141,17 @@ class FourCorner(Manoeuvre):
         Raises:
             UsageError: where the vessel has no command for each of the three forces.
         """
+        if helm.forces is None or helm.state[MOTION] != PLANAR.names:
+            raise UsageError(
+                "a four-corner course needs a vessel in surge, sway and yaw that is commanded in"
+                " all three, by forces or azimuth thrusters"
+            )
         step = float(t[1] - t[0])
-        sources = [FourCornerSource(m, helm, step) for m in manoeuvres if isinstance(m, FourCorner)]
+        sources = [
+            ClosedLoop(Allocated(m.control.build(step), helm.forces), m.filter.build(step))
+            for m in manoeuvres
+            if isinstance(m, FourCorner)
+        ]
         return StackedSource(sources, [1] * len(sources))
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
@@ -178,29 +168,3 @@ class FourCorner(Manoeuvre):
             "mean_position_error": float(np.hypot(*error[:, :HEADING].T).mean()),
             "mean_heading_error": float(np.abs(wrap_array(error[:, HEADING])).mean()),
         }
-
-
-@final
-class FourCornerSource(Source):
-    """Reference filter and PID of one course, their memories side by side."""
-
-    def __init__(self, manoeuvre: FourCorner, helm: Helm, step: float) -> None:
-        super().__init__()
-        if helm.forces is None or helm.state[MOTION] != PLANAR.names:
-            raise UsageError(
-                "a four-corner course needs a vessel in surge, sway and yaw that is commanded in"
-                " all three, by forces or azimuth thrusters"
-            )
-        self.forces = helm.forces
-        self.reference = manoeuvre.filter.build(step)
-        self.policy = manoeuvre.control.build(step)
-
-    def initial(self, x: Tensor) -> Tensor:
-        """Return the filter at the vessel's pose, no integral."""
-        return torch.cat((self.reference.initial_state(x), self.policy.initial_state(x)), dim=-1)
-
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        n = self.reference.n_state
-        target, guided = self.reference(x, k, memory[:, :n])
-        tau, s = self.policy(x, target, memory[:, n:])
-        return commanded(self.forces(tau), w), torch.cat((guided, s), dim=-1)

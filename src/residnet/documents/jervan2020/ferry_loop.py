@@ -267,7 +267,7 @@ class Ferry:
         if not feedback:
             gains = gains.model_copy(update={"frequency": (0.0, 0.0, 0.0)})
         pid = gains.pid(self.believed.mass)
-        policy = Allocated(Assisted(pid, lags, step), self.thrusters)
+        policy = Allocated(Assisted(pid, lags, step), self.thrusters.allocate)
         inputs = len(self.true.inputs)
         asked = torch.zeros(len(feeds), 0, 0, dtype=torch.float64)
         if isinstance(path, CrossingConfig):
