@@ -16,8 +16,10 @@ from residnet.control.courses.config import (
     BuoyConfig,
     BuoyCourseConfig,
     feasibility,
+    overlapping,
     plan_course,
     smallest_turn,
+    widened,
 )
 from residnet.control.courses.course_plan import Course
 from residnet.control.courses.turns import TurnMaker, steady_turn, turning_step
@@ -54,7 +56,16 @@ def circle(radius: float, step: float = 0.1) -> Course:
 def test_the_steady_turn_is_that_of_the_model(vessel: SteeredPlant) -> None:
     steady = steady_turn(vessel, LIMIT, 100.0, 0.05)
     assert steady.radius == pytest.approx(3.2 / (3.47 * LIMIT), rel=1e-3)
-    assert not any(one["possible"] for one in feasibility(WANTED.buoys, steady.radius))
+    # printed radii of 10 m are too tight for five degrees of rudder
+    assert not any(one["possible"] for one in feasibility(BUOYS, steady.radius))
+    wide = feasibility(widened(BUOYS, steady.radius), steady.radius)
+    assert all(one["possible"] for one in wide)
+
+
+def test_circles_that_overlap_leave_no_way_between_them() -> None:
+    near = BUOYS[1].model_copy(update={"north": 50, "east": 45})
+    assert overlapping([BUOYS[0], near, BUOYS[2]]) == [(1, 2)]
+    assert overlapping(BUOYS) == []
 
 
 def test_turns_take_the_time_of_full_rudder_and_counter_rudder(vessel: SteeredPlant) -> None:
@@ -121,7 +132,7 @@ def test_no_part_of_a_plan_is_tighter_than_the_vessel_turns_and_buoys_stay_outsi
     assert np.abs(np.diff(heading)).max() <= 1.03 * planned.course.step / steady.radius
     for buoy in planned.buoys:
         assert np.hypot(inside[:, 0] - buoy.north, inside[:, 1] - buoy.east).min() >= steady.radius
-    assert planned.course.length <= 1.06 * planned.reference
+    assert planned.reference < planned.course.length <= 1.06 * planned.reference
 
 
 @pytest.mark.long
@@ -141,7 +152,9 @@ def test_a_given_heading_lengthens_the_shortest_course_past_sides(vessel: Steere
     assert onward.reference == pytest.approx(free.reference, rel=2e-3)
     assert onward.course.length == pytest.approx(free.course.length, rel=0.02)
     assert away.reference > free.reference + math.pi * steady.radius
-    assert free.course.length + steady.radius < away.course.length < 1.15 * away.reference
+    assert free.course.length + steady.radius < away.course.length
+    # it comes round within a full turn
+    assert away.course.length < 1.05 * (free.course.length + 2.0 * math.pi * steady.radius)
 
 
 def test_circles_of_acceptance_are_entered(vessel: SteeredPlant) -> None:
@@ -153,7 +166,7 @@ def test_circles_of_acceptance_are_entered(vessel: SteeredPlant) -> None:
     inside = planned.course.track[: int(planned.course.length / planned.course.step) + 2]
     for buoy in BUOYS:
         assert np.hypot(inside[:, 0] - buoy.north, inside[:, 1] - buoy.east).min() <= 3.4
-    assert planned.course.length <= 1.06 * planned.reference
+    assert planned.reference < planned.course.length <= 1.06 * planned.reference
 
 
 def test_what_is_missed_is_passed_farther_off_next_time(vessel: SteeredPlant) -> None:

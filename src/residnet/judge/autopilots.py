@@ -18,7 +18,7 @@ from torch import Tensor
 
 from residnet.control.base import Policy
 from residnet.control.courses.config import PlannedCourse
-from residnet.control.courses.course_check import Asked, passages
+from residnet.control.courses.course_check import passages
 from residnet.control.heading.conditions import (
     ConditionedRun,
     ConditionsConfig,
@@ -114,21 +114,19 @@ def _cheaper(model: str, rows: Sequence[Mapping[str, Any]], protocol: str, what:
     return [f"{what} a flight costs {own:.4g} s, with {best} {laws[best]:.4g} s"]
 
 
+def _row(controller: str, kind: str, protocol: str, found: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Return a row of metrics.json with the distributions of what was found, [B] by name."""
+    row = {"model": controller, "kind": kind, "split": "simulated", "protocol": protocol}
+    return row | {name: distribution(values) for name, values in found.items()}
+
+
 def step_row(
     controller: str, kind: str, protocol: str, flights: Flights, band: float
 ) -> dict[str, Any]:
     """Return a row of metrics.json: distributions, flights not settled at the end, flights."""
-    found = measure(flights, band)
     finite = torch.isfinite(flights.states).all(dim=2).all(dim=1)
     unsettled = (flights.error[:, -1].abs() > band) | ~finite
-    out: dict[str, Any] = {
-        "model": controller,
-        "kind": kind,
-        "split": "simulated",
-        "protocol": protocol,
-    }
-    out |= {name: distribution(values) for name, values in found.items()}
-    return out | {
+    return _row(controller, kind, protocol, measure(flights, band)) | {
         "unsettled": int(unsettled.sum()),
         "n": len(finite),
         "diverged": int((~finite).sum()),
@@ -209,15 +207,7 @@ def sea_row(controller: str, kind: str, flights: Flights, start: float) -> dict[
     }
     if "phi" in flights.names:
         found["heel_rms"] = flights.rms("phi", start)
-    out: dict[str, Any] = {
-        "model": controller,
-        "kind": kind,
-        "split": "simulated",
-        "protocol": "sea",
-    }
-    return (
-        out | {name: distribution(values) for name, values in found.items()} | {"n": len(settled)}
-    )
+    return _row(controller, kind, "sea", found) | {"n": len(settled)}
 
 
 def _nominal(rows: int) -> Tensor:
@@ -280,9 +270,8 @@ def judged(
         name: torch.where(finite, values, worst if name == "cost" else torch.nan)
         for name, values in flown.measured(conditions).items()
     }
-    row = {"model": controller, "kind": kind, "split": "simulated", "protocol": protocol}
     kept = {name: values if name == "cost" else values[finite] for name, values in found.items()}
-    figures = {name: distribution(values) for name, values in kept.items() if len(values)}
+    known = {name: values for name, values in kept.items() if len(values)}
     table = pd.DataFrame(
         {
             "controller": controller,
@@ -291,7 +280,8 @@ def judged(
             **{name: values.numpy() for name, values in found.items()},
         }
     )
-    return {**row, **figures, "n": len(finite), "diverged": int((~finite).sum())}, table
+    row = _row(controller, kind, protocol, known)
+    return row | {"n": len(finite), "diverged": int((~finite).sum())}, table
 
 
 def swinging(
@@ -307,16 +297,9 @@ def swinging(
     most = _ALLOWED * limits.of(flown.axis)[0], _ALLOWED * limits.rudder_swing
     # what is no number is not within its limit
     steady = (heading <= most[0]) & (rudder <= most[1])
-    return {
-        "model": controller,
-        "kind": kind,
-        "split": "simulated",
-        "protocol": "quiet",
-        "heading_swing": distribution(heading),
-        "rudder_swing": distribution(rudder),
-        "cycling": int((~steady).sum()),
-        "n": len(heading),
-    }
+    found = {"heading_swing": heading, "rudder_swing": rudder}
+    row = _row(controller, kind, "quiet", found)
+    return row | {"cycling": int((~steady).sum()), "n": len(heading)}
 
 
 @dataclass(frozen=True)
@@ -421,38 +404,6 @@ class CourseFlight:
     finished: bool
 
 
-@dataclass(frozen=True)
-class Pass:
-    """A passage of a buoy.
-
-    Attributes:
-        distance: smallest distance on the whole course after the start has been left, in m.
-        side: that the buoy lay on when it was nearest, in its turn.
-        time: of that, in s.
-    """
-
-    distance: float
-    side: str
-    time: float
-
-
-def passes(
-    flight: CourseFlight, places: Sequence[tuple[float, float]], within: Sequence[float]
-) -> list[Pass]:
-    """Return how each buoy at (north, east) was passed, one after the other.
-
-    The moments follow each other, and the sum of the distances then is least.
-
-    Args:
-        within: radii in m; a vessel that starts in a circle first leaves it.
-    """
-    asked = [Asked(*place, radius, "") for place, radius in zip(places, within, strict=True)]
-    return [
-        Pass(passage.least, passage.side, passage.at * flight.dt)
-        for passage in passages(flight.track, asked)
-    ]
-
-
 def row(
     model: str,
     kind: str,
@@ -469,19 +420,19 @@ def row(
     how far inside the circle that was entered least, or outside the one that was passed most
     closely.
     """
-    places = [(buoy.north, buoy.east) for buoy in planned.buoys]
-    radii = [acceptance if planned.protocol == "enter" else buoy.radius for buoy in planned.buoys]
-    seen = passes(flight, places, radii)
+    enters = planned.protocol == "enter"
+    buoys = [
+        buoy.model_copy(update={"radius": acceptance}) if enters else buoy for buoy in planned.buoys
+    ]
+    seen = passages(flight.track, buoys)
     time = (len(flight.track) - 1) * flight.dt
+    rate = np.abs(np.diff(flight.heading)) / flight.dt
     out: dict[str, Any] = {
         "model": model,
         "kind": kind,
         "guidance": guidance,
         "split": "simulated",
         "protocol": planned.protocol,
-    }
-    rate = np.abs(np.diff(flight.heading)) / flight.dt
-    out |= {
         "finished": flight.finished,
         "course_time": time,
         "reference_time": planned.reference / speed,
@@ -491,27 +442,17 @@ def row(
         "cross_track_max": float(np.abs(flight.cross_track).max()),
         "travel": float(abs(flight.rudder[0]) + np.abs(np.diff(flight.rudder)).sum()),
         "tightest_turn": float((flight.speed[:-1] / np.maximum(rate, 1e-9)).min()),
-        "distances": [passage.distance for passage in seen],
+        "distances": [passage.least for passage in seen],
     }
-    if planned.protocol == "enter":
-        inside = [radius - passage.distance for passage, radius in zip(seen, radii, strict=True)]
-        entered = sum(margin >= 0 for margin in inside)
-        return out | {
-            "entered": entered,
-            "passed": entered == len(seen),
-            "margin": min(inside),
-            "n": len(seen),
-        }
-    buoys = zip(seen, planned.buoys, strict=True)
-    right = sum(passage.side == buoy.leave_to for passage, buoy in buoys)
-    outside = [passage.distance - radius for passage, radius in zip(seen, radii, strict=True)]
-    clear = sum(margin >= 0 for margin in outside)
-    passed = {"right_side": right, "clear": clear, "clearance": min(outside)}
-    return (
-        out
-        | passed
-        | {"passed": right == clear == len(seen), "margin": min(outside), "n": len(seen)}
-    )
+    outside = [passage.least - buoy.radius for passage, buoy in zip(seen, buoys, strict=True)]
+    margins = [-distance for distance in outside] if enters else outside
+    kept, right = sum(margin >= 0 for margin in margins), len(seen)
+    if enters:
+        out |= {"entered": kept}
+    else:
+        right = sum(one.side == buoy.leave_to for one, buoy in zip(seen, buoys, strict=True))
+        out |= {"right_side": right, "clear": kept, "clearance": min(margins)}
+    return out | {"passed": right == kept == len(seen), "margin": min(margins), "n": len(seen)}
 
 
 def spread_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

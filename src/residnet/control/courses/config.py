@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from functools import cached_property
 
 import numpy as np
 from pydantic import Field
 
-from residnet.control.courses.course_check import Asked, Protocol
+from residnet.control.courses.course_check import BuoyConfig, Protocol
 from residnet.control.courses.course_plan import Course, CourseRequest, plan
 from residnet.control.courses.outline import Circle
 from residnet.control.courses.turns import (
@@ -28,65 +28,10 @@ from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError
 
-Side = Literal["starboard", "port"]
-
-
-class BuoyConfig(Config):
-    """A buoy with the side to pass it on and the circle to keep out of.
-
-    Attributes:
-        north: place in m.
-        east: place in m.
-        leave_to: the side of the vessel that it passes on; rounded to starboard, it is left to
-            starboard. Document 004 plots x to the right and y upwards: its "counter-clockwise" is a
-            turn from x towards y, to starboard with x north and y east.
-        radius: of the circle that the vessel must stay outside of.
-    """
-
-    north: Metres
-    east: Metres
-    leave_to: Side
-    radius: Metres
-
-
-class Piece(NamedTuple):
-    """A part of a course: a straight line (`turn` 0) or an arc about a centre.
-
-    An arc turns to starboard (+1) or port (-1).
-
-    Attributes:
-        length: in m.
-        north, east, heading: of its beginning, in m and rad.
-        turn: see above.
-        radius: of an arc in m.
-    """
-
-    length: float
-    north: float
-    east: float
-    heading: float
-    turn: int
-    radius: float
-
 
 def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
     """Return the buoys with radii that the vessel can follow."""
     return [buoy.model_copy(update={"radius": max(buoy.radius, smallest)}) for buoy in buoys]
-
-
-def taut_course(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> list[Piece]:
-    """Return the taut course from a point round the buoys in their order, to the last one's circle.
-
-    It consists of tangents and arcs in turn, as a rope would lie that is laid round every buoy on
-    its side.
-
-    Raises:
-        ConfigError: where the start lies in the first circle, or circles overlap so that no tangent
-            joins them.
-    """
-    if not buoys:
-        raise ConfigError("a course needs at least one buoy")
-    return _tangents(start, list(enumerate(buoys, start=1)))
 
 
 def overlapping(buoys: Sequence[BuoyConfig]) -> list[tuple[int, int]]:
@@ -100,106 +45,6 @@ def overlapping(buoys: Sequence[BuoyConfig]) -> list[tuple[int, int]]:
         if one.leave_to != two.leave_to
         and math.hypot(two.north - one.north, two.east - one.east) < one.radius + two.radius
     ]
-
-
-def _tangents(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]]) -> list[Piece]:
-    """Return the course that touches every circle of numbered buoys."""
-    signs = [1 if buoy.leave_to == "starboard" else -1 for _, buoy in buoys]
-    lines: list[tuple[float, float, float, float]] = []
-    north, east, radius, sign = start[0], start[1], 0.0, 0
-    for (number, buoy), side in zip(buoys, signs, strict=True):
-        along, across = buoy.north - north, buoy.east - east
-        # the tangent from circle 0 to circle 1: the centres' line in its own frame is (length, s1
-        # r1 - s0 r0)
-        offset = side * buoy.radius - sign * radius
-        square = along**2 + across**2 - offset**2
-        if square <= 0:
-            raise ConfigError(
-                f"buoy {number}: its circle of {buoy.radius:.4g} m overlaps what comes before it:"
-                " no tangent joins them"
-            )
-        heading = math.atan2(across, along) - math.atan2(offset, math.sqrt(square))
-        begin = (
-            north + sign * radius * math.sin(heading),
-            east - sign * radius * math.cos(heading),
-        )
-        lines.append((*begin, heading, math.sqrt(square)))
-        north, east, radius, sign = buoy.north, buoy.east, buoy.radius, side
-    pieces: list[Piece] = []
-    for number, (line_north, line_east, heading, length) in enumerate(lines):
-        if number > 0:
-            before, side = lines[number - 1], signs[number - 1]
-            turned = (side * (heading - before[2])) % (2.0 * math.pi)
-            end = (
-                before[0] + before[3] * math.cos(before[2]),
-                before[1] + before[3] * math.sin(before[2]),
-            )
-            pieces.append(
-                Piece(
-                    turned * buoys[number - 1][1].radius,
-                    *end,
-                    before[2],
-                    side,
-                    buoys[number - 1][1].radius,
-                )
-            )
-        pieces.append(Piece(length, line_north, line_east, heading, 0, 0.0))
-    return pieces
-
-
-_TURN = 2.0 * math.pi
-
-
-def _arc(side: float, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the angle turned from one heading to another, side +1 to starboard and -1 to port."""
-    # a full turn that is none but for rounding
-    turned = (side * (end - begin)) % _TURN
-    return np.where(turned > _TURN - 1e-9, 0.0, turned)
-
-
-def _centre(pose: np.ndarray, side: float, radius: float) -> np.ndarray:
-    return pose[..., :2] + side * radius * np.stack(
-        (-np.sin(pose[..., 2]), np.cos(pose[..., 2])), axis=-1
-    )
-
-
-def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarray:
-    """Return the length [...] in m of the shortest path between poses of bounded curvature.
-
-    The path is two arcs and their common tangent, or three arcs (L. E. Dubins 1957). Poses [..., 3]
-    = (north, east, heading) broadcast; turns have a radius of at least `radius`.
-    """
-    start, end = np.broadcast_arrays(np.asarray(start, dtype=float), np.asarray(end, dtype=float))
-    h0, h1 = start[..., 2], end[..., 2]
-    best = np.full(h0.shape, np.inf)
-    for side in (1.0, -1.0):
-        centre = _centre(start, side, radius)
-        line = _centre(end, side, radius) - centre
-        distance, bearing = (
-            np.hypot(line[..., 0], line[..., 1]),
-            np.arctan2(line[..., 1], line[..., 0]),
-        )
-        best = np.minimum(
-            best, radius * (_arc(side, h0, bearing) + _arc(side, bearing, h1)) + distance
-        )
-        # three arcs, the middle one about either point that is two radii from both centres
-        lean = np.arccos(np.clip(distance / (4.0 * radius), 0.0, 1.0))
-        for hand in (1.0, -1.0):
-            out = bearing + hand * lean
-            back = bearing + math.pi - hand * lean
-            first, second = out + side * 0.5 * math.pi, back + side * 0.5 * math.pi
-            turned = _arc(side, h0, first) + _arc(-side, first, second) + _arc(side, second, h1)
-            best = np.where(distance <= 4.0 * radius, np.minimum(best, radius * turned), best)
-        line = _centre(end, -side, radius) - centre
-        distance, bearing = (
-            np.hypot(line[..., 0], line[..., 1]),
-            np.arctan2(line[..., 1], line[..., 0]),
-        )
-        straight = np.sqrt(np.maximum(distance**2 - 4.0 * radius**2, 0.0))
-        heading = bearing + side * np.arctan2(2.0 * radius, straight)
-        total = radius * (_arc(side, h0, heading) + _arc(-side, heading, h1)) + straight
-        best = np.where(distance >= 2.0 * radius, np.minimum(best, total), best)
-    return best
 
 
 _STEP = math.log(1.12)
@@ -249,16 +94,23 @@ class PlannedCourse:
         course: the plan.
         buoys: with radii that the vessel can follow.
         steady: the vessel's smallest turn.
-        reference: length in m that times are compared with, for turns of that radius that begin at
-            once: of the taut course round all buoys where they are passed on their sides, which
-            need not be the shortest, and of the shortest course found where they are entered.
+        shortest: the same course without margins, for turns of that radius that begin at once.
     """
 
     protocol: Protocol
     course: Course
     buoys: tuple[BuoyConfig, ...]
     steady: SteadyTurn
-    reference: float
+    shortest: CourseRequest
+
+    @cached_property
+    def reference(self) -> float:
+        """The length in m of the shortest such course found, which times are compared with.
+
+        Raises:
+            ConfigError: where none is found.
+        """
+        return plan(self.shortest, self.course.step, self.course.step).length
 
 
 def smallest_turn(
@@ -299,7 +151,6 @@ def plan_course(
         ConfigError: where none is found.
     """
     buoys = tuple(widened(config.buoys, steady.radius))
-    step = 0.1 * turning.speed
     if protocol == "sides" and (pairs := overlapping(buoys)):
         one, two = pairs[0]
         raise ConfigError(
@@ -310,70 +161,32 @@ def plan_course(
     share = config.share * (1.0 - current)
     aside = config.current * (turning.time + config.lookahead / turning.speed)
     margin = config.reach if protocol == "enter" else config.margin
-    circles, radii = _request(config, protocol, buoys, steady.radius / share, margin, aside)
-    rudder = limit * steady.radius / radii
     # what a turn takes is seen from the yaw rate that it reaches, which K overstates in hard turns
     reached = replace(turning, gain=steady.yaw_rate / limit)
     make = TurnMaker(vessel, reached, steady.step)
-    turns = simulated_turns(make, rudder, steady.radius)
-    course = plan(
-        _asked(config, protocol, buoys, circles, turns, aside), step, 5.0 * config.lookahead, make
-    )
-    reference = _reference(config, protocol, buoys, steady, turning.speed)
-    return PlannedCourse(protocol, course, buoys, steady, reference)
 
-
-def _reference(
-    config: BuoyCourseConfig,
-    protocol: Protocol,
-    buoys: tuple[BuoyConfig, ...],
-    steady: SteadyTurn,
-    speed: float,
-) -> float:
-    """Return the length in m that plans and flights are compared with."""
-    if protocol == "enter":
-        circles, radii = _request(config, protocol, buoys, steady.radius, 0.0, 0.0)
-        asked = _asked(config, protocol, buoys, circles, arcs(radii, speed))
-        return plan(asked, 0.1 * speed, 0.1 * speed).length
-    try:
-        line, *rest = taut_course(config.start, buoys)
-    except ConfigError:
-        places = np.array([config.start, *((buoy.north, buoy.east) for buoy in buoys)])
-        return float(np.hypot(*np.diff(places, axis=0).T).sum())
-    onto = line.length
-    if config.heading is not None:
-        end = (
-            line.north + line.length * math.cos(line.heading),
-            line.east + line.length * math.sin(line.heading),
-            line.heading,
+    def request(
+        tightest: float, margin: float, aside: float, turns: Callable[[np.ndarray], Turns]
+    ) -> CourseRequest:
+        circles, radii = _circles(config, protocol, buoys, tightest, margin, aside)
+        asked = buoys
+        if protocol == "enter":
+            asked = tuple(one.model_copy(update={"radius": config.acceptance}) for one in buoys)
+        return CourseRequest(
+            config.start, config.heading, circles, asked, protocol, turns(radii), aside
         )
-        onto = float(
-            dubins_length(np.array([*config.start, config.heading]), np.array(end), steady.radius)
-        )
-    return onto + sum(piece.length for piece in rest)
+
+    def simulated(radii: np.ndarray) -> Turns:
+        return simulated_turns(make, limit * steady.radius / radii, steady.radius)
+
+    step = 0.1 * turning.speed
+    wanted = request(steady.radius / share, margin, aside, simulated)
+    course = plan(wanted, step, 5.0 * config.lookahead, make)
+    shortest = request(steady.radius, 0.0, 0.0, lambda radii: arcs(radii, turning.speed))
+    return PlannedCourse(protocol, course, buoys, steady, shortest)
 
 
-def _asked(
-    config: BuoyCourseConfig,
-    protocol: Protocol,
-    buoys: tuple[BuoyConfig, ...],
-    circles: tuple[Circle, ...],
-    turns: Turns,
-    aside: float = 0.0,
-) -> CourseRequest:
-    asked = tuple(
-        Asked(
-            buoy.north,
-            buoy.east,
-            config.acceptance if protocol == "enter" else buoy.radius,
-            buoy.leave_to,
-        )
-        for buoy in buoys
-    )
-    return CourseRequest(config.start, config.heading, circles, asked, protocol, turns, aside)
-
-
-def _request(
+def _circles(
     config: BuoyCourseConfig,
     protocol: Protocol,
     buoys: tuple[BuoyConfig, ...],

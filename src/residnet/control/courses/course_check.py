@@ -11,6 +11,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from residnet.core.config import Config, Metres
+
 Array = NDArray[np.float64]
 Protocol = Literal["enter", "sides"]
 """Buoys are entered: a circle of acceptance about each; or each is passed on its side, outside its
@@ -18,19 +20,22 @@ own circle.
 """
 
 
-class Asked(NamedTuple):
-    """What a course has to do at a buoy.
+class BuoyConfig(Config):
+    """A buoy with the side to pass it on and the circle to keep out of.
 
     Attributes:
-        north, east: in m.
-        radius: of its circle in m.
-        leave_to: side that it is passed on, starboard or port.
+        north: place in m.
+        east: place in m.
+        leave_to: the side of the vessel that it passes on; rounded to starboard, it is left to
+            starboard. Document 004 plots x to the right and y upwards: its "counter-clockwise" is a
+            turn from x towards y, to starboard with x north and y east.
+        radius: of the circle that the vessel must stay outside of.
     """
 
-    north: float
-    east: float
-    radius: float
-    leave_to: str
+    north: Metres
+    east: Metres
+    leave_to: Literal["starboard", "port"]
+    radius: Metres
 
 
 class Passage(NamedTuple):
@@ -71,7 +76,7 @@ def left_behind(distance: Array, radius: float) -> int:
     return first + int(nearer[0]) if len(nearer) else len(distance) - 1
 
 
-def passages(track: Array, buoys: Sequence[Asked]) -> list[Passage]:
+def passages(track: Array, buoys: Sequence[BuoyConfig]) -> list[Passage]:
     """Return how a track [N, 2] passes buoys in their order.
 
     The moments are in the order of the buoys, and the sum of the distances then is least.
@@ -104,7 +109,7 @@ def passages(track: Array, buoys: Sequence[Asked]) -> list[Passage]:
     return found
 
 
-def _side(track: Array, at: int, buoy: Asked) -> str:
+def _side(track: Array, at: int, buoy: BuoyConfig) -> str:
     """Return the side that a buoy lies on at a sample."""
     step = track[min(at + 1, len(track) - 1)] - track[max(at - 1, 0)]
     north, east = buoy.north - track[at, 0], buoy.east - track[at, 1]
@@ -112,7 +117,7 @@ def _side(track: Array, at: int, buoy: Asked) -> str:
 
 
 def first_fault(
-    track: Array, buoys: Sequence[Asked], protocol: Protocol, turn: float, missed: float = 0.0
+    track: Array, buoys: Sequence[BuoyConfig], protocol: Protocol, turn: float, missed: float = 0.0
 ) -> tuple[int, str] | None:
     """Return the first buoy, from 0, where a track [N, 2] does wrong, and what; None where nowhere.
 

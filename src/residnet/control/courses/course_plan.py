@@ -18,7 +18,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from residnet.control.courses.course_check import Asked, Protocol, first_fault
+from residnet.control.courses.course_check import BuoyConfig, Protocol, first_fault
 from residnet.control.courses.fitting import Fit, Fitted
 from residnet.control.courses.outline import RINGS, Circle, Outlines, Room
 from residnet.control.courses.turns import (
@@ -122,7 +122,7 @@ class _Joining:
             follows = Route(route.start, route.sides, tuple(range(len(holds))), turns)
             self.fit = self.fit.on(follows)
             for wider in _WIDER:
-                fitted = self.fit.solve(np.clip(z, follows.least(), follows.most()), wider * reach)
+                fitted = self.fit.solve(np.clip(z, *self.fit.bounds()), wider * reach)
                 self.fitted = fitted
                 if fitted.missed <= _HELD * turns.radius:
                     break
@@ -189,7 +189,7 @@ class CourseRequest:
     start: tuple[float, float]
     heading: float | None
     circles: tuple[Circle, ...]
-    buoys: tuple[Asked, ...]
+    buoys: tuple[BuoyConfig, ...]
     protocol: Protocol
     turns: Turns
     aside: float = 0.0

@@ -1,13 +1,14 @@
 """The lengths of a route's legs and turns that make it quickest and keep it right.
 
-What is asked of it, with exact derivatives; `descent` solves it.
+What is asked of it has exact derivatives; linear programs find the lengths, quadratic ones mend
+them.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,177 +32,6 @@ _HELD = (0.05, 0.3, 0.7)
 
 _BENT = (0.5, 25)
 """Largest reach of all steps of quadratic programs, and how many there are at most."""
-
-
-class Linear(NamedTuple):
-    """A problem at z, and how it changes with it.
-
-    Attributes:
-        cost: to make small.
-        slope: derivatives [nz] of it.
-        values: what must not be negative [m].
-        rows: derivatives [m, nz] of these.
-        price: of one that they are negative by [m].
-        even: what must vanish [e].
-        level: derivatives [e, nz] of these.
-        dear: price of one that they differ from zero by.
-        fixed: which of z stay [nz].
-    """
-
-    cost: float
-    slope: Array
-    values: Array
-    rows: Array
-    price: Array
-    even: Array
-    level: Array
-    dear: float
-    fixed: NDArray[np.bool_]
-
-    def merit(self) -> float:
-        """Return the cost, and what is missed at its price."""
-        missed = float((self.price * np.maximum(-self.values, 0.0)).sum())
-        return self.cost + missed + self.dear * float(np.abs(self.even).sum())
-
-
-class Problem(Protocol):
-    """A smooth cost over z [nz] with bounds, equations, and values that must not be negative."""
-
-    def least(self) -> Array:
-        """Return the smallest z [nz]."""
-
-    def most(self) -> Array:
-        """Return the largest z [nz]."""
-
-    def linear(self, z: Array) -> Linear:
-        """Return the problem as it is linear at z."""
-
-    def look(self, z: Array) -> None:
-        """Look anew what must not be negative near z."""
-
-
-def descend(problem: Problem, z: Array) -> Array:
-    """Return the z of least merit near a start.
-
-    A step solves the problem as it is linear there, within a reach that follows how well this
-    holds. What is asked may be missed by a step, so that there always is one. Where the problem
-    bends too much for a step, it is corrected once for what that step has missed.
-    """
-    reach, least, most = _REACH[1], problem.least(), problem.most()
-    problem.look(z)
-    here = problem.linear(z)
-    for number in range(1, _ROUNDS + 1):
-        if number % _LOOKED == 0:
-            problem.look(z)
-            here = problem.linear(z)
-        low, high = np.maximum(least - z, -reach), np.minimum(most - z, reach)
-        low[here.fixed] = high[here.fixed] = 0.0
-        step, promised = _step(here, low, high)
-        if promised < _SETTLED:
-            break
-        after, there, gained = _tried(problem, here, z, step)
-        if gained < _HELD[0] * promised:
-            bent = here._replace(
-                values=there.values - here.rows @ (after - z),
-                even=there.even - here.level @ (after - z),
-            )
-            corrected, _ = _step(bent, low, high)
-            other, elsewhere, more = _tried(problem, here, z, corrected)
-            if more > gained:
-                after, there, gained = other, elsewhere, more
-        size = float(np.abs(after - z).max())
-        if gained > _HELD[0] * promised:
-            z, here = after, there
-        if gained < _HELD[1] * promised:
-            reach = 0.4 * min(reach, size)
-        elif gained > _HELD[2] * promised:
-            reach = min(2.0 * reach, _REACH[2])
-        if reach < _REACH[0]:
-            break
-    problem.look(z)
-    return z
-
-
-def polished(problem: Problem, z: Array) -> Array:
-    """Return the z of least cost near an end of `descend`, or that end where none is found.
-
-    Linear programs creep where less is asked than z has parts, because the cost bends there.
-    Quadratic ones (SLSQP) see the bend. What is far from being missed is left out.
-    """
-    first = problem.linear(z)
-    low = np.maximum(problem.least(), z - _BENT[0])
-    high = np.minimum(problem.most(), z + _BENT[0])
-    low[first.fixed] = high[first.fixed] = z[first.fixed]
-    kept = first.values < np.abs(first.rows).max(axis=1, initial=0.0) * _BENT[0]
-    conditions: list[Any] = [
-        {
-            "type": "ineq",
-            "fun": lambda x: problem.linear(x).values[kept],
-            "jac": lambda x: problem.linear(x).rows[kept],
-        }
-    ]
-    if len(first.even):
-        conditions.append(
-            {
-                "type": "eq",
-                "fun": lambda x: problem.linear(x).even,
-                "jac": lambda x: problem.linear(x).level,
-            }
-        )
-    # its types know no conditions with derivatives
-    solve: Any = minimize
-    found = solve(
-        lambda x: (problem.linear(x).cost, problem.linear(x).slope),
-        z,
-        jac=True,
-        method="SLSQP",
-        bounds=np.stack((low, high), axis=-1),
-        constraints=conditions,
-        options={"maxiter": _BENT[1], "ftol": 1e-4},
-    )
-    after = np.clip(found.x, low, high)
-    better = problem.linear(after).merit() < first.merit()
-    problem.look(after if better else z)
-    return after if better else z
-
-
-def _tried(problem: Problem, here: Linear, z: Array, step: Array) -> tuple[Array, Linear, float]:
-    """Return where a step leads to, the problem there, and the merit gained."""
-    after = np.clip(z + step, problem.least(), problem.most())
-    there = problem.linear(after)
-    return after, there, here.merit() - there.merit()
-
-
-def _step(here: Linear, low: Array, high: Array) -> tuple[Array, float]:
-    """Return the best step within bounds where all is linear, and the merit that it promises."""
-    # what cannot become negative within the bounds is left out
-    kept = here.values < np.abs(here.rows) @ np.maximum(-low, high)
-    rows, values = here.rows[kept], here.values[kept]
-    size, count, both = len(low), len(values), len(here.even)
-    upper = sparse.hstack(
-        (sparse.csr_array(-rows), -sparse.eye_array(count), sparse.csr_array((count, 2 * both)))
-    )
-    one = sparse.eye_array(both)
-    equal = sparse.hstack(
-        (sparse.csr_array(here.level), sparse.csr_array((both, count)), one, -one)
-    )
-    missed = np.tile([0.0, np.inf], (count + 2 * both, 1))
-    # its types know no sparse arrays
-    solve: Any = linprog
-    found = solve(
-        np.concatenate((here.slope, here.price[kept], np.full(2 * both, here.dear))),
-        upper if count else None,
-        values if count else None,
-        equal if both else None,
-        -here.even if both else None,
-        np.concatenate((np.stack((low, high), axis=-1), missed)),
-        method="highs",
-    )
-    if found.x is None:
-        return np.zeros(size), 0.0
-    return found.x[:size], here.merit() - here.cost - float(found.fun)
-
-
 _DEAR = 40.0
 """Turning radii that a course may be longer by to miss what is asked by one less."""
 _PRICE = 4.0
@@ -222,7 +52,51 @@ FARTHEST = 0.3
 """How much farther off than its circle a buoy may be passed, in turning radii."""
 
 
-_Results = tuple[float, Array, Array, Array, Array, Array, np.ndarray]
+class Linear(NamedTuple):
+    """A route at z as a linear problem, in turning radii and the time that one takes.
+
+    Attributes:
+        cost: the time, to make small.
+        slope: derivatives [nz] of it.
+        values: what must not be negative [m].
+        rows: derivatives [m, nz] of these.
+        price: of one that they are negative by [m].
+        numbers: of the buoys that they are for [m].
+        hard: how many of them, the first ones, a right course needs.
+    """
+
+    cost: float
+    slope: Array
+    values: Array
+    rows: Array
+    price: Array
+    numbers: list[int]
+    hard: int
+
+    def merit(self) -> float:
+        """Return the cost, and what is missed at its price."""
+        return self.cost + float((self.price * np.maximum(-self.values, 0.0)).sum())
+
+    def step(self, low: Array, high: Array) -> tuple[Array, float]:
+        """Return the best step within bounds where all is linear, and the merit it promises."""
+        # what cannot become negative within the bounds is left out
+        kept = self.values < np.abs(self.rows) @ np.maximum(-low, high)
+        rows, values = self.rows[kept], self.values[kept]
+        size, count = len(low), len(values)
+        # its types know no sparse arrays
+        solve: Any = linprog
+        found = solve(
+            np.concatenate((self.slope, self.price[kept])),
+            sparse.hstack((sparse.csr_array(-rows), -sparse.eye_array(count))) if count else None,
+            values if count else None,
+            bounds=np.concatenate(
+                (np.stack((low, high), axis=-1), np.tile([0.0, np.inf], (count, 1)))
+            ),
+            method="highs",
+        )
+        if found.x is None:
+            return np.zeros(size), 0.0
+        return found.x[:size], self.merit() - self.cost - float(found.fun)
 
 
 class Fitted(NamedTuple):
@@ -279,10 +153,9 @@ class Fit:
         self.edges = np.concatenate(([0], middle, [-1]))
         self.others: list[tuple[int, int, slice]] = []
         self.apart = [self._apart(circle) for circle in circles]
-        self.hard, self.price, self.effort = 0, _PRICE, 0
-        self.seen: Array | None = None
+        self.price, self.effort = _PRICE, 0
+        self.seen: tuple[Array, Linear] | None = None
         self.near: tuple[Array, float] | None = None
-        self.last: _Results
 
     def on(self, route: Route) -> Fit:
         """Return the same problem with other tables of turns."""
@@ -382,14 +255,14 @@ class Fit:
             np.where(ahead[:, None], swing, sign[:, None] * change),
         )
 
-    def results(self, z: Array) -> _Results:
-        """Return the time, what must not be negative, what must vanish, and their derivatives."""
-        if self.seen is not None and np.array_equal(self.seen, z):
-            return self.last
+    def linear(self, z: Array) -> Linear:
+        """Return the problem as it is linear at z."""
+        if self.seen is not None and np.array_equal(self.seen[0], z):
+            return self.seen[1]
         drawn = self.route(z)
         self.effort += 1
         goal, number = self.circles[-1], len(self.circles)
-        far, values, rows = FARTHEST * self.unit, [], []
+        asked: list[tuple[int, float, Array]] = []
         near = self._nearest(drawn, self._parts(drawn.points))
         # on the wrong side, distances are negative
         entered, side = self.sides == 0, self.sides[:, None]
@@ -397,60 +270,53 @@ class Fit:
         change = np.where(side == 0, near.change[:number], side * near.swing[:number])
         for j, circle in enumerate(self.circles):
             if circle.side == 0:
-                values.append(circle.radius - own[j])
-                rows.append(-change[j])
+                asked.append((j, circle.radius - own[j], -change[j]))
             else:
-                values += [own[j] - circle.radius, circle.radius + far - own[j]]
-                rows += [change[j], -change[j]]
+                beyond = circle.radius + FARTHEST * self.unit - own[j]
+                asked += [(j, own[j] - circle.radius, change[j]), (j, beyond, -change[j])]
         for k, (j, _, _) in enumerate(self.others, start=number):
-            values.append(near.distance[k] - self.circles[j].radius)
-            rows.append(near.change[k])
-        self.hard = len(values)
+            asked.append((j, near.distance[k] - self.circles[j].radius, near.change[k]))
+        if goal.side != 0:
+            # the end lies neither before nor behind the last buoy
+            along = np.exp(1j * drawn.heading)
+            left = (goal.place - drawn.points[-1]) * along.conjugate()
+            moved = drawn.moved(np.array([len(drawn.points) - 1]))[0]
+            level = -(moved * along.conjugate()).real + left.imag * drawn.turned
+            asked += [(number - 1, left.real, level), (number - 1, -left.real, -level)]
+        hard = len(asked)
         for k, (j, i, _) in enumerate(self.others, start=number):
             if i != j:
                 # where it lies on its side too, a buoy may be as near
                 apart = self.apart[j] if near.abeam[k] * self.circles[j].side < 0 else 0.0
-                values.append(near.distance[k] - own[j] - apart)
-                rows.append(near.change[k] - change[j])
-        even, level = [], []
-        if goal.side != 0:
-            along = np.exp(1j * drawn.heading)
-            left = (goal.place - drawn.points[-1]) * along.conjugate()
-            moved = drawn.moved(np.array([len(drawn.points) - 1]))[0]
-            even.append(left.real)
-            level.append(-(moved * along.conjugate()).real + left.imag * drawn.turned)
-        unit, time = self.unit, self.unit / self.route.turns.speed
-        size = len(z)
-        self.last = (
+                asked.append((j, near.distance[k] - own[j] - apart, near.change[k] - change[j]))
+        time = self.unit / self.route.turns.speed
+        found = Linear(
             drawn.time / time,
             drawn.slower / time,
-            np.array(values) / unit,
-            np.array(rows).reshape(-1, size) / unit,
-            np.array(even) / unit,
-            np.array(level).reshape(-1, size) / unit,
-            drawn.points,
+            np.array([value for _, value, _ in asked]) / self.unit,
+            np.array([row for _, _, row in asked]).reshape(-1, len(z)) / self.unit,
+            np.where(np.arange(len(asked)) < hard, _DEAR, self.price),
+            [j for j, _, _ in asked],
+            hard,
         )
-        self.seen = z.copy()
-        return self.last
+        self.seen = z.copy(), found
+        return found
 
-    def least(self) -> Array:
-        """Return the smallest z."""
-        least = self.route.least()
-        return least if self.near is None else np.maximum(least, self.near[0] - self.near[1])
+    def bounds(self) -> tuple[Array, Array]:
+        """Return the smallest and the largest z."""
+        least, most = self.route.least(), self.route.most()
+        if self.near is None:
+            return least, most
+        z, reach = self.near
+        return np.maximum(least, z - reach), np.minimum(most, z + reach)
 
-    def most(self) -> Array:
-        """Return the largest z."""
-        most = self.route.most()
-        return most if self.near is None else np.minimum(most, self.near[0] + self.near[1])
-
-    def linear(self, z: Array) -> Linear:
-        """Return the problem as it is linear at z."""
-        time, slower, values, rows, even, level, _ = self.results(z)
-        price = np.full(len(values), self.price)
-        price[: self.hard] = _DEAR
-        fixed = np.zeros(len(z), dtype=bool)
-        fixed[0] = not self.free
-        return Linear(time, slower, values, rows, price, even, level, _DEAR, fixed)
+    def within(self, z: Array, reach: float) -> tuple[Array, Array]:
+        """Return the bounds of z that is changed by no more than a reach."""
+        least, most = self.bounds()
+        low, high = np.maximum(least, z - reach), np.minimum(most, z + reach)
+        if not self.free:
+            low[0] = high[0] = z[0]
+        return low, high
 
     def look(self, z: Array) -> None:
         """Look anew which parts of the course come near which buoys."""
@@ -459,16 +325,10 @@ class Fit:
 
     def missed(self, z: Array) -> tuple[float, int]:
         """Return by how much a route misses what is asked of it, in m, and at which buoy."""
-        _, _, values, _, even, _, _ = self.results(z)
-        numbers = [
-            *(j for j, circle in enumerate(self.circles) for _ in range(1 + abs(circle.side))),
-            *(j for j, _, _ in self.others),
-        ]
-        short = np.maximum(-values[: self.hard], 0.0)
+        here = self.linear(z)
+        short = np.maximum(-here.values[: here.hard], 0.0)
         worst = int(short.argmax())
-        if len(even) and abs(even[0]) > short[worst]:
-            return self.unit * float(abs(even[0])), len(self.circles) - 1
-        return self.unit * float(short[worst]), numbers[worst]
+        return self.unit * float(short[worst]), here.numbers[worst]
 
     def alone(self, z: Array, reach: float | None = None) -> Fitted:
         """Return the route that is found where buoys are hardly approached out of their turns."""
@@ -478,8 +338,79 @@ class Fit:
     def solve(self, z: Array, reach: float | None = None) -> Fitted:
         """Return the route that is found from a start, not farther from it than a reach of z."""
         self.near = None if reach is None else (z, reach)
-        z = descend(self, np.clip(z, self.least(), self.most()))
+        z = self._descended(np.clip(z, *self.bounds()))
         if self.missed(z)[0] <= _CLOSE * self.unit:
-            z = polished(self, z)
+            z = self._polished(z)
         missed, worst = self.missed(z)
-        return Fitted(z, self.results(z)[0] * self.unit / self.route.turns.speed, missed, worst)
+        return Fitted(z, self.linear(z).cost * self.unit / self.route.turns.speed, missed, worst)
+
+    def _descended(self, z: Array) -> Array:
+        """Return the z of least merit near a start.
+
+        A step solves the problem as it is linear there, within a reach that follows how well this
+        holds. What is asked may be missed by a step, so that there always is one. Where the problem
+        bends too much for a step, it is corrected once for what that step has missed.
+        """
+        reach, (least, most) = _REACH[1], self.bounds()
+        self.look(z)
+        here = self.linear(z)
+
+        def tried(step: Array) -> tuple[Array, Linear, float]:
+            after = np.clip(z + step, least, most)
+            there = self.linear(after)
+            return after, there, here.merit() - there.merit()
+
+        for number in range(1, _ROUNDS + 1):
+            if number % _LOOKED == 0:
+                self.look(z)
+                here = self.linear(z)
+            low, high = (bound - z for bound in self.within(z, reach))
+            step, promised = here.step(low, high)
+            if promised < _SETTLED:
+                break
+            after, there, gained = tried(step)
+            if gained < _HELD[0] * promised:
+                bent = here._replace(values=there.values - here.rows @ (after - z))
+                other = tried(bent.step(low, high)[0])
+                if other[2] > gained:
+                    after, there, gained = other
+            size = float(np.abs(after - z).max())
+            if gained > _HELD[0] * promised:
+                z, here = after, there
+            if gained < _HELD[1] * promised:
+                reach = 0.4 * min(reach, size)
+            elif gained > _HELD[2] * promised:
+                reach = min(2.0 * reach, _REACH[2])
+            if reach < _REACH[0]:
+                break
+        self.look(z)
+        return z
+
+    def _polished(self, z: Array) -> Array:
+        """Return the z of least cost near an end of `_descended`, or that end where none is found.
+
+        Linear programs creep where less is asked than z has parts, because the cost bends there.
+        Quadratic ones (SLSQP) see the bend. What is far from being missed is left out.
+        """
+        first = self.linear(z)
+        low, high = self.within(z, _BENT[0])
+        kept = first.values < np.abs(first.rows).max(axis=1, initial=0.0) * _BENT[0]
+        # its types know no conditions with derivatives
+        solve: Any = minimize
+        found = solve(
+            lambda x: (self.linear(x).cost, self.linear(x).slope),
+            z,
+            jac=True,
+            method="SLSQP",
+            bounds=np.stack((low, high), axis=-1),
+            constraints={
+                "type": "ineq",
+                "fun": lambda x: self.linear(x).values[kept],
+                "jac": lambda x: self.linear(x).rows[kept],
+            },
+            options={"maxiter": _BENT[1], "ftol": 1e-4},
+        )
+        after = np.clip(found.x, low, high)
+        better = self.linear(after).merit() < first.merit()
+        self.look(after if better else z)
+        return after if better else z

@@ -26,8 +26,6 @@ from residnet.dynamics.rollout import Rollout
 Array = NDArray[np.float64]
 _COUNTER = 1.5
 """Time constants within which counter-rudder stops a turn; T ln 2 by Nomoto's model."""
-_HALVED = 40
-"""Times that the interval is halved in which the yaw stops."""
 _STEPS = (0.25, 6)
 """Longest step of simulated turns in time constants, and how often it is halved at most."""
 _ALIKE = 1e-3
@@ -159,19 +157,12 @@ class TurnMaker:
 
         The end where it does not.
         """
-        column, rows = self.vessel.column("r"), np.arange(len(side))
-        yaw = countered(countered.x)[:, :, column] * side
-        after = np.argmax(yaw <= 0.0, axis=0)
-        before = np.maximum(after - 1, 0)
-        cubic = countered.c[:, before, rows, column] * side
-        low, high = np.zeros(len(side)), np.diff(countered.x)[before]
-        for _ in range(_HALVED):
-            middle = 0.5 * (low + high)
-            turning = np.polyval(cubic, middle) > 0
-            low, high = np.where(turning, middle, low), np.where(turning, high, middle)
-        stops = countered.x[before] + np.where(after > 0, low, 0.0)
-        time: Array = np.where((yaw > 0).all(axis=0), countered.x[-1], stops)
-        return time
+        column, stops = self.vessel.column("r"), []
+        for row, begun in enumerate(side * countered.c[-1, 0, :, column]):
+            yaw = PPoly(countered.c[:, :, row, column], countered.x)
+            roots = yaw.roots(extrapolate=False) if begun > 0 else np.zeros(1)
+            stops.append(float(roots[0]) if len(roots) else float(countered.x[-1]))
+        return np.array(stops)
 
 
 def _of_rows(states: CubicSpline, times: Array, rows: NDArray[np.intp]) -> Array:

@@ -298,10 +298,8 @@ def _definition(run: RunFiles) -> list[str]:
     texts = [
         f"At {math.degrees(metrics['rudder']):.3g} deg of rudder the vessel turns with a radius of"
         f" {steady['radius']:.2f} m at {steady['speed']:.3g} m/s. {followed}",
-        "The reference is a course of straight lines and arcs of this radius, for a vessel that"
-        " yaws at once: the shortest that was found where buoys are entered, and the taut one round"
-        " every buoy where they are passed on their sides. It is no lower bound: a buoy may also be"
-        " passed without being rounded. Ratio:"
+        "The reference is the shortest course that was found of straight lines and arcs of this"
+        " radius, for a vessel that yaws at once and keeps no margin. Ratio:"
         f" course time over its length at the service speed of {metrics['speed']:.3g} m/s. Ratio,"
         " turning: the same at the speed that the vessel keeps in its smallest turn.",
         "On its side and clear: number of buoys left on their side, and outside their circles."
