@@ -21,7 +21,6 @@ from residnet.control.heading.classical import (
     regulator_gains,
 )
 from residnet.control.heading.policies import (
-    CONSTANTS,
     SIGHT,
     AnglePolicy,
     DepthPolicy,
@@ -52,11 +51,21 @@ class SearchRange(NamedTuple):
         low, high: its ends.
         idle: value at which the law does without the parameter, None for none. The law is searched
             without it too, so that none does worse than the simpler one within it.
+        power: of T that all three are multiples of; those of a distance go with the speed too.
+        way: whether it is a distance.
     """
 
     low: float
     high: float
     idle: float | None = None
+    power: int = 0
+    way: bool = False
+
+    def of(self, turning: Turning) -> SearchRange:
+        """Return the range of a vessel in SI units."""
+        unit = turning.time**self.power * (turning.speed if self.way else 1.0)
+        idle = None if self.idle is None else self.idle * unit
+        return SearchRange(self.low * unit, self.high * unit, idle)
 
 
 @final
@@ -116,20 +125,22 @@ class ControllerConfig(Config, ABC):
 
 
 class TunableConfig(ControllerConfig, ABC):
-    """The config of a controller whose missing parameters are tuned."""
+    """The config of a controller whose missing parameters are tuned, within `ranges`."""
+
+    ranges: ClassVar[Mapping[str, SearchRange]]
 
     @property
     @abstractmethod
     def own(self) -> tuple[str, ...]:
         """The names of the numbers of what `rows` returns that every row has for itself."""
 
-    @abstractmethod
     def parameters(self) -> dict[str, float | None]:
         """Return the parameters by name; None where they are to be tuned."""
+        return {name: getattr(self, name) for name in self.ranges}
 
-    @abstractmethod
     def axes(self, turning: Turning) -> dict[str, SearchRange]:
         """Return the ranges that tuning searches, by parameter."""
+        return {name: one.of(turning) for name, one in self.ranges.items()}
 
     @abstractmethod
     def rows(self, parameters: dict[str, Tensor], steering: Steering) -> Policy:
@@ -153,8 +164,8 @@ class TunableConfig(ControllerConfig, ABC):
         return {name: value for name, value in given.items() if value is not None}
 
 
-_NOT_OF_THE_LAW = ("kind", "filter_time")
-"""Fields of a linear law's config that are no constants of the law itself."""
+# from nearly none to where it slows the loop
+_FILTER = {"filter_time": SearchRange(0.002, 0.3, power=1)}
 
 
 class TunedConfig(TunableConfig, ABC):
@@ -172,10 +183,6 @@ class TunedConfig(TunableConfig, ABC):
         return LinearLaw.NUMBERS
 
     @abstractmethod
-    def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
-        """Return the ranges of the law's own parameters."""
-
-    @abstractmethod
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -183,15 +190,9 @@ class TunedConfig(TunableConfig, ABC):
 
     @final
     def parameters(self) -> dict[str, float | None]:
-        fields, lag = type(self).model_fields, self.filter_time
-        given = {name: getattr(self, name) for name in fields if name not in _NOT_OF_THE_LAW}
-        return {**given, "filter_time": 0.0 if lag is None and None not in given.values() else lag}
-
-    @final
-    def axes(self, turning: Turning) -> dict[str, SearchRange]:
-        """Return the ranges; the filter's goes from nearly none to where it slows the loop."""
-        lag = SearchRange(0.002 * turning.time, 0.3 * turning.time)
-        return {**self.law_axes(turning), "filter_time": lag}
+        given, lag = super().parameters(), self.filter_time
+        open_ = None in [value for name, value in given.items() if name != "filter_time"]
+        return {**given, "filter_time": 0.0 if lag is None and not open_ else lag}
 
     def build(self, steering: Steering) -> LinearLaw:
         """Return the law with these parameters."""
@@ -212,16 +213,14 @@ class PdConfig(TunedConfig):
         damping_time: kd/kp.
     """
 
+    ranges: ClassVar[Mapping[str, SearchRange]] = {
+        "kp": SearchRange(0.3, 60.0),
+        "damping_time": SearchRange(0.05, 2.0, power=1),
+        **_FILTER,
+    }
     kind: Literal["pd"] = "pd"
     kp: float | None = Field(default=None, gt=0)
     damping_time: Seconds | None = Field(default=None, gt=0)
-
-    def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
-        """Return the ranges: two decades of kp, damping_time from a twentieth of T to twice T."""
-        return {
-            "kp": SearchRange(0.3, 60.0),
-            "damping_time": SearchRange(0.05 * turning.time, 2.0 * turning.time),
-        }
 
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
@@ -242,15 +241,17 @@ class PidConfig(TunedConfig):
         integral_time: kp/ki.
     """
 
+    ranges: ClassVar[Mapping[str, SearchRange]] = {
+        "kp": SearchRange(0.3, 60.0),
+        "damping_time": SearchRange(0.05, 2.0, power=1),
+        # a million T is no integral in single precision
+        "integral_time": SearchRange(1.0, 50.0, idle=1e6, power=1),
+        **_FILTER,
+    }
     kind: Literal["pid"] = "pid"
     kp: float | None = Field(default=None, gt=0)
     damping_time: Seconds | None = Field(default=None, gt=0)
     integral_time: Seconds | None = Field(default=None, gt=0)
-
-    def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
-        """Return those of PD, and T to 50 T; a million T is no integral in single precision."""
-        pd, time = PdConfig().law_axes(turning), turning.time
-        return {**pd, "integral_time": SearchRange(time, 50.0 * time, idle=1e6 * time)}
 
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
@@ -272,16 +273,14 @@ class LqrConfig(TunedConfig):
         rate_weight: weight of the squared yaw rate times T, dimensionless; None to tune it.
     """
 
+    ranges: ClassVar[Mapping[str, SearchRange]] = {
+        "heading_weight": SearchRange(0.1, 3600.0),
+        "rate_weight": SearchRange(1e-3, 3600.0),
+        **_FILTER,
+    }
     kind: Literal["lqr"] = "lqr"
     heading_weight: float | None = Field(default=None, gt=0)
     rate_weight: float | None = Field(default=None, ge=0)
-
-    def law_axes(self, turning: Turning) -> dict[str, SearchRange]:
-        """Return both weights over decades."""
-        return {
-            "heading_weight": SearchRange(0.1, 3600.0),
-            "rate_weight": SearchRange(1e-3, 3600.0),
-        }
 
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
@@ -323,6 +322,14 @@ class BangBangConfig(ControllerConfig):
 Positive = Annotated[float, Field(gt=0)]
 
 
+_OBSERVER = {
+    "heading_rate": SearchRange(1.0, 120.0, power=-1),
+    "yaw_rate_rate": SearchRange(1.0, 120.0, power=-1),
+    "push_rate": SearchRange(0.08, 30.0, power=-1),
+    "cross_rate": SearchRange(0.15, 150.0, power=-2),
+}
+
+
 class ObservedConfig(TunableConfig, ABC):
     """A law on the estimates of a disturbance observer, with a predictor of pending commands.
 
@@ -349,25 +356,6 @@ class ObservedConfig(TunableConfig, ABC):
     @abstractmethod
     def law(self, limit: float, rate: float | None) -> HeadingLaw:
         """Return the law for a rudder with a limit in rad and a rate in rad/s, None for none."""
-
-    @abstractmethod
-    def law_axes(self) -> dict[str, SearchRange]:
-        """Return the ranges of the law's own constants."""
-
-    def parameters(self) -> dict[str, float | None]:
-        """Return the constants of law and observer; None where they are to be tuned."""
-        return {name: getattr(self, name) for name in (*self.law_axes(), *CONSTANTS)}
-
-    def axes(self, turning: Turning) -> dict[str, SearchRange]:
-        """Return the ranges of all constants; those of the observer go with 1/T."""
-        once = 1.0 / turning.time
-        return {
-            **self.law_axes(),
-            "heading_rate": SearchRange(once, 120.0 * once),
-            "yaw_rate_rate": SearchRange(once, 120.0 * once),
-            "push_rate": SearchRange(0.08 * once, 30.0 * once),
-            "cross_rate": SearchRange(0.15 * once**2, 150.0 * once**2),
-        }
 
     def rows(self, parameters: dict[str, Tensor], steering: Steering) -> ObservedPolicy:
         """Return the law with constants of its own for every row."""
@@ -399,6 +387,11 @@ class ObservedLqrConfig(ObservedConfig):
         rate_weight: weight of the squared yaw rate times T, dimensionless.
     """
 
+    ranges: ClassVar[Mapping[str, SearchRange]] = {
+        "heading_weight": SearchRange(0.01, 3600.0),
+        "rate_weight": SearchRange(1e-3, 3600.0),
+        **_OBSERVER,
+    }
     kind: Literal["lqr_observer"] = "lqr_observer"
     heading_weight: Positive | None = None
     rate_weight: Positive | None = None
@@ -406,13 +399,6 @@ class ObservedLqrConfig(ObservedConfig):
     def law(self, limit: float, rate: float | None) -> HeadingLaw:
         """Return the linear regulator with this rudder limit in rad."""
         return RegulatorLaw(limit)
-
-    def law_axes(self) -> dict[str, SearchRange]:
-        """Return both weights over decades."""
-        return {
-            "heading_weight": SearchRange(0.01, 3600.0),
-            "rate_weight": SearchRange(1e-3, 3600.0),
-        }
 
 
 class PtosConfig(ObservedConfig):
@@ -424,6 +410,12 @@ class PtosConfig(ObservedConfig):
         damping: relative damping near the reference.
     """
 
+    ranges: ClassVar[Mapping[str, SearchRange]] = {
+        "steepness": SearchRange(3.0, 600.0),
+        "share": SearchRange(0.2, 1.2),
+        "damping": SearchRange(0.3, 3.0),
+        **_OBSERVER,
+    }
     kind: Literal["ptos"] = "ptos"
     steepness: Positive | None = None
     share: Positive | None = None
@@ -431,14 +423,6 @@ class PtosConfig(ObservedConfig):
 
     def law(self, limit: float, rate: float | None) -> HeadingLaw:
         return StoppingLaw(0.0 if rate is None else limit / rate)
-
-    def law_axes(self) -> dict[str, SearchRange]:
-        """Return the ranges of steepness, share and damping."""
-        return {
-            "steepness": SearchRange(3.0, 600.0),
-            "share": SearchRange(0.2, 1.2),
-            "damping": SearchRange(0.3, 3.0),
-        }
 
 
 AnyObserved = Annotated[ObservedLqrConfig | PtosConfig, Field(discriminator="kind")]
@@ -460,6 +444,12 @@ class DepthConfig(TunableConfig):
         drift_rate: how fast the drift of the depth is learned, in 1/s.
     """
 
+    # a vessel goes speed times T while its dive angle changes
+    ranges: ClassVar[Mapping[str, SearchRange]] = {
+        "lookahead": SearchRange(0.3, 20.0, power=1, way=True),
+        "depth_rate": SearchRange(0.05, 20.0, power=-1),
+        "drift_rate": SearchRange(0.01, 1.0, power=-1),
+    }
     kind: Literal["depth"] = "depth"
     pitch: AnyPitch
     steepest: Radians = Field(default=0.5235987755982988, gt=0, lt=1.3)
@@ -473,17 +463,10 @@ class DepthConfig(TunableConfig):
 
     def parameters(self) -> dict[str, float | None]:
         """Return the constants of the line of sight, then those of the law."""
-        return {name: getattr(self, name) for name in SIGHT} | self.pitch.parameters()
+        return super().parameters() | self.pitch.parameters()
 
     def axes(self, turning: Turning) -> dict[str, SearchRange]:
-        """Return the ranges; a vessel goes speed times T while its dive angle changes."""
-        way, once = turning.speed * turning.time, 1.0 / turning.time
-        return {
-            "lookahead": SearchRange(0.3 * way, 20.0 * way),
-            "depth_rate": SearchRange(0.05 * once, 20.0 * once),
-            "drift_rate": SearchRange(0.01 * once, once),
-            **self.pitch.axes(turning),
-        }
+        return super().axes(turning) | self.pitch.axes(turning)
 
     def tuned(self, found: Mapping[str, float]) -> Self:
         """Return the config with parameters given, those of the law in it."""
