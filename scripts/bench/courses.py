@@ -28,7 +28,7 @@ from residnet.control.courses.config import (
     smallest_turn,
 )
 from residnet.control.guidance import CourseGuidance, DriftEstimate, TrackKeeping
-from residnet.control.heading.classical import HeadingPID
+from residnet.control.heading.classical import HeadingPD
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ResidnetError
@@ -96,7 +96,7 @@ class Ship:
     def tracks(self, planned: PlannedCourse, currents: np.ndarray) -> list[Any]:
         """Return the flights of the nominal vessel in steady currents [B, 2] in m/s."""
         turning, vessel = self.turning, self.vessel
-        law = HeadingPID.placed(
+        law = HeadingPD.placed(
             vessel.state,
             gain=turning.gain,
             time=turning.time,

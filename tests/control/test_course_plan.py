@@ -24,7 +24,7 @@ from residnet.control.courses.config import (
 from residnet.control.courses.course_plan import Course
 from residnet.control.courses.turns import TurnMaker, steady_turn, turning_step
 from residnet.control.guidance import CourseGuidance, TrackKeeping
-from residnet.control.heading.classical import HeadingPID
+from residnet.control.heading.classical import HeadingPD
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError
@@ -253,7 +253,7 @@ def test_a_vessel_beside_the_course_comes_back_to_it(vessel: SteeredPlant) -> No
         np.full(len(course.track), steady),
         course.length,
     )
-    law = HeadingPID.placed(
+    law = HeadingPD.placed(
         vessel.state, gain=3.47, time=3.94, frequency=1.0, damping=1.0, limit=LIMIT
     )
     guidance = CourseGuidance(course, 8.0, vessel.state)
@@ -290,7 +290,7 @@ def test_a_vessel_that_sways_and_rolls_follows_turns_that_join_each_other() -> N
         wanted, "enter", patrol, turning, LIMIT, smallest_turn(wanted, patrol, turning, LIMIT)
     )
     assert np.ptp(np.sign(planned.course.rudder)) == 2.0
-    law = HeadingPID.placed(
+    law = HeadingPD.placed(
         patrol.state, gain=turning.gain, time=turning.time, frequency=0.8, damping=1.0, limit=LIMIT
     )
     follower = TrackKeeping(law, patrol.state, limit=LIMIT, dt=0.1, rate=patrol.rate)

@@ -21,7 +21,7 @@ from residnet.control.guidance import (
     TrackKeeping,
     WaypointGuidance,
 )
-from residnet.control.heading.classical import HeadingPID
+from residnet.control.heading.classical import HeadingPD
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
@@ -30,7 +30,7 @@ from residnet.physics.vessel import load_vessel
 
 DT, LIMIT, SPEED, LEG = 0.1, math.radians(5), 3.2, 0.7
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
-LAW = HeadingPID.placed(VESSEL.state, gain=3.47, time=3.94, frequency=2.0, damping=1.0, limit=LIMIT)
+LAW = HeadingPD.placed(VESSEL.state, gain=3.47, time=3.94, frequency=2.0, damping=1.0, limit=LIMIT)
 END = (3000.0 * math.cos(LEG), 3000.0 * math.sin(LEG))
 
 

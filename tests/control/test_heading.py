@@ -15,9 +15,12 @@ from residnet.control import (
     BangBangHeading,
     ClosedLoop,
     GivenReference,
-    HeadingPID,
+    HeadingPD,
     Policy,
 )
+from residnet.control.heading.controllers import PidConfig, Steering
+from residnet.control.heading.turning import Turning
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.documents.gouletas2020.law import DocumentAutopilot, Predictor, SimulatedPredictor
 from residnet.dynamics.rollout import Rollout
@@ -52,7 +55,7 @@ def flown(policy: Policy, target: float, seconds: float) -> tuple[np.ndarray, np
 
 
 def test_pd_law_saturation_and_wrapped_error() -> None:
-    policy = HeadingPID(STATE, kp=2.0, kd=3.0, limit=0.5)
+    policy = HeadingPD(STATE, kp=2.0, kd=3.0, limit=0.5)
     none = torch.zeros(1, 0, dtype=torch.float64)
     assert policy(at(0.1, 0.02), heading(0.2), none)[0].item() == pytest.approx(2 * 0.1 - 3 * 0.02)
     assert policy(at(0.0, 0.0), heading(1.0), none)[0].item() == 0.5
@@ -67,7 +70,7 @@ def test_placed_poles_show_in_the_response() -> None:
     """Overshoot of a second-order system of damping 0.6, while nothing saturates: exp(-pi zeta /
     sqrt(1 - zeta^2)).
     """
-    policy = HeadingPID.placed(STATE, gain=GAIN, time=TIME, frequency=0.5, damping=0.6, limit=LIMIT)
+    policy = HeadingPD.placed(STATE, gain=GAIN, time=TIME, frequency=0.5, damping=0.6, limit=LIMIT)
     target = 0.05
     psi, rudder = flown(policy, target, 40.0)
     assert np.abs(rudder).max() < LIMIT
@@ -90,20 +93,20 @@ def test_integral_action_against_a_bias_without_winding_up() -> None:
             return command + 0.01, s
 
     target = float(np.radians(30.0))
-    pd = HeadingPID(STATE, kp=1.0, kd=1.0, limit=LIMIT)
-    pid = HeadingPID(STATE, kp=1.0, kd=1.0, ki=0.2, limit=LIMIT, dt=0.01)
+    pd = HeadingPD(STATE, kp=1.0, kd=1.0, limit=LIMIT)
+    vessel = SteeredPlant(load_vessel("nomoto_oceanos").build())
+    gains = PidConfig(kp=1.0, damping_time=1.0, integral_time=5.0, filter_time=0.0)
+    pid = gains.build(Steering(vessel, Turning(GAIN, TIME, 3.2), LIMIT, 0.01))
     assert flown(Askew(pd), target, 60.0)[0][-1] - target == pytest.approx(0.01, rel=1e-3)
     psi, _ = flown(Askew(pid), target, 60.0)
     assert psi[-1] == pytest.approx(target, abs=1e-5)
-    held, memory = pid(at(0.0, 0.0), heading(target), torch.full((1, 1), 0.3, dtype=torch.float64))
-    assert (held.item(), memory.item()) == (
-        LIMIT,
-        0.3,
-    ), "saturated towards the target: the integral waits"
-    _, memory = pid(
-        at(target + 0.1, 0.0), heading(target), torch.full((1, 1), 3.0, dtype=torch.float64)
-    )
-    assert memory.item() == pytest.approx(3.0 - 0.001), "saturated, but the error unwinds it"
+    s = torch.tensor([[0.3, 0.0, 0.0]], dtype=torch.float64)
+    held, after = pid(at(0.0, 0.0), heading(target), s)
+    waits = "saturated towards the target: the integral waits"
+    assert (held.item(), after[0, 0].item()) == (LIMIT, 0.3), waits
+    s = torch.tensor([[3.0, target + 0.1, 0.0]], dtype=torch.float64)
+    _, after = pid(at(target + 0.1, 0.0), heading(target), s)
+    assert after[0, 0].item() == pytest.approx(3.0 - 0.001), "saturated, but the error unwinds it"
 
 
 def test_time_optimal_switches_where_the_closed_form_says() -> None:
@@ -200,8 +203,7 @@ def test_a_simulated_predictor_is_the_simulation_of_each_candidate() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: HeadingPID(STATE, kp=1, kd=1, limit=0), "limit must be positive"),
-        (lambda: HeadingPID(STATE, kp=1, kd=1, ki=0.1, limit=1), "dt belongs to ki"),
+        (lambda: HeadingPD(STATE, kp=1, kd=1, limit=0), "limit must be positive"),
         (lambda: BangBangHeading(STATE, gain=1, time=-1, limit=1), "must be positive"),
         (lambda: DocumentAutopilot(Linear(), limit=1, candidates=1), "candidates >= 2"),
         (

@@ -28,7 +28,7 @@ from residnet.control import (
     BangBangHeading,
     ClosedLoop,
     GivenReference,
-    HeadingPID,
+    HeadingPD,
     Policy,
 )
 from residnet.documents.gouletas2020.law import DocumentAutopilot, SimulatedPredictor
@@ -127,7 +127,7 @@ def document(horizon: str, tau: str) -> Case:
 
 def tuned(heading: str | None = None) -> Case:
     plant = nomoto()
-    policy = HeadingPID.placed(
+    policy = HeadingPD.placed(
         plant.state, gain=GAIN, time=TIME, frequency=2.0, damping=0.9, limit=LIMIT
     )
     return Case(
@@ -160,7 +160,7 @@ def patrol_document(parameters: str, horizon: str, tau: str | None, spacing: flo
 
 def patrol_pd(parameters: str, heading: str) -> Case:
     plant = patrol(parameters)
-    policy = HeadingPID(plant.state, kp=6.0, kd=6.0, limit=LIMIT)
+    policy = HeadingPD(plant.state, kp=6.0, kd=6.0, limit=LIMIT)
     return Case(
         plant, RecordedPlantDynamics(plant, 0.05), partial(follow, policy, step_to(float(heading)))
     )

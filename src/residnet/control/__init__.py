@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from residnet.control.base import ClosedLoop, GivenReference, Policy, Reference
-from residnet.control.heading.classical import BangBangHeading, HeadingPID
+from residnet.control.heading.classical import BangBangHeading, HeadingPD
 from residnet.control.motion import (
     Allocated,
     FeedForward,
@@ -21,7 +21,7 @@ __all__ = [
     "ClosedLoop",
     "FeedForward",
     "GivenReference",
-    "HeadingPID",
+    "HeadingPD",
     "HullFeedForward",
     "MotionPID",
     "MotionPIDConfig",

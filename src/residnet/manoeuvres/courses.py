@@ -13,7 +13,7 @@ from torch import Tensor
 
 from residnet.control.base import ClosedLoop
 from residnet.control.guidance import LookAhead, WaypointGuidance
-from residnet.control.heading.classical import HeadingPID
+from residnet.control.heading.classical import HeadingPD
 from residnet.control.motion import Allocated, MotionPIDConfig, ReferenceFilterConfig, Waypoint
 from residnet.core.config import Metres, RadiansPerSecond, Seconds
 from residnet.core.errors import UsageError
@@ -61,7 +61,7 @@ class Waypoints(Manoeuvre):
         return StackedSource(sources, [1] * len(sources))
 
     def _loop(self, helm: Helm) -> ClosedLoop:
-        autopilot = HeadingPID(helm.state, kp=self.gain, kd=self.rate_gain, limit=1.0)
+        autopilot = HeadingPD(helm.state, kp=self.gain, kd=self.rate_gain, limit=1.0)
 
         def commands(steer: Tensor) -> Tensor:
             return helm.demand(torch.full_like(steer[:, 0], self.drive), steer[:, 0])
