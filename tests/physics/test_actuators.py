@@ -9,9 +9,7 @@ import pytest
 import torch
 from kinds import of_kind
 
-from residnet.core.config import validate
-from residnet.core.errors import ConfigError
-from residnet.physics.actuators import DifferentialThrustConfig, Thrusters
+from residnet.physics.actuators import Thrusters
 from residnet.physics.vessel import load_vessel
 
 N_MAX = 2380.0 / 60.0
@@ -64,10 +62,6 @@ def test_dead_band_and_sign(thrusters: Thrusters) -> None:
     assert float(rise.max()) < 1.05 * float(n[1] - n[0]) * (5.04 + 2 * 0.12744 * N_MAX)
 
 
-def test_zero_and_not_a_number(thrusters: Thrusters) -> None:
-    assert thrusters.forces.thrust(rpm(0.0, -0.0)).tolist() == [0.0, 0.0]
-
-
 def test_moment_arm_and_side(thrusters: Thrusters) -> None:
     """Port thrust turns to starboard (r > 0) about half the spacing."""
     tau = thrusters.forces(rpm(1200, 0))
@@ -76,13 +70,6 @@ def test_moment_arm_and_side(thrusters: Thrusters) -> None:
     np.testing.assert_allclose(
         thrusters.forces(rpm(0, 1200)), [force, 0.0, -1.22 * force], rtol=1e-4
     )
-
-
-def test_shapes(thrusters: Thrusters) -> None:
-    n = torch.rand(3, 5, 2, dtype=torch.float64)
-    assert thrusters.forces(n).shape == (3, 5, 3)
-    assert thrusters.forces(n.float()).dtype == torch.float32
-    np.testing.assert_array_equal(thrusters.forces(n)[1, 2], thrusters.forces(n[1, 2]))
 
 
 def test_rate_limit(thrusters: Thrusters) -> None:
@@ -103,39 +90,3 @@ def test_rate_limit(thrusters: Thrusters) -> None:
         n = thrusters.advance(n, -command, dt)
         reversal += 1
     assert reversal in (317, 318)
-
-
-def test_saturation_and_small_steps(thrusters: Thrusters) -> None:
-    far = torch.tensor([[100.0, -100.0]], dtype=torch.float64)
-    held = torch.tensor([[N_MAX, -N_MAX]], dtype=torch.float64)
-    assert torch.equal(thrusters.advance(held, far, 0.1), held)
-    n, near = (
-        torch.tensor([[10.0, 10.0]], dtype=torch.float64),
-        torch.tensor([[10.001, 9.999]], dtype=torch.float64),
-    )
-    torch.testing.assert_close(thrusters.advance(n, near, 0.1), near, rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("spacing", "0 m", "greater than 0"),
-        ("n_max", "-3 rpm", "greater than 0"),
-        ("n_rate", "10 rpm", "rpm"),
-    ],
-)
-def test_wrong_limits_are_config_errors(key: str, value: str, message: str) -> None:
-    curve = [0.0, 1.0, 0.0]
-    limits = {"spacing": 2.0, "n_max": "1000 rpm", "n_rate": "500 rpm/s"}
-    good = {
-        "kind": "differential_thrust",
-        "forward": curve,
-        "reverse": curve,
-        "source": "made",
-        **limits,
-    }
-    validate(good, DifferentialThrustConfig, "here")
-    with pytest.raises(ConfigError, match=message) as caught:
-        validate({**good, key: value}, DifferentialThrustConfig, "here")
-    assert "\n" not in str(caught.value)
-    assert key in str(caught.value)

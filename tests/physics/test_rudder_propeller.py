@@ -13,7 +13,7 @@ from kinds import of_kind
 
 from residnet.core.config import validate
 from residnet.physics.actuators import RudderPropellerConfig, Thrusters, ThrustersConfig
-from residnet.physics.actuators.rudders import RudderPropeller
+from residnet.physics.actuators.base import SteeredActuators
 from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel, vessel_files
 
@@ -32,7 +32,7 @@ BASE: dict[str, Any] = {
 }
 
 
-def merged(**changes: dict[str, Any]) -> RudderPropeller:
+def merged(**changes: dict[str, Any]) -> SteeredActuators:
     content = {
         key: BASE[key] | changes.get(key, {}) if isinstance(BASE[key], dict) else BASE[key]
         for key in BASE
@@ -42,7 +42,7 @@ def merged(**changes: dict[str, Any]) -> RudderPropeller:
 
 
 def force(
-    unit: RudderPropeller, delta: float, n: float, nu: tuple[float, float, float]
+    unit: SteeredActuators, delta: float, n: float, nu: tuple[float, float, float]
 ) -> np.ndarray:
     command, motion = (
         torch.tensor([[delta, n]], dtype=torch.float64),

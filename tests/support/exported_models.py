@@ -134,7 +134,7 @@ class AsTensors:
     def warmup(self, y: Tensor, w: Tensor) -> Tensor:
         rows = zip(y.numpy(), w.numpy(), strict=True)
         return torch.from_numpy(
-            np.stack([self.exported.memory(self.loaded, *row, "the file") for row in rows])
+            np.stack([self.exported.memory(self.loaded, *row) for row in rows])
         ).float()
 
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,12 +10,17 @@ from typing import Literal, final
 
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor
+from torch import Tensor, nn
 
-from residnet.core.config import Config, MetresPerSecond, RevRate, RevsPerSecond
+from residnet.core.config import Config, MetresPerSecond, RevsPerSecond
 from residnet.core.names import VELOCITY
-from residnet.physics.actuators.base import Actuators, ServoConfig
-from residnet.physics.actuators.rudders import SteeringGearConfig
+from residnet.physics.actuators.base import (
+    Actuators,
+    Command,
+    ShaftConfig,
+    SteeringGearConfig,
+    demanded,
+)
 from residnet.physics.environment import WindLoadsConfig
 from residnet.physics.parameters import Density
 from residnet.physics.plant import Hull, HullPlant
@@ -26,18 +31,14 @@ SERIES = ("du", "v", "r", "delta", "dn")
 """What the terms are made of: u - U0, sway, yaw rate, rudder angle, n - n0."""
 
 
-class ShaftConfig(ServoConfig):
+class SeriesShaftConfig(ShaftConfig):
     """The propeller's shaft, for series with terms in dn.
 
     Attributes:
         n_0: revolutions at service speed in 1/s.
-        n_max: largest revolutions in 1/s.
-        n_rate: largest change of revolutions in 1/s^2; None for no limit.
     """
 
     n_0: RevsPerSecond = Field(gt=0)
-    n_max: RevsPerSecond = Field(gt=0)
-    n_rate: RevRate | None = Field(default=None, gt=0)
 
 
 class SeriesMass(Config):
@@ -125,7 +126,7 @@ class AbkowitzConfig(VesselFile):
     coefficients: Derivatives
     source: str = Field(min_length=1)
     rudder: SteeringGearConfig
-    shaft: ShaftConfig | None = None
+    shaft: SeriesShaftConfig | None = None
     wind: WindLoadsConfig | None = None
 
     @model_validator(mode="after")
@@ -179,13 +180,14 @@ class SeriesForces(Actuators):
 
     def __init__(self, config: AbkowitzConfig) -> None:
         rudder, shaft = config.rudder, config.shaft
-        servos, limits = [rudder.follow(rudder.limit, rudder.rate, "delta")], [rudder.limit]
+        servos, asked = [rudder.servo("delta")], [Command("cmd_delta", "steer", rudder.limit)]
         if shaft is not None:
-            servos.append(shaft.follow(shaft.n_max, shaft.n_rate, "n"))
-            limits.append(shaft.n_max)
+            servos.append(shaft.servo("n"))
+            asked.append(Command("cmd_n", "drive", shaft.n_max))
         super().__init__(*servos)
+        self.asked = tuple(asked)
         self.turns, self.n_0 = shaft is not None, shaft.n_0 if shaft is not None else 1.0
-        self.commands = ("cmd_delta", "cmd_n")[: len(servos)]
+        self.commands = tuple(command.name for command in asked)
         self.prime = config.units == "prime"
         self.length, self.speed = config.length.value, config.speed
         self.sign = float(config.delta_sign)
@@ -193,24 +195,17 @@ class SeriesForces(Actuators):
         rows = [row for _, row in config.coefficients]
         self.terms = TermLibrary(sorted({term for row in rows for term in row}), SERIES)
         values = [[row.get(term, 0.0) for row in rows] for term in self.terms.terms]
+        self.coefficients = nn.Buffer(torch.tensor(values, dtype=torch.float64), persistent=False)
         # moments carry one length more than forces
-        for name, numbers in (
-            ("coefficients", values),
-            ("limits", limits),
-            ("lengths", [1.0, 1.0, self.length]),
-        ):
-            self.register_buffer(name, torch.tensor(numbers, dtype=torch.float64), persistent=False)
-        self.coefficients: Tensor
-        self.limits: Tensor
-        self.lengths: Tensor
+        lengths = torch.tensor([1.0, 1.0, self.length], dtype=torch.float64)
+        self.lengths = nn.Buffer(lengths, persistent=False)
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the rudder angle from steer.
 
         Revolutions from drive where the series knows them (else it keeps its service power).
         """
-        both = torch.stack((steer, drive) if self.turns else (steer,), dim=-1)
-        return both.clamp(-1.0, 1.0) * self.limits.to(drive.dtype)
+        return demanded(self.asked, drive, steer)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         position = self.positions(a, command)

@@ -158,69 +158,35 @@ GRAVITY = 9.81
 """Acceleration of free fall in m/s^2."""
 
 
-class Spectrum(Config, ABC):
-    """A wave spectrum's shape, for a significant height of 4 sqrt(m0).
+class JonswapSpectrum(Config):
+    """The spectrum of a fetch-limited sea (JONSWAP, Hasselmann et al. 1973).
+
+    It is the ITTC form with its peak raised by gamma, scaled back to the significant height. With a
+    gamma of 1 it is that of a fully developed sea: modified Pierson-Moskowitz (ITTC 1978).
 
     Attributes:
         kind: kind of the spectrum.
-    """
-
-    kind: str
-
-    @abstractmethod
-    def peakedness(self, ratio: np.ndarray) -> np.ndarray:
-        """Return the factor on the ITTC form at omega / omega_p = ratio, any shape."""
-
-    @final
-    def density(self, omega: np.ndarray, height: float, period: float) -> np.ndarray:
-        """Return S(omega) [m^2 s] at omega [rad/s], up to the peakedness' own area.
-
-        Args:
-            omega: frequencies in rad/s, any shape.
-            height: significant wave height in m.
-            period: peak period in s.
-        """
-        peak = 2 * np.pi / period
-        ratio = omega / peak
-        form: np.ndarray = 5 / 16 * height**2 / peak * ratio**-5.0 * np.exp(-1.25 * ratio**-4.0)
-        density: np.ndarray = form * self.peakedness(ratio)
-        return density
-
-
-@final
-class IttcSpectrum(Spectrum):
-    """The spectrum of a fully developed sea: modified Pierson-Moskowitz (ITTC 1978).
-
-    It is given by significant height and peak period.
-    """
-
-    kind: Literal["ittc"] = "ittc"
-
-    def peakedness(self, ratio: np.ndarray) -> np.ndarray:
-        return np.ones_like(ratio)
-
-
-@final
-class JonswapSpectrum(Spectrum):
-    """The spectrum of a fetch-limited sea (JONSWAP, Hasselmann et al. 1973).
-
-    It is the ITTC form with its peak raised by gamma, scaled back to the significant height.
-
-    Attributes:
         gamma: peak enhancement factor, dimensionless.
     """
 
     kind: Literal["jonswap"] = "jonswap"
     gamma: float = Field(default=3.3, ge=1, le=7)
 
-    def peakedness(self, ratio: np.ndarray) -> np.ndarray:
-        """Return gamma^exp(-(ratio - 1)^2 / (2 sigma^2)), any shape.
+    def density(self, omega: np.ndarray, height: float, period: float) -> np.ndarray:
+        """Return S(omega) [m^2 s] at omega [rad/s], up to the peakedness' own area.
 
-        sigma is 0.07 below the peak and 0.09 above.
+        Args:
+            omega: frequencies in rad/s, any shape.
+            height: significant wave height in m, 4 sqrt(m0).
+            period: peak period in s.
         """
+        peak = 2 * np.pi / period
+        ratio = omega / peak
+        form = 5 / 16 * height**2 / peak * ratio**-5.0 * np.exp(-1.25 * ratio**-4.0)
+        # narrower below the peak than above
         width = np.where(ratio <= 1, 0.07, 0.09)
-        peaked: np.ndarray = self.gamma ** np.exp(-((ratio - 1) ** 2) / (2 * width**2))
-        return peaked
+        peaked = self.gamma ** np.exp(-((ratio - 1) ** 2) / (2 * width**2))
+        return np.asarray(form * peaked)
 
 
 class Box(Config):
@@ -253,9 +219,7 @@ class WavesConfig(Config):
         water_density: of the water.
     """
 
-    spectrum: Annotated[IttcSpectrum | JonswapSpectrum, Field(discriminator="kind")] = (
-        JonswapSpectrum()
-    )
+    spectrum: JonswapSpectrum = JonswapSpectrum()
     significant_height: Metres = Field(gt=0)
     peak_period: Seconds = Field(gt=0)
     direction: Radians
@@ -338,7 +302,8 @@ class Waves(nn.Module):
         c, s, k = torch.cos(chi), torch.sin(chi), self.number
         length, breadth = self.length, self.breadth
         deep = torch.exp(-k * self.draught)
-        along, across = _sinc(0.5 * k * c * length), _sinc(0.5 * k * s * breadth)
+        along = torch.sinc(0.5 * k * c * length / torch.pi)
+        across = torch.sinc(0.5 * k * s * breadth / torch.pi)
         pressure = self.weight * (1.0 - deep)
         even = length * breadth * along * across
         tilt_x, tilt_y = _first_moment(k * c, length), _first_moment(k * s, breadth)
@@ -361,11 +326,6 @@ class Waves(nn.Module):
         side = (quadrature * (self.amplitude * torch.sin(phase)).unsqueeze(-1)).sum(-2)
         turn = (yaw * self.amplitude * torch.cos(phase)).sum(-1, keepdim=True)
         return torch.cat((side, turn), dim=-1)
-
-
-def _sinc(x: Tensor) -> Tensor:
-    """Return sin x / x."""
-    return torch.sinc(x / torch.pi)
 
 
 def _first_moment(kappa: Tensor, width: float) -> Tensor:

@@ -83,10 +83,8 @@ class Correction(nn.Module):
     def __init__(self, terms: Sequence[str], coefficients: Tensor, intercept: Tensor) -> None:
         super().__init__()
         self.library = TermLibrary(terms, MOTION)
-        self.register_buffer("coefficients", coefficients.to(torch.float64))
-        self.register_buffer("intercept", intercept.to(torch.float64))
-        self.coefficients: Tensor
-        self.intercept: Tensor
+        self.coefficients = nn.Buffer(coefficients.to(torch.float64))
+        self.intercept = nn.Buffer(intercept.to(torch.float64))
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Return the force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
@@ -126,10 +124,7 @@ class ForceModel(nn.Module):
         super().__init__()
         self.hull = hull
         self.corrections = nn.ModuleList(corrections)
-        self.register_buffer(
-            "earth", torch.zeros(2, dtype=torch.float64) if earth is None else earth
-        )
-        self.earth: Tensor
+        self.earth = nn.Buffer(torch.zeros(2, dtype=torch.float64) if earth is None else earth)
 
     def extended(self, correction: Correction, earth: Tensor | None = None) -> ForceModel:
         """Return the next model of the chain."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar, Literal, final
+from typing import Annotated, ClassVar, Literal, final
 
 import torch
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond
@@ -31,8 +31,8 @@ from residnet.physics.parameters import (
     MassArm,
     MassDensity,
     Parameter,
+    Positive,
     Volume,
-    above_zero,
     dimension,
     of_dimension,
     unit_text,
@@ -54,11 +54,9 @@ class RigidBody(Config):
         x_G: centre of gravity ahead of the body origin in m.
     """
 
-    m: Mass
-    I_z: Inertia
+    m: Annotated[Mass, Positive]
+    I_z: Annotated[Inertia, Positive]
     x_G: Length
-
-    _positive = field_validator("m", "I_z")(above_zero)
 
 
 class AddedMass(Config):
@@ -284,13 +282,9 @@ class Gains(Config):
         n: yaw in 1/(kg m^2).
     """
 
-    x: Parameter
-    y: Parameter
-    n: Parameter
-
-    _linear = field_validator("x", "y")(of_dimension(-1, 0, 0))
-    _angular = field_validator("n")(of_dimension(-1, -2, 0))
-    _positive = field_validator("x", "y", "n")(above_zero)
+    x: Annotated[Parameter, AfterValidator(of_dimension(-1, 0, 0)), Positive]
+    y: Annotated[Parameter, AfterValidator(of_dimension(-1, 0, 0)), Positive]
+    n: Annotated[Parameter, AfterValidator(of_dimension(-1, -2, 0)), Positive]
 
 
 class AccelerationTerms(TermRows):
@@ -349,10 +343,8 @@ class RollingBody(RigidBody):
         z_G: centre of gravity below the body origin in m; negative above it.
     """
 
-    I_x: Inertia
+    I_x: Annotated[Inertia, Positive]
     z_G: Length
-
-    _positive_roll = field_validator("I_x")(above_zero)
 
 
 class RollingAddedMass(AddedMass):
@@ -407,11 +399,9 @@ class Hydrostatics(Config):
         GM: transverse metacentric height.
     """
 
-    density: MassDensity
-    volume: Volume
-    GM: Length
-
-    _positive = field_validator("density", "volume", "GM")(above_zero)
+    density: Annotated[MassDensity, Positive]
+    volume: Annotated[Volume, Positive]
+    GM: Annotated[Length, Positive]
 
     @property
     def stiffness(self) -> float:
@@ -491,9 +481,7 @@ class SubmergedBody(RollingBody):
         z_G: centre of gravity below the body origin in m.
     """
 
-    I_y: Inertia
-
-    _positive_pitch = field_validator("I_y")(above_zero)
+    I_y: Annotated[Inertia, Positive]
 
 
 class SubmergedAddedMass(Config):
@@ -550,12 +538,10 @@ class Buoyancy(Config):
         z_B: centre of buoyancy below the body origin in m; negative above it.
     """
 
-    density: MassDensity
-    volume: Volume
+    density: Annotated[MassDensity, Positive]
+    volume: Annotated[Volume, Positive]
     x_B: Length
     z_B: Length
-
-    _positive = field_validator("density", "volume")(above_zero)
 
 
 @final

@@ -11,13 +11,13 @@ from typing import Annotated, ClassVar, Literal, NamedTuple, final
 import numpy as np
 import torch
 from pydantic import AfterValidator, Field, model_validator
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.core.columns import heading, surge, sway, yaw_rate
 from residnet.core.config import MetresPerSecond
 from residnet.core.frames import to_earth
 from residnet.core.layout import SURGE, SWAY
-from residnet.physics.actuators.rudders import SteeringGearConfig
+from residnet.physics.actuators.base import SteeringGearConfig
 from residnet.physics.parameters import Parameter, measured_in
 from residnet.physics.plant import Plant
 from residnet.physics.vessel_file import VesselFile
@@ -185,17 +185,15 @@ class SteeringVessel(Plant):
         super().__init__()
         a, b, extra = config.steering()
         self.speed, self.delta_max = config.speed, config.rudder.limit
-        self.servo = config.rudder.follow(config.rudder.limit, config.rudder.rate, "delta")
+        self.servo = config.rudder.servo("delta")
         self.free = 2 + len(extra)
         self.turning_columns = slice(SWAY, SWAY + self.free)
         self.rudder_columns = slice(SWAY + self.free, None)
         self.state = ("x", "y", "psi", "u", "v", "r", *extra, *self.servo.state)
         self.inputs = ("cmd_delta",)
         self.commands = 1
-        for name, value in (("a", a), ("b", b)):
-            self.register_buffer(name, torch.from_numpy(value), persistent=False)
-        self.a: Tensor
-        self.b: Tensor
+        self.a = nn.Buffer(torch.from_numpy(a), persistent=False)
+        self.b = nn.Buffer(torch.from_numpy(b), persistent=False)
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the rudder angle [..., 1] for a steer [...] as a share of the limit.

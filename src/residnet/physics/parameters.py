@@ -72,6 +72,7 @@ def above_zero(parameter: Parameter) -> Parameter:
     return parameter
 
 
+Positive = AfterValidator(above_zero)
 _BASE = {
     "kg": (0, 0),
     "m": (1, 0),

@@ -133,15 +133,10 @@ class Hull(nn.Module):
         super().__init__()
         self.terms = TermLibrary(list(dict.fromkeys(t for row in rows for t in row)), channels)
         coefficients = [[row.get(term, 0.0) for row in rows] for term in self.terms.terms]
-        for name, value in (
-            ("mass", torch.tensor(mass, dtype=torch.float64)),
-            ("coefficients", torch.tensor(coefficients, dtype=torch.float64).view(-1, len(rows))),
-        ):
-            self.register_buffer(name, value, persistent=False)
-        self.register_buffer("inverse", inverse_mass(self.mass, vessel), persistent=False)
-        self.mass: Tensor
-        self.inverse: Tensor
-        self.coefficients: Tensor
+        table = torch.tensor(coefficients, dtype=torch.float64).view(-1, len(rows))
+        self.mass: Tensor = nn.Buffer(torch.tensor(mass, dtype=torch.float64), persistent=False)
+        self.coefficients = nn.Buffer(table, persistent=False)
+        self.inverse = nn.Buffer(inverse_mass(self.mass, vessel), persistent=False)
 
     def load(self, motion: Tensor) -> Tensor:
         """Return the forces [..., n] in N and N m of water, weight and rotation."""

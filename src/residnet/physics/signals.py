@@ -184,8 +184,7 @@ class Signals(nn.Module):
         self.dof = config.live.size
         self.spatial = config.live.spatial
         seen = torch.tensor([name not in config.live.hidden for name in config.live.moving])
-        self.register_buffer("seen", seen.double(), persistent=False)
-        self.seen: Tensor
+        self.seen = nn.Buffer(seen.double(), persistent=False)
         names += FORCE_CHANNELS if self.forces else ()
         names += WIND_CHANNELS if self.wind else ()
         self.names: tuple[str, ...] = ChannelNames(names, config.pairs, config.live)
@@ -283,11 +282,9 @@ class VelocityBound(nn.Module):
         super().__init__()
         self.margin = margin
         self.channels, self.dof = channels, dof
-        for name, count in (("low", channels), ("high", channels), ("rate", dof)):
-            self.register_buffer(name, torch.zeros(count, dtype=torch.float64))
-        self.low: Tensor
-        self.high: Tensor
-        self.rate: Tensor
+        self.low = nn.Buffer(torch.zeros(channels, dtype=torch.float64))
+        self.high = nn.Buffer(torch.zeros(channels, dtype=torch.float64))
+        self.rate = nn.Buffer(torch.zeros(dof, dtype=torch.float64))
 
     def calibrate(self, samples: Samples) -> None:
         """Take the ranges of the channels, and the rate from the accelerations."""

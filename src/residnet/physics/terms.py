@@ -167,15 +167,13 @@ class TermLibrary(nn.Module):
         self.count, self.depth = len(columns), max([len(column) for column in columns], default=0)
         padded = [column + [0] * (self.depth - len(column)) for column in columns]
         gather = torch.tensor(padded, dtype=torch.long).reshape(self.count, self.depth).T
-        self.register_buffer("index", gather.contiguous(), persistent=False)
-        self.index: Tensor
+        self.index = nn.Buffer(gather.contiguous(), persistent=False)
         # a linear model has the channels alone for terms
         self.linear = self.count > 0 and all(
             len(column) == 1 and 0 < column[0] <= len(names) for column in columns
         )
         channel = gather[0] - 1 if self.linear else gather.new_zeros(0)
-        self.register_buffer("channel", channel, persistent=False)
-        self.channel: Tensor
+        self.channel = nn.Buffer(channel, persistent=False)
         self.same = self.linear and channel.tolist() == list(range(len(names)))
 
     def forward(self, z: Tensor) -> Tensor:
@@ -253,10 +251,8 @@ class SplitTerms(nn.Module):
         self.coupled = any(other != "1" for other in beside)
         self.beside = TermLibrary(beside if self.coupled else (), names)
         self.linear = not self.coupled and (self.moving.linear or not moving)
-        for name, rows in (("places", places), ("apart", apart)):
-            self.register_buffer(name, torch.tensor(rows, dtype=torch.long), persistent=False)
-        self.places: Tensor
-        self.apart: Tensor
+        self.places = nn.Buffer(torch.tensor(places, dtype=torch.long), persistent=False)
+        self.apart = nn.Buffer(torch.tensor(apart, dtype=torch.long), persistent=False)
 
     def ahead(self, p: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Return what velocities do not decide: rows [..., q], and the weights of what they do.

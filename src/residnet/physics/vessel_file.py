@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ValidationInfo, field_validator, model_validator
+from pydantic import ValidationInfo, model_validator
 
 from residnet.core.config import Config, load_mapping
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.core.registry import vessel_files
-from residnet.physics.parameters import Length, above_zero
+from residnet.physics.parameters import Length, Positive
 from residnet.physics.plant import Plant
 
 
@@ -29,9 +29,7 @@ class VesselFile(Config, ABC):
 
     name: str
     description: str
-    length: Length
-
-    _positive_length = field_validator("length")(above_zero)
+    length: Annotated[Length, Positive]
 
     @model_validator(mode="before")
     @classmethod

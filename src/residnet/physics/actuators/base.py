@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import Annotated, ClassVar, Literal, Protocol, final
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self, final
 
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.core.config import Config, RadiansPerSecond, RevsPerSecond, Seconds
+from residnet.core.config import (
+    Config,
+    Radians,
+    RadiansPerSecond,
+    RevRate,
+    RevsPerSecond,
+    Seconds,
+)
 from residnet.core.errors import ConfigError
 
 
@@ -120,6 +127,38 @@ class ServoConfig(Config):
     def follow(self, limit: float, rate: float | None, *names: str) -> Servo:
         """Return the servo of actuators that are alike, within their limits."""
         return Servo(self, limit, rate, names)
+
+
+class SteeringGearConfig(ServoConfig):
+    """The steering gear: how far and how fast the rudder turns.
+
+    Attributes:
+        limit: largest rudder angle of either side in rad.
+        rate: largest rudder rate in rad/s; None for no limit.
+    """
+
+    limit: Radians = Field(gt=0, lt=1.5707)
+    rate: RadiansPerSecond | None = Field(default=None, gt=0)
+
+    def servo(self, *names: str) -> Servo:
+        """Return the servo of rudders by name."""
+        return self.follow(self.limit, self.rate, *names)
+
+
+class ShaftConfig(ServoConfig):
+    """A shaft with a propeller or jet.
+
+    Attributes:
+        n_max: largest revolutions of either direction in 1/s; commands beyond it saturate.
+        n_rate: largest change of revolutions in 1/s^2; None for at once.
+    """
+
+    n_max: RevsPerSecond = Field(gt=0)
+    n_rate: RevRate | None = Field(default=None, gt=0)
+
+    def servo(self, *names: str) -> Servo:
+        """Return the servo of shafts by name."""
+        return self.follow(self.n_max, self.n_rate, *names)
 
 
 @final
@@ -285,58 +324,116 @@ class ActuatorConfig(Config, ABC):
         """Build the module that turns commands into forces."""
 
 
+class Command(NamedTuple):
+    """One command of steered actuators.
+
+    Attributes:
+        name: of the command.
+        by: what a manoeuvre sets it by.
+        largest: value of a whole share.
+        least: least share; 0 for what pushes one way.
+    """
+
+    name: str
+    by: Literal["drive", "steer", "dive"]
+    largest: float
+    least: float = -1.0
+
+
+def demanded(commands: Sequence[Command], drive: Tensor, steer: Tensor) -> Tensor:
+    """Return commands [..., c] for drive and steer [...], shares of what is largest."""
+    given = {"drive": drive, "steer": steer, "dive": torch.zeros_like(steer)}
+    parts = [given[c.by].clamp(c.least, 1.0) * c.largest for c in commands]
+    return torch.stack(parts, dim=-1)
+
+
+class SteeredConfig(ActuatorConfig, ABC):
+    """Actuators whose config says what they do."""
+
+    @abstractmethod
+    def commanded(self) -> tuple[Command, ...]:
+        """Return the commands, those that servos follow first."""
+
+    @abstractmethod
+    def servos(self) -> tuple[Servo, ...]:
+        """Return the servos, in the order of the commands."""
+
+    @abstractmethod
+    def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        """Return the forces tau [..., n] on the hull in N and N m.
+
+        Args:
+            position: where the servos stand [..., c].
+            command: commands [..., c].
+            nu: velocities through the water [..., n].
+        """
+
+    def followed(self, command: Tensor) -> Tensor:
+        """Return the commands [..., c] that servos follow, in their order."""
+        return command
+
+    @final
+    def build(self) -> SteeredActuators:
+        return SteeredActuators(self)
+
+
+@final
+class SteeredActuators(Actuators):
+    """Rudders, fins and jets with their propellers, as their config has them."""
+
+    def __init__(self, config: SteeredConfig) -> None:
+        super().__init__(*config.servos())
+        self.config, self.commanded = config, config.commanded()
+        self.commands = tuple(command.name for command in self.commanded)
+        dive = [command.largest * (command.by == "dive") for command in self.commanded]
+        self.diving = torch.tensor(dive, dtype=torch.float64) if any(dive) else None
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        return demanded(self.commanded, drive, steer)
+
+    def followed(self, command: Tensor) -> Tensor:
+        return self.config.followed(command)
+
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        return self.config.force(self.positions(a, command), command, nu)
+
+
 Coefficients = tuple[float, float, float]
 CurveRange = tuple[RevsPerSecond, RevsPerSecond]
 """Revolutions (astern, ahead) between which a curve was measured."""
 
 
-class Curved(Protocol):
-    """A config with a thrust curve and the limits of its shaft, n_max in 1/s."""
-
-    @property
-    def n_max(self) -> float: ...
-
-    @property
-    def curve_range(self) -> CurveRange | None: ...
-
-
-def require_range(config: Curved) -> None:
+def require_range(curve_range: CurveRange | None, n_max: float) -> None:
     """Stop where a shaft may turn faster than its thrust curve is known.
 
     Raises:
         ValueError: naming both.
     """
-    if config.curve_range is None:
-        return
-    low, high = config.curve_range
-    if low > -config.n_max or high < config.n_max:
+    low, high = curve_range or (-n_max, n_max)
+    if low > -n_max or high < n_max:
         raise ValueError(
             f"curve_range {low * 60:g} to {high * 60:g} rpm does not reach n_max"
-            f" (+-{config.n_max * 60:g} rpm); lower n_max or measure the curve further"
+            f" (+-{n_max * 60:g} rpm); lower n_max or measure the curve further"
         )
 
 
-@final
-class ThrustCurve(nn.Module):
-    """The curves T = c0 + c1 n + c2 n^2 [N] of c propellers, others for n < 0 [1/s].
+class ThrustConfig(Config):
+    """The thrust curve of a propeller, c0 + c1 n + c2 n^2; it never opposes the rotation.
 
-    Thrust never opposes the sense of rotation (correction W5).
-
-    Args:
-        forward: coefficients (c0, c1, c2) of each propeller for n > 0.
-        reverse: the same for n < 0.
+    Attributes:
+        n_max: largest revolutions of either direction in 1/s; commands beyond it saturate.
+        forward: coefficients c0 [N], c1 [N s], c2 [N s^2] for n > 0 [1/s], at standstill.
+        reverse: coefficients for n < 0 (signed).
+        curve_range: revolutions (astern, ahead) in 1/s that the curve was measured between; it must
+            include +-n_max.
     """
 
-    def __init__(self, forward: Sequence[Coefficients], reverse: Sequence[Coefficients]) -> None:
-        super().__init__()
-        for name, rows in (("ahead", forward), ("astern", reverse)):
-            self.register_buffer(name, torch.tensor(rows, dtype=torch.float64).T, persistent=False)
-        self.ahead: Tensor
-        self.astern: Tensor
+    n_max: RevsPerSecond = Field(gt=0)
+    forward: Coefficients
+    reverse: Coefficients
+    curve_range: CurveRange | None = None
 
-    def forward(self, n: Tensor) -> Tensor:
-        """Return the thrusts [N] at revolutions n [..., c] in 1/s."""
-        f, b = self.ahead.to(n.dtype), self.astern.to(n.dtype)
-        ahead = (f[0] + n * (f[1] + n * f[2])).clamp(min=0.0)
-        astern = (b[0] + n * (b[1] + n * b[2])).clamp(max=0.0)
-        return torch.where(n > 0, ahead, torch.where(n < 0, astern, torch.zeros_like(n)))
+    @model_validator(mode="after")
+    def _range(self) -> Self:
+        require_range(self.curve_range, self.n_max)
+        return self

@@ -11,40 +11,20 @@ from abc import ABC, abstractmethod
 from typing import Annotated, Literal, final
 
 import torch
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field
 from torch import Tensor
 
-from residnet.core.config import (
-    Config,
-    Metres,
-    Newtons,
-    Radians,
-    RadiansPerSecond,
-    RevRate,
-    RevsPerSecond,
-)
+from residnet.core.config import Config, Metres, Newtons, Radians, RevsPerSecond
 from residnet.physics.actuators.base import (
-    ActuatorConfig,
-    Actuators,
-    Coefficients,
-    CurveRange,
+    Command,
+    Servo,
     ServoConfig,
-    ThrustCurve,
-    require_range,
+    ShaftConfig,
+    SteeredConfig,
+    SteeringGearConfig,
+    ThrustConfig,
 )
-from residnet.physics.parameters import Density, Parameter, SquareMetres, above_zero, of_dimension
-
-
-class SteeringGearConfig(ServoConfig):
-    """The steering gear: how far and how fast the rudder turns.
-
-    Attributes:
-        limit: largest rudder angle of either side in rad.
-        rate: largest rudder rate in rad/s; None for no limit.
-    """
-
-    limit: Radians = Field(gt=0, lt=1.5707)
-    rate: RadiansPerSecond | None = Field(default=None, gt=0)
+from residnet.physics.parameters import Density, Parameter, Positive, SquareMetres, of_dimension
 
 
 class RudderConfig(SteeringGearConfig):
@@ -68,39 +48,31 @@ class RudderConfig(SteeringGearConfig):
     straightening: float = Field(default=1.0, ge=0, le=1)
 
 
-class PropellerConfig(ServoConfig):
+class PropellerConfig(ShaftConfig, ThrustConfig):
     """A propeller on its shaft.
 
     Attributes:
         diameter: of the disc.
-        forward: coefficients c0 [N], c1 [N s], c2 [N s^2] of the thrust c0 + c1 n + c2 n^2 at
-            standstill for n > 0 [1/s]; it never opposes the rotation.
-        reverse: coefficients for n < 0.
-        curve_range: revolutions (astern, ahead) that these were measured between; they must include
-            +-n_max.
-        n_max: largest revolutions of either direction; commands beyond it saturate.
-        n_rate: rate limit of the shaft; None for no limit.
         advance_loss: thrust lost per revolution and speed, T = curve - advance_loss |n| u [N
             s^2/m], u >= 0; K_T falls linearly.
         thrust_deduction: share t of the thrust that the hull takes back.
     """
 
     diameter: Metres = Field(gt=0)
-    forward: Coefficients
-    reverse: Coefficients
-    curve_range: CurveRange | None = None
-    n_max: RevsPerSecond = Field(gt=0)
-    n_rate: RevRate | None = Field(default=None, gt=0)
     advance_loss: float = Field(default=0.0, ge=0)
     thrust_deduction: float = Field(default=0.0, ge=0, lt=1)
 
-    @model_validator(mode="after")
-    def _range(self) -> PropellerConfig:
-        require_range(self)
-        return self
+    def thrust(self, n: Tensor, u: Tensor) -> Tensor:
+        """Return the thrust [N] at n [1/s] and speed through the water u [m/s], any shape."""
+        f, b = self.forward, self.reverse
+        ahead = (f[0] + n * (f[1] + n * f[2])).clamp(min=0.0)
+        astern = (b[0] + n * (b[1] + n * b[2])).clamp(max=0.0)
+        curve = torch.where(n > 0, ahead, torch.where(n < 0, astern, torch.zeros_like(n)))
+        return curve - self.advance_loss * n.abs() * u.clamp(min=0.0)
 
 
-class RudderPropellerConfig(ActuatorConfig):
+@final
+class RudderPropellerConfig(SteeredConfig):
     """A propeller and a rudder, without hull interaction.
 
     Normal force and inflow are those of the MMG standard method (Yasukawa and Yoshimura 2015).
@@ -108,6 +80,9 @@ class RudderPropellerConfig(ActuatorConfig):
     F_N = 0.5 rho A f sin(delta_e) U_R^2, X = -F_N sin delta, Y = -F_N cos delta, N = x Y; delta > 0
     turns to starboard. The inflow is U_R^2 = u|u| + race_share 2 T / (rho A_p): the race of an
     actuator disc, fully contracted.
+
+    Commands are cmd_delta [rad] and cmd_n [1/s]; states are delta and n where they do not follow at
+    once.
 
     Attributes:
         rudder: the rudder.
@@ -120,63 +95,42 @@ class RudderPropellerConfig(ActuatorConfig):
     propeller: PropellerConfig
     density: Density = Field(default=1025.0, gt=0)
 
-    def build(self) -> RudderPropeller:
-        return RudderPropeller(self)
-
-
-@final
-class RudderPropeller(Actuators):
-    """The forces tau [..., 3] of a propeller and a rudder.
-
-    Commands are cmd_delta [rad] and cmd_n [1/s]; states are delta and n where they do not follow at
-    once.
-    """
-
-    commands = ("cmd_delta", "cmd_n")
-
-    def __init__(self, config: RudderPropellerConfig) -> None:
-        rudder, propeller = config.rudder, config.propeller
-        super().__init__(
-            rudder.follow(rudder.limit, rudder.rate, "delta"),
-            propeller.follow(propeller.n_max, propeller.n_rate, "n"),
+    def commanded(self) -> tuple[Command, ...]:
+        """Return the rudder angle from steer, to starboard, and revolutions from drive."""
+        return (
+            Command("cmd_delta", "steer", self.rudder.limit),
+            Command("cmd_n", "drive", self.propeller.n_max),
         )
-        self.config = config
-        self.curve = ThrustCurve([propeller.forward], [propeller.reverse])
-        slope = 6.13 * rudder.aspect_ratio / (rudder.aspect_ratio + 2.25)
-        self.lift = 0.5 * config.density * rudder.area * slope
-        disc = 0.25 * math.pi * propeller.diameter**2
-        self.race = rudder.race_share * 2.0 / (config.density * disc)
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the rudder angle from steer and revolutions from drive, as shares of their limits.
+    def servos(self) -> tuple[Servo, ...]:
+        return self.rudder.servo("delta"), self.propeller.servo("n")
 
-        Steer to starboard is positive.
-        """
-        angle = steer.clamp(-1.0, 1.0) * self.config.rudder.limit
-        return torch.stack((angle, drive.clamp(-1.0, 1.0) * self.config.propeller.n_max), dim=-1)
-
-    def thrust(self, n: Tensor, u: Tensor) -> Tensor:
-        """Return the thrust [N] of the propeller at n [1/s] and speed through the water u [m/s]."""
-        loss = self.config.propeller.advance_loss
-        thrust: Tensor = self.curve(n) - loss * n.abs() * u.clamp(min=0.0)
-        return thrust
-
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        rudder, position = self.config.rudder, self.positions(a, command)
+    def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        rudder, propeller = self.rudder, self.propeller
         delta, u = position[..., 0], nu[..., 0]
-        thrust = self.thrust(position[..., 1], u)
-        square = u * u.abs() + self.race * thrust.clamp(min=0.0)
+        lift = 0.5 * self.density * rudder.area
+        lift *= 6.13 * rudder.aspect_ratio / (rudder.aspect_ratio + 2.25)
+        disc = 0.25 * math.pi * propeller.diameter**2
+        thrust = propeller.thrust(position[..., 1], u)
+        race = rudder.race_share * 2.0 / (self.density * disc)
+        square = u * u.abs() + race * thrust.clamp(min=0.0)
         across = rudder.straightening * (nu[..., 1] + rudder.x * nu[..., 2])
         # the offset keeps the gradient finite at rest
         inflow = torch.sqrt(square.abs() + 1e-8)
-        normal = self.lift * (square * torch.sin(delta) + inflow * across * torch.cos(delta))
+        normal = lift * (square * torch.sin(delta) + inflow * across * torch.cos(delta))
         side = -normal * torch.cos(delta)
-        ahead = (1.0 - self.config.propeller.thrust_deduction) * thrust
+        ahead = (1.0 - propeller.thrust_deduction) * thrust
         return torch.stack((ahead - normal * torch.sin(delta), side, rudder.x * side), dim=-1)
 
 
-class SternRuddersConfig(SteeringGearConfig, ActuatorConfig, ABC):
+class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
     """Rudders that move together behind propellers whose thrust is commanded.
+
+    Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state where the rudder has a
+    rate.
+
+    delta > 0 turns to starboard: Y = -L, K = z L, N = -x L, X = T - D (document 004 eqs.
+    (5.26)-(5.29), signs as in corrections G9, G10).
 
     Attributes:
         x: place of the rudders' centre of pressure ahead of the body origin in m; negative aft.
@@ -200,9 +154,25 @@ class SternRuddersConfig(SteeringGearConfig, ActuatorConfig, ABC):
             thrust: of all propellers [...] in N.
         """
 
+    def commanded(self) -> tuple[Command, ...]:
+        """Return rudder angle and thrust; there is none astern."""
+        return (
+            Command("cmd_delta", "steer", self.limit),
+            Command("cmd_thrust", "drive", self.thrust, 0.0),
+        )
+
+    def servos(self) -> tuple[Servo, ...]:
+        return (self.servo("delta"),)
+
+    def followed(self, command: Tensor) -> Tensor:
+        """Return the rudder's command [..., 1]; thrust acts at once."""
+        return command[..., :1]
+
     @final
-    def build(self) -> SternRudders:
-        return SternRudders(self)
+    def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        thrust = command[..., 1].clamp(0.0, self.thrust)
+        lift, drag = self.foil(position[..., 0], nu[..., 0], nu[..., 1], thrust)
+        return torch.stack((thrust - drag, -lift, self.z * lift, -self.x * lift), dim=-1)
 
 
 @final
@@ -267,45 +237,6 @@ class LinearRuddersConfig(SternRuddersConfig):
         return self.Y_delta_uu * u * u * delta, torch.zeros_like(delta)
 
 
-@final
-class SternRudders(Actuators):
-    """The forces tau [..., 4] along x, y and about x, z of rudders and propellers at the stern.
-
-    Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state where the rudder has a
-    rate.
-
-    delta > 0 turns to starboard: Y = -L, K = z L, N = -x L, X = T - D (document 004 eqs.
-    (5.26)-(5.29), signs as in corrections G9, G10).
-    """
-
-    commands = ("cmd_delta", "cmd_thrust")
-
-    def __init__(self, config: SternRuddersConfig) -> None:
-        super().__init__(config.follow(config.limit, config.rate, "delta"))
-        self.config = config
-        self.delta_max, self.thrust_max = config.limit, config.thrust
-
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return rudder angle and thrust [..., 2] for steer and drive, shares of their limits.
-
-        There is no thrust astern.
-        """
-        angle, thrust = steer.clamp(-1.0, 1.0), drive.clamp(0.0, 1.0)
-        return torch.stack((angle * self.delta_max, thrust * self.thrust_max), dim=-1)
-
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        delta = self.positions(a, command)[..., 0]
-        thrust = command[..., 1].clamp(0.0, self.thrust_max)
-        lift, drag = self.config.foil(delta, nu[..., 0], nu[..., 1], thrust)
-        return torch.stack(
-            (thrust - drag, -lift, self.config.z * lift, -self.config.x * lift), dim=-1
-        )
-
-    def followed(self, command: Tensor) -> Tensor:
-        """Return the rudder's command [..., 1]; thrust acts at once."""
-        return command[..., :1]
-
-
 Force = Annotated[Parameter, AfterValidator(of_dimension(1, 1, -2))]
 ForcePerSpeed = Annotated[Parameter, AfterValidator(of_dimension(1, 0, -1))]
 ForcePerSquaredSpeed = Annotated[Parameter, AfterValidator(of_dimension(1, -1, 0))]
@@ -341,24 +272,11 @@ class RevolutionsCurve(Config):
     r0: Ratio
     r1: PerRevolutions
     r2: PerSquaredRevolutions
-    reference: Ratio
-
-    _positive = field_validator("reference")(above_zero)
+    reference: Annotated[Ratio, Positive]
 
 
-class MotorConfig(ServoConfig):
-    """The motor of each jet, which turns in one direction.
-
-    Attributes:
-        n_max: largest revolutions in 1/s.
-        n_rate: largest change of revolutions in 1/s^2; None for at once.
-    """
-
-    n_max: RevsPerSecond = Field(gt=0)
-    n_rate: RevRate | None = Field(default=None, gt=0)
-
-
-class WaterJetsConfig(ActuatorConfig):
+@final
+class WaterJetsConfig(SteeredConfig):
     """Equal water jets that turn and run together.
 
     Commands are cmd_n [1/s] and cmd_nozzle [rad], whose thrust pushes to starboard where positive.
@@ -369,7 +287,7 @@ class WaterJetsConfig(ActuatorConfig):
         speed: parabola of the thrust of one jet over the speed; its product with `revolutions` is
             the thrust (6.16), which may be negative below some revolutions (H15).
         revolutions: parabola of the thrust over the revolutions.
-        motor: limits of the revolutions.
+        motor: limits of the revolutions; it turns in one direction.
         nozzle: limits of the angle of the nozzles, which direct the jets.
     """
 
@@ -378,63 +296,50 @@ class WaterJetsConfig(ActuatorConfig):
     x: Metres
     speed: SpeedCurve
     revolutions: RevolutionsCurve
-    motor: MotorConfig
+    motor: ShaftConfig
     nozzle: SteeringGearConfig
 
-    def build(self) -> WaterJets:
-        return WaterJets(self)
-
-
-@final
-class WaterJets(Actuators):
-    """The forces tau [..., 3] of water jets from motor speed and nozzle angle."""
-
-    commands = ("cmd_n", "cmd_nozzle")
-
-    def __init__(self, config: WaterJetsConfig) -> None:
-        motor, nozzle = config.motor, config.nozzle
-        super().__init__(
-            motor.follow(motor.n_max, motor.n_rate, "n"),
-            nozzle.follow(nozzle.limit, nozzle.rate, "nozzle"),
+    def commanded(self) -> tuple[Command, ...]:
+        """Return revolutions, since jets do not push astern, and the yaw moment's sense."""
+        side = self.nozzle.limit if self.x > 0 else -self.nozzle.limit
+        return (
+            Command("cmd_n", "drive", self.motor.n_max, 0.0),
+            Command("cmd_nozzle", "steer", side),
         )
-        self.config = config
+
+    def servos(self) -> tuple[Servo, ...]:
+        return self.motor.servo("n"), self.nozzle.servo("nozzle")
+
+    def followed(self, command: Tensor) -> Tensor:
+        """Return the commands [..., 2] without negative revolutions."""
+        return torch.stack((command[..., 0].clamp(min=0.0), command[..., 1]), dim=-1)
 
     def thrust(self, n: Tensor, u: Tensor) -> Tensor:
         """Return the thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape.
 
         Source: document 000 eq. (6.16).
         """
-        a, r = self.config.speed, self.config.revolutions
+        a, r = self.speed, self.revolutions
         by_speed = a.a0.value + u * (a.a1.value + u * a.a2.value)
         share = (r.r0.value + n * (r.r1.value + n * r.r2.value)) / r.reference.value
         return by_speed * share
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., 2] for drive and steer.
-
-        Drive ahead is the share of the motor's revolutions (jets do not push astern), steer the yaw
-        moment's sense.
-        """
-        limit = self.config.nozzle.limit
-        side = steer.clamp(-1.0, 1.0) * (limit if self.config.x > 0 else -limit)
-        return torch.stack((drive.clamp(0.0, 1.0) * self.config.motor.n_max, side), dim=-1)
-
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        n, angle = self.positions(a, command).unbind(-1)
-        total = self.config.jets * self.thrust(n, nu[..., 0])
+    def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        n, angle = position.unbind(-1)
+        total = self.jets * self.thrust(n, nu[..., 0])
         across = total * torch.sin(angle)
-        return torch.stack((total * torch.cos(angle), across, self.config.x * across), dim=-1)
-
-    def followed(self, command: Tensor) -> Tensor:
-        """Return the commands [..., 2] without negative revolutions."""
-        return torch.stack((command[..., 0].clamp(min=0.0), command[..., 1]), dim=-1)
+        return torch.stack((total * torch.cos(angle), across, self.x * across), dim=-1)
 
 
-class TorpedoFinsConfig(ServoConfig, ActuatorConfig):
+@final
+class TorpedoFinsConfig(ServoConfig, SteeredConfig):
     """A propeller, a rudder and stern planes at the tail of a torpedo, each behind the same lag.
 
     Commands are cmd_delta [rad] (positive to starboard), cmd_delta_s [rad] (positive to dive) and
-    cmd_n [1/s].
+    cmd_n [1/s]. The lift of a fin is across the hull, its drag grows by the square of its angle.
+    Astern the propeller has its thrust at rest.
+
+    Source: Fossen's model of the REMUS 100 (PythonVehicleSimulator, vehicles/remus100.py).
 
     Attributes:
         limit: largest angle of rudder and planes.
@@ -463,46 +368,29 @@ class TorpedoFinsConfig(ServoConfig, ActuatorConfig):
     wake: float = Field(gt=0, le=1)
     thrust_deduction: float = Field(ge=0, lt=1)
 
-    def build(self) -> TorpedoFins:
-        return TorpedoFins(self)
-
-
-@final
-class TorpedoFins(Actuators):
-    """The forces tau [..., 6] of fins and propeller.
-
-    The lift of a fin is across the hull, its drag grows by the square of its angle. Astern the
-    propeller has its thrust at rest.
-
-    Source: Fossen's model of the REMUS 100 (PythonVehicleSimulator, vehicles/remus100.py).
-    """
-
-    commands = ("cmd_delta", "cmd_delta_s", "cmd_n")
-
-    def __init__(self, config: TorpedoFinsConfig) -> None:
-        super().__init__(
-            config.follow(config.limit, None, "delta", "delta_s"),
-            config.follow(config.n_max, None, "n"),
+    def commanded(self) -> tuple[Command, ...]:
+        """Return rudder, planes and revolutions; there are none astern."""
+        return (
+            Command("cmd_delta", "steer", self.limit),
+            Command("cmd_delta_s", "dive", self.limit),
+            Command("cmd_n", "drive", self.n_max, 0.0),
         )
-        self.config = config
-        self.diving = torch.tensor([0.0, config.limit, 0.0], dtype=torch.float64)
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return rudder, planes amidships and revolutions [..., 3], shares of their limits."""
-        angle = steer.clamp(-1.0, 1.0) * self.config.limit
-        turning = drive.clamp(0.0, 1.0) * self.config.n_max
-        return torch.stack((angle, torch.zeros_like(angle), turning), dim=-1)
+    def servos(self) -> tuple[Servo, ...]:
+        return (
+            self.follow(self.limit, None, "delta", "delta_s"),
+            self.follow(self.n_max, None, "n"),
+        )
 
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        c, position = self.config, self.positions(a, command)
+    def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         delta, dive, n = position.unbind(-1)
-        square = 0.5 * c.density * nu[..., 0].square()
-        side, lift = -square * c.rudder * delta, -square * c.planes * dive
+        square = 0.5 * self.density * nu[..., 0].square()
+        side, lift = -square * self.rudder * delta, -square * self.planes * dive
         drag = -side * delta - lift * dive
-        advance = c.wake * nu[..., 0] / c.diameter * n.clamp(min=0.0)
+        advance = self.wake * nu[..., 0] / self.diameter * n.clamp(min=0.0)
         thrust, torque = (
-            c.density * c.diameter**power * (rest * n * n.abs() + slope * advance)
-            for power, (rest, slope) in ((4, c.K_T), (5, c.K_Q))
+            self.density * self.diameter**power * (rest * n * n.abs() + slope * advance)
+            for power, (rest, slope) in ((4, self.K_T), (5, self.K_Q))
         )
-        ahead = (1.0 - c.thrust_deduction) * thrust - drag
-        return torch.stack((ahead, side, lift, torque, -c.x * lift, c.x * side), dim=-1)
+        ahead = (1.0 - self.thrust_deduction) * thrust - drag
+        return torch.stack((ahead, side, lift, torque, -self.x * lift, self.x * side), dim=-1)

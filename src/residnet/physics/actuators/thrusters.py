@@ -19,12 +19,10 @@ from residnet.core.config import (
     Radians,
     RadiansPerSecond,
     RevRate,
-    RevsPerSecond,
 )
 from residnet.physics.actuators.base import (
     ActuatorConfig,
     Actuators,
-    Coefficients,
     CurveRange,
     FirstOrderConfig,
     ForceActuators,
@@ -32,7 +30,8 @@ from residnet.physics.actuators.base import (
     SecondOrderConfig,
     Servo,
     ServoConfig,
-    ThrustCurve,
+    ShaftConfig,
+    ThrustConfig,
     require_range,
 )
 
@@ -47,37 +46,30 @@ def _different(names: Sequence[str]) -> None:
         raise ValueError(f"two thrusters are named '{repeated[0]}'")
 
 
-class ThrusterConfig(ServoConfig):
+class PlaceConfig(Config):
+    """The name and place of one thruster.
+
+    Attributes:
+        name: what ends the names of its channels, for example `port`.
+        x: distance forward of the body origin in m.
+        y: distance to starboard of the body origin in m.
+    """
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]*$")
+    x: Metres = 0.0
+    y: Metres = 0.0
+
+
+class ThrusterConfig(PlaceConfig, ShaftConfig, ThrustConfig):
     """One fixed thruster of several.
 
     Attributes:
-        name: ends its channels, n_<name> and cmd_<name>, for example `port`.
-        x: place ahead of the body origin in m.
-        y: place to starboard of the body origin in m.
+        name: ends its channels, n_<name> and cmd_<name>.
         angle: of its thrust from the bow, clockwise; 90 deg for a bow thruster that pushes to
             starboard.
-        n_max: largest revolutions of either direction in 1/s; commands beyond it saturate.
-        n_rate: rate limit of the shaft in 1/s^2; None for no limit.
-        forward: coefficients c0 [N], c1 [N s], c2 [N s^2] of the thrust for n > 0.
-        reverse: coefficients for n < 0.
-        curve_range: revolutions (astern, ahead) in 1/s that the curves were measured between; they
-            must include +-n_max.
     """
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    x: Metres = 0.0
-    y: Metres = 0.0
     angle: Radians = 0.0
-    n_max: RevsPerSecond = Field(gt=0)
-    n_rate: RevRate | None = Field(default=None, gt=0)
-    forward: Coefficients
-    reverse: Coefficients
-    curve_range: CurveRange | None = None
-
-    @model_validator(mode="after")
-    def _range(self) -> ThrusterConfig:
-        require_range(self)
-        return self
 
 
 class ThrustersConfig(ActuatorConfig):
@@ -100,12 +92,10 @@ class ThrustersConfig(ActuatorConfig):
 
     def build(self) -> Thrusters:
         units = self.thrusters
-        return Thrusters(
-            units, [unit.follow(unit.n_max, unit.n_rate, f"n_{unit.name}") for unit in units]
-        )
+        return Thrusters(units, [unit.servo(f"n_{unit.name}") for unit in units])
 
 
-class DifferentialThrustConfig(ActuatorConfig):
+class DifferentialThrustConfig(ThrustConfig, ActuatorConfig):
     """Two fixed thrusters side by side (document 003 section 4.1; revolutions in 1/s).
 
     The thrust curve is clipped so that thrust never opposes the sense of rotation, which closes the
@@ -113,27 +103,12 @@ class DifferentialThrustConfig(ActuatorConfig):
 
     Attributes:
         spacing: distance between the thrusters in m.
-        n_max: largest revolutions of either direction in 1/s.
         n_rate: largest change of revolutions in 1/s^2.
-        forward: coefficients (c0 [N], c1 [N s], c2 [N s^2]) of T = c0 + c1 n + c2 n^2 per thruster,
-            for n > 0.
-        reverse: coefficients for n < 0 (signed).
-        curve_range: revolutions (astern, ahead) in 1/s that the curves were measured between; they
-            must include +-n_max.
     """
 
     kind: Literal["differential_thrust"] = "differential_thrust"
     spacing: Metres = Field(gt=0)
-    n_max: RevsPerSecond = Field(gt=0)
     n_rate: RevRate = Field(gt=0)
-    forward: Coefficients
-    reverse: Coefficients
-    curve_range: CurveRange | None = None
-
-    @model_validator(mode="after")
-    def _range(self) -> DifferentialThrustConfig:
-        require_range(self)
-        return self
 
     def build(self) -> Thrusters:
         """Build the module of a thruster to port and one to starboard, in this order."""
@@ -155,18 +130,24 @@ class ThrusterForces(nn.Module):
 
     def __init__(self, units: Sequence[ThrusterConfig]) -> None:
         super().__init__()
-        self.thrust = ThrustCurve([unit.forward for unit in units], [u.reverse for u in units])
+        curves = torch.tensor([[u.forward, u.reverse] for u in units], dtype=torch.float64)
+        self.curves = nn.Buffer(curves.permute(1, 2, 0).contiguous(), persistent=False)
         rows = [[unit.x, unit.y, unit.angle] for unit in units]
         x, y, angle = torch.tensor(rows, dtype=torch.float64).unbind(-1)
         along, across = torch.cos(angle), torch.sin(angle)
         lever = x * across - y * along
-        self.register_buffer("map", torch.stack((along, across, lever), dim=-1), persistent=False)
-        self.map: Tensor
+        self.map = nn.Buffer(torch.stack((along, across, lever), dim=-1), persistent=False)
+
+    def thrust(self, n: Tensor) -> Tensor:
+        """Return the thrusts [N] at revolutions n [..., c] in 1/s."""
+        f, b = self.curves.to(n.dtype).unbind(0)
+        ahead = (f[0] + n * (f[1] + n * f[2])).clamp(min=0.0)
+        astern = (b[0] + n * (b[1] + n * b[2])).clamp(max=0.0)
+        return torch.where(n > 0, ahead, torch.where(n < 0, astern, torch.zeros_like(n)))
 
     def forward(self, n: Tensor) -> Tensor:
         """Return tau [..., 3] of revolutions n [..., c]."""
-        thrust: Tensor = self.thrust(n)
-        return thrust @ self.map.to(n.dtype)
+        return self.thrust(n) @ self.map.to(n.dtype)
 
 
 @final
@@ -184,10 +165,8 @@ class Thrusters(Actuators):
         wish = torch.stack((along, torch.sign(lever)))
         small = torch.stack((along, lever)).abs() < 1e-9
         n_max = torch.tensor([unit.n_max for unit in units], dtype=torch.float64)
-        self.register_buffer("wish", torch.where(small, 0.0, wish), persistent=False)
-        self.register_buffer("n_max", n_max, persistent=False)
-        self.wish: Tensor
-        self.n_max: Tensor
+        self.wish = nn.Buffer(torch.where(small, 0.0, wish), persistent=False)
+        self.n_max = nn.Buffer(n_max, persistent=False)
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the revolutions [..., c]: each thruster's share of drive and steer, within +-1.
@@ -202,18 +181,6 @@ class Thrusters(Actuators):
         return force
 
 
-class PropellerShaftConfig(ServoConfig):
-    """A propeller shaft that turns in either direction.
-
-    Attributes:
-        n_max: largest revolutions of either direction in 1/s.
-        n_rate: largest change of revolutions in 1/s^2; None for at once.
-    """
-
-    n_max: RevsPerSecond = Field(gt=0)
-    n_rate: RevRate | None = Field(default=None, gt=0)
-
-
 class AzimuthConfig(ServoConfig):
     """The drive that turns a thruster to either side of the bow, not through its limit.
 
@@ -224,20 +191,6 @@ class AzimuthConfig(ServoConfig):
 
     limit: Radians = Field(default=math.pi, gt=0)
     rate: RadiansPerSecond | None = Field(default=None, gt=0)
-
-
-class PlaceConfig(Config):
-    """The name and place of one thruster.
-
-    Attributes:
-        name: what ends the names of its channels.
-        x: distance forward of the body origin in m.
-        y: distance to starboard of the body origin in m.
-    """
-
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]*$")
-    x: Metres
-    y: Metres = 0.0
 
 
 class AzimuthThrustersConfig(ActuatorConfig):
@@ -258,19 +211,14 @@ class AzimuthThrustersConfig(ActuatorConfig):
     places: Annotated[tuple[PlaceConfig, ...], Field(min_length=1)]
     thrust: Annotated[tuple[float, ...], Field(min_length=2)]
     curve_range: CurveRange | None = None
-    shaft: PropellerShaftConfig
+    shaft: ShaftConfig
     azimuth: AzimuthConfig = AzimuthConfig()
-
-    @property
-    def n_max(self) -> float:
-        """Largest revolutions of either direction in 1/s."""
-        return self.shaft.n_max
 
     @model_validator(mode="after")
     def _consistent(self) -> AzimuthThrustersConfig:
         _different([place.name for place in self.places])
-        require_range(self)
-        n = np.linspace(-self.n_max, self.n_max, _TABLE)
+        require_range(self.curve_range, self.shaft.n_max)
+        n = np.linspace(-self.shaft.n_max, self.shaft.n_max, _TABLE)
         falling = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
         if len(falling):
             raise ValueError(
@@ -296,7 +244,7 @@ class AzimuthThrusters(ForceActuators):
         shaft, azimuth = config.shaft, config.azimuth
         names = [place.name for place in config.places]
         super().__init__(
-            shaft.follow(shaft.n_max, shaft.n_rate, *(f"n_{name}" for name in names)),
+            shaft.servo(*(f"n_{name}" for name in names)),
             azimuth.follow(azimuth.limit, azimuth.rate, *(f"alpha_{name}" for name in names)),
         )
         self.commands = tuple(f"cmd_{kind}_{name}" for kind in ("n", "alpha") for name in names)
@@ -310,13 +258,10 @@ class AzimuthThrusters(ForceActuators):
             zeros + ones,
             [-place.y for place in config.places] + [place.x for place in config.places],
         ]
-        self.register_buffer("map", torch.tensor(rows, dtype=torch.float64), persistent=False)
-        self.map: Tensor
-        self.register_buffer("share", torch.linalg.pinv(self.map), persistent=False)
-        self.share: Tensor
+        self.map = nn.Buffer(torch.tensor(rows, dtype=torch.float64), persistent=False)
+        self.share = nn.Buffer(torch.linalg.pinv(self.map), persistent=False)
         grid = torch.linspace(-shaft.n_max, shaft.n_max, _TABLE, dtype=torch.float64)
-        self.register_buffer("table", torch.stack((grid, self.thrust(grid))), persistent=False)
-        self.table: Tensor
+        self.table = nn.Buffer(torch.stack((grid, self.thrust(grid))), persistent=False)
         self.strongest = float(self.table[1, -1])
 
     def thrust(self, n: Tensor) -> Tensor:
@@ -417,8 +362,7 @@ class ForceCommands(ForceActuators):
             servo.follow(math.inf, None, *(f"acting_{name}" for name in self.commands))
         )
         limit = torch.tensor([config.x_max, config.y_max, config.n_max], dtype=torch.float64)
-        self.register_buffer("limit", limit, persistent=False)
-        self.limit: Tensor
+        self.limit = nn.Buffer(limit, persistent=False)
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return tau [..., 3] for drive (surge force) and steer (yaw moment), each within +-1."""
@@ -494,13 +438,11 @@ class VectoredThrusters(Actuators):
         push = torch.tensor([t.push for t in config.thrusters], dtype=torch.float64)
         push = nn.functional.normalize(push, dim=-1)
         effect = torch.cat((push, torch.linalg.cross(place, push)), dim=-1)
-        self.register_buffer("map", effect, persistent=False)
-        self.map: Tensor
+        self.map = nn.Buffer(effect, persistent=False)
         # ahead, about the vertical and down, as far as a thruster does any of it
         wish = torch.stack((effect[:, 0], effect[:, 5], effect[:, 2]))
         wish = torch.where(wish.abs() < 1e-9, 0.0, torch.sign(wish)) * config.limit
-        self.register_buffer("wish", wish[:2], persistent=False)
-        self.wish: Tensor
+        self.wish = nn.Buffer(wish[:2], persistent=False)
         self.diving = wish[2]
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:

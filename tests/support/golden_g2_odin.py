@@ -8,25 +8,24 @@ cites as [15] (corrections of document 000).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-import pytest
 import torch
-from golden_tables import over_its_length, table, tensor
+from golden_tables import Row, accelerations, tensor
 from scipy.signal import square
 from staged_plant import StagedPlantDynamics
 from torch import Tensor
 
 from residnet.dynamics.rollout import Rollout
-from residnet.physics.actuators.rudders import WaterJets
+from residnet.physics.actuators.rudders import WaterJetsConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
-GROUP = "g2_odin"
 DT, EVERY, END = 0.01, 10, 300.0
 VESSELS = {"force": "odin_forces", "jet": "odin_jets"}
 # square waves change within steps, where each implementation has its own rounding
@@ -122,15 +121,25 @@ def plant_of(path: Path) -> HullPlant:
     return plant
 
 
+def has_jets(plant: HullPlant) -> bool:
+    return plant.actuators.commands == ("cmd_n", "cmd_nozzle")
+
+
+def jets() -> WaterJetsConfig:
+    found = load_vessel("odin_jets").actuators
+    assert isinstance(found, WaterJetsConfig)
+    return found
+
+
 def recorded(frame: pd.DataFrame, plant: HullPlant) -> Tensor:
     """Commands [T, c] as the file has them, in SI."""
-    if isinstance(plant.actuators, WaterJets):
+    if has_jets(plant):
         return tensor(frame, "rpm", "nozzle") * torch.tensor([1 / 60, 1.0], dtype=torch.float64)
     return tensor(frame, "tau_x", "tau_y", "tau_z")
 
 
 @cache
-def flown(folder: Path, vessel: str, seconds: float) -> dict[str, np.ndarray]:
+def trajectories(folder: Path, vessel: str, seconds: float) -> dict[str, np.ndarray]:
     """States [T+1, 6] at the steps of every file of one vessel, flown side by side."""
     files = [path for path in sorted(folder.glob("*.csv.gz")) if case_of(path)[0] == vessel]
     plant = plant_of(files[0]).in_calm_water()
@@ -148,95 +157,62 @@ def flown(folder: Path, vessel: str, seconds: float) -> dict[str, np.ndarray]:
     return {path.name: states[i].numpy() for i, path in enumerate(files)}
 
 
-def test_inputs_from_the_name(golden_file: Path) -> None:
-    frame, plant = table(golden_file), plant_of(golden_file)
-    found = torch.from_numpy(commands(golden_file)(frame["t"].to_numpy()))
-    if isinstance(plant.actuators, WaterJets):
-        found[:, 0] = found[:, 0].clamp(0.0, plant.actuators.config.motor.n_max)
+def flown(path: Path, seconds: float) -> dict[str, Any]:
+    vessel, design = case_of(path)
+    states = trajectories(path.parent, vessel, seconds)[path.name][::EVERY].T
+    channels = dict(zip(("x", "y", "psi", "u", "v", "r"), states, strict=True))
+    shown = ("u", "v", "r") if design in EDGES else tuple(channels)
+    return {"step": EVERY * DT, **{name: channels[name] for name in shown}}
+
+
+def allowed(path: Path, name: str, frame: pd.DataFrame, usual: float) -> float:
+    """Where inputs jump within steps, velocities agree to 3e-2."""
+    return 3e-2 if case_of(path)[1] in EDGES else usual
+
+
+def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
+    plant, command = plant_of(path), recorded(frame, plant_of(path))
+    asked = torch.from_numpy(commands(path)(frame["t"].to_numpy()))
+    if has_jets(plant):
+        asked[:, 0] = asked[:, 0].clamp(0.0, jets().motor.n_max)
     # times in the file are rounded sums; an input that jumps there may be seen before or after
-    away = (found - recorded(frame, plant)).abs() > 1e-9 * recorded(frame, plant).abs().amax(
-        0
-    ) + 1e-12
+    away = (asked - command).abs() > 1e-9 * command.abs().amax(0) + 1e-12
     jumps = int(away.any(-1).sum())
-    assert jumps <= (3 if case_of(golden_file)[1] in (*EDGES, "force2") else 0), f"{jumps} rows"
-
-
-def test_forces_of_the_commands(golden_file: Path) -> None:
-    frame, plant = table(golden_file), plant_of(golden_file)
-    nu, command = tensor(frame, "u", "v", "r"), recorded(frame, plant)
-    tau = plant.actuators.force(nu[:, :0], command, nu)
+    assert jumps <= (3 if case_of(path)[1] in (*EDGES, "force2") else 0), f"{jumps} rows"
+    nu, tau = tensor(frame, "u", "v", "r"), tensor(frame, "tau_x", "tau_y", "tau_z")
+    made = plant.actuators.force(nu[:, :0], command, nu)
     # both parabolas of the jets cancel: exact to the size of their largest part
-    size = tau.abs().numpy()
-    if isinstance(plant.actuators, WaterJets):
+    size = made.abs()
+    if has_jets(plant):
         u, n = nu[:, 0].abs(), command[:, 0].abs()
-        config = plant.actuators.config
         (a, b, c), (d, e, f, whole) = (
-            [abs(p.value) for _, p in part] for part in (config.speed, config.revolutions)
+            [abs(p.value) for _, p in part] for part in (jets().speed, jets().revolutions)
         )
         largest = 2 * (a + u * (b + u * c)) * (d + n * (e + n * f)) / whole
         across = largest * torch.sin(command[:, 1]).abs()
-        size = torch.stack((largest, across, 3.82 * across), dim=-1).numpy()
-    truth = frame[["tau_x", "tau_y", "tau_z"]].to_numpy()
-    assert (np.abs(tau.numpy() - truth) <= 1e-12 * np.maximum(size, np.abs(truth))).all()
+        size = torch.stack((largest, across, 3.82 * across), dim=-1)
+    within = 1e-12 * np.maximum(size.numpy(), np.abs(tau.numpy()))
+    yield "forces", made.numpy(), tau.numpy(), within
+    yield accelerations(plant.hull, nu, tau, frame)
 
 
-def test_right_hand_side_row_by_row(golden_file: Path) -> None:
-    """From the state and the forces of each row; sums are as exact as their largest term."""
-    frame, plant = table(golden_file), plant_of(golden_file)
-    nu, tau = tensor(frame, "u", "v", "r"), tensor(frame, "tau_x", "tau_y", "tau_z")
-    hull = plant.hull
-    parts = (hull.terms(nu).abs() @ hull.coefficients.abs() + tau.abs()) @ hull.inverse.T
-    truth = frame[["du", "dv", "dr"]].to_numpy()
-    assert (
-        np.abs(hull(nu, tau).numpy() - truth) <= 1e-12 * np.maximum(parts.numpy(), np.abs(truth))
-    ).all()
-    x = torch.cat((tensor(frame, "x", "y", "psi"), nu), dim=1)
-    w = torch.zeros(len(frame), len(plant.inputs), dtype=torch.float64)
-    w[:, : plant.commands] = recorded(frame, plant)
-    rate = plant.rate(x, w).numpy()
-    np.testing.assert_allclose(rate[:, 3:], truth, rtol=1e-10, atol=1e-12)
-    c, s, (u, v, r) = np.cos(frame["psi"]), np.sin(frame["psi"]), nu.T.numpy()
-    np.testing.assert_allclose(
-        rate[:, :3], np.stack((c * u - s * v, s * u + c * v, r), axis=1), rtol=1e-12, atol=1e-15
-    )
+def described(case: tuple[str, str]) -> tuple[str, str]:
+    return case
 
 
-@over_its_length
-def test_trajectory(golden_file: Path, seconds: float) -> None:
-    """Each channel to 1e-6 of its range; where inputs jump within steps, velocities to 3e-2."""
-    frame = table(golden_file)
-    frame = frame[frame["t"] <= seconds]
-    rows = np.rint(frame["t"].to_numpy() / DT).astype(int)
-    np.testing.assert_array_equal(rows, EVERY * np.arange(len(frame)))
-    found = dict(
-        zip(
-            ("x", "y", "psi", "u", "v", "r"),
-            flown(golden_file.parent, case_of(golden_file)[0], seconds)[golden_file.name][rows].T,
-            strict=True,
-        )
-    )
-    edges = case_of(golden_file)[1] in EDGES
-    for name in ("u", "v", "r") if edges else found:
-        truth = frame[name].to_numpy()
-        allowed = 3e-2 if edges else 1e-6 * np.ptp(truth) + 1e-12
-        assert np.abs(found[name] - truth).max() <= allowed, (
-            f"{name} differs by {np.abs(found[name] - truth).max():.3g} (allowed {allowed:.3g})"
-        )
+FURTHER = {
+    "force3": ("odin_forces", "force3"),
+    "jet3_author3": ("odin_jets", "jet3"),
+    "jetA2_author2": ("odin_jets", "jetA2"),
+}
+UNKNOWN = ("jet9", "wave1")
 
 
-def test_names_of_further_files_are_understood() -> None:
-    """Files are kept back for acceptance: names of the same pattern give the set-ups that
-    golden/README.md describes.
-    """
-    assert case_of(Path("force3.csv.gz")) == ("odin_forces", "force3")
-    assert case_of(Path("jet3_author3.csv.gz")) == ("odin_jets", "jet3")
-    assert case_of(Path("jetA2_author2.csv.gz")) == ("odin_jets", "jetA2")
+def check_inputs() -> None:
+    """Those of names that no file here has."""
     t = np.array([0.0, 19.99, 20.0, 119.0, 280.0, 299.9, 300.0])
     np.testing.assert_array_equal(
         commands(Path("force2.csv.gz"))(t), STEPS[[0, 0, 1, 5, 14, 14, 14]]
     )
     rpm, nozzle = commands(Path("jet3.csv.gz"))(np.array([1.5 * np.pi])).T * [[60], [1]]
     np.testing.assert_allclose([rpm[0], nozzle[0]], [1600.0, -0.1])
-    for name in ("jet9", "wave1"):
-        with pytest.raises(AssertionError, match="no "):
-            case_of(Path(f"{name}.csv.gz"))

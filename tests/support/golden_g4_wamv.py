@@ -5,16 +5,16 @@ implementation (golden/README.md, g4_wamv).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
+import pandas as pd
 import torch
-from golden_tables import over_its_length, table, tensor
+from golden_tables import Row, accelerations, table, tensor
 from kinds import of_kind
 from scipy.linalg import expm
 
@@ -31,7 +31,6 @@ from residnet.physics.plant import HullPlant
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
-GROUP = "g4_wamv"
 DT, EVERY = 0.01, 5
 VESSELS = {"CAL": "wam_v_cal", "VRXNEW": "wam_v_vrx"}
 
@@ -77,16 +76,6 @@ def is_linear(path: Path) -> bool:
     return path.name.startswith("linear")
 
 
-def on_plant(function: Any) -> Any:
-    function.only = lambda path: not is_linear(path)
-    return function
-
-
-def on_linear(function: Any) -> Any:
-    function.only = is_linear
-    return function
-
-
 @cache
 def trajectories(
     vessel: str, folder: Path, seconds: float
@@ -114,95 +103,45 @@ def trajectories(
     }
 
 
-@on_plant
-def test_thrust_columns(golden_file: Path) -> None:
-    frame = table(golden_file)
-    vessel = load_vessel(case_of(golden_file).vessel)
-    thrusters = of_kind(vessel.actuators.build(), Thrusters)
-    thrust = thrusters.forces.thrust(tensor(frame, "n_port", "n_stbd") / 60.0).numpy()
-    truth = frame[["T_port", "T_stbd"]].to_numpy()
+def flown(path: Path, seconds: float) -> dict[str, Any]:
+    if is_linear(path):
+        return linear(path)
+    states, commands = trajectories(case_of(path).vessel, path.parent, seconds)[path.name]
+    names = ("x", "y", "psi", "u", "v", "r", "n_port", "n_stbd")
+    rpm = dict(zip(("cmd_port", "cmd_stbd"), 60.0 * commands[::EVERY].T, strict=True))
+    channels = dict(zip(names, states[::EVERY].T, strict=True))
+    rpm |= {name: 60.0 * channels.pop(name) for name in names[6:]}
+    return {"step": EVERY * DT, **channels, **rpm}
+
+
+def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
+    if is_linear(path):
+        return
+    plant = of_kind(load_vessel(case_of(path).vessel).build(), HullPlant)
+    forces, n = of_kind(plant.actuators, Thrusters).forces, tensor(frame, "n_port", "n_stbd") / 60
+    thrust, truth = forces.thrust(n).numpy(), frame[["T_port", "T_stbd"]].to_numpy()
     # the printed polynomial cancels near zero thrust, where only its largest term bounds the
     # rounding
-    np.testing.assert_allclose(thrust, truth, rtol=1e-12, atol=1e-12 * 3.8)
+    yield "thrust", thrust, truth, 1e-12 * (np.abs(truth) + 3.8)
+    yield accelerations(plant.hull, tensor(frame, "u", "v", "r"), forces(n), frame)
 
 
-@on_plant
-def test_right_hand_side_row_by_row(golden_file: Path) -> None:
-    frame = table(golden_file)
-    plant = of_kind(load_vessel(case_of(golden_file).vessel).build(), HullPlant)
-    x = torch.cat(
-        (tensor(frame, "x", "y", "psi", "u", "v", "r"), tensor(frame, "n_port", "n_stbd") / 60.0),
-        dim=1,
-    )
-    with torch.no_grad():
-        rate = plant.rate(
-            x, torch.zeros(len(frame), len(plant.inputs), dtype=torch.float64)
-        ).numpy()
-        hull = plant.hull
-        nu = x[:, 3:6]
-        # a difference of forces cannot be more exact than its largest part
-        parts = (
-            plant.actuators.forces(x[:, 6:8]).abs() + hull.terms(nu).abs() @ hull.coefficients.abs()
-        )
-        size = (parts @ hull.inverse.abs().T).numpy()
-    truth = frame[["du", "dv", "dr"]].to_numpy()
-    assert (np.abs(rate[:, 3:6] - truth) <= 1e-12 * np.maximum(size, np.abs(truth))).all()
-    nu_rows = frame[["u", "v", "r"]].to_numpy()
-    c, s = np.cos(frame["psi"]), np.sin(frame["psi"])
-    north, east = c * nu_rows[:, 0] - s * nu_rows[:, 1], s * nu_rows[:, 0] + c * nu_rows[:, 1]
-    np.testing.assert_allclose(
-        rate[:, :3], np.stack((north, east, nu_rows[:, 2]), axis=1), rtol=1e-12, atol=1e-15
-    )
-
-
-@over_its_length
-@on_plant
-def test_trajectory(golden_file: Path, seconds: float) -> None:
-    frame = table(golden_file)
-    frame = frame[frame["t"] <= seconds]
-    flown = trajectories(case_of(golden_file).vessel, golden_file.parent, seconds)
-    states, commands = flown[golden_file.name]
-    rows = np.rint(frame["t"].to_numpy() / DT).astype(int)
-    np.testing.assert_allclose(frame["t"], rows * DT, atol=1e-9)
-    np.testing.assert_array_equal(rows, EVERY * np.arange(len(frame)))
-    simulated = dict(
-        zip(("x", "y", "psi", "u", "v", "r", "n_port", "n_stbd"), states[rows].T, strict=True)
-    )
-    simulated |= dict(zip(("cmd_port", "cmd_stbd"), commands[rows].T, strict=True))
-    for name, values in simulated.items():
-        truth = frame[name].to_numpy()
-        values = values * 60.0 if name.startswith(("n_", "cmd_")) else values
-        allowed = 1e-6 * np.ptp(truth) + 1e-12
-        assert np.abs(values - truth).max() <= allowed, (
-            f"{name} differs by {np.abs(values - truth).max():.3g} (allowed {allowed:.3g})"
-        )
-
-
-@on_linear
-def test_linear_model_by_exact_discretisation(golden_file: Path) -> None:
-    """(33), (34) as printed, or with B = -A Phi from Table 1 (corrections W11 to W14): the file's
-    own matrices, by the matrix exponential.
+def linear(path: Path) -> dict[str, Any]:
+    """(33), (34) as printed, or with B = -A Phi from Table 1 (corrections W11 to W14), as a
+    baseline; and by the matrix exponential, which is exact.
     """
-    frame = table(golden_file)
-    a, b, c = linear_model(golden_file)
+    frame = table(path)
+    a, b, c = linear_model(path)
     dt = float(frame["t"].iloc[1])
     block = np.zeros((6, 6))
     block[:3, :3], block[:3, 3:5], block[:3, 5] = a, b, c
     step = expm(block * dt)
     tau = frame[["tau_x", "tau_N"]].to_numpy()
-    x = np.zeros((len(frame), 3))
+    exact = np.zeros((len(frame), 3))
     for k in range(len(frame) - 1):
-        x[k + 1] = (step @ np.concatenate((x[k], tau[k], [1.0])))[:3]
-    # here r is in deg/s
+        exact[k + 1] = (step @ np.concatenate((exact[k], tau[k], [1.0])))[:3]
     truth = frame[["u", "v_mps", "r_degps"]].to_numpy()
-    assert (np.abs(x - truth).max(0) <= 1e-11 * np.ptp(truth, axis=0)).all()
-
-
-@on_linear
-def test_linear_model_as_a_baseline(golden_file: Path) -> None:
-    frame = table(golden_file)
-    a, b, c = linear_model(golden_file)
-    dt = float(frame["t"].iloc[1])
+    assert (np.abs(exact - truth).max(0) <= 1e-11 * np.ptp(truth, axis=0)).all()
     # from r in deg/s to rad/s
     scale = np.diag([1.0, 1.0, np.pi / 180.0])
     a, b, c = scale @ a @ np.linalg.inv(scale), scale @ b, scale @ c
@@ -211,13 +150,11 @@ def test_linear_model_as_a_baseline(golden_file: Path) -> None:
     baseline = RegressorBaseline([terms] * 3, signals.names)
     baseline.theta.data.copy_(torch.from_numpy(np.concatenate((a, b, c[:, None]), axis=1)))
     model = HybridDynamics(signals, baseline, ZeroHead(), dt, "rk4")
-    w = tensor(frame, "tau_x", "tau_N")[None, :-1]
     x0 = torch.zeros(1, 6, dtype=torch.float64)
     with torch.no_grad():
-        states, _, _ = Rollout(model)(x0, w, x0[:, :0])
+        states, _, _ = Rollout(model)(x0, torch.tensor(tau)[None, :-1], x0[:, :0])
     nu = states[0, :, 3:].numpy() @ np.linalg.inv(scale)
-    truth = frame[["u", "v_mps", "r_degps"]].to_numpy()
-    assert (np.abs(nu - truth).max(0) <= 1e-6 * np.ptp(truth, axis=0)).all()
+    return {"step": dt, **dict(zip(("u", "v_mps", "r_degps"), nu.T, strict=True))}
 
 
 def linear_model(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -234,22 +171,17 @@ def linear_model(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return a, b, np.array([0.6836, 0.0068, 1.3276])
 
 
-def test_names_of_further_files_are_understood() -> None:
-    """Files are kept back for acceptance: names of the same pattern give the set-ups that
-    golden/README.md describes.
-    """
-    zigzag = case_of(Path("VRXNEW_zz20_10.csv.gz"))
-    assert zigzag.vessel == "wam_v_vrx"
-    assert zigzag.manoeuvre == Zigzag(
-        drive=0.6, steer=1.0, start=8.0, heading=float(np.radians(20.0))
-    )
-    assert case_of(Path("CAL_turn08_02.csv.gz")).manoeuvre == ConstantInput(drive=0.8, steer=0.2)
-    times = torch.arange(0.0, 60.0, 1.0, dtype=torch.float64)
-    excitation = of_kind(case_of(Path("CAL_t3211.csv.gz")).manoeuvre, ThreeTwoOneOne)
-    drive, steer = excitation.demands(times)
-    assert drive.tolist() == [0.5] * 60
-    assert (
-        steer.tolist() == [0.0] * 10 + [0.5] * 9 + [-0.5] * 6 + [0.5] * 3 + [-0.5] * 3 + [0.0] * 29
-    )
-    with pytest.raises(AssertionError, match="no manoeuvre"):
-        case_of(Path("CAL_loop.csv.gz"))
+def described(case: Case) -> Case:
+    return case
+
+
+FURTHER = {
+    "VRXNEW_zz20_10": Case(
+        "wam_v_vrx", Zigzag(drive=0.6, steer=1.0, start=8.0, heading=float(np.radians(20.0)))
+    ),
+    "CAL_turn08_02": Case("wam_v_cal", ConstantInput(drive=0.8, steer=0.2)),
+    "CAL_t3211": Case(
+        "wam_v_cal", ThreeTwoOneOne(drive=0.5, steer=0.5, start=10.0, unit=3.0, repeat=False)
+    ),
+}
+UNKNOWN = ("CAL_loop",)

@@ -7,15 +7,16 @@ The gains that the README prints are rounded; the files were made by those of co
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-import pytest
 import torch
-from golden_tables import over_its_length, table, tensor
+from golden_tables import Row, accelerations, table, tensor
 from torch import Tensor
 
 from residnet.control import (
@@ -35,7 +36,6 @@ from residnet.physics.hull import MassMatrixConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import vessel_files
 
-GROUP = "g3_milliampere"
 DT, OPEN_DT = 0.02, 0.01
 EVERY = {"closed": 5, "open": 10}
 # Table 4.1, row 4 as correction J12 has it; rows 13 to 24 repeat these
@@ -202,41 +202,28 @@ def simulated(path: Path, seconds: float) -> pd.DataFrame:
     return pd.DataFrame(states[0, :: EVERY["open"], :6].numpy(), columns=STATE[:6])
 
 
-@over_its_length
-def test_every_column_along_the_run(golden_file: Path, seconds: float) -> None:
-    """To 1e-6 of its range; parts of the command of the largest range among them."""
-    truth, found = table(golden_file), simulated(golden_file, seconds)
-    truth = truth[truth["t"] <= seconds + 1e-9]
-    step = (
-        EVERY["closed"] * DT
-        if isinstance(case_of(golden_file), Flight)
-        else EVERY["open"] * OPEN_DT
-    )
-    np.testing.assert_allclose(truth["t"], step * np.arange(len(truth)), atol=1e-9)
-    assert set(truth.columns) == {"t", *found.columns}
-    for name in found.columns:
-        values, known = found[name].to_numpy()[: len(truth)], truth[name].to_numpy()
-        assert len(values) == len(known)
-        allowed = 1e-6 * np.ptp(known) + 1e-12
-        if name.startswith("fb_"):
-            # what is left of the command without the feed-forward is as exact as these
-            allowed = max(allowed, 1e-12 * float(truth["tc" + name[2:]].abs().max()))
-        assert np.abs(values - known).max() <= allowed, (
-            f"{name} differs by {np.abs(values - known).max():.3g} (allowed {allowed:.3g})"
-        )
+def flown(path: Path, seconds: float) -> dict[str, Any]:
+    found = simulated(path, seconds)
+    closed = isinstance(case_of(path), Flight)
+    step = EVERY["closed"] * DT if closed else EVERY["open"] * OPEN_DT
+    assert set(table(path).columns) == {"t", *found.columns}
+    return {"step": step, **{str(name): found[name].to_numpy() for name in found.columns}}
 
 
-def closed(function: object) -> object:
-    function.only = lambda path: isinstance(case_of(path), Flight)  # type: ignore[attr-defined]
-    return function
+def allowed(path: Path, name: str, frame: pd.DataFrame, usual: float) -> float:
+    """What is left of the command without the feed-forward is as exact as these."""
+    if not name.startswith("fb_"):
+        return usual
+    return max(usual, 1e-12 * float(frame[f"tc{name[2:]}"].abs().max()))
 
 
-@closed
-def test_right_hand_side_row_by_row(golden_file: Path) -> None:
-    """nu_dot from the measured velocities and the forces behind the thrusters."""
-    frame, case = table(golden_file), case_of(golden_file)
-    assert isinstance(case, Flight)
-    hull = vessel(case.scale).hull
+def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
+    """nu_dot from the measured velocities and the forces behind the thrusters; feed-forward from
+    the desired motion, and feedback whose integral grows as the errors between the rows say.
+    """
+    case = case_of(path)
+    if not isinstance(case, Flight):
+        return
     nu, tau = tensor(frame, "u", "v", "r"), tensor(frame, "tau_u", "tau_v", "tau_r")
     psi = frame["psi"].to_numpy()
     push = [
@@ -245,21 +232,7 @@ def test_right_hand_side_row_by_row(golden_file: Path) -> None:
         0.0 * psi,
     ]
     tau = tau + case.disturbed * torch.from_numpy(np.stack(push, axis=1))
-    truth = frame[["du", "dv", "dr"]].to_numpy()
-    # a difference of forces cannot be more exact than its largest part
-    size = (
-        (tau.abs() + hull.terms(nu).abs() @ hull.coefficients.abs()) @ hull.inverse.abs().T
-    ).numpy()
-    assert (np.abs(hull(nu, tau).numpy() - truth) <= 1e-12 * np.maximum(size, np.abs(truth))).all()
-
-
-@closed
-def test_controller_row_by_row(golden_file: Path) -> None:
-    """Feed-forward from the desired motion, and feedback whose integral grows as the errors between
-    the rows say.
-    """
-    frame, case = table(golden_file), case_of(golden_file)
-    assert isinstance(case, Flight)
+    yield accelerations(vessel(case.scale).hull, nu, tau, frame)
     believed = vessel(1.0).hull
     controller = MotionPID([pid(case.feedback)], DT, HullFeedForward(believed))
     x = tensor(frame, *STATE[:6])
@@ -269,10 +242,8 @@ def test_controller_row_by_row(golden_file: Path) -> None:
     water = believed.terms(nu_d).abs() @ believed.coefficients.abs()
     size = ((nu_dot_d @ believed.mass.T).abs() + water).numpy()
     forward = frame[["ff_u", "ff_v", "ff_r"]].to_numpy()
-    assert (
-        np.abs(believed.required(nu_dot_d, nu_d).numpy() - forward)
-        <= 2e-12 * np.maximum(size, np.abs(forward))
-    ).all()
+    asked = believed.required(nu_dot_d, nu_d).numpy()
+    yield "feed-forward", asked, forward, 2e-12 * np.maximum(size, np.abs(forward))
     integral = tensor(frame, "tc_u", "tc_v", "tc_r") - command
     if not case.feedback:
         assert float(integral.abs().max()) <= 1e-11 * float(command.abs().max())
@@ -289,49 +260,20 @@ def test_controller_row_by_row(golden_file: Path) -> None:
     assert float(wrap(desired[:, 2] - x[:, 2]).abs().max()) < np.pi
 
 
-def test_names_of_further_files_are_understood() -> None:
-    """Files are kept back for acceptance: names of the same pattern give the set-ups that
-    golden/README.md describes.
-    """
-    for name, (scale, disturbed, frequency, feedback) in {
-        "cal_matched": (1.0, False, 0.2, True),
-        "cal_half_dist": (0.5, True, 0.2, True),
-        "lit_matched": (1.0, False, 0.5, True),
-        "lit_half_FFonly": (0.5, False, 0.5, False),
-        "cal_matched_FFonly": (1.0, False, 0.2, False),
-    }.items():
-        case = case_of(Path(f"{name}.csv.gz"))
-        assert isinstance(case, Flight)
-        assert (case.scale, case.disturbed, case.guidance.frequency[0], case.feedback) == (
-            scale,
-            disturbed,
-            frequency,
-            feedback,
-        )
-        assert case.guidance.duration == 720.0
-    twice = case_of(Path("cal_half.csv.gz"))
-    assert isinstance(twice, Flight)
-    assert twice.guidance.waypoints[:12] == twice.guidance.waypoints[12:]
-    assert case_of(Path("ol_yaw100.csv.gz")) == OpenLoop((0.0, 0.0, 100.0))
-    with pytest.raises(AssertionError, match="no run"):
-        case_of(Path("cal_third.csv.gz"))
+def described(case: Flight | OpenLoop) -> Any:
+    if isinstance(case, OpenLoop):
+        return case.force
+    frequency, laps = case.guidance.frequency[0], case.guidance.duration / 720.0
+    return case.scale, case.disturbed, frequency, case.feedback, laps
 
 
-def test_the_disturbed_plant_is_the_calm_one_without_disturbance() -> None:
-    """The faster plant without exogenous inputs, which most of these runs fly, against the one with
-    them.
-    """
-    full, calm = vessel(0.5), vessel(0.5)
-    calm.in_calm_water()
-    x0 = torch.zeros(2, len(full.state), dtype=torch.float64)
-    command = (
-        torch.randn(
-            2, 200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-        ).repeat_interleave(5, dim=1)
-        * 200
-    )
-    w = torch.cat((command, torch.zeros(2, 1000, 7, dtype=torch.float64)), dim=-1)
-    with torch.no_grad():
-        plain, _, _ = Rollout(RecordedPlantDynamics(full, DT))(x0, w, x0[:, :0])
-        fast, _, _ = Rollout(RecordedPlantDynamics(calm, DT))(x0, command, x0[:, :0])
-    torch.testing.assert_close(fast, plain, rtol=1e-10, atol=1e-11)
+FURTHER = {
+    "cal_matched": (1.0, False, 0.2, True, 1.0),
+    "cal_half_dist": (0.5, True, 0.2, True, 1.0),
+    "cal_half": (0.5, False, 0.2, True, 2.0),
+    "lit_matched": (1.0, False, 0.5, True, 1.0),
+    "lit_half_FFonly": (0.5, False, 0.5, False, 1.0),
+    "cal_matched_FFonly": (1.0, False, 0.2, False, 1.0),
+    "ol_yaw100": (0.0, 0.0, 100.0),
+}
+UNKNOWN = ("cal_third",)

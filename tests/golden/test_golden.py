@@ -1,0 +1,80 @@
+"""Vessels and controllers against golden runs of another implementation (golden/README.md).
+
+A group of files has a module in `support`, named by its folder, which reads the set-up from a
+file's name, so that further files need no new code.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from golden_tables import over_its_length, table
+
+GROUPS = ("g1_4dof", "g2_odin", "g3_milliampere", "g4_wamv", "g5_nomoto")
+
+
+def set_up(group: str) -> Any:
+    return importlib.import_module(f"golden_{group}")
+
+
+def files(part: str) -> list[Any]:
+    """The files of all groups that have a function of this name."""
+    folder = Path(os.environ.get("RESIDNET_GOLDEN", "/nowhere"))
+    found = [
+        path
+        for group in GROUPS
+        if hasattr(set_up(group), part)
+        for path in sorted((folder / group).glob("*.csv.gz"))
+    ]
+    absent = pytest.mark.skip(reason="set RESIDNET_GOLDEN to the folder that holds golden runs")
+    names = [path.name.removesuffix(".csv.gz") for path in found]
+    return [
+        pytest.param(path, id=f"{path.parent.name}-{name}")
+        for path, name in zip(found, names, strict=True)
+    ] or [pytest.param(None, marks=absent)]
+
+
+@over_its_length
+@pytest.mark.parametrize("path", files("flown"))
+def test_trajectory(path: Path, seconds: float) -> None:
+    """Every channel to 1e-6 of its range, unless its group says why not."""
+    frame, group = table(path), set_up(path.parent.name)
+    frame = frame[frame["t"] <= seconds + 1e-9]
+    channels = group.flown(path, seconds)
+    step = channels.pop("step")
+    np.testing.assert_allclose(frame["t"], step * np.arange(len(frame)), atol=1e-9)
+    for name, values in channels.items():
+        truth = frame[name].to_numpy()
+        allowed = 1e-6 * np.ptp(truth) + 1e-12
+        if hasattr(group, "allowed"):
+            allowed = group.allowed(path, name, frame, allowed)
+        apart = np.abs(np.asarray(values)[: len(frame)] - truth).max()
+        assert apart <= allowed, f"{name} differs by {apart:.3g} (allowed {allowed:.3g})"
+
+
+@pytest.mark.parametrize("path", files("by_row"))
+def test_rows(path: Path) -> None:
+    """What each row says of itself: as exact as the largest part of a sum."""
+    for name, found, truth, allowed in set_up(path.parent.name).by_row(path, table(path)):
+        assert found.shape == truth.shape
+        assert (np.abs(found - truth) <= allowed).all(), name
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_names_of_further_files_are_understood(group: str) -> None:
+    """Files are kept back for acceptance: names of the same pattern give the set-ups that
+    golden/README.md describes.
+    """
+    module = set_up(group)
+    for name, wanted in module.FURTHER.items():
+        assert module.described(module.case_of(Path(f"{name}.csv.gz"))) == wanted, name
+    if hasattr(module, "check_inputs"):
+        module.check_inputs()
+    for name in module.UNKNOWN:
+        with pytest.raises(AssertionError, match=r"no (run|inputs|parameter set|manoeuvre)"):
+            module.case_of(Path(f"{name}.csv.gz"))
