@@ -10,8 +10,8 @@
     ships       random ships with propeller and rudder, no settings at all, without and with noise
     ratios      the same of ships that divide by their revolutions, which stay away from zero
     bred        the noisy ships by genetic programming, no settings at all (extra gp)
-    delay       a delay of 0.5 s, 10 % noise on all channels: one profile, and a regression for
-                every shift as the document does
+    delay       a delay of 0.5 s, 10 % noise on all channels: the errors of the true terms at every
+                shift, and a search for every shift as the document does
 
 Truth and designs stand in tests/support/made_odin.py and made_equations.py. Times are of the wall,
 of the terms' values, factorisation and search together.
@@ -39,9 +39,8 @@ from made_odin import FORCE_TRUTH, JET_TRUTH, force_logs, jet_logs, msd_log
 from residnet.core.errors import ConfigError
 from residnet.core.names import ACCELERATION
 from residnet.heads.genetic import GeneticConfig
-from residnet.heads.symbolic import SymbolicConfig
+from residnet.heads.symbolic import Past, SymbolicConfig, best_delay
 from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term
-from residnet.regression.equation_rows import delay_profile
 from residnet.regression.sparse import SearchConfig, find, reduce
 
 Log = dict[str, np.ndarray]
@@ -122,41 +121,27 @@ def exact(count: int, _: int) -> None:
 
 def delay(_: int, __: int) -> None:
     log, longest = msd_log(delay=0.5), 20
-    hits, times, same = [0, 0], [[], []], 0.0
-    one = np.ones(len(log["t"]))
-    delay_profile(one[:, None], one[:, None], one, np.zeros(len(one), dtype=int), longest)
+    hits, times = 0, []
+    zeros, names = np.zeros(len(log["t"])), ("u", "v", "tau")
     for seed in range(20):
         random = np.random.default_rng(seed)
         z = {
-            name: log[name] + 0.1 * np.ptp(log[name]) * random.uniform(-1, 1, len(one))
+            name: log[name] + 0.1 * np.ptp(log[name]) * random.uniform(-1, 1, len(zeros))
             for name in (*SPRING, "w_dot")
         }
         started = time.perf_counter()
-        held, moved = (
-            np.stack((z["x"], z["w"], one), axis=1),
-            np.stack((one, one, z["tau"]), axis=1),
-        )
-        profile = delay_profile(held, moved, z["w_dot"], np.zeros(len(one), dtype=int), longest)
-        middle = time.perf_counter()
-        errors = [_refit(z, shift, longest) for shift in range(longest + 1)]
-        times[0].append(middle - started)
-        times[1].append(time.perf_counter() - middle)
-        hits[0] += profile.shift == 5
-        hits[1] += int(np.argmin(errors)) == 5
-        same = max(same, float(np.abs(profile.rss / errors - 1).max()))
-    fast, slow = (1e3 * np.median(t) for t in times)
-    count, ratio = longest + 1, slow / fast
-    print(
-        f"delay       0.5 s found in {hits[0]} of 20 by the profile in {fast:.2f} ms, in {hits[1]}"
-        f" of 20 by {count} regressions in {slow:.2f} ms;"
-    )
-    print(f"            ratio {ratio:.1f}; residual sums of squares differ by {same:.0e} at most")
+        chosen = np.stack([z[name] for name in SPRING], axis=1)
+        past = Past(chosen, z["w_dot"][:, None], zeros, 0.1)
+        found, _ = best_delay(past, [("u", "v", "tau")], names, np.array([2]), longest)
+        times.append(time.perf_counter() - started)
+        hits += found == 5
+    print(f"delay       0.5 s found in {hits} of 20, each in {1e3 * np.median(times):.2f} ms")
     started = time.perf_counter()
     for shift in range(longest + 1):
         now = {
             "x": z["x"][longest:],
             "w": z["w"][longest:],
-            "tau": z["tau"][longest - shift : len(one) - shift],
+            "tau": z["tau"][longest - shift : len(zeros) - shift],
         }
         regress(now, SPRING, MSD, z["w_dot"][longest:, None])
     print(
@@ -232,15 +217,6 @@ def bred(count: int, first: int) -> None:
     """Breed the equations of noisy ships, with the defaults of genetic programming."""
     designs = [draw_ship(seed, noise=0.1) for seed in range(first, first + count)]
     drawn("bred 0.1", designs, {}, kind=GeneticConfig)
-
-
-def _refit(z: Log, shift: int, longest: int) -> float:
-    end = len(z["x"])
-    x = np.stack(
-        (z["x"][longest:], z["w"][longest:], z["tau"][longest - shift : end - shift]), axis=1
-    )
-    left = z["w_dot"][longest:] - x @ np.linalg.lstsq(x, z["w_dot"][longest:], rcond=None)[0]
-    return float(left @ left)
 
 
 PARTS: dict[str, Callable[[int, int], None]] = {

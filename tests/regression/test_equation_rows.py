@@ -8,7 +8,6 @@ import pytest
 from residnet.core.errors import ConfigError, FitError
 from residnet.regression.equation_rows import (
     Rows,
-    SampleRows,
     WeakRows,
     correlation_time,
     step_of,
@@ -79,11 +78,6 @@ def test_stretches_end_at_gaps_and_manoeuvres() -> None:
     group = np.array([0, 0, 0, 0, 0, 1, 1])
     assert step_of(group, t) == pytest.approx(0.1)
     assert unbroken_stretches(group, t, 0.1).tolist() == [0, 0, 0, 1, 1, 2, 2]
-
-
-def test_least_squares_takes_samples_as_they_are() -> None:
-    sampled = record()
-    assert SampleRows().rows(sampled, 0.0) is sampled
 
 
 def test_what_cannot_be_done_is_one_line() -> None:

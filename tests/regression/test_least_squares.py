@@ -129,11 +129,6 @@ def test_errors_hold_for_correlated_residuals() -> None:
             np.random.default_rng(5).normal(size=(50, 3)) * [1, 0, 1],
             "regressor 'b' is zero in all 50 samples",
         ),
-        (
-            np.random.default_rng(6).normal(size=(50, 1)) * [1, 2, 0]
-            + np.random.default_rng(7).normal(size=(50, 1)) * [0, 0, 1],
-            "tell apart",
-        ),
     ],
 )
 def test_what_the_data_do_not_determine_is_refused(x: np.ndarray, message: str) -> None:

@@ -14,7 +14,6 @@ from sklearn.linear_model import OrthogonalMatchingPursuit
 
 from residnet.core.errors import FitError
 from residnet.regression.sparse import (
-    Criterion,
     Equation,
     Search,
     SearchConfig,
@@ -104,7 +103,7 @@ def test_forward_regression_is_orthogonal_matching_pursuit_on_orthogonal_columns
     x = np.linalg.qr(random.normal(size=(200, 20)))[0]
     y = x @ random.normal(size=20) + 0.1 * random.normal(size=200)
     other = OrthogonalMatchingPursuit(n_nonzero_coefs=terms, fit_intercept=False).fit(x, y)
-    search = Search(x, y, Criterion(200, 20, 0.0, float(y @ y), 1e-13), terms)
+    search = Search(x, y, 200.0, SearchConfig(max_terms=terms, gamma=0.0))
     chosen = search.best()[1]
     assert set(chosen) == set(np.flatnonzero(other.coef_))
     np.testing.assert_allclose(
@@ -120,8 +119,7 @@ def test_the_search_finds_the_best_of_all_subsets(seed: int) -> None:
     x = random.normal(size=(60, 9)) @ (np.eye(9) + random.normal(size=(9, 9)))
     x /= np.linalg.norm(x, axis=0)
     y = x[:, :3] @ [1.0, -1.0, 1.0] + 0.05 * random.normal(size=60)
-    rule = Criterion(60, 9, 0.5, float(y @ y), 1e-13)
-    search = Search(x, y, rule, 9)
+    search = Search(x, y, 60.0, SearchConfig(gamma=0.5))
     everything = [list(chosen) for k in range(10) for chosen in combinations(range(9), k)]
     best = min(everything, key=search.value)
     value, chosen = search.best()
@@ -129,8 +127,9 @@ def test_the_search_finds_the_best_of_all_subsets(seed: int) -> None:
 
 
 def test_criterion_is_the_formula() -> None:
-    rule = Criterion(100.0, 20, 0.5, 50.0, 1e-13)
-    assert float(rule.value(2.0, 3)) == pytest.approx(
+    y = np.full(2, 5.0)
+    search = Search(np.zeros((2, 20)), y, 100.0, SearchConfig(gamma=0.5))
+    assert float(search.criterion(2.0, 3)) == pytest.approx(
         100 * log(2.0 / 50.0) + 3 * log(100) + log(comb(20, 3))
     )
 

@@ -1,4 +1,4 @@
-"""Rows of a regression: samples, or integrals over short windows; delays.
+"""Rows of a regression: samples, or integrals over short windows.
 
 Noise enters an equation twice: through the derivative on its left, which differentiation amplifies,
 and through the regressors on its right, which pull coefficients towards zero. Integrating both
@@ -22,8 +22,6 @@ from residnet.core.stretches import stretch_bounds
 
 _BLOCK = 8_000_000
 """Numbers of windows held at a time."""
-_ROUNDED = 1e-10
-"""Share of the largest eigenvalue up to which one is what rounding leaves."""
 _TINY = 1e-300
 """Least variance or size that is divided by."""
 
@@ -172,67 +170,3 @@ def correlation_time(residual: np.ndarray) -> np.ndarray:
     # noise of an estimate of zero: what is less than two of its deviations ends the sum
     positive = np.cumprod(rho > 2.0 / np.sqrt(n), axis=0).astype(bool)
     return np.asarray(np.maximum(2.0 * np.where(positive, rho, 0.0).sum(axis=0) - 1.0, 1.0))
-
-
-class DelayProfile(NamedTuple):
-    """The residual sums of squares by shift [S + 1], and the shift of the least one in samples."""
-
-    rss: np.ndarray
-    shift: int
-
-
-def delay_profile(
-    held: np.ndarray, delayed: np.ndarray, y: np.ndarray, stretch: np.ndarray, longest: int
-) -> DelayProfile:
-    """Return the errors of y(t) = sum_j c_j held_j(t) delayed_j(t - s) for shifts 0 ... longest.
-
-    Source: document 000 section 5.3.4.
-
-    All shifts are judged on the same samples, those with a past of `longest`. The moments of all
-    shifts are correlations of held_i held_j with delayed_i delayed_j, taken by FFT: no shift costs
-    a regression over the samples.
-
-    Args:
-        held: the part of each term that is not delayed [N, J].
-        delayed: the part that is, ones where there is none [N, J].
-        y: target [N].
-        stretch: number of the unbroken stretch that each sample belongs to, ascending [N].
-        longest: longest shift, in samples.
-
-    Raises:
-        FitError: with fewer samples that have a past than terms.
-    """
-    n, j = held.shape
-    has_past = np.concatenate(
-        (np.zeros(min(longest, n), dtype=bool), stretch[longest:] == stretch[: max(n - longest, 0)])
-    )
-    count = int(has_past.sum())
-    if count <= j:
-        raise FitError(
-            f"delay: {count} samples have a past of {longest} samples, {j} terms need more; give"
-            " longer logs or a shorter delay"
-        )
-    scale = np.maximum(np.abs(held).max(axis=0) * np.abs(delayed).max(axis=0), _TINY)
-    held = held / scale * has_past[:, None]
-    first, second = np.triu_indices(j)
-    # pairs of terms, then each term with the target
-    now = np.concatenate((held[:, first] * held[:, second], held * y[:, None]), axis=1)
-    past = np.concatenate((delayed[:, first] * delayed[:, second], delayed), axis=1)
-    # sum_t now(t) past(t - s) for s = 0 ... longest
-    size = 1 << (n + longest).bit_length()
-    spectra = np.fft.rfft(now, size, axis=0) * np.conj(np.fft.rfft(past, size, axis=0))
-    moments = np.fft.irfft(spectra, size, axis=0)[: longest + 1]
-    gram = np.zeros((longest + 1, j, j))
-    gram[:, first, second] = gram[:, second, first] = moments[:, : first.size]
-    cross = moments[:, first.size :]
-    length = np.sqrt(np.maximum(gram.diagonal(axis1=1, axis2=2), _TINY))
-    gram = gram / length[:, :, None] / length[:, None, :]
-    cross = cross / length
-    # candidates may be collinear: what rounding cannot tell apart shares its part
-    values, vectors = np.linalg.eigh(gram)
-    along = np.einsum("sij,si->sj", vectors, cross)
-    kept = values > _ROUNDED * values[:, -1:]
-    explained = np.where(kept, np.square(along) / np.where(kept, values, 1.0), 0.0).sum(axis=1)
-    energy = float(np.square(y[has_past]).sum())
-    rss = np.maximum(energy - explained, 0.0)
-    return DelayProfile(rss, int(rss.argmin()))

@@ -316,8 +316,7 @@ class Products(Table):
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("index", torch.zeros(1, 0, dtype=torch.long))
-        self.index: Tensor
+        self.index = nn.Buffer(torch.zeros(1, 0, dtype=torch.long))
 
     @torch.jit.unused
     def products(self, place: Mapping[int, int]) -> list[Product]:
@@ -338,10 +337,8 @@ class Functions(Table):
     def __init__(self) -> None:
         super().__init__()
         self.products = Products()
-        self.register_buffer("weight", torch.zeros(0, 1, dtype=torch.float64))
-        self.register_buffer("pick", torch.zeros(0, len(FUNCTIONS), dtype=torch.float64))
-        self.weight: Tensor
-        self.pick: Tensor
+        self.weight = nn.Buffer(torch.zeros(0, 1, dtype=torch.float64))
+        self.pick = nn.Buffer(torch.zeros(0, len(FUNCTIONS), dtype=torch.float64))
         self.root_floor = _ROOT_FLOOR
 
     def forward(self, columns: Tensor) -> Tensor:
@@ -410,8 +407,7 @@ class Weights(Table):
 
     def __init__(self, outputs: int) -> None:
         super().__init__()
-        self.register_buffer("values", torch.zeros(0, outputs, dtype=torch.float64))
-        self.values: Tensor
+        self.values = nn.Buffer(torch.zeros(0, outputs, dtype=torch.float64))
 
 
 def tables(algebra: Algebra, terms: Sequence[Product], nesting: int) -> dict[str, Tensor]:

@@ -68,7 +68,6 @@ class EvolutionConfig(Config):
         generations: most generations after the first.
         operators: of the trees; `/` is 0 at a divisor of 0 and `sqrt` takes the magnitude (document
             001 section 2.4).
-        one: whether trees may also hold the number 1.
         constants: range of random constants in trees; None for none. A term's factor is fitted, so
             that they only matter within functions.
         tournament: individuals among which a parent is the best.
@@ -84,7 +83,6 @@ class EvolutionConfig(Config):
         equal_terms: what becomes of a tree in which a term stands twice: its terms are added
             (`merge`), or it takes no part (`reject`), as in the document, whose Gram matrix is then
             singular (section 5.1.2).
-        intercept: whether the constant always is a term.
         max_terms: most terms of an individual; those with more take no part, nor those with
             products of more than `max_degree` factors.
         max_degree: most factors of a term.
@@ -100,7 +98,6 @@ class EvolutionConfig(Config):
     population: int = Field(default=500, ge=2, le=100_000)
     generations: int = Field(default=30, ge=0, le=10_000)
     operators: tuple[Operator, ...] = ("+", "*", "abs")
-    one: bool = False
     constants: tuple[float, float] | None = None
     tournament: int = Field(default=5, ge=1, le=10_000)
     crossover: float = Field(default=0.5, ge=0, le=1)
@@ -110,7 +107,6 @@ class EvolutionConfig(Config):
     genes: int = Field(default=1, ge=1, le=20)
     split: Literal["gene", "sum", "expand"] = "expand"
     equal_terms: Literal["merge", "reject"] = "merge"
-    intercept: bool = False
     max_terms: int = Field(default=40, ge=1, le=200)
     max_degree: int = Field(default=8, ge=1, le=20)
     nesting: int = Field(default=2, ge=0, le=5)
@@ -388,8 +384,6 @@ class _Breeding:
             made.addPrimitive(None, arity, name=BINARY.get(operator, operator))
         for name in self.algebra.channels:
             made.addTerminal(None, name=f"channel {name}")
-        if self.config.one:
-            made.addTerminal(1.0)
         if self.config.constants is not None:
             made.addEphemeralConstant(
                 f"constant {self.config.constants}", partial(random.uniform, *self.config.constants)
@@ -492,7 +486,7 @@ class _Breeding:
 
     def _terms(self, individual: Individual) -> Terms | None:
         """Return the terms of an individual; None beyond the limits or without any."""
-        products: set[Product] = {ONE} if self.config.intercept else set()
+        products: set[Product] = set()
         try:
             for tree in individual.trees:
                 if self.config.equal_terms == "reject" and self._repeats(tree):

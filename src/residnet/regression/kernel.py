@@ -192,17 +192,10 @@ class RbfKernel(Kernel):
 
     def __init__(self, config: Rbf, count: int, outputs: int = 3) -> None:
         super().__init__()
-        self.sigmas = config.sigma
-        self.exact = config.exact
-        self.landmarks = config.landmarks
-        self.seed = config.seed
-        self.outputs = outputs
-        self.register_buffer("points", torch.zeros(0, count, dtype=torch.float64))
-        self.register_buffer("gamma", torch.ones(outputs, dtype=torch.float64))
-        self.register_buffer("coefficients", torch.zeros(0, outputs, dtype=torch.float64))
-        self.points: Tensor
-        self.gamma: Tensor
-        self.coefficients: Tensor
+        self.config, self.outputs = config, outputs
+        self.points = nn.Buffer(torch.zeros(0, count, dtype=torch.float64))
+        self.gamma = nn.Buffer(torch.ones(outputs, dtype=torch.float64))
+        self.coefficients = nn.Buffer(torch.zeros(0, outputs, dtype=torch.float64))
 
     def forward(self, x: Tensor) -> Tensor:
         apart = squared_distances(x, self.points.to(x.dtype))
@@ -222,16 +215,16 @@ class RbfKernel(Kernel):
         It is exact where there are no more than `exact` samples, else by Nystroem's method on
         landmarks.
         """
-        if len(x) <= self.exact:
+        if len(x) <= self.config.exact:
             apart = squared_distances(x, x)
             exact = [
                 (sigma, dual_path(torch.exp(-apart / (2 * sigma)), y, fold, folds, penalties))
-                for sigma in self.sigmas
+                for sigma in self.config.sigma
             ]
             return [replace(path, sigma=sigma, points=x) for sigma, path in exact]
-        points = x[spread_out(x, self.landmarks, self.seed)]
+        points = x[spread_out(x, self.config.landmarks, self.config.seed)]
         out = []
-        for sigma in self.sigmas:
+        for sigma in self.config.sigma:
             values, vectors = torch.linalg.eigh(
                 torch.exp(-squared_distances(points, points) / (2 * sigma))
             )
@@ -289,19 +282,14 @@ class PolynomialKernel(Kernel):
         super().__init__()
         self.degree = config.degree
         chosen = list(combinations_with_replacement(range(count + 1), config.degree))
-        self.register_buffer(
-            "index", torch.tensor(chosen, dtype=torch.long).T.contiguous(), persistent=False
+        self.index = nn.Buffer(
+            torch.tensor(chosen, dtype=torch.long).T.contiguous(), persistent=False
         )
-        self.register_buffer(
-            "weight",
-            torch.tensor([_weight(c) for c in chosen], dtype=torch.float64).sqrt(),
-            persistent=False,
+        self.weight = nn.Buffer(
+            torch.tensor([_weight(c) for c in chosen], dtype=torch.float64).sqrt(), persistent=False
         )
-        self.register_buffer("coefficients", torch.zeros(len(chosen), outputs, dtype=torch.float64))
+        self.coefficients = nn.Buffer(torch.zeros(len(chosen), outputs, dtype=torch.float64))
         self.slope, self.constant = config.slope**0.5, config.constant**0.5
-        self.index: Tensor
-        self.weight: Tensor
-        self.coefficients: Tensor
 
     def products(self, x: Tensor) -> Tensor:
         """Return the weighted products [..., P] of inputs [..., F], whose inner product it is."""

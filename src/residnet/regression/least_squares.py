@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar, final
 
 import torch
@@ -86,23 +86,25 @@ class LeastSquares(Estimator):
                 f"the data cannot tell apart regressors '{worst[0]}' and '{worst[1]}' (condition"
                 f" {condition:.1e}); leave one out, excite them separately, or give a ridge penalty"
             )
-        condition = condition
         solutions = []
         for penalty in self.penalties:
             inverse = torch.linalg.inv(gram + penalty * torch.eye(j, dtype=y.dtype))
             coefficients = inverse @ cross
             score = _score_spreads(x, y, scale, coefficients, gram, groups)
             covariance = inverse @ score @ inverse / n**2 / torch.outer(scale, scale)
-            solutions.append(
-                linear_solution(
-                    {"ridge": penalty} if len(self.penalties) > 1 else {},
-                    coefficients / scale[:, None],
-                    covariance,
-                    names,
-                    outputs,
-                    {"condition": condition},
-                )
+            found = Solution(
+                {"ridge": penalty} if len(self.penalties) > 1 else {},
+                {"coefficients": coefficients / scale[:, None]},
+                notes={"condition": condition},
+                covariance=covariance,
             )
+            estimates, errors = found.coefficients.tolist(), found.errors.tolist()
+            table = tuple(
+                Coefficient(output, name, estimates[j][k], errors[j][k])
+                for k, output in enumerate(outputs)
+                for j, name in enumerate(names)
+            )
+            solutions.append(replace(found, table=table))
         return solutions
 
 
@@ -183,25 +185,6 @@ class ElasticNet(Estimator):
             "intercept": torch.tensor(intercepts, dtype=y.dtype),
         }
         return [Solution({"alpha": penalties}, state)]
-
-
-def linear_solution(
-    choice: dict[str, float],
-    coefficients: Tensor,
-    covariance: Tensor,
-    names: Sequence[str],
-    outputs: Sequence[str],
-    notes: dict[str, float],
-) -> Solution:
-    """Return a solution with its table, from coefficients [J, n] and covariances [n, J, J]."""
-    found = Solution(choice, {"coefficients": coefficients}, (), notes, covariance=covariance)
-    errors = found.errors
-    table = tuple(
-        Coefficient(output, name, float(coefficients[j, k]), float(errors[j, k]))
-        for k, output in enumerate(outputs)
-        for j, name in enumerate(names)
-    )
-    return Solution(choice, found.state, table, notes, covariance=covariance)
 
 
 def _score_spreads(

@@ -122,14 +122,6 @@ class FoldMoments:
         cross = total[1:, 1:] - n * torch.outer(mean, mean)
         return Centred(n, mean[:j], mean[j:], cross[:j, :j], cross[:j, j:])
 
-    def all(self) -> Centred:
-        """Return the moments of all folds about their means."""
-        return self.centred(self.sums.sum(0))
-
-    def without(self, fold: int) -> Centred:
-        """Return the moments of all folds but one about their means."""
-        return self.centred(self.sums.sum(0) - self.sums[fold])
-
     def squared_error(self, fold: int, coefficients: Tensor, part: Centred) -> Tensor:
         """Return the sums of squared errors on one fold [C, n] of models about a part's means.
 
@@ -199,10 +191,11 @@ class _PathEstimator(Estimator):
         notes: dict[str, Any] = {"terms": x.shape[1]}
         n = y.shape[1]
         zero = {"coefficients": y.new_zeros(x.shape[1], n), "intercept": y.new_zeros(n)}
-        whole = moments.all()
+        total = moments.sums.sum(0)
+        whole = moments.centred(total)
         found, errors = self._models(whole), None
         if groups is not None:
-            parts = [moments.without(f) for f in range(moments.folds)]
+            parts = [moments.centred(total - one) for one in moments.sums]
             models = [self._models(part) for part in parts]
             count = min(len(model) for model in models)
             squares = [

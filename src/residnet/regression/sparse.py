@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 import scipy
@@ -217,33 +217,6 @@ def _triangle(x: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(x, mode="r"))
 
 
-class Criterion(NamedTuple):
-    """The extended BIC of k terms out of `candidates`.
-
-    An error below `precision` of the target is no better than none.
-    """
-
-    samples: float
-    candidates: int
-    gamma: float
-    energy: float
-    precision: float
-
-    def value(self, rss: np.ndarray | float, terms: int) -> np.ndarray:
-        """Return the criterion of models with `terms` terms and residual sums of squares `rss`."""
-        share = np.maximum(np.asarray(rss), 0.0) / self.energy + self.precision**2
-        room = max(self.candidates, terms)
-        gammaln = scipy.special.gammaln
-        ways = gammaln(room + 1) - gammaln(terms + 1) - gammaln(room - terms + 1)
-        return np.asarray(
-            self.samples * np.log(share) + terms * np.log(self.samples) + 2.0 * self.gamma * ways
-        )
-
-    def exact(self, rss: float) -> bool:
-        """Return whether a fit is as good as arithmetic allows."""
-        return rss <= (2.0 * self.precision) ** 2 * self.energy
-
-
 def coefficients(r: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return least-squares coefficients [p] of columns [R, p], and their triangle's inverse.
 
@@ -256,13 +229,31 @@ def coefficients(r: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @final
 class Search:
-    """A search of one target [R] in columns of unit length [R, J]."""
+    """A search of one target [R] in columns of unit length [R, J], by the extended BIC.
 
-    def __init__(self, r: np.ndarray, y: np.ndarray, rule: Criterion, max_terms: int) -> None:
-        self.r = r
-        self.y = y
-        self.rule = rule
-        self.max_terms = min(max_terms, r.shape[1])
+    Args:
+        samples: as many independent rows as the correlated ones are worth.
+    """
+
+    def __init__(self, r: np.ndarray, y: np.ndarray, samples: float, config: SearchConfig) -> None:
+        self.r, self.y, self.samples, self.config = r, y, samples, config
+        self.energy = float(y @ y)
+        self.max_terms = min(config.max_terms, r.shape[1])
+
+    def criterion(self, rss: np.ndarray | float, terms: int) -> np.ndarray:
+        """Return the criterion of models with `terms` terms and residual sums of squares `rss`.
+
+        An error below `precision` of the target is no better than none.
+        """
+        share = np.maximum(np.asarray(rss), 0.0) / self.energy + self.config.precision**2
+        room, gammaln = max(self.r.shape[1], terms), scipy.special.gammaln
+        ways = gammaln(room + 1) - gammaln(terms + 1) - gammaln(room - terms + 1)
+        fit, size = self.samples * np.log(share), terms * np.log(self.samples)
+        return np.asarray(fit + size + 2.0 * self.config.gamma * ways)
+
+    def exact(self, rss: float) -> bool:
+        """Return whether a fit is as good as arithmetic allows."""
+        return rss <= (2.0 * self.config.precision) ** 2 * self.energy
 
     def rss(self, chosen: Sequence[int]) -> float:
         """Return the residual sum of squares of the chosen columns."""
@@ -271,7 +262,7 @@ class Search:
 
     def value(self, chosen: Sequence[int]) -> float:
         """Return the criterion of the chosen columns."""
-        return float(self.rule.value(self.rss(chosen), len(chosen)))
+        return float(self.criterion(self.rss(chosen), len(chosen)))
 
     def beside(
         self, chosen: Sequence[int], columns: np.ndarray | None = None
@@ -291,7 +282,7 @@ class Search:
         Each size keeps the best sets of the size before with one column more. A single way takes a
         column that stands for two true ones and seldom finds back.
         """
-        best: tuple[float, list[int]] = (float(self.rule.value(float(self.y @ self.y), 0)), [])
+        best: tuple[float, list[int]] = (float(self.criterion(self.energy, 0)), [])
         sets, idle = np.zeros((1, 0), dtype=int), 0
         while sets.shape[1] < self.max_terms and idle < _PATIENCE:
             left = added_one(self.r, self.y, sets)
@@ -305,10 +296,10 @@ class Search:
             sets = grown[np.sort(first)[:_BEAM]]
             leader = sets[0].tolist()
             rss = self.rss(leader)
-            value, idle = float(self.rule.value(rss, len(leader))), idle + 1
+            value, idle = float(self.criterion(rss, len(leader))), idle + 1
             if value < best[0]:
                 best, idle = (value, leader), 0
-            if self.rule.exact(rss):
+            if self.exact(rss):
                 break
         return best
 
@@ -324,7 +315,7 @@ class Search:
             least = int((np.square(estimate) / np.square(inverse).sum(axis=1)).argmin())
             fewer = chosen[:least] + chosen[least + 1 :]
             without = self.value(fewer)
-            evidence = 0.0 if self.rule.exact(self.rss(chosen)) else _POSITIVE
+            evidence = 0.0 if self.exact(self.rss(chosen)) else _POSITIVE
             if without > value + evidence:
                 break
             chosen, value = fewer, without
@@ -420,8 +411,7 @@ def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
     the criterion, which knows how many candidates each had to choose from, decides between them.
     """
     y = reduced.y[:, target]
-    energy = float(y @ y)
-    if energy <= _TINY:
+    if float(y @ y) <= _TINY:
         return Equation((), np.zeros(0), np.zeros(0), 0.0, True, -np.inf, {}, {})
     best: tuple[float, list[int], Search] | None = None
     for stage in np.unique(reduced.degree).tolist():
@@ -429,7 +419,7 @@ def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
         value, chosen = search.best()
         if best is None or value < best[0]:
             best = (value, chosen, search)
-        if search.rule.exact(search.rss(best[1])):
+        if search.exact(search.rss(best[1])):
             break
     assert best is not None
     _, chosen, search = best
@@ -438,10 +428,8 @@ def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
 
 def _prepared(reduced: Reduced, target: int, config: SearchConfig, width: int) -> Search:
     """Return the search among the first `width` candidates."""
-    y = reduced.y[:, target]
     samples = float(reduced.samples[target])
-    rule = Criterion(samples, width, config.gamma, float(y @ y), config.precision)
-    return Search(reduced.r[:, :width], y, rule, config.max_terms)
+    return Search(reduced.r[:, :width], reduced.y[:, target], samples, config)
 
 
 def everything(reduced: Reduced, target: int) -> Equation:
@@ -453,19 +441,19 @@ def everything(reduced: Reduced, target: int) -> Equation:
 def equation_of(reduced: Reduced, search: Search, chosen: list[int]) -> Equation:
     """Return the equation of the chosen columns, with what stands beside it."""
     chosen = sorted(chosen)
-    rule, rss = search.rule, search.rss(chosen)
-    exact = rule.exact(rss)
+    rss = search.rss(chosen)
+    exact = search.exact(rss)
     value, inverse = coefficients(search.r[:, chosen], search.y)
-    std = np.sqrt(rss / max(rule.samples - len(chosen), 1.0))
+    std = np.sqrt(rss / max(search.samples - len(chosen), 1.0))
     errors = std * np.sqrt(np.square(inverse).sum(axis=1))
     names = np.array(reduced.names, dtype=object)
     return Equation(
         terms=tuple(names[chosen]),
         values=value / reduced.scale[chosen],
         errors=errors / reduced.scale[chosen],
-        share=float(np.sqrt(rss / rule.energy)),
+        share=float(np.sqrt(rss / search.energy)),
         exact=exact,
-        criterion=float(rule.value(rss, len(chosen))),
+        criterion=float(search.criterion(rss, len(chosen))),
         alternatives=_alternatives(search, chosen, names),
         undecided={} if exact else _undecided(search, chosen, names, std),
     )
@@ -478,7 +466,7 @@ def _alternatives(search: Search, chosen: list[int], names: np.ndarray) -> dict[
     limit = search.value(chosen) + _EVIDENCE
     kept = [[c for c in chosen if c != gone] for gone in chosen]
     sets = np.array(kept, dtype=int).reshape(len(chosen), -1)
-    table = search.rule.value(added_one(search.r, search.y, sets), len(chosen))
+    table = search.criterion(added_one(search.r, search.y, sets), len(chosen))
     out: dict[str, list[str]] = {}
     for place, others, row in zip(chosen, kept, table, strict=True):
         near = [int(j) for j in np.flatnonzero(row <= limit + _EVIDENCE) if j not in chosen]
@@ -501,7 +489,7 @@ def _undecided(
     free = np.flatnonzero(length > _MADE_UP)
     free = free[~np.isin(free, chosen)]
     along = np.abs(columns[:, free].T @ target) / length[free]
-    reach = (along + 2.0 * std) / length[free] / np.sqrt(search.rule.energy)
+    reach = (along + 2.0 * std) / length[free] / np.sqrt(search.energy)
     return {str(names[j]): round(float(s), 3) for j, s in zip(free, reach, strict=True) if s > 0.05}
 
 
