@@ -161,11 +161,3 @@ def test_config_names_what_is_wrong() -> None:
     with pytest.raises(ConfigError, match="'delta'"):
         MMGConfig.model_validate(TANKER).build(("u", "v", "r", "n"))
 
-
-def test_it_runs_as_torchscript() -> None:
-    baseline, z = built(), channels(5)
-    with torch.no_grad():
-        torch.testing.assert_close(torch.jit.script(baseline)(z), baseline(z))
-        torch.testing.assert_close(
-            torch.jit.script(baseline)(z.float()), baseline(z).float(), rtol=1e-4, atol=1e-5
-        )

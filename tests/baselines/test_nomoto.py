@@ -13,7 +13,7 @@ import torch
 
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.baselines.steering import NomotoConfig, NomotoSideslipConfig
-from residnet.core.errors import ConfigError, FitError
+from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
@@ -164,8 +164,6 @@ def test_other_channels_and_manoeuvres() -> None:
 
 
 def test_errors() -> None:
-    with pytest.raises(ConfigError, match="needs the channel 'delta'"):
-        NomotoConfig().build(("u", "v", "r", "n"))
     samples = made()
     unstable = samples.target.clone()
     unstable[:, 2] += samples.column("r")

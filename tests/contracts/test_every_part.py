@@ -16,8 +16,9 @@ from kinds import HEADS
 from torch import Tensor
 
 from residnet.baselines import BaselineConfig
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate
-from residnet.core.errors import ConfigError, UsageError
+from residnet.core.errors import ConfigError, ResidnetError, UsageError
 from residnet.core.layout import VELOCITIES, Live
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
@@ -25,6 +26,7 @@ from residnet.core.registry import kinds
 from residnet.data.readers import ReaderConfig
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.store import ModelSpec
 from residnet.export import FORMATS, exporter, vessel
 from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
@@ -42,7 +44,14 @@ from residnet.testing import (
     check_vessel,
     example_samples,
 )
-from residnet.testing.checks import ROLLING, SIGNALS, SUBMERGED, example_model, example_spec
+from residnet.testing.checks import (
+    ROLLING,
+    SIGNALS,
+    STEP,
+    SUBMERGED,
+    example_model,
+    example_spec,
+)
 
 RUDDER = SignalsConfig(inputs=("n", "delta"))
 # what a baseline cannot do without, and whose trials it is identified from
@@ -64,6 +73,28 @@ BASELINES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "nomoto": ({}, "example_rudder_boat"),
     "nomoto_sideslip": ({}, "example_rudder_boat"),
+}
+# settings with which a head goes ways that it does not go without
+HEAD_VARIANTS: dict[str, dict[str, Any]] = {
+    "softsign": {"kind": "lstm", "hidden_size": 6, "activation": "softsign", "readout": 4},
+    "per axis": {"kind": "lstm", "hidden_size": 4, "per_axis": True, "mirror": True},
+    "of inputs": {
+        "kind": "lstm",
+        "hidden_size": 5,
+        "readout": 4,
+        "memory": ["tau_x", "tau_n"],
+        "mirror": True,
+    },
+    "of motion": {"kind": "lstm", "hidden_size": 5, "readout": 4, "memory": ["v", "r"]},
+    "mirrored": {"kind": "mlp", "hidden": [8, 6], "mirror": True, "activation": "silu"},
+    "late": {"kind": "symbolic", "delay": {"channels": ["n_port", "n_stbd"], "longest": 4}},
+    "terms": {"kind": "kernel", "folds": 2, "penalties": [0.1], "terms": ["n_port|n_port|"]},
+    "landmarks": {
+        "kind": "kernel",
+        "folds": 2,
+        "penalties": [0.1],
+        "kernel": {"kind": "rbf", "exact": 100, "landmarks": 60},
+    },
 }
 MANOEUVRES: dict[str, dict[str, Any]] = {
     "constant": {"drive": 0.6, "steer": 0.2},
@@ -105,10 +136,15 @@ def head_of(kind: str) -> Any:
     return validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here")
 
 
-@pytest.mark.parametrize("signals", [SIGNALS, ROLLING], ids=["planar", "roll"])
+@pytest.mark.parametrize("signals", [SIGNALS, ROLLING, SUBMERGED], ids=["planar", "roll", "six"])
 @pytest.mark.parametrize("kind", kinds(HeadConfig))
 def test_head(kind: str, signals: SignalsConfig) -> None:
     check_head(head_of(kind), signals)
+
+
+@pytest.mark.parametrize("kind", HEAD_VARIANTS)
+def test_head_with_settings_of_its_own(kind: str) -> None:
+    check_head(validate(HEAD_VARIANTS[kind], HeadConfig, "here"))
 
 
 @pytest.mark.parametrize("kind", sorted({*kinds(HeadConfig)} - {"sklearn"}))
@@ -158,6 +194,36 @@ def test_baseline(kind: str) -> None:
     config = validate({"kind": kind, **settings}, BaselineConfig, "here")
     boat = vessel == "example_rudder_boat"
     check_baseline(config, example_samples(vessel, RUDDER) if boat else None)
+
+
+@pytest.mark.parametrize(
+    ("signals", "refusal"),
+    [(ROLLING, "knows no roll"), (SUBMERGED, "knows no depth and pitch")],
+    ids=["roll", "six"],
+)
+@pytest.mark.parametrize("kind", kinds(BaselineConfig))
+def test_baseline_beyond_the_plane(kind: str, signals: SignalsConfig, refusal: str) -> None:
+    """It keeps its contract, or says why not."""
+    config = validate({"kind": kind, **BASELINES.get(kind, ({}, ""))[0]}, BaselineConfig, "here")
+    if kind in ("regressors", "still"):
+        config = RegressorsConfig() if kind == "regressors" else config
+        check_baseline(config, example_samples(signals=signals))
+        return
+    with pytest.raises(ResidnetError, match=refusal):
+        config.build(signals.build().names)
+
+
+@pytest.mark.parametrize("signals", [ROLLING, SUBMERGED], ids=["roll", "six"])
+def test_zero_goes_on_level(signals: SignalsConfig) -> None:
+    content = example_spec(None, signals).model_dump(mode="json", by_alias=True)
+    content |= {"role": "zero", "baseline": {"kind": "still"}}
+    model, live = ModelSpec.model_validate(content).build().double(), signals.live
+    x = torch.zeros(1, len(live.states), dtype=torch.float64)
+    x[0, 3:] = torch.tensor([1.5, *[0.1] * (live.size - 1)])
+    w = torch.zeros(1, len(signals.columns), dtype=torch.float64)
+    after, _ = model.step(x, w, model.initial_state(1).double())
+    torch.testing.assert_close(after[:, 3:], x[:, 3:], rtol=0, atol=0)
+    assert not live.spatial or float(after[0, 2]) == pytest.approx(0.1 * STEP)
 
 
 @pytest.mark.parametrize("kind", kinds(ManoeuvreConfig))

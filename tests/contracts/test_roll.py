@@ -10,20 +10,17 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
-from kinds import check_or_refused
 
-from residnet.baselines import BaselineConfig
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.control.heading.vessels import SteeredModel, SteeredPlant
 from residnet.core.layout import ROLL, Live, levelled
 from residnet.core.log import Log
-from residnet.core.registry import kinds
 from residnet.data.doctor import inspect
 from residnet.data.simulated import Craft, Disturbance, Sea, SensorNoise, fly
 from residnet.dynamics.actuated import ActuatedDynamics, PlantActuators
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.rollout import Rollout, scripted
-from residnet.dynamics.store import ModelSpec, save_model
+from residnet.dynamics.store import save_model
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
 from residnet.identification.changes import Change, ChangedDynamics
@@ -40,11 +37,6 @@ from residnet.testing import example_samples
 from residnet.testing.checks import ROLLING, SUBMERGED, example_model, example_spec
 
 PHI, P = ROLL.names.index("phi"), ROLL.names.index("p")
-
-
-@pytest.mark.parametrize("kind", kinds(BaselineConfig))
-def test_baseline(kind: str) -> None:
-    check_or_refused(kind, ROLLING, "knows no roll")
 
 
 def test_an_angle_has_no_equation_of_its_own_and_restores() -> None:
@@ -92,15 +84,6 @@ def test_the_pose_moves_with_the_roll() -> None:
     np.testing.assert_allclose(levelled(nu), [[1.0, 0.5 * level, 0.2 * level]])
     assert levelled(nu[:, :3]) is not nu
     np.testing.assert_array_equal(levelled(nu[:, :3]), nu[:, :3])
-
-
-def test_zero_holds_the_roll_angle() -> None:
-    content = example_spec(None, ROLLING).model_dump(mode="json", by_alias=True)
-    content |= {"role": "zero", "baseline": {"kind": "still"}}
-    model = ModelSpec.model_validate(content).build().double()
-    x = torch.tensor([[0.0, 0.0, 0.0, 5.0, 0.0, 0.0, 0.1, 0.2]], dtype=torch.float64)
-    after, _ = model.step(x, torch.zeros(1, 2).double(), model.initial_state(1).double())
-    torch.testing.assert_close(after[:, 3:], x[:, 3:], rtol=0, atol=0)
 
 
 def test_what_logs_tell() -> None:

@@ -8,24 +8,19 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
-from kinds import HEADS, check_or_refused
 from scipy.spatial.transform import Rotation
 
-from residnet.baselines import BaselineConfig
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate
 from residnet.core.errors import ResidnetError, UsageError
 from residnet.core.frames import rotated, to_earth, turn_between, upright
 from residnet.core.layout import ATTITUDE, SIX, Live, levelled
 from residnet.core.log import Log
-from residnet.core.registry import kinds
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.simulated import SimulatedTrials, fly_trials
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.rollout import Rollout, scripted
-from residnet.dynamics.store import ModelSpec
-from residnet.heads import HeadConfig
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
 from residnet.identification.changes import causes
@@ -34,24 +29,12 @@ from residnet.judge.freerun import drift
 from residnet.physics.hull import SubmergedConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
-from residnet.testing import check_head, example_samples
+from residnet.testing import example_samples
 from residnet.testing.checks import STEP, SUBMERGED, example_model, example_spec
 from residnet.training import refit
 
 DEPTH = SIX.names.index("z")
 HULL = RegressorsConfig(sets=("fossen",), ridge=1e-4)
-
-
-@pytest.mark.parametrize("kind", kinds(HeadConfig))
-def test_head(kind: str) -> None:
-    if kind == "genetic":
-        pytest.importorskip("deap", reason="genetic programming needs the extra gp")
-    check_head(validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here"), SUBMERGED)
-
-
-@pytest.mark.parametrize("kind", kinds(BaselineConfig))
-def test_baseline(kind: str) -> None:
-    check_or_refused(kind, SUBMERGED, "knows no depth and pitch")
 
 
 def test_rotations_are_those_of_quaternions() -> None:
@@ -163,17 +146,6 @@ def test_a_drafted_model_swings_as_its_vessel() -> None:
         run = Rollout(model)(x, torch.zeros(1, 50, 3).double(), model.initial_state(1).double())[0]
     wanted = 0.05 * np.cos(rate * 0.1 * np.arange(51))
     np.testing.assert_allclose(run[0, :, ATTITUDE[0]].numpy(), wanted, atol=0.1 * 0.05)
-
-
-def test_zero_goes_on_level() -> None:
-    content = example_spec(None, SUBMERGED).model_dump(mode="json", by_alias=True)
-    content |= {"role": "zero", "baseline": {"kind": "still"}}
-    model = ModelSpec.model_validate(content).build().double()
-    x = torch.zeros(1, 12, dtype=torch.float64)
-    x[0, 3:] = torch.tensor([1.5, 0.1, 0.1, 0.1, 0.1, 0.1, 3.0, 0.1, 0.2])
-    after, _ = model.step(x, torch.zeros(1, 3).double(), model.initial_state(1).double())
-    torch.testing.assert_close(after[:, 3:], x[:, 3:], rtol=0, atol=0)
-    assert float(after[0, 2]) == pytest.approx(0.1 * STEP)
 
 
 def trials(count: int, duration: float) -> SimulatedTrials:

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from made_samples import NAMES as SURGE_YAW
 
 from residnet.baselines.given import BelievedConfig
 from residnet.baselines.regressors import RegressorsConfig
@@ -242,38 +241,3 @@ def test_believed_mass_is_the_hulls_times_its_factor() -> None:
     mass = BelievedConfig(vessel="milliampere", scale=0.5).build(NAMES).mass()
     assert mass is not None
     torch.testing.assert_close(mass, 0.5 * hull("milliampere").mass, rtol=1e-10, atol=1e-8)
-
-
-@pytest.mark.parametrize("kind", [PlsrConfig, RidgeConfig])
-def test_columns_that_say_nothing_get_nothing(kind: Any) -> None:
-    """A constant and a doubled column: no coefficient for the one, the same prediction without the
-    other; NaN and few samples are errors.
-    """
-    random = torch.Generator().manual_seed(1)
-    z = torch.randn(400, 5, generator=random, dtype=torch.float64)
-    z[:, 3] = 0.1
-    target = z[:, :3] @ torch.randn(3, 3, generator=random, dtype=torch.float64)
-    group = torch.arange(400) // 40
-    of = Samples(z, target, group, torch.zeros(400), ("a",) * 10, SURGE_YAW)
-
-    def answer(terms: tuple[str, ...], samples_: Samples = of) -> tuple[Any, torch.Tensor]:
-        head = kind(terms=terms, choose="one_step").build(SURGE_YAW)
-        head.calibrate(samples_)
-        head.solve(samples_)
-        return head, head(samples_.z, samples_.z[:, :0])[0]
-
-    _, plain = answer(("u", "v", "r"))
-    head, with_constant = answer(("u", "v", "r", "tau_x", "tau_x^2"))
-    assert not bool(head.coefficients[3:].any())
-    torch.testing.assert_close(with_constant, plain, rtol=0, atol=1e-6)
-    head, doubled = answer(("u", "v", "r", "u v", "v u"))
-    assert float(head.coefficients.abs().max()) < 10
-    torch.testing.assert_close(doubled, plain, rtol=0, atol=1e-5)
-    spoiled = z.clone()
-    spoiled[7, 0] = torch.nan
-    with pytest.raises(FitError, match="channel 'u' is not finite at sample 7"):
-        answer(("v", "u"), Samples(spoiled, target, group, of.t, of.kinds, SURGE_YAW))
-    with pytest.raises(FitError, match="samples do not determine"):
-        answer((), of.where(torch.arange(400) % 40 == 0))
-    with pytest.raises(FitError, match="one run or segment only"):
-        answer(("u",), Samples(z, target, torch.zeros_like(group), of.t, ("a",), SURGE_YAW))

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -181,7 +178,7 @@ def truth(u: np.ndarray, v: np.ndarray, r: np.ndarray) -> np.ndarray:
     )
 
 
-def test_tables_and_writing_say_the_same(tmp_path: Path) -> None:
+def test_tables_and_writing_say_the_same() -> None:
     algebra = Algebra(("u", "v", "r"), Limits(nesting=3))
     meant = expression(algebra)
     products, weights = list(meant), list(meant.values())
@@ -200,16 +197,6 @@ def test_tables_and_writing_say_the_same(tmp_path: Path) -> None:
     written = equation("total", "", value, algebra.channels)
     called = sympy.lambdify(sympy.symbols("u v r"), sympy.sympify(written["sympy"]), "numpy")
     np.testing.assert_allclose(called(*z.T), wanted, rtol=1e-12)
-    if shutil.which("gcc"):
-        (tmp_path / "total.c").write_text("#include <math.h>\n" + written["c"])
-        subprocess.run(
-            ["gcc", "-std=c99", "-O2", "-shared", "-fPIC", "total.c", "-o", "total.so", "-lm"],
-            cwd=tmp_path,
-            check=True,
-        )
-        function = ctypes.CDLL(str(tmp_path / "total.so")).total
-        function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double] * 3
-        np.testing.assert_allclose([function(*row) for row in z], wanted, rtol=1e-12)
     assert r"\sqrt{\left|{v}\right|}" in written["latex"]
 
 

@@ -11,7 +11,6 @@ import pytest
 import torch
 from made_samples import NAMES, channels, made
 from sklearn.kernel_ridge import KernelRidge
-from sklearn.linear_model import Ridge
 from sklearn.metrics.pairwise import rbf_kernel
 
 from residnet.core.errors import ConfigError, FitError
@@ -80,18 +79,6 @@ def test_polynomials_equal_scikit_learn(
         answer(head, SAMPLES.z), truth.predict(standardised(SAMPLES.z)), atol=1e-10
     )
     np.testing.assert_allclose(answer(head, NEW), truth.predict(standardised(NEW)), atol=1e-10)
-
-
-def test_the_linear_kernel_is_ridge_regression() -> None:
-    """Document 001 section 4: p = 1 is standard ridge regression, here with a constant that is
-    penalised too.
-    """
-    head, _ = fitted(Polynomial(degree=1), (1e-2,))
-    joined = np.concatenate((np.ones((len(SAMPLES), 1)), standardised(SAMPLES.z)), axis=1)
-    truth = Ridge(alpha=1e-2 * len(SAMPLES), fit_intercept=False, solver="cholesky").fit(
-        joined, SAMPLES.target.numpy()
-    )
-    np.testing.assert_allclose(answer(head, SAMPLES.z), truth.predict(joined), atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -238,8 +225,6 @@ def test_terms_are_features_too() -> None:
     np.testing.assert_allclose(
         answer(head, NEW), truth.predict((columns(NEW) - own.mean(0)) / own.std(0)), atol=1e-10
     )
-    scripted = torch.jit.script(head)
-    np.testing.assert_array_equal(scripted(NEW, NEW[:, :0])[0], answer(head, NEW))
 
 
 def test_terms_that_say_nothing_are_refused() -> None:

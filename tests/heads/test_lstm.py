@@ -36,38 +36,6 @@ def stepped(head: LstmHead, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
     return torch.stack(out, dim=1), s
 
 
-VARIANTS = [
-    {},
-    {"activation": "softsign"},
-    {"per_axis": True},
-    {"readout": 7},
-    {"per_axis": True, "readout": 5, "activation": "softsign"},
-]
-
-
-@pytest.mark.parametrize("config", VARIANTS, ids=str)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_stepping_equals_the_sequence_and_the_warm_up(
-    config: dict[str, object], dtype: torch.dtype
-) -> None:
-    head, z = built(**config).to(dtype), windows().to(dtype)
-    with torch.no_grad():
-        out, s = stepped(head, z)
-        scale = float(out.abs().max())
-        torch.testing.assert_close(head.sequence(z), out, rtol=0, atol=1e-6 * max(scale, 1.0))
-        torch.testing.assert_close(head.warmup(z), s, rtol=0, atol=1e-6)
-    assert s.shape == (3, head.n_state)
-    assert scale > 1e-3
-
-
-@pytest.mark.parametrize("config", VARIANTS, ids=str)
-def test_an_empty_past_leaves_no_memory(config: dict[str, object]) -> None:
-    head = built(**config)
-    assert torch.equal(
-        head.warmup(windows()[:, :0]), torch.zeros(3, head.n_state, dtype=torch.float64)
-    )
-
-
 def test_core_equals_torch_lstm() -> None:
     core, z = LstmCore(4, 10, softsign=False).double(), torch.randn(5, 30, 4, dtype=torch.float64)
     other = nn.LSTM(4, 10, batch_first=True).double()
@@ -138,15 +106,6 @@ def test_axes_of_their_own_are_independent() -> None:
     assert torch.equal(before[..., 1:], after[..., 1:])
 
 
-def test_memory_forgets_nothing_at_once() -> None:
-    """A head with memory answers differently to the same sample after another past."""
-    head, z = built(), windows()
-    with torch.no_grad():
-        one = head(z[:, 0], head.warmup(z[:, 1:5]))[0]
-        two = head(z[:, 0], head.warmup(z[:, 5:9]))[0]
-    assert float((one - two).abs().max()) > 1e-6
-
-
 def test_gradients_of_the_sequence_are_those_of_the_steps() -> None:
     for activation in ("tanh", "softsign"):
         head, z = built(activation=activation), windows(2, 10)
@@ -160,22 +119,12 @@ def test_gradients_of_the_sequence_are_those_of_the_steps() -> None:
             torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-12)
 
 
-def test_dropout_acts_only_while_training() -> None:
-    head, z = built(dropout=0.5), windows()
-    with torch.no_grad():
-        assert torch.equal(head.sequence(z), head.sequence(z))
-        head.train()
-        assert not torch.equal(head.sequence(z), head.sequence(z))
-
-
 @pytest.mark.parametrize(
     ("config", "message"),
     [
         ({"axis_features": {"u": ["u"], "v": ["v"], "r": ["r"]}}, "needs per_axis"),
         ({"per_axis": True, "axis_features": {"u": ["u"]}}, "all of u, v, r"),
-        ({"activation": "sigmoid"}, "tanh"),
-        ({"hidden_size": 0}, "greater than or equal to 1"),
-        ({"dropout": 1.0}, "less than 1"),
+        ({"memory": [NAMES[-1]]}, "readout"),
     ],
 )
 def test_wrong_configs(config: dict[str, object], message: str) -> None:
@@ -190,11 +139,3 @@ def test_a_memory_of_chosen_features_ignores_the_others() -> None:
     other[:, :, : len(NAMES) - 1] += 0.1
     assert torch.equal(head.warmup(z), head.warmup(other))
     assert not torch.equal(head.sequence(z), head.sequence(other))
-    out, s = stepped(head, z)
-    torch.testing.assert_close(head.sequence(z), out)
-    torch.testing.assert_close(head.warmup(z), s)
-
-
-def test_a_memory_of_chosen_features_needs_a_readout() -> None:
-    with pytest.raises(ConfigError, match="readout"):
-        validate({"kind": "lstm", "memory": [NAMES[-1]]}, LstmConfig, "test")

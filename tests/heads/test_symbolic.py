@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import subprocess
@@ -11,14 +12,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import sympy
 import torch
 from made_equations import SPACE, draw, draw_ship
 from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, msd_log, step_log
 
+from residnet.core.errors import FitError
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.data.derivatives import SavitzkyGolay
-from residnet.heads.symbolic import SymbolicConfig, SymbolicHead
+from residnet.heads.symbolic import Past, SymbolicConfig, SymbolicHead, best_delay
 from residnet.physics.symmetry import term_parity
 
 FORCES, JETS = ("u", "v", "r", "tau_x", "tau_y", "tau_n"), ("u", "v", "r", "rpm", "nozzle")
@@ -242,6 +245,7 @@ def test_a_delay_is_found_inside_the_regression_and_remembered() -> None:
     log = msd_log(delay=0.5)
     config = {**SPRING, "delay": {"channels": ["tau"], "longest": 12}}
     head, notes = fitted(config, spring(log, log["w_dot"]))
+    compiled = torch.jit.script(head.eval())
     assert notes["delay"]["steps"] == 5
     assert notes["delay"]["seconds"] == pytest.approx(0.5)
     assert found(notes, "v_dot") == pytest.approx(SPRING_TRUTH, rel=1e-9)
@@ -252,7 +256,9 @@ def test_a_delay_is_found_inside_the_regression_and_remembered() -> None:
     with torch.no_grad():
         s = head.warmup(data.z[None, :100])
         for k in range(100, 140):
+            same, _ = compiled(data.z[k : k + 1], s)
             rho, s = head(data.z[k : k + 1], s)
+            assert torch.equal(same, rho)
             torch.testing.assert_close(rho[0], data.target[k], rtol=0, atol=1e-12)
         late = head.sequence(data.z[None])[0]
     torch.testing.assert_close(late[12:], data.target[12:], rtol=0, atol=1e-12)
@@ -267,18 +273,26 @@ def test_a_delay_is_found_inside_the_regression_and_remembered() -> None:
     assert right >= 19
 
 
-def test_a_delayed_head_is_scriptable_with_the_same_answers() -> None:
-    log = msd_log(delay=0.5)
-    head, _ = fitted(
-        {**SPRING, "delay": {"channels": ["tau"], "longest": 12}}, spring(log, log["w_dot"])
-    )
-    data = spring(log, log["w_dot"])
-    compiled = torch.jit.script(head.eval())
-    s = head.warmup(data.z[None, :30])
-    for k in range(30, 40):
-        same, _ = compiled(data.z[k : k + 1], s)
-        rho, s = head(data.z[k : k + 1], s)
-        assert torch.equal(same, rho)
+@pytest.mark.parametrize("shift", [0, 3, 8])
+def test_errors_by_delay_are_those_of_refits_across_gaps(shift: int) -> None:
+    random, count = np.random.default_rng(shift), 400
+    u, tau = random.normal(size=(2, count)) * [[1.0], [500.0]]
+    late = np.roll(tau, shift)
+    y = -u + 1e-3 * late + 1e-7 * u**2 * late * np.abs(late) + 0.3 * random.normal(size=count)
+    stretch = np.repeat([0, 1, 2], [150, 50, 200])
+    # one term twice does no harm
+    terms, index = ("u", "tau", "u^2 tau |tau|", "tau"), np.array([1])
+    past = Past(np.stack((u, tau), axis=1), y[:, None], stretch, 0.1)
+    found, profile = best_delay(past, [terms], ("u", "tau"), index, 10)
+    now = np.array([i for i in range(10, count) if stretch[i] == stretch[i - 10]])
+    for steps in range(11):
+        then = tau[now - steps]
+        x = np.stack((u[now], then, u[now] ** 2 * then * np.abs(then)), axis=1)
+        left = y[now] - x @ np.linalg.lstsq(x, y[now], rcond=None)[0]
+        assert profile[steps] == pytest.approx(np.log(left @ left), abs=1e-9)
+    assert found == shift
+    with pytest.raises(FitError, match="delay: 0 samples have a past of 300"):
+        best_delay(past, [terms], ("u", "tau"), index, 300)
 
 
 def test_a_symmetric_vessel_has_no_terms_that_a_mirror_forbids() -> None:
@@ -347,51 +361,28 @@ def written() -> tuple[SymbolicHead, dict[str, Any], torch.Tensor]:
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
-def test_c_code_equals_the_head(tmp_path: Path) -> None:
-    import ctypes
-
+def test_c_code_and_sympy_text_equal_the_head(tmp_path: Path) -> None:
     head, notes, z = written()
     source = "#include <math.h>\n" + "".join(
         equation["c"] for equation in notes["equations"].values()
     )
     (tmp_path / "model.c").write_text(source)
-    build = [
-        "gcc",
-        "-std=c99",
-        "-Wall",
-        "-Wextra",
-        "-Werror",
-        "-O2",
-        "-shared",
-        "-fPIC",
-        "model.c",
-        "-o",
-        "model.so",
-        "-lm",
-    ]
-    subprocess.run(build, cwd=tmp_path, check=True)
+    flags = "-std=c99 -Wall -Wextra -Werror -O2 -shared -fPIC model.c -o model.so -lm"
+    subprocess.run(["gcc", *flags.split()], cwd=tmp_path, check=True)
     library = ctypes.CDLL(str(tmp_path / "model.so"))
     with torch.no_grad():
         rho = head(z, z[:, :0])[0]
+    symbols = sympy.symbols("u v r tau_x", real=True)
     for axis, name in enumerate(ACCELERATION):
         function = getattr(library, name)
         function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double] * 4
         np.testing.assert_allclose(
             [function(*row) for row in z.tolist()], rho[:, axis], rtol=1e-12, atol=1e-12
         )
-
-
-def test_sympy_text_equals_the_head() -> None:
-    sympy = pytest.importorskip("sympy")
-    head, notes, z = written()
-    with torch.no_grad():
-        rho = head(z, z[:, :0])[0]
-    symbols = sympy.symbols("u v r tau_x", real=True)
-    for axis, equation in enumerate(notes["equations"].values()):
-        function = sympy.lambdify(
-            symbols, sympy.sympify(equation["sympy"], locals={s.name: s for s in symbols}), "numpy"
-        )
-        np.testing.assert_allclose(function(*z.numpy().T), rho[:, axis], rtol=1e-12, atol=1e-12)
+        text = notes["equations"][name]["sympy"]
+        right = sympy.sympify(text, locals={symbol.name: symbol for symbol in symbols})
+        called = sympy.lambdify(symbols, right, "numpy")
+        np.testing.assert_allclose(called(*z.numpy().T), rho[:, axis], rtol=1e-12, atol=1e-12)
 
 
 def test_text_and_latex() -> None:

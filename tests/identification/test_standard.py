@@ -19,7 +19,6 @@ from residnet.core.layout import ALIVE
 from residnet.core.log import Log
 from residnet.data.prepare import samples
 from residnet.dynamics.hybrid import Missed
-from residnet.heads.lstm import LstmConfig
 from residnet.identification.fit import Identified, fit
 from residnet.identification.fitter import FitStore, Fitter, burden
 from residnet.identification.prepared import PreparedSplits, prepare_logs
@@ -337,21 +336,6 @@ def test_what_was_predicted_wrong_of_the_past_is_told_and_fades() -> None:
         x = x + 0.1 * torch.cat((torch.zeros(1, 3), force), dim=-1) * (k < 1950)
     torch.testing.assert_close(told / force, torch.full_like(force, math.exp(-4.9 / 5.0)))
     torch.jit.script(missed)
-
-
-def test_an_encoder_starts_the_memory_with_weights_of_its_own() -> None:
-    names = ("u", "v", "r", "n")
-    head = LstmConfig(hidden_size=3, readout=2, encoder=True).build(names)
-    plain = LstmConfig(hidden_size=3, readout=2).build(names)
-    z = torch.randn(2, 7, 4, generator=torch.Generator().manual_seed(0))
-    assert head.warmup(z).shape == (2, 6)
-    assert not head.warmup(z[:, :0]).any(), "no past, no memory"
-    assert not head.warms_by_steps()
-    assert plain.warms_by_steps()
-    s = torch.zeros(2, 6)
-    for k in range(7):
-        s = head(z[:, k], s)[1]
-    assert not torch.allclose(s, head.warmup(z))
 
 
 def test_a_term_that_turns_the_damping_about_is_left_out(logs: PreparedSplits) -> None:

@@ -26,7 +26,7 @@ HEADS = {
     "mlp": MlpConfig(hidden=(6,)),
     "mirrored mlp": MlpConfig(hidden=(6,), mirror=True),
     "lstm": LstmConfig(hidden_size=4),
-    "lstm with encoder": LstmConfig(hidden_size=4, encoder=True, memory=("tau_x",), readout=5),
+    "lstm of commands": LstmConfig(hidden_size=4, memory=("tau_x",), readout=5),
     "softsign lstm per axis": LstmConfig(hidden_size=4, activation="softsign", per_axis=True),
     "restoring lstm": LstmConfig(hidden_size=4, restoring=True),
 }

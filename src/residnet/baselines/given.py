@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self, final
 
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, require
 from residnet.core.columns import zero_acceleration
@@ -47,12 +47,10 @@ class GivenBaseline(Baseline):
         beside = [dict[str, float]()] * (self.dof - len(rows))
         theta = [[row.get(term, 0.0) for term in terms] for row in (*rows, *beside)]
         # a baseline without terms has nothing to store
-        self.register_buffer(
-            "theta",
+        self.theta = nn.Buffer(
             torch.tensor(theta, dtype=torch.float64).reshape(self.dof, len(terms)),
             persistent=len(terms) > 0,
         )
-        self.theta: Tensor
 
     def forward(self, z: Tensor) -> Tensor:
         if self.library.count == 0:
@@ -108,30 +106,42 @@ class StillConfig(GivenConfig):
         return GivenBaseline([], names)
 
 
-class EquationsConfig(GivenConfig):
-    """Published equations of the accelerations; nothing is identified.
-
-    Examples are eqs. (6.24)-(6.32) and (7.2)-(7.7) of document 000.
+class AxisRows(Config):
+    """Accelerations as sums of terms.
 
     Attributes:
         u: coefficients of u_dot by term; a term that is left out is zero.
         v: coefficients of v_dot by term.
         r: coefficients of r_dot by term.
+    """
+
+    u: Row = Field(default_factory=dict)
+    v: Row = Field(default_factory=dict)
+    r: Row = Field(default_factory=dict)
+
+    def rows(self) -> tuple[Row, Row, Row]:
+        """Return the coefficients of u_dot, v_dot and r_dot."""
+        return self.u, self.v, self.r
+
+
+class EquationsConfig(AxisRows, GivenConfig):
+    """Published equations of the accelerations; nothing is identified.
+
+    Examples are eqs. (6.24)-(6.32) and (7.2)-(7.7) of document 000.
+
+    Attributes:
         units: units in which the coefficients take channels, where not SI (document 000 has
             revolutions in rpm).
         source: where the equations stand.
     """
 
     kind: Literal["equations"] = "equations"
-    u: Row = Field(default_factory=dict)
-    v: Row = Field(default_factory=dict)
-    r: Row = Field(default_factory=dict)
     units: dict[str, str] = Field(default_factory=dict)
     source: str = ""
 
     @model_validator(mode="after")
     def _any(self) -> EquationsConfig:
-        if not (self.u or self.v or self.r):
+        if not any(self.rows()):
             raise ValueError("no axis has a term; give coefficients by term under u, v or r")
         for name, unit in self.units.items():
             try:
@@ -156,34 +166,21 @@ class EquationsConfig(GivenConfig):
         require(names, (), "baseline 'equations'")
         rows = [
             {term: self._in_si(axis, term, value, names) for term, value in row.items()}
-            for axis, row in zip(VELOCITY, (self.u, self.v, self.r), strict=True)
+            for axis, row in zip(VELOCITY, self.rows(), strict=True)
         ]
         return GivenBaseline(rows, names, fitted=True)
 
 
-class HullEquations(Config):
+class HullEquations(AxisRows):
     """The accelerations of a hull written out, in SI.
 
     The terms are products of u, v, r, tau_x, tau_y and tau_n.
-
-    Attributes:
-        u: coefficients of u_dot by term.
-        v: coefficients of v_dot by term.
-        r: coefficients of r_dot by term.
     """
-
-    u: Row
-    v: Row
-    r: Row
 
     @model_validator(mode="after")
     def _terms(self) -> HullEquations:
         read_rows(dict(self), VELOCITY + FORCE_CHANNELS)
         return self
-
-    def rows(self) -> tuple[Row, Row, Row]:
-        """Return the coefficients of u_dot, v_dot and r_dot."""
-        return self.u, self.v, self.r
 
 
 class BelievedConfig(GivenConfig):

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, final
 
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres
 from residnet.baselines.sets import Roles, SetName, expand, merged
@@ -69,14 +69,13 @@ class RegressorBaseline(ParametricBaseline):
         allowed = torch.tensor(
             [[term in row for term in terms] for row in rows], dtype=torch.float64
         )
-        self.register_buffer("allowed", allowed, persistent=False)
-        self.allowed: Tensor
+        self.allowed = nn.Buffer(allowed, persistent=False)
         self.held = tuple((axis, terms.index(term)) for axis, term in held)
         self.dissipative = dissipative
         self.names = names if isinstance(names, ChannelNames) else tuple(names)
-        self.bound: VelocityBound | None = None
-        if bounded:
-            self.bound = VelocityBound(_BEYOND, len(names), live.size)
+        self.bound: VelocityBound | None = (
+            VelocityBound(_BEYOND, len(names), live.size) if bounded else None
+        )
         self.split = SplitTerms(terms, names[live.size :], live.moving)
         self.linear = self.split.linear and not bounded
 

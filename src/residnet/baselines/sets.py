@@ -118,12 +118,6 @@ def _turning(steer: str, drives: Sequence[str]) -> list[str]:
     ]
 
 
-def _controls(roles: Roles) -> list[str]:
-    return [t for drive in roles.drives for t in _thrust(drive)] + [
-        t for steer in roles.steers for t in _turning(steer, roles.drives)
-    ]
-
-
 def _fossen(roles: Roles) -> list[str]:
     """Return the terms of Fossen's manoeuvring model.
 
@@ -136,7 +130,10 @@ def _fossen(roles: Roles) -> list[str]:
     hull = ["u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|"]
     if "p" in roles.moving:
         hull += ["u p", "p|p|", "u|u| phi", "phi^3"]
-    return ["1", *roles.moving, *hull, *_controls(roles.known("fossen"))]
+    drives, steers = roles.known("fossen").drives, roles.steers
+    controls = [t for drive in drives for t in _thrust(drive)]
+    controls += [t for steer in steers for t in _turning(steer, drives)]
+    return ["1", *roles.moving, *hull, *controls]
 
 
 VERTICAL = ("sin(theta)", "cos(theta) sin(phi)", "cos(theta) cos(phi)")

@@ -59,6 +59,8 @@ GONE: dict[str, str] = {
     "separate": "models of single phases are always fitted besides",
     "standard.bounds": "parameters are free, as in the document",
     "identify": "the first half identifies, as in the document",
+    "spectrum.kind=ittc": "jonswap with gamma: 1 is the same",
+    "encoder": "the memory of a measured past is that of the steps along it",
 }
 """Keys that nothing took the place of, and what holds instead."""
 

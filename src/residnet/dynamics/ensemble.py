@@ -77,9 +77,6 @@ class MeanHead(ResidualHead):
     def sequence(self, z: Tensor) -> Tensor:
         return self._sequences(z).mean(dim=0)
 
-    def warms_by_steps(self) -> bool:
-        return all(member.warms_by_steps() for member in self.members)  # type: ignore[operator]
-
     def warmup(self, z: Tensor) -> Tensor:
         memory: list[Tensor] = []
         for member in self.members:

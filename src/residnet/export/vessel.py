@@ -359,7 +359,7 @@ class ExportedVessel(Exported):
         """
         y, w, eager = self.free_run(dtype)
         past, inputs = y[0].numpy(), w[0].numpy()
-        s = self.memory(loaded, past, inputs[:PAST], what)
+        s = self.memory(loaded, past, inputs[:PAST])
         x = past[-1].copy()
         together = loaded.rollout(x, inputs[PAST:], s)
         path = [x]
@@ -380,23 +380,15 @@ class ExportedVessel(Exported):
             )
         return shares
 
-    def memory(self, loaded: Loaded, y: Numbers, w: Numbers, what: str) -> Numbers:
+    def memory(self, loaded: Loaded, y: Numbers, w: Numbers) -> Numbers:
         """Return the memory that states [T, 3 + n] and inputs [T, m] of a measured past leave.
 
         Where a format has only steps, these are taken. In the place of a sample that is no
         measurement stands the last one before it that is, or else the first one behind it.
-
-        Raises:
-            ExportError: where steps do not warm the memory up.
         """
         found = loaded.memory(y, w)
         if found is not None:
             return found
-        if not self.model.head.warms_by_steps():
-            raise ExportError(
-                f"{what}: an encoder of its own starts the memory of {self.name}, which this format"
-                " has no place for; export it as torchscript, or export a model without an encoder"
-            )
         guard = GuardedDynamics(self.model, self.spec)
         seen = np.concatenate((y, w), axis=1)
         within = (seen >= guard.least.numpy()) & (seen <= guard.most.numpy())

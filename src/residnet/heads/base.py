@@ -18,6 +18,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.layout import PLANAR
 from residnet.core.names import ACCELERATION, nearest
 from residnet.core.samples import Samples
+from residnet.physics.signals import VelocityBound
 from residnet.physics.symmetry import live_of, without_dead
 from residnet.regression.estimator import Solution
 from residnet.regression.shrinkage import CONSTANT
@@ -35,6 +36,7 @@ class ResidualHead(nn.Module, ABC):
     but those with a `refusal`.
 
     Attributes:
+        outputs: names of what it gives.
         copies: number of networks that it holds; rows are then those of one after the other.
         settle: time in s over which it wants to know how wrong accelerations were predicted: n
             channels more, behind the others; 0 for none.
@@ -46,7 +48,7 @@ class ResidualHead(nn.Module, ABC):
 
     def __init__(self, names: Sequence[str] = ()) -> None:
         super().__init__()
-        self.dof = live_of(names).size
+        self.dof, self.outputs = live_of(names).size, live_of(names).rates
         self.n_state = 0
         self.copies = 1
         self.settle = 0.0
@@ -123,10 +125,6 @@ class ResidualHead(nn.Module, ABC):
         """
         return baseline
 
-    def warms_by_steps(self) -> bool:
-        """Return whether a past leaves the memory that steps along it do; an encoder does not."""
-        return True
-
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] that past channels [B, T, nz], oldest first, leave."""
         return torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
@@ -140,7 +138,13 @@ class ResidualHead(nn.Module, ABC):
         return -limit, limit
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges from the training samples; called once, before the fit."""
+        """Take scales and ranges from the training samples; called once, before the fit.
+
+        The features, the scale and the bound that a head is made of take theirs by themselves.
+        """
+        for part in self.modules():
+            if isinstance(part, Features | ResidualScale | VelocityBound):
+                part.calibrate(samples)
 
     def residual_std(self) -> Tensor:
         """Return the standard deviation of the residual on the training samples, [n], float64.
@@ -198,8 +202,20 @@ class EquationHead(ClosedFormHead):
     """A closed-form head that is a sum of few terms."""
 
     @abstractmethod
+    def names(self) -> list[str]:
+        """Return the terms in writing, [J]."""
+
+    @abstractmethod
+    def along(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the terms [T, J] along channels z [T, nz], and their coefficients [J, n]."""
+
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
         """Return each term of an axis times its coefficient [T], along channels z [T, nz]."""
+        with torch.no_grad():
+            terms, weights = self.along(z)
+            values = (terms * weights[:, axis].to(z.dtype)).numpy()
+        kept = weights[:, axis].tolist()
+        return {name: values[:, j] for j, name in enumerate(self.names()) if kept[j] != 0.0}
 
 
 class FeatureConfig(Config):
@@ -264,34 +280,17 @@ class Features(nn.Module):
         self.names, self.dof = tuple(chosen), len(moving)
         self.count = len(self.names)
         self.margin = margin
-        self.register_buffer(
-            "index",
-            torch.tensor([list(names).index(name) for name in chosen], dtype=torch.long),
-            persistent=False,
-        )
-        self.register_buffer("mean", torch.zeros(self.count, dtype=torch.float64))
-        self.register_buffer("std", torch.ones(self.count, dtype=torch.float64))
-        self.register_buffer("low", torch.full((self.count,), -torch.inf, dtype=torch.float64))
-        self.register_buffer("high", torch.full((self.count,), torch.inf, dtype=torch.float64))
+        self.index = _places([list(names).index(name) for name in chosen])
+        self.mean = nn.Buffer(torch.zeros(self.count, dtype=torch.float64))
+        self.std = nn.Buffer(torch.ones(self.count, dtype=torch.float64))
+        self.low = nn.Buffer(torch.full((self.count,), -torch.inf, dtype=torch.float64))
+        self.high = nn.Buffer(torch.full((self.count,), torch.inf, dtype=torch.float64))
         # velocities decide some of them, the channels behind these the others
         near = [place for place, name in enumerate(chosen) if name in moving]
         far = [place for place, name in enumerate(chosen) if name not in moving]
-        for name, places in (
-            ("near", near),
-            ("axis", [moving.index(chosen[place]) for place in near]),
-            ("far", far),
-            ("column", [list(names).index(chosen[place]) - self.dof for place in far]),
-        ):
-            self.register_buffer(name, torch.tensor(places, dtype=torch.long), persistent=False)
-        self.index: Tensor
-        self.mean: Tensor
-        self.std: Tensor
-        self.low: Tensor
-        self.high: Tensor
-        self.near: Tensor
-        self.axis: Tensor
-        self.far: Tensor
-        self.column: Tensor
+        self.near, self.far = _places(near), _places(far)
+        self.axis = _places([moving.index(chosen[place]) for place in near])
+        self.column = _places([list(names).index(chosen[place]) - self.dof for place in far])
 
     def inputs(self, p: Tensor) -> Tensor:
         """Return the features that velocities do not decide, held in their range [..., F'].
@@ -361,6 +360,10 @@ class Features(nn.Module):
         return (self.guarded(z) - self.mean.to(z.dtype)) / self.std.to(z.dtype)
 
 
+def _places(of: Sequence[int]) -> nn.Buffer:
+    return nn.Buffer(torch.tensor(of, dtype=torch.long), persistent=False)
+
+
 class ResidualScale(nn.Module):
     """The scale between a network's output near one and accelerations.
 
@@ -369,8 +372,7 @@ class ResidualScale(nn.Module):
 
     def __init__(self, dof: int = PLANAR.dof) -> None:
         super().__init__()
-        self.register_buffer("spread", torch.ones(dof, dtype=torch.float64))
-        self.spread: Tensor
+        self.spread = nn.Buffer(torch.ones(dof, dtype=torch.float64))
 
     def calibrate(self, samples: Samples) -> None:
         """Take the standard deviation of each axis from the samples' target."""

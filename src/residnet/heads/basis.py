@@ -5,13 +5,13 @@ Their solutions differ, their evaluation does not.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Literal, Self
+from typing import Literal, Self, final
 
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.core.arrays.paged import row_pieces
 from residnet.core.names import ACCELERATION
@@ -29,7 +29,7 @@ from residnet.regression.estimator import (
 )
 
 
-class BasisConfig(FeatureConfig):
+class BasisConfig(FeatureConfig, ABC):
     """The basis functions of a head.
 
     Attributes:
@@ -63,17 +63,18 @@ class BasisConfig(FeatureConfig):
             )
         return self
 
+    @abstractmethod
+    def estimator(self, folds: int | None) -> Estimator:
+        """Return the estimator of the coefficients, cross-validated over so many folds."""
 
+
+@final
 class BasisHead(ClosedFormHead):
-    """A head that is linear in basis functions: intercept + phi(features / std) coefficients.
-
-    The buffers are found by the estimator of the subclass.
-    """
+    """A head that is linear in basis functions: intercept + phi(features / std) coefficients."""
 
     def __init__(self, config: BasisConfig, names: Sequence[str]) -> None:
         super().__init__(names)
         chosen, moving = config.chosen(names), live_of(names).moving
-        self.outputs = live_of(names).rates
         self.features = Features(chosen, names, config.margin)
         magnitudes = [name for name in moving if name in chosen]
         self.library = TermLibrary(
@@ -82,17 +83,11 @@ class BasisHead(ClosedFormHead):
         self.split = SplitTerms(
             self.library.terms, [name for name in chosen if name not in moving], moving
         )
-        self.folds = config.folds
-        self.by_free_run = config.choose == "free_run"
-        self.register_buffer(
-            "coefficients", torch.zeros(self.library.count, self.dof, dtype=torch.float64)
+        self.config = config
+        self.coefficients = nn.Buffer(
+            torch.zeros(self.library.count, self.dof, dtype=torch.float64)
         )
-        self.register_buffer("intercept", torch.zeros(self.dof, dtype=torch.float64))
-        self.coefficients: Tensor
-        self.intercept: Tensor
-
-    def calibrate(self, samples: Samples) -> None:
-        self.features.calibrate(samples)
+        self.intercept = nn.Buffer(torch.zeros(self.dof, dtype=torch.float64))
 
     def basis(self, z: Tensor) -> Tensor:
         """Return the basis functions [..., J] at channels z [..., nz].
@@ -123,20 +118,16 @@ class BasisHead(ClosedFormHead):
         rho: Tensor = self.split(torch.clamp(nu, held[0], held[1]) / held[2], row, held[3])
         return rho, s
 
-    @abstractmethod
-    def estimator(self, folds: int | None) -> Estimator:
-        """Return the estimator of the coefficients, cross-validated over so many folds."""
-
     def require_samples(self, samples: Samples) -> None:
-        fold_numbers(samples.group, self.folds or usual_folds(samples.group))
+        fold_numbers(samples.group, self.config.folds or usual_folds(samples.group))
 
     def solutions(self, samples: Samples) -> list[Solution]:
         columns = [samples.names.index(name) for name in self.features.names]
         for rows in row_pieces(len(samples)):
             chosen = samples.z[rows][:, columns]
             require_finite(chosen, self.features.names, "channel", rows.start)
-        folds = self.folds or usual_folds(samples.group)
-        return self.estimator(folds).fit(
+        folds = self.config.folds or usual_folds(samples.group)
+        return self.config.estimator(folds).fit(
             regressors(self.basis, samples.z, range(self.library.count)),
             samples.target,
             samples.group,

@@ -5,7 +5,6 @@ They are affine in nu_dot to run forward (document 002 (3.19)-(3.24)).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import final
 
 import torch
@@ -17,32 +16,13 @@ from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead
-from residnet.heads.basis import BasisConfig, BasisHead
-from residnet.physics.force_model import FERRY_TERMS, MOTION, accelerating, augmented
+from residnet.heads.basis import BasisHead
+from residnet.physics.force_model import accelerating, augmented
 from residnet.physics.signals import FORCE_CHANNELS
 from residnet.regression.estimator import Solution
 
 _STEADY = 1e-9
 """Standard deviation of a force in N or N m up to which it never varies."""
-
-
-def in_space(
-    config: BasisConfig,
-    names: Sequence[str],
-    make: Callable[[BasisConfig, Sequence[str]], BasisHead],
-) -> ClosedFormHead:
-    """Return a head of basis functions in the space that its config names.
-
-    Raises:
-        ConfigError: where a term is not understood, or in force space not affine in the
-            accelerations.
-    """
-    if config.space == "acceleration":
-        return make(config, names)
-    settings = config.model_copy(
-        update={"features": config.features or MOTION, "terms": config.terms or FERRY_TERMS}
-    )
-    return ForceHead(make(settings, (*ACCELERATION, *names)))
 
 
 @final
@@ -60,16 +40,11 @@ class ForceHead(ClosedFormHead):
         self.seen = inner.features.names
         self.moving = accelerating(inner.library.terms, self.seen)
         self.still: list[str] = []
-        self.register_buffer("mass", torch.eye(3, dtype=torch.float64))
-        self.register_buffer("inverse", torch.eye(3, dtype=torch.float64))
-        self.register_buffer("gain", torch.eye(3, dtype=torch.float64))
-        self.register_buffer("lowest", torch.zeros(3, dtype=torch.float64))
-        self.register_buffer("highest", torch.zeros(3, dtype=torch.float64))
-        self.mass: Tensor
-        self.inverse: Tensor
-        self.gain: Tensor
-        self.lowest: Tensor
-        self.highest: Tensor
+        self.mass = nn.Buffer(torch.eye(3, dtype=torch.float64))
+        self.inverse = nn.Buffer(torch.eye(3, dtype=torch.float64))
+        self.gain = nn.Buffer(torch.eye(3, dtype=torch.float64))
+        self.lowest = nn.Buffer(torch.zeros(3, dtype=torch.float64))
+        self.highest = nn.Buffer(torch.zeros(3, dtype=torch.float64))
 
     def set_mass(self, mass: Tensor | None) -> None:
         if mass is None:
@@ -185,8 +160,7 @@ class AugmentedMassBaseline(nn.Module):
     def __init__(self, baseline: nn.Module, gain: Tensor) -> None:
         super().__init__()
         self.baseline = baseline
-        self.register_buffer("gain", gain.clone())
-        self.gain: Tensor
+        self.gain = nn.Buffer(gain.clone())
 
     def forward(self, z: Tensor) -> Tensor:
         """Return nu_dot [..., 3] at channels z [..., nz]."""

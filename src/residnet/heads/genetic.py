@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, final
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
-from residnet.physics.symmetry import live_of
 from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term
 from residnet.regression.estimator import Solution
 from residnet.regression.expressions import ExpressionLibrary, Term, Weights, term
@@ -48,14 +46,10 @@ class GeneticHead(EquationHead):
 
     def __init__(self, config: GeneticConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.outputs = live_of(names).rates
         self.features = Features(config.chosen(names), names, config.margin)
         self.config = config
         self.library = ExpressionLibrary(config.evolution.nesting)
         self.weights = Weights(self.dof)
-
-    def calibrate(self, samples: Samples) -> None:
-        self.features.calibrate(samples)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         return self.library(self.features.guarded(z)) @ self.weights.values.to(z.dtype), s
@@ -63,20 +57,12 @@ class GeneticHead(EquationHead):
     def parameter_count(self) -> list[float]:
         return [float(count) for count in (self.weights.values != 0).sum(0)]
 
-    def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        with torch.no_grad():
-            values = (
-                self.library(self.features.guarded(z)) * self.weights.values[:, axis].to(z.dtype)
-            ).numpy()
-        return {
-            name: values[:, j]
-            for j, name in enumerate(self.names())
-            if float(self.weights.values[j, axis]) != 0.0
-        }
+    @torch.jit.unused
+    def along(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        return self.library(self.features.guarded(z)), self.weights.values
 
     @torch.jit.unused
     def names(self) -> list[str]:
-        """Return the terms in writing."""
         algebra, products = self.library.read(self.features.names)
         return [term(algebra, product) for product in products]
 

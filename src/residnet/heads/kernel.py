@@ -64,10 +64,8 @@ class TermFeatures(nn.Module):
         super().__init__()
         self.library = TermLibrary(terms, channels)
         self.count = self.library.count
-        self.register_buffer("mean", torch.zeros(self.count, dtype=torch.float64))
-        self.register_buffer("std", torch.ones(self.count, dtype=torch.float64))
-        self.mean: Tensor
-        self.std: Tensor
+        self.mean = nn.Buffer(torch.zeros(self.count, dtype=torch.float64))
+        self.std = nn.Buffer(torch.ones(self.count, dtype=torch.float64))
 
     def calibrate(self, channels: Tensor) -> None:
         """Take mean and standard deviation from the training samples of the channels [N, F].
@@ -100,20 +98,15 @@ class KernelHead(ClosedFormHead):
 
     def __init__(self, config: KernelConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.outputs = live_of(names).rates
         chosen = config.chosen(names)
         self.features = Features(chosen, names, config.margin)
         self.terms = TermFeatures(config.terms, chosen)
         self.kernel = config.kernel.build(len(chosen) + self.terms.count, self.dof)
-        self.penalties = tuple(sorted(config.penalties))
-        self.folds = config.folds
-        self.by_free_run = config.choose == "free_run"
-        self.by_recursion = config.choose == "recursion"
-        self.register_buffer("effective", torch.zeros(self.dof, dtype=torch.float64))
-        self.effective: Tensor
+        self.config = config
+        self.effective = nn.Buffer(torch.zeros(self.dof, dtype=torch.float64))
 
     def calibrate(self, samples: Samples) -> None:
-        self.features.calibrate(samples)
+        super().calibrate(samples)
         if self.terms.count:
             self.terms.calibrate(self.features.guarded(samples.z))
 
@@ -134,16 +127,23 @@ class KernelHead(ClosedFormHead):
         return [float(count) for count in self.effective]
 
     def require_samples(self, samples: Samples) -> None:
-        fold_numbers(samples.group, self.folds or usual_folds(samples.group))
+        fold_numbers(samples.group, self.config.folds or usual_folds(samples.group))
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        recursion = _recursion(samples) if self.by_recursion else None
+        scoring = None
+        if self.config.choose == "recursion":
+            group, t = samples.group.numpy(), samples.t.numpy()
+            step = step_of(group, t)
+            stretch = torch.from_numpy(unbroken_stretches(group, t, step))
+            columns = [samples.names.index(name) for name in live_of(samples.names).moving]
+            recursion = Recursion(samples.z, samples.target, stretch, step, columns)
+            scoring = partial(self._recursion_errors, recursion)
         estimator = KernelRidge(
             self.kernel,
-            self.penalties,
-            folds=self.folds or usual_folds(samples.group),
-            scoring=partial(self._recursion_errors, recursion) if recursion else None,
-            alternatives=self.by_free_run,
+            self.config.penalties,
+            folds=self.config.folds or usual_folds(samples.group),
+            scoring=scoring,
+            alternatives=self.config.choose == "free_run",
         )
         with torch.no_grad():
             x = self.columns(samples.z)
@@ -161,7 +161,7 @@ class KernelHead(ClosedFormHead):
 
     def _recursion_errors(self, recursion: Recursion, paths: Sequence[Path]) -> Tensor:
         """Return mean square errors of velocities that run alone, [settings, penalties, n]."""
-        count = len(self.penalties)
+        count = len(self.config.penalties)
         out = torch.zeros(len(paths), count, self.dof, dtype=torch.float64)
         for i, path in enumerate(paths):
             for axis in range(self.dof):
@@ -174,16 +174,3 @@ class KernelHead(ClosedFormHead):
                 with torch.no_grad():
                     out[i, :, axis] = recursion.errors(axis, predicted, count)
         return out
-
-
-def _recursion(samples: Samples) -> Recursion:
-    """Return the recursion of the velocities along samples with times.
-
-    Raises:
-        FitError: where no manoeuvre has two samples at different times.
-    """
-    group, t = samples.group.numpy(), samples.t.numpy()
-    step = step_of(group, t)
-    stretch = torch.from_numpy(unbroken_stretches(group, t, step))
-    columns = [samples.names.index(name) for name in live_of(samples.names).moving]
-    return Recursion(samples.z, samples.target, stretch, step, columns)

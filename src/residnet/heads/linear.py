@@ -2,19 +2,37 @@
 
 from __future__ import annotations
 
+from abc import ABC
 from collections.abc import Sequence
 from typing import Literal, final
 
 from pydantic import Field
 
+from residnet.core.names import ACCELERATION
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
-from residnet.heads.force import in_space
+from residnet.heads.force import ForceHead
+from residnet.physics.force_model import FERRY_TERMS, MOTION
 from residnet.regression.estimator import Estimator
 from residnet.regression.shrinkage import PLSR, Ridge
 
 
-class PlsrConfig(BasisConfig):
+class _LinearConfig(BasisConfig, ABC):
+    @final
+    def build(self, names: Sequence[str]) -> ClosedFormHead:
+        """Return the module for channels `names`, in the space that the config names.
+
+        Raises:
+            ConfigError: where a term is not understood, or in force space not affine in the
+                accelerations.
+        """
+        if self.space == "acceleration":
+            return BasisHead(self, names)
+        chosen = {"features": self.features or MOTION, "terms": self.terms or FERRY_TERMS}
+        return ForceHead(BasisHead(self.model_copy(update=chosen), (*ACCELERATION, *names)))
+
+
+class PlsrConfig(_LinearConfig):
     """A PLSR of the three residuals together.
 
     Attributes:
@@ -27,35 +45,13 @@ class PlsrConfig(BasisConfig):
     order: int | None = Field(default=None, ge=1)
     max_order: int = Field(default=40, ge=1)
 
-    def build(self, names: Sequence[str]) -> ClosedFormHead:
-        """Return the module for channels `names`."""
-        return in_space(
-            self,
-            names,
-            lambda settings, channels: PlsrHead(self.model_validate(settings), channels),
-        )
-
-
-@final
-class PlsrHead(BasisHead):
-    """A head of basis functions with coefficients by PLSR."""
-
-    def __init__(self, config: PlsrConfig, names: Sequence[str]) -> None:
-        super().__init__(config, names)
-        self.order = config.order
-        self.max_order = config.max_order
-
     def estimator(self, folds: int | None) -> Estimator:
         """Return PLSR of all axes, other orders on offer where free runs choose."""
-        return PLSR(
-            self.order,
-            max_order=self.max_order,
-            folds=folds,
-            alternatives=self.by_free_run and self.order is None,
-        )
+        offered = self.choose == "free_run" and self.order is None
+        return PLSR(self.order, max_order=self.max_order, folds=folds, alternatives=offered)
 
 
-class RidgeConfig(BasisConfig):
+class RidgeConfig(_LinearConfig):
     """A ridge regression of each residual.
 
     Attributes:
@@ -69,23 +65,6 @@ class RidgeConfig(BasisConfig):
         default=(1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0), min_length=1
     )
 
-    def build(self, names: Sequence[str]) -> ClosedFormHead:
-        """Return the module for channels `names`."""
-        return in_space(
-            self,
-            names,
-            lambda settings, channels: RidgeHead(self.model_validate(settings), channels),
-        )
-
-
-@final
-class RidgeHead(BasisHead):
-    """A head of basis functions with coefficients by ridge regression."""
-
-    def __init__(self, config: RidgeConfig, names: Sequence[str]) -> None:
-        super().__init__(config, names)
-        self.penalties = config.penalties
-
     def estimator(self, folds: int | None) -> Estimator:
         """Return ridge regression, every penalty on offer where free runs choose."""
-        return Ridge(self.penalties, folds=folds, alternatives=self.by_free_run)
+        return Ridge(self.penalties, folds=folds, alternatives=self.choose == "free_run")

@@ -11,7 +11,6 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError
-from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead, Tanh, quick_tanh
 from residnet.physics.signals import VelocityBound
@@ -37,10 +36,6 @@ class LstmConfig(FeatureConfig):
         per_axis: one network for each of surge, sway, yaw, as document 003 has it.
         axis_features: channels of each axis' network, where they differ; needs `per_axis`.
         mirror: make the residual mirror-symmetric between port and starboard by construction.
-        encoder: a second LSTM with weights of its own reads the measured past, and its memory is
-            what a free run starts from; otherwise the same weights do both (Forgione and Piga 2021,
-            Continuous-time system identification with neural networks, section 3; Weber and others
-            2021, Non-linear RNN identification: diagnosis and simulation).
         restoring: velocities that leave their training range are pulled back into it, so that a
             network that stands alone cannot run away.
     """
@@ -54,7 +49,6 @@ class LstmConfig(FeatureConfig):
     per_axis: bool = False
     axis_features: dict[Literal["u", "v", "r"], tuple[str, ...]] | None = None
     mirror: bool = False
-    encoder: bool = False
     restoring: bool = False
 
     @model_validator(mode="after")
@@ -113,8 +107,7 @@ class LstmCore(nn.Module):
         with torch.no_grad():
             # a forget gate that starts open lets the memory reach back from the first epoch
             self.bias[hidden : 2 * hidden] = 1.0
-        self.register_buffer("no_bias", torch.zeros(4 * hidden), persistent=False)
-        self.no_bias: Tensor
+        self.no_bias = nn.Buffer(torch.zeros(4 * hidden), persistent=False)
 
     def forward(self, f: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return output h [B, H] and memory [B, 2H] after one step of features [B, F]."""
@@ -178,19 +171,14 @@ class LstmNetwork(nn.Module):
         self.features = Features(chosen, names, config.margin)
         seen = FeatureConfig(features=config.memory).chosen(chosen)
         self.partial = len(config.memory) > 0
-        self.register_buffer(
-            "seen",
+        self.seen = nn.Buffer(
             torch.tensor([list(chosen).index(name) for name in seen], dtype=torch.long),
             persistent=False,
         )
-        self.seen: Tensor
         # a memory of inputs alone
         self.fed = self.partial and not any(name in live_of(names).moving for name in seen)
         softsign = config.activation == "softsign"
         self.core = LstmCore(len(seen), config.hidden_size, softsign)
-        self.encoder: LstmCore | None = (
-            LstmCore(self.features.count, config.hidden_size, softsign) if config.encoder else None
-        )
         self.dropout = nn.Dropout(config.dropout)
         self.skip = config.readout > 0
         out = nn.Linear(config.readout or config.hidden_size, outputs)
@@ -266,13 +254,6 @@ class LstmNetwork(nn.Module):
                 out = layer(out)
         return out, s
 
-    def memory_after(self, z: Tensor) -> Tensor:
-        """Return the memory [B, 2H] that past channels [B, T, nz] leave."""
-        f = self.features(z)
-        if self.encoder is not None:
-            return self.encoder.sequence(f)[1]
-        return self.core.sequence(self.remembered(f))[1]
-
     def sequence(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return [B, T, outputs] for channels [B, T, nz], and the memory after them."""
         f = self.features(z)
@@ -295,16 +276,9 @@ class LstmHead(ResidualHead):
         self.width = 2 * config.hidden_size
         self.n_state = self.width * len(self.networks)
         self.scale = ResidualScale(self.dof)
-        self.restoring: VelocityBound | None = None
-        if config.restoring:
-            self.restoring = VelocityBound(channels=self.dof, dof=self.dof)
-
-    def calibrate(self, samples: Samples) -> None:
-        if self.restoring is not None:
-            self.restoring.calibrate(samples)
-        for network in self.networks:
-            network.features.calibrate(samples)
-        self.scale.calibrate(samples)
+        self.restoring: VelocityBound | None = (
+            VelocityBound(channels=self.dof, dof=self.dof) if config.restoring else None
+        )
 
     def residual_std(self) -> Tensor:
         return self.scale.spread
@@ -316,10 +290,14 @@ class LstmHead(ResidualHead):
             y, m = network(z, s[:, i * self.width : (i + 1) * self.width])
             out.append(y)
             memory.append(m)
+        return self.joined(out, memory, z)
+
+    def joined(self, out: list[Tensor], memory: list[Tensor], nu: Tensor) -> tuple[Tensor, Tensor]:
+        """Return residual and memory of all networks, from those of each, at velocities nu."""
+        # joining a single part would copy it
         rho: Tensor = self.scale(out[0] if len(out) == 1 else torch.cat(out, dim=-1))
         if self.restoring is not None:
-            rho = rho + self.restoring(z)
-        # joining a single part would copy it
+            rho = rho + self.restoring(nu)
         return rho, memory[0] if len(memory) == 1 else torch.cat(memory, dim=-1)
 
     def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -344,23 +322,23 @@ class LstmHead(ResidualHead):
             )
             out.append(y)
             memory.append(m)
-        rho: Tensor = self.scale(out[0] if len(out) == 1 else torch.cat(out, dim=-1))
-        if self.restoring is not None:
-            rho = rho + self.restoring(nu)
-        return rho, memory[0] if len(memory) == 1 else torch.cat(memory, dim=-1)
+        return self.joined(out, memory, nu)
 
     def sequence(self, z: Tensor) -> Tensor:
-        scaled = torch.cat([network.sequence(z)[0] for network in self.networks], dim=-1)
-        rho: Tensor = self.scale(scaled)
-        if self.restoring is not None:
-            rho = rho + self.restoring(z)
-        return rho
-
-    def warms_by_steps(self) -> bool:
-        return all(network.encoder is None for network in self.networks)
+        out: list[Tensor] = []
+        memory: list[Tensor] = []
+        for network in self.networks:
+            y, m = network.sequence(z)
+            out.append(y)
+            memory.append(m)
+        return self.joined(out, memory, z)[0]
 
     def warmup(self, z: Tensor) -> Tensor:
-        return torch.cat([network.memory_after(z) for network in self.networks], dim=-1)
+        memory: list[Tensor] = []
+        for network in self.networks:
+            seen = network.remembered(network.features(z))
+            memory.append(network.core.sequence(seen)[1])
+        return torch.cat(memory, dim=-1)
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
         ranges = [network.core.memory_range() for network in self.networks]

@@ -65,14 +65,11 @@ class MirroredHead(ResidualHead):
         self.inner = inner
         self.width = inner.n_state
         self.n_state = 2 * inner.n_state
-        self.register_buffer("index", torch.tensor(mirror[0], dtype=torch.long), persistent=False)
-        self.register_buffer("sign", torch.tensor(mirror[1], dtype=torch.float64), persistent=False)
-        self.register_buffer(
-            "turned", torch.tensor(axis_parities(names), dtype=torch.float64), persistent=False
+        self.index = nn.Buffer(torch.tensor(mirror[0], dtype=torch.long), persistent=False)
+        self.sign = nn.Buffer(torch.tensor(mirror[1], dtype=torch.float64), persistent=False)
+        self.turned = nn.Buffer(
+            torch.tensor(axis_parities(names), dtype=torch.float64), persistent=False
         )
-        self.index: Tensor
-        self.sign: Tensor
-        self.turned: Tensor
 
     def calibrate(self, samples: Samples) -> None:
         """Take scales from the samples and their mirror images.
@@ -111,10 +108,6 @@ class MirroredHead(ResidualHead):
 
     def sequence(self, z: Tensor) -> Tensor:
         return self.mean(self.inner.sequence(self.both(z)))
-
-    def warms_by_steps(self) -> bool:
-        """Return what the inner head says."""
-        return self.inner.warms_by_steps()
 
     def warmup(self, z: Tensor) -> Tensor:
         s = self.inner.warmup(self.both(z))

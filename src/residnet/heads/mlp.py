@@ -9,7 +9,6 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead, Tanh
 
@@ -68,10 +67,6 @@ class MlpHead(ResidualHead):
             out.weight.mul_(0.1)
             out.bias.zero_()
         self.net = nn.Sequential(*layers, out)
-
-    def calibrate(self, samples: Samples) -> None:
-        self.features.calibrate(samples)
-        self.scale.calibrate(samples)
 
     def residual_std(self) -> Tensor:
         return self.scale.spread

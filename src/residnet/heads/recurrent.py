@@ -11,7 +11,6 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.config import Seconds
-from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.physics.signals import VelocityBound
 
@@ -66,9 +65,9 @@ class RecurrentHead(ResidualHead):
         self.channels = len(names)
         self.features = Features(config.chosen(names), names, config.margin)
         self.scale = ResidualScale(self.dof)
-        self.restoring: VelocityBound | None = None
-        if config.restoring:
-            self.restoring = VelocityBound(channels=self.dof, dof=self.dof)
+        self.restoring: VelocityBound | None = (
+            VelocityBound(channels=self.dof, dof=self.dof) if config.restoring else None
+        )
         self.seen = seen = self.features.count + self.dof
         hidden = config.hidden_size
 
@@ -86,12 +85,6 @@ class RecurrentHead(ResidualHead):
 
     def set_step(self, dt: float) -> None:
         self.share = dt / self.coarse
-
-    def calibrate(self, samples: Samples) -> None:
-        if self.restoring is not None:
-            self.restoring.calibrate(samples)
-        self.features.calibrate(samples)
-        self.scale.calibrate(samples)
 
     def residual_std(self) -> Tensor:
         return self.scale.spread

@@ -19,7 +19,6 @@ from torch import Tensor
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features, ResidualScale
-from residnet.physics.symmetry import live_of
 from residnet.regression.estimator import Solution
 
 _REACH = 0.1
@@ -95,37 +94,18 @@ def _made(step: Any) -> Any:
         raise ValueError(f"{name}: {error}") from None
 
 
-class _Fitted:
-    """The fitted pipelines of the axes."""
-
-    def __init__(self, dof: int) -> None:
-        self.axes: list[Any] = []
-        self.dof = dof
-
-    def asked(self, x: np.ndarray) -> np.ndarray:
-        """Return standardised residuals [N, n] at standardised features [N, F]."""
-        if not self.axes or not len(x):
-            return np.zeros((len(x), self.dof))
-        return np.stack([np.asarray(axis.predict(x)).reshape(-1) for axis in self.axes], axis=1)
-
-
 @final
 class SklearnHead(ClosedFormHead):
     """A head rho [..., n] that asks a fitted pipeline for each axis."""
 
     def __init__(self, config: SklearnConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.outputs = live_of(names).rates
         self.refusal = "scikit-learn predicts in Python, which no format of export holds"
         self.config = config
         self.features = Features(config.chosen(names), names, config.margin)
         self.scale = ResidualScale(self.dof)
         self.learned = np.zeros((0, self.features.count + self.dof))
-        self.fitted = _Fitted(self.dof)
-
-    def calibrate(self, samples: Samples) -> None:
-        self.features.calibrate(samples)
-        self.scale.calibrate(samples)
+        self.axes: list[Any] = []
 
     def residual_std(self) -> Tensor:
         return self.scale.spread
@@ -168,10 +148,18 @@ class SklearnHead(ClosedFormHead):
                 first = (str(error).splitlines() or [""])[0]
                 raise FitError(f"scikit-learn cannot fit {axis}: {first}") from None
             axes.append(whole)
-        self.learned, self.fitted.axes = learned, axes
+        self.learned, self.axes = learned, axes
+
+    def asked(self, x: Tensor) -> Tensor:
+        """Return standardised residuals [N, n] at standardised features [N, F]."""
+        if not self.axes or not len(x):
+            return x.new_zeros(len(x), self.dof)
+        rows = x.double().numpy()
+        answers = [np.asarray(axis.predict(rows)).reshape(-1) for axis in self.axes]
+        return torch.from_numpy(np.stack(answers, axis=1)).to(x)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        found: Tensor = _Asked.apply(self.features(z), self.fitted)  # type: ignore[no-untyped-call]
+        found: Tensor = _Asked.apply(self.features(z), self)  # type: ignore[no-untyped-call]
         return self.scale(found), s
 
     def parameter_count(self) -> list[float]:
@@ -183,25 +171,21 @@ class _Asked(torch.autograd.Function):
     """The answer of fitted pipelines, with slopes by central differences."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, fitted: _Fitted) -> Tensor:
+    def forward(ctx: Any, x: Tensor, head: SklearnHead) -> Tensor:
         flat = x.detach().reshape(-1, x.shape[-1])
-        ctx.fitted = fitted
+        ctx.head = head
         ctx.save_for_backward(flat)
-        answer = torch.from_numpy(fitted.asked(flat.double().numpy())).to(x)
-        return answer.reshape(*x.shape[:-1], fitted.dof)
+        return head.asked(flat).reshape(*x.shape[:-1], head.dof)
 
     @staticmethod
     def backward(ctx: Any, *given: Tensor) -> tuple[Tensor, None]:
         (flat,) = ctx.saved_tensors
         grad = given[0]
-        flow = grad.reshape(-1, ctx.fitted.dof)
+        flow = grad.reshape(-1, ctx.head.dof)
         out = torch.zeros_like(flat)
         for i in range(flat.shape[1]):
             step = torch.zeros_like(flat)
             step[:, i] = _REACH
-            ahead, behind = (
-                torch.from_numpy(ctx.fitted.asked(at.double().numpy())).to(flat)
-                for at in (flat + step, flat - step)
-            )
-            out[:, i] = (flow * (ahead - behind)).sum(1) / (2.0 * _REACH)
+            apart = ctx.head.asked(flat + step) - ctx.head.asked(flat - step)
+            out[:, i] = (flow * apart).sum(1) / (2.0 * _REACH)
         return out.reshape(*grad.shape[:-1], flat.shape[1]), None

@@ -15,17 +15,16 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.config import Config
-from residnet.core.errors import ConfigError
+from residnet.core.errors import ConfigError, FitError
 from residnet.core.names import nearest
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
-from residnet.physics.symmetry import axis_parities, live_of, term_parity
+from residnet.physics.symmetry import axis_parities, term_parity
 from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term, rated
 from residnet.regression.equation_rows import (
     Rows,
     RowsConfig,
     SampleRows,
-    delay_profile,
     step_of,
     unbroken_stretches,
 )
@@ -35,8 +34,10 @@ from residnet.regression.sparse import SearchConfig, SparseRegression
 
 _PRECISION = 1e-14
 """Share of the energy of a target that rounding leaves."""
+_ROUNDED = 1e-10
+"""Share of the largest eigenvalue up to which one is what rounding leaves."""
 _TINY = 1e-300
-"""Keeps the logarithm of the error of a target of zeros finite."""
+"""Keeps the logarithm of the error of a target of zeros finite, and least length of a term."""
 
 
 class DelayConfig(Config):
@@ -72,15 +73,12 @@ class DelayLine(nn.Module):
         self.channels = late
         self.count = len(late)
         self.n_state = self.longest * self.count + 1 if self.count > 0 else 0
-        self.register_buffer(
-            "index",
+        self.index = nn.Buffer(
             torch.tensor([list(names).index(name) for name in late], dtype=torch.long),
             persistent=False,
         )
         # a float, as all stored numbers are
-        self.register_buffer("steps", torch.zeros(1, dtype=torch.float64))
-        self.index: Tensor
-        self.steps: Tensor
+        self.steps = nn.Buffer(torch.zeros(1, dtype=torch.float64))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return channels [B, nz] with the late ones delayed, and the next memory [B, n_state]."""
@@ -146,12 +144,14 @@ class Past(NamedTuple):
     stretch: np.ndarray
     step: float
 
-    def delayed(self, steps: int, index: np.ndarray) -> Past:
-        """Return the samples that have a past of `steps`, with the features `index` from then."""
-        if steps == 0:
-            return self
-        now = np.arange(steps, len(self.stretch))
-        now = now[self.stretch[now] == self.stretch[now - steps]]
+    def delayed(self, steps: int, index: np.ndarray, least: int = 0) -> Past:
+        """Return samples with the features `index` from `steps` before.
+
+        Those are left out that have no past of so many samples, and of `least`.
+        """
+        reach = max(steps, least)
+        now = np.arange(reach, len(self.stretch))
+        now = now[self.stretch[now] == self.stretch[now - reach]]
         chosen = self.chosen[now].copy()
         chosen[:, index] = self.chosen[now - steps][:, index]
         return Past(chosen, self.target[now], self.stretch[now], self.step)
@@ -161,42 +161,43 @@ def best_delay(
     past: Past,
     terms: Sequence[Sequence[str]],
     names: Sequence[str],
-    late: Sequence[str],
+    index: np.ndarray,
     longest: int,
 ) -> tuple[int, np.ndarray]:
     """Return the delay at which terms explain their targets best, and the profile of errors.
 
     The delay is in steps; the profile is the mean over targets of ln(RSS) for each delay [longest +
-    1].
+    1]. All delays are judged on the same samples (document 000 section 5.3.4).
 
     Args:
         past: samples.
+        terms: of each target.
+        names: of the features.
+        index: places of those that act late.
         longest: longest delay, in steps.
 
     Raises:
-        FitError: with too few samples that have such a past.
+        FitError: with fewer samples that have a past than terms.
     """
-    z = torch.from_numpy(past.chosen)
-    total = np.zeros(longest + 1)
-    for names_of_terms, y in zip(terms, past.target.T, strict=True):
-        held, moved = (
-            TermLibrary([_part(term, names, late, take) for term in names_of_terms], names)(
-                z
-            ).numpy()
-            for take in (False, True)
-        )
-        rss = delay_profile(held, moved, y, past.stretch, longest).rss
-        # what rounding leaves of a perfect fit is no evidence
-        total += np.log(rss + _PRECISION * float(y @ y) + _TINY) / len(terms)
-    return int(total.argmin()), total
-
-
-def _part(term: str, names: Sequence[str], late: Sequence[str], take: bool) -> str:
-    """Return the factors of a term that are delayed, or those that are not."""
-    factors = [factor for factor in parse_term(term, names) if (factor.name in late) == take]
-    return (
-        " ".join(f"{f'|{f.name}|' if f.magnitude else f.symbol}^{f.power}" for f in factors) or "1"
-    )
+    profile, libraries = np.zeros(longest + 1), [TermLibrary(row, names) for row in terms]
+    for steps in range(longest + 1):
+        late = past.delayed(steps, index, longest)
+        z, most = torch.from_numpy(late.chosen), max(map(len, terms))
+        if len(z) <= most:
+            raise FitError(
+                f"delay: {len(z)} samples have a past of {longest} samples, {most} terms need more;"
+                " give longer logs or a shorter delay"
+            )
+        for library, y in zip(libraries, late.target.T, strict=True):
+            x = library(z).numpy()
+            x = x / np.maximum(np.linalg.norm(x, axis=0), _TINY)
+            # candidates may be collinear: what rounding cannot tell apart shares its part
+            inverse = np.linalg.pinv(x.T @ x, rcond=_ROUNDED, hermitian=True)
+            energy, along = float(y @ y), x.T @ y
+            rss = max(energy - float(along @ inverse @ along), 0.0)
+            # what rounding leaves of a perfect fit is no evidence
+            profile[steps] += np.log(rss + _PRECISION * energy + _TINY) / len(terms)
+    return int(profile.argmin()), profile
 
 
 _GAMMAS = (0.0, 0.5, 1.0)
@@ -244,7 +245,7 @@ class SymbolicHead(EquationHead):
 
     def __init__(self, config: SymbolicConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.outputs, self.parities = live_of(names).rates, axis_parities(names)
+        self.parities = axis_parities(names)
         chosen = config.chosen(names)
         self.features = Features(chosen, names, config.margin)
         self.line = DelayLine(config.delay, chosen)
@@ -256,13 +257,9 @@ class SymbolicHead(EquationHead):
             else config.candidates.candidates(chosen)
         )
         self.library = TermLibrary([candidate.term for candidate in self.candidates], chosen)
-        self.register_buffer(
-            "coefficients", torch.zeros(self.library.count, self.dof, dtype=torch.float64)
+        self.coefficients = nn.Buffer(
+            torch.zeros(self.library.count, self.dof, dtype=torch.float64)
         )
-        self.coefficients: Tensor
-
-    def calibrate(self, samples: Samples) -> None:
-        self.features.calibrate(samples)
 
     def basis(self, chosen: Tensor) -> Tensor:
         """Return all candidate terms [..., J] of chosen features [..., F].
@@ -288,17 +285,12 @@ class SymbolicHead(EquationHead):
         """Return the least and largest late inputs: those that the features are held between."""
         return self.line.memory_range(self.features.low, self.features.high)
 
-    def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        with torch.no_grad():
-            values = (
-                self.basis(self.line.sequence(z.index_select(-1, self.features.index)))
-                * self.coefficients[:, axis].to(z.dtype)
-            ).numpy()
-        return {
-            term: values[:, j]
-            for j, term in enumerate(self.library.terms)
-            if float(self.coefficients[j, axis]) != 0.0
-        }
+    def names(self) -> list[str]:
+        return list(self.library.terms)
+
+    def along(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        chosen = self.line.sequence(z.index_select(-1, self.features.index))
+        return self.basis(chosen), self.coefficients
 
     def solutions(self, samples: Samples) -> list[Solution]:
         """Return the equations of the extended BIC, then what free runs may prefer.
@@ -364,7 +356,7 @@ class SymbolicHead(EquationHead):
         """
         if self.line.count == 0:
             return 0, {}
-        possible = self._allowed(past).any(1).tolist()
+        possible, index = self._allowed(past).any(1).tolist(), self.line.index.numpy()
         simple = [
             c.term
             for c, some in zip(self.candidates, possible, strict=True)
@@ -374,11 +366,9 @@ class SymbolicHead(EquationHead):
         tried: list[int] = []
         profile = np.zeros(0)
         while len(tried) < 2 or (tried[-1] != tried[-2] and len(tried) < _MOST_DELAYS):
-            steps, profile = best_delay(
-                past, terms, self.features.names, self.line.channels, self.line.longest
-            )
+            steps, profile = best_delay(past, terms, self.features.names, index, self.line.longest)
             tried.append(steps)
-            table = self._fit(past.delayed(steps, self.line.index.numpy()))[0].table
+            table = self._fit(past.delayed(steps, index))[0].table
             found = [[c.term for c in table if c.axis == name] for name in self.outputs]
             terms = [list(dict.fromkeys((*row, *simple))) for row in found]
         notes = {"steps": tried[-1], "seconds": tried[-1] * past.step, "profile": profile.tolist()}
