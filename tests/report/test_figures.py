@@ -219,7 +219,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_figure_of_a_fit_is_a_light_picture_that_shows_something(run: Path) -> None:
     figures = read_figures(run / "figures")
-    names = ["track", "free_runs", "horizon", "residuals", "bars", "learning"]
+    names = ["track", "free_runs", "horizon", "residuals", "learning"]
     assert [figure.name for figure in figures] == names
     for path in (path for figure in figures for path in figure.stills):
         assert path.stat().st_size < 200_000
@@ -264,14 +264,19 @@ def test_runs_to_choose_from_are_the_median_worst_and_best_of_each_kind(run: Pat
 def test_masked_samples_do_not_count(run: Path) -> None:
     window = next(window for window in RunFiles(run).windows("test") if window.log == "zigzag_02")
     np.testing.assert_allclose(window.rmse("plsr"), LEVEL["plsr"], rtol=1e-12)
-    time, error = runs.growth([window], "plsr")
+    error = runs.growth([window], "plsr")
+    time = error.index.to_numpy()
     assert time[0] == pytest.approx(0.1)
-    seen = np.isfinite(error[:, 0])
+    seen = np.isfinite(error["u"])
     # the second in which all samples are masked leaves no error of u, v and position, but one of r
     assert 0 < (~seen).sum() <= 6
-    np.testing.assert_allclose(error[seen, 0], LEVEL["plsr"][0], rtol=1e-9)
-    np.testing.assert_allclose(error[:, 2], LEVEL["plsr"][2], rtol=1e-9)
-    assert error[-1, 3] == pytest.approx(np.hypot(*LEVEL["plsr"][:2]) * time[-1], rel=0.02)
+    np.testing.assert_allclose(error["u"][seen], LEVEL["plsr"][0], rtol=1e-9)
+    np.testing.assert_allclose(error["r"], LEVEL["plsr"][2], rtol=1e-9)
+    assert error["x"].iloc[-1] == pytest.approx(np.hypot(*LEVEL["plsr"][:2]) * time[-1], rel=0.02)
+    # a whole turn more is no error of the heading
+    turned = window.predicted["plsr"] + np.where(np.arange(6) == 3, 2 * np.pi, 0.0)
+    window = replace(window, predicted={"plsr": turned})
+    assert runs.growth([window], "plsr")["psi"].max() < 0.1
 
 
 def test_many_heads_keep_distinct_looks(tmp_path: Path) -> None:
@@ -285,30 +290,11 @@ def test_many_heads_keep_distinct_looks(tmp_path: Path) -> None:
     assert len({(look.color, look.dash) for look in looks}) == 12
 
 
-def test_bars_follow_speed_and_steering_runs_where_there_are_such_groups(
-    run: Path, tmp_path: Path
-) -> None:
-    assert runs.bar_group(RunFiles(run), "whole", "u") == "all"
-    content = metrics(("test",))
-    content["rows"] += [
-        line | {"manoeuvre": name}
-        for line in content["rows"]
-        if line["manoeuvre"] == "all"
-        for name in ("speed", "steering")
-    ]
-    write_json(tmp_path / "metrics.json", content)
-    groups = [runs.bar_group(RunFiles(tmp_path), "whole", channel) for channel in "uvr"]
-    assert groups == ["speed", "steering", "steering"]
-
-
-def test_metrics_alone_give_the_bars_alone_and_a_folder_without_is_refused(tmp_path: Path) -> None:
+def test_metrics_alone_give_no_figure_and_a_folder_without_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no metrics\.json"):
         write_fit_figures(RunFiles(tmp_path))
     write_json(tmp_path / "metrics.json", metrics(("external",), ("baseline", "plsr")))
-    (figure,) = write_fit_figures(RunFiles(tmp_path))
-    assert figure.stills[0].name == "01_bars.png"
-    outline = figure.cases[0].curves[0]["external"][0]
-    assert np.nanmax(outline) == pytest.approx(0.1)
+    assert write_fit_figures(RunFiles(tmp_path)) == []
 
 
 def test_a_bred_equation_shows_its_generations(tmp_path: Path) -> None:

@@ -295,7 +295,7 @@ def test_the_file_stands_alone_and_loads_nothing(run: Path) -> None:
     assert '<meta name="viewport"' in text
     page = Page(text)
     assert all(source.startswith(("data:image/png;base64,", "#")) for source in page.sources)
-    assert sum(source.startswith("data:") for source in page.sources) == 9
+    assert sum(source.startswith("data:") for source in page.sources) == 8
     markup = re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
     assert not re.search(r"url\(|@import|https?://", markup)
     assert not list(run.glob("*.partial"))

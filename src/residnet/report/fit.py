@@ -50,7 +50,6 @@ def _figures(run: RunFiles) -> Iterator[Figure | None]:
     yield runs.free_runs(run, windows)
     yield runs.horizon(run, windows)
     yield runs.residuals(run)
-    yield runs.error_bars(run)
     yield runs.bands(run, windows)
     yield from manoeuvres.booklet_figures(run)
     yield from models.terms(run)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,11 +16,15 @@ from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_table
 from residnet.core.format import SHOWN_UNITS, shown_unit
+from residnet.core.frames import wrap_array
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.names import CHANNEL_UNITS, END_UNITS, to_si
 from residnet.core.units import known_unit
 from residnet.judge.metrics import INPUT, columns_of
 from residnet.judge.verdict import by_windows, sized
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Content = Mapping[str, Any]
 """What a JSON object holds."""
@@ -62,13 +66,26 @@ class StoredWindow:
     high: dict[str, np.ndarray] = field(default_factory=dict)
     live: Live = ALIVE
 
+    def errors(self, model: str) -> pd.DataFrame:
+        """Return what a model is off by [T] in SI and rad, `x` standing for the distance in place.
+
+        u, v and the position are NaN where they are not scored; of angles, whole turns do not
+        count.
+        """
+        import pandas as pd
+
+        names = columns_of(self.live)
+        error = pd.DataFrame(self.predicted[model] - self.measured, columns=names)
+        for angle in {"psi", "phi"}.intersection(names):
+            error[angle] = wrap_array(error[angle].to_numpy())
+        error["x"] = np.hypot(error["x"], error.pop("y"))
+        error.loc[~self.usable, ["u", "v", "x"]] = np.nan
+        return error
+
     def rmse(self, model: str) -> np.ndarray:
-        """Return the root mean square errors [n] of u, v (usable samples) and the rest (all)."""
-        places = [columns_of(self.live).index(name) for name in self.live.moving]
-        error = (self.predicted[model] - self.measured)[:, places]
-        good = self.usable if self.usable.any() else np.ones_like(self.usable)
-        parts = (*error[good, :2].T, *error[:, 2:].T)
-        return np.sqrt([np.mean(part**2) for part in parts])
+        """Return the root mean square errors [n] of what moves, over the samples that count."""
+        found = self.errors(model)[list(self.live.moving)].pow(2).mean().pow(0.5)
+        return found.to_numpy()
 
 
 class RunFiles:

@@ -8,16 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from residnet.core.errors import UsageError
-from residnet.core.format import number, shown_unit
-from residnet.core.names import CHANNEL_UNITS
+from residnet.core.format import number
 from residnet.judge.metrics import blocks, difference
 from residnet.report.blocks import Block, Cell, Section, Table, table_of
 from residnet.report.figure import GLANCE, Case, Figure, Panel, family
 from residnet.report.figure_files import write_figure
 from residnet.report.page import write_page
-from residnet.report.run_reader import RunFiles
+from residnet.report.run_reader import RunFiles, StoredWindow
+from residnet.report.sections.free_runs import errors_table
+from residnet.report.sections.runs import growth
 from residnet.runs.folder import RunFolder
 
 _MOST = 60
@@ -28,7 +30,7 @@ Window = tuple[str, str, float]
 
 
 class JudgedRun(RunFiles):
-    """A finished fit, as far as runs are compared.
+    """A finished fit, as far as runs are compared: by its selected model.
 
     Attributes:
         name: that tells it from the others.
@@ -36,30 +38,15 @@ class JudgedRun(RunFiles):
 
     def __init__(self, name: str, path: Path) -> None:
         super().__init__(RunFolder.open(path).path)
-        self.name = name
         if not (path / "metrics.json").is_file():
             raise UsageError(f"{path}: has no metrics.json; runs of fits can be compared")
-        found = (split for split in ("test", "external") if split in self.splits)
-        self.split = next(found, self.splits[-1])
-        self.model = str(self.metrics["selected"])
-        told = self.metrics["scales"]
-        self._told = {name: float(told[name]) for name in self.live.channels}
-
-    def scales_of(self, names: Sequence[str]) -> np.ndarray:
-        """Return the scales of some of what moves [n]."""
-        return np.array([self._told[name] for name in names])
+        self.name, self.model = name, str(self.metrics["selected"])
 
     @cached_property
-    def series(self) -> dict[Window, tuple[np.ndarray, np.ndarray]]:
-        """Of each window the times from its start [T] and the errors of the selected model in
-        its velocities, u, v, r [T, 3] where all live, NaN where a sample is not usable.
-        """
-        out = {}
-        for one in self.windows(self.split):
-            apart = (one.predicted[self.model] - one.measured)[:, self.live.axes]
-            errors = np.where(one.usable[:, None], apart, np.nan)
-            out[one.log, one.protocol, round(float(one.t[0]), 3)] = (one.t - one.t[0], errors)
-        return out
+    def of(self) -> dict[Window, StoredWindow]:
+        """The free runs that it was judged on."""
+        found = self.windows(self.focus)
+        return {(one.log, one.protocol, round(float(one.t[0]), 3)): one for one in found}
 
 
 def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
@@ -73,21 +60,22 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
     """
     runs = judged_runs(paths)
     pairs = paired(runs)
-    tables = [_metrics_table(runs), *([_paired_table(runs, pairs)] if pairs else [])]
+    of_runs = [errors_table(run, run.focus) for run in runs]
+    for run, table in zip(runs, of_runs, strict=True):
+        table.caption = f"{run.name}. {table.caption}"
     found = _differing([run.resolved for run in runs], "")
     found = [pair for pair in found if pair[0] not in ("name", "description")]
     more = f" The first {_MOST} of {len(found)} stand here." if len(found) > _MOST else ""
     told = f"What the runs were asked to do differently; what is alike is left out.{more}"
-    tables.append(
-        table_of(
-            found[:_MOST],
-            [
-                ("setting", lambda pair: pair[0]),
-                *((run.name, lambda pair, i=i: pair[1][i]) for i, run in enumerate(runs)),
-            ],
-            caption=told if found else "The runs were asked to do the same.",
-        )
+    differing = table_of(
+        found[:_MOST],
+        [
+            ("setting", lambda pair: pair[0]),
+            *((run.name, lambda pair, i=i: pair[1][i]) for i, run in enumerate(runs)),
+        ],
+        caption=told if found else "The runs were asked to do the same.",
     )
+    against = [_paired_table(runs, pairs)] if pairs else []
     verdict = _sentence(runs, pairs)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -98,16 +86,17 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
             glance = _paired_table(runs, main).part(3, 6)
             glance.caption = f"Selected models, {next(iter(main))}."
             sections.append(Section("", [_curves(runs, out), glance]))
-            sections.append(Section("Selected models over common windows", [tables[1]]))
+            sections.append(Section("Selected models over common windows", against))
         sections += [
-            Section("Every model of every run", [tables[0]]),
-            Section("Where the runs differ", [tables[-1]]),
+            Section("Every model of every run", of_runs),
+            Section("Where the runs differ", [differing]),
         ]
         names = " against ".join(run.name for run in runs)
         page = write_page(out, "Runs compared", names, [verdict], sections)
     except OSError as error:
         raise UsageError(f"{out}: cannot be written ({error.strerror})") from error
-    return "\n\n".join([*(table.text() for table in tables), verdict]), page
+    tables = [table.text() for table in (*of_runs, *against, differing)]
+    return "\n\n".join([*tables, verdict]), page
 
 
 def judged_runs(paths: Sequence[Path]) -> list[JudgedRun]:
@@ -138,17 +127,14 @@ def shared_channels(runs: Sequence[JudgedRun]) -> list[str]:
     return [name for name in runs[0].live.channels if all(name in r.live.channels for r in runs)]
 
 
-def _errors(run: JudgedRun, window: Window, names: Sequence[str], scales: np.ndarray) -> np.ndarray:
-    """Return the errors of a run in a window over scales [n], of some of what moves [T, n]."""
-    columns = [run.live.channels.index(name) for name in names]
-    found: np.ndarray = run.series[window][1][:, columns] / scales
-    return found
-
-
-def _common(runs: Sequence[JudgedRun]) -> list[Window]:
-    """Return the windows that all runs were judged on, of one and the same length."""
-    shared = set.intersection(*(set(run.series) for run in runs))
-    return sorted(w for w in shared if len({len(run.series[w][0]) for run in runs}) == 1)
+def _common(runs: Sequence[JudgedRun]) -> dict[str, list[Window]]:
+    """Return the windows by protocol that all runs were judged on, of one and the same length."""
+    shared = set.intersection(*(set(run.of) for run in runs))
+    out: dict[str, list[Window]] = {}
+    for window in sorted(shared):
+        if len({len(run.of[window].t) for run in runs}) == 1:
+            out.setdefault(window[1], []).append(window)
+    return out
 
 
 def paired(runs: Sequence[JudgedRun]) -> dict[str, dict[str, Any]]:
@@ -158,58 +144,33 @@ def paired(runs: Sequence[JudgedRun]) -> dict[str, dict[str, Any]]:
     run's scales.
     """
     out: dict[str, dict[str, Any]] = {}
-    names = shared_channels(runs)
-    scales = runs[0].scales_of(names)
-    shared = _common(runs)
-    for protocol in dict.fromkeys(window[1] for window in shared):
-        windows = [window for window in shared if window[1] == protocol]
-        squares = [
-            [np.nanmean(_errors(run, w, names, scales) ** 2, axis=0) for w in windows]
+    scales = _scales(runs)
+    for protocol, windows in _common(runs).items():
+        errors = [
+            np.array([_size(run.of[window].errors(run.model), scales) for window in windows])
             for run in runs
         ]
-        errors = np.sqrt(np.array(squares)).mean(axis=-1)
-        known = np.isfinite(errors).all(axis=0)
-        if not known.any():
-            continue
         logs = list(dict.fromkeys(window[0] for window in windows))
-        numbers = np.array([logs.index(window[0]) for window in windows])
-        resampled = blocks(numbers[known])
+        resampled = blocks([logs.index(window[0]) for window in windows])
         out[protocol] = {
             run.name: {
-                "windows": int(known.sum()),
-                "mean": float(own[known].mean()),
-                **difference(own[known], errors[0][known], runs[0].name, resampled),
+                "windows": len(windows),
+                "mean": float(own.mean()),
+                **difference(own, errors[0], runs[0].name, resampled),
             }
             for run, own in zip(runs, errors, strict=True)
         }
     return out
 
 
-def _metrics_table(runs: Sequence[JudgedRun]) -> Table:
-    rows = [
-        {**row, "run": run.name, "chosen": row["model"] == run.model}
-        for run in runs
-        for row in run.rows
-        if (row["split"], row["manoeuvre"]) == (run.split, "all")
-    ]
-    return table_of(
-        rows,
-        [
-            ("run", "run"),
-            ("model", lambda row: f"{row['model']}{' (selected)' if row['chosen'] else ''}"),
-            ("protocol", "protocol"),
-            *(
-                (f"{name} [{unit}]", f"rmse.{name}", number, factor)
-                for name in dict.fromkeys(name for run in runs for name in run.live.channels)
-                for unit, factor in [shown_unit(CHANNEL_UNITS[name])]
-            ),
-            ("NRMSE [-]", "nrmse.mean", number),
-            ("diverged", lambda row: Cell(f"{row['diverged']}/{row['windows']}")),
-        ],
-        caption="Errors in free run on the test split of each run, by that run's own scales.",
-        selected=lambda row: row["chosen"],
-        rule=lambda row: row["run"],
-    )
+def _scales(runs: Sequence[JudgedRun]) -> pd.Series:
+    """Return the first run's scales of what moves in all runs."""
+    return pd.Series(runs[0].metrics["scales"], dtype=float)[shared_channels(runs)]
+
+
+def _size(errors: pd.DataFrame, scales: pd.Series) -> float:
+    """Return the mean over some channels of the root mean square over the samples that count."""
+    return float((errors[scales.index].pow(2).mean().pow(0.5) / scales).mean())
 
 
 def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -302,21 +263,16 @@ def _sentence(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]])
 
 def _curves(runs: Sequence[JudgedRun], out: Path) -> Block:
     """Draw how the errors of the selected models grow over the common windows."""
-    windows = _common(runs)
-    protocol = windows[0][1]
-    chosen = [window for window in windows if window[1] == protocol]
-    shortest = min(len(runs[0].series[window][0]) for window in chosen)
-    curves, names = {}, shared_channels(runs)
-    scales = runs[0].scales_of(names)
+    protocol, windows = next(iter(_common(runs).items()))
+    scales, curves = _scales(runs), {}
     for run in runs:
-        size = np.stack([_errors(run, w, names, scales)[:shortest] ** 2 for w in chosen])
-        growth = np.sqrt(np.nanmean(size, axis=0))
-        curves[run.name] = (run.series[chosen[0]][0][:shortest], growth.mean(axis=1))
+        error = growth([run.of[window] for window in windows], run.model)[scales.index] / scales
+        curves[run.name] = (error.index.to_numpy(), error.mean(axis=1).to_numpy())
     figure = Figure(
         "horizon",
         "Error against horizon",
-        f"Selected models over {len(chosen)} common windows of {protocol}, mean over"
-        f" {', '.join(names)}.",
+        f"Selected models over {len(windows)} common windows of {protocol}, mean over"
+        f" {', '.join(scales.index)}.",
         family(curves),
         [Panel("error [-]", "time from the start of a free run [s]", height=GLANCE)],
         [Case("", [curves])],

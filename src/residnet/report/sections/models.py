@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from residnet.core.errors import ConfigError
-from residnet.core.format import DASH, DEG, interval, number
+from residnet.core.format import DASH, interval, number
 from residnet.core.format import whole as whole_number
 from residnet.core.names import CHANNEL_UNITS
 from residnet.judge.verdict import diverged_note
@@ -20,9 +20,8 @@ from residnet.physics.terms import parse_term
 from residnet.report.blocks import Block, Cell, Code, Mark, Section, Table, Text, table_of
 from residnet.report.figure import BLUE, Case, Curve, Figure, Look, Panel, family
 from residnet.report.run_reader import Content, RunFiles
-from residnet.report.sections.runs import model_looks, short_label
+from residnet.report.sections.runs import AXES, model_looks, short_label
 
-_AXES = {"u_dot": "surge u′", "v_dot": "sway v′", "r_dot": "yaw r′", "p_dot": "roll p′"}
 _EXTRA_UNITS = {"wind_u": "m/s", "wind_v": "m/s", "wind_mag": "m/s"}
 """Units of factors of terms that are no channels of a log."""
 _NAMED = 8
@@ -296,11 +295,11 @@ def terms(run: RunFiles) -> Iterator[Figure]:
     frame = run.frame("terms.parquet")
     for model, rows in [] if frame is None else frame.groupby("model", sort=False):
         curves: list[dict[str, Curve]] = []
-        axes = [axis for axis in _AXES if (rows["axis"] == axis).any()]
+        axes = [axis for axis in AXES if (rows["axis"] == axis).any()]
         for axis in axes:
             of_axis = rows[rows["axis"] == axis]
             wide = of_axis.pivot_table(index="t", columns="term", values="value", sort=False)
-            wide *= DEG if axis == "r_dot" else 1.0
+            wide *= AXES[axis][2]
             time, target = wide.index.to_numpy(), wide.pop("target")
             order = (wide**2).mean().sort_values(ascending=False, kind="stable").index
             shown = {"target": target} | {str(term): wide[term] for term in order[:_TERMS]}
@@ -328,7 +327,7 @@ def terms(run: RunFiles) -> Iterator[Figure]:
             looks,
             [
                 Panel(
-                    f"{_AXES[axis].split()[0]} [{'deg' if axis in ('r_dot', 'p_dot') else 'm'}/s²]",
+                    "{} [{}]".format(*AXES[axis]),
                     "time [s]" if axis == axes[-1] else "",
                     height=230,
                 )
@@ -351,9 +350,9 @@ def breeding(run: RunFiles) -> Iterator[Figure]:
                 {part: (errors.index.to_numpy(), errors[part].to_numpy()) for part in _PARTS}
                 | {"kept": (kept.index.to_numpy(), kept["validation"].to_numpy())}
             )
-            label, title = "" if panels else "share of the mean square [-]", _AXES.get(axis, axis)
+            label = "" if panels else "share of the mean square [-]"
             panels.append(
-                Panel(label, "generation", title.split(" ")[0], height=230, y_log=True, group=axis)
+                Panel(label, "generation", AXES[axis][0], height=230, y_log=True, group=axis)
             )
         if panels:
             yield Figure(
@@ -435,14 +434,15 @@ def goodness(run: RunFiles) -> Section | None:
     splits = run.json("goodness.json").get("splits") or {}
     split = next((name for name in (run.focus, *splits) if splits.get(name)), "")
     parts: list[Block] = []
-    for axis, title in _AXES.items():
+    for axis, (title, *_) in AXES.items():
         of_axis = [row for row in splits.get(split, []) if row["axis"] == axis]
         if of_axis:
-            unit, factor = run.unit(axis.replace("_dot", ""))
+            name = axis.removesuffix("_dot")
+            unit, factor = run.unit(name)
             unit = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
             parts.append(
                 Section(
-                    f"{title} [{unit}], {split} data",
+                    f"{title} {name}′ [{unit}], {split} data",
                     [*_fit_tables(of_axis, factor), Text(" ".join(_sentences(of_axis)))],
                     folded=bool(parts),
                 )

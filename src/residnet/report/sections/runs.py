@@ -8,21 +8,23 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
+import pandas as pd
 
-from residnet.core.format import DEG, fixed, shown_unit
+from residnet.core.format import DEG, fixed, plural, shown_unit
 from residnet.core.layout import Live
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.stretches import stretches
 from residnet.judge.metrics import columns_of
 from residnet.report.figure import (
-    BLUE,
     COLORS,
+    DASHED,
     GLANCE,
     GREEN,
     GREY,
     MASKED,
     MEASURED,
     ORANGE,
+    SOLID,
     START,
     Case,
     Curve,
@@ -30,11 +32,7 @@ from residnet.report.figure import (
     Look,
     Panel,
     band,
-    bars,
     family,
-    joined,
-    names_of,
-    whiskers,
 )
 from residnet.report.run_reader import RunFiles, StoredWindow
 
@@ -64,14 +62,15 @@ _ERRORS = {
 }  # fmt: skip
 """Channel whose unit an error has, and the name of the error."""
 _SI: Units = {name: (unit, *shown_unit(unit)) for name, unit in CHANNEL_UNITS.items()}
-_AXES = (
-    ("u_dot", "surge", "m/s²", 1.0),
-    ("v_dot", "sway", "m/s²", 1.0),
-    ("r_dot", "yaw", "deg/s²", DEG),
-    ("p_dot", "roll", "deg/s²", DEG),
-    ("w_dot", "heave", "m/s²", 1.0),
-    ("q_dot", "pitch", "deg/s²", DEG),
-)
+AXES = {
+    "u_dot": ("surge", "m/s²", 1.0),
+    "v_dot": ("sway", "m/s²", 1.0),
+    "r_dot": ("yaw", "deg/s²", DEG),
+    "p_dot": ("roll", "deg/s²", DEG),
+    "w_dot": ("heave", "m/s²", 1.0),
+    "q_dot": ("pitch", "deg/s²", DEG),
+}
+"""Name of each acceleration's axis, its unit on a page, and the factor to that."""
 # colour, line, order; the plant lies on the head that comes near it and shows it through its gaps
 _ROLES = {
     "zero": (GREY, "dotted", 3),
@@ -304,66 +303,49 @@ def _curves(window: StoredWindow, lead: str, units: Units) -> list[dict[str, Cur
     return out
 
 
-def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.ndarray]:
+def growth(windows: Sequence[StoredWindow], model: str) -> pd.DataFrame:
     """Return the root mean square errors over windows against the time since the start.
 
     Args:
         windows: free runs of one protocol.
 
     Returns:
-        Middles of time bins [K] in s, and errors [K, 2 + n] of u, v, r, position, heading and the
-        rest in SI. Bins that fewer than half of the windows reach are left out. u, v and position
-        count where usable.
+        A row for each time bin that at least half of the windows reach, by its middle in s; columns
+        as of `StoredWindow.errors`, in SI.
     """
     of_model = [window for window in windows if model in window.predicted]
     longest = max(float(window.t[-1] - window.t[0]) for window in of_model)
     count = max(min(_BINS, max(window.t.size for window in of_model) // 2), 1)
-    wide = of_model[0].measured.shape[1] - 1
-    squares, samples, reached = np.zeros((count, wide)), np.zeros((count, wide)), np.zeros(count)
-    masked = np.isin(np.arange(wide), (0, 1, 3))
-    for window in of_model:
-        error = np.square(window.predicted[model] - window.measured)
-        columns = np.column_stack(
-            (error[:, :3], error[:, 4] + error[:, 5], error[:, 3], error[:, 6:])
-        )
-        weight = np.where(masked, window.usable[:, None], True)
-        index = np.minimum((count * (window.t - window.t[0]) / longest).astype(int), count - 1)
-        reached[np.unique(index)] += 1
-        np.add.at(squares, index, np.where(weight, columns, 0.0))
-        np.add.at(samples, index, weight)
-    keep = reached >= 0.5 * len(of_model)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        error = np.sqrt(squares / samples)
-    return ((np.arange(count) + 0.5) * longest / count)[keep], error[keep]
+    bins = [
+        np.minimum((count * (window.t - window.t[0]) / longest).astype(int), count - 1)
+        for window in of_model
+    ]
+    reached = np.bincount(np.concatenate([np.unique(one) for one in bins]))
+    squares = pd.concat([window.errors(model).pow(2) for window in of_model])
+    error = squares.groupby(np.concatenate(bins)).mean().pow(0.5)
+    error = error[reached[error.index] >= 0.5 * len(of_model)]
+    return error.set_index((error.index + 0.5) * longest / count)
 
 
 def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the error of every model against the horizon, on a logarithmic scale."""
-    cases, units, shown = [], units_of(run), _errors_of(run)
-    named = _told(run.live)
-    factors = [units[name][2] for name in named]
+    cases, (panels, factors) = [], _error_panels(run, "RMS error of\n", 175)
     for protocol in run.protocols:
         members = [window for window in windows if window.protocol == protocol]
-        curves: list[dict[str, Curve]] = [{} for _ in named]
+        curves: list[dict[str, Curve]] = [{} for _ in panels]
         for model in run.kinds:
             if any(model in window.predicted for window in members):
-                time, errors = growth(members, model)
-                errors *= factors
-                # errors that start from zero would stretch the scale
-                errors[:1] = np.nan if len(errors) > 1 else errors[:1]
-                for panel, column in zip(curves, errors.T, strict=True):
-                    panel[model] = (time, np.where(column > 0, column, np.nan))
+                error = growth(members, model)
+                error = error[error > 0]
+                if len(error) > 1:
+                    # errors that start from zero would stretch the scale
+                    error.iloc[0] = np.nan
+                for panel, (name, factor) in zip(curves, factors.items(), strict=True):
+                    panel[model] = (error.index.to_numpy(), factor * error[name].to_numpy())
         if members:
-            runs = "run" if len(members) == 1 else "runs"
-            kept = [curves[place] for place in shown.values()]
-            cases.append(Case(f"{protocol} ({len(members)} {runs})", kept))
+            cases.append(Case(f"{protocol} ({plural(len(members), 'run')})", curves))
     if not cases:
         return None
-    panels = [
-        replace(_panel(f"RMS error of\n{_ERRORS[name]}", units[name], 175), y_log=True)
-        for name in shown
-    ]
-    panels[-2:] = [replace(one, x_label="time since the start [s]") for one in panels[-2:]]
     return Figure(
         "horizon",
         "Error against horizon",
@@ -371,94 +353,20 @@ def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
         " model whose curve stays level predicts as well late as early; one whose curve climbs"
         " drifts. The level that no model undercuts is the measurement noise.",
         {name: replace(look, shown=True) for name, look in model_looks(run).items()},
-        panels,
+        [replace(panel, y_log=True) for panel in panels],
         cases,
         "Protocol",
         columns=2,
     )
 
 
-def _errors_of(run: RunFiles) -> dict[str, int]:
-    """Return the channels of `_ERRORS` that the live velocities move, with their places there."""
-    moved = _moved(run.live)
-    return {name: place for place, name in enumerate(_told(run.live)) if name in moved}
-
-
-def _told(live: Live) -> list[str]:
-    """Return the channels of `_ERRORS` that free runs of a layout have errors of."""
-    return [name for name in _ERRORS if name in ("x", "psi", *live.moving)]
-
-
-def error_bars(run: RunFiles) -> Figure:
-    """Draw the error of every model, train beside test, with 95 % intervals.
-
-    Figures 16 and 17 of document 003 look like this. `zero` is left out: it would flatten the rest.
-    """
-    protocol = run.protocols[0]
-    models = [model for model, kind in run.kinds.items() if kind != "zero"]
-    thick = 0.8 / len(run.sides)
-    curves = []
-    panels: list[Panel] = []
-    for channel in run.live.channels:
-        text = _MOTION[channel].partition("\n")[0]
-        unit, factor = run.unit(channel)
-        group = bar_group(run, protocol, channel)
-        panel: dict[str, Curve] = {}
-        spread = []
-        for place, split in enumerate(run.sides):
-            rows = [run.row(model, split, protocol, group) for model in models]
-            found = [(i, row) for i, row in enumerate(rows) if row and channel in row["rmse"]]
-            at = [i + (place - 0.5 * (len(run.sides) - 1)) * thick for i, _ in found]
-            values = [factor * row["rmse"][channel] for _, row in found]
-            panel[split] = bars(at, values, thick)[::-1]
-            ends = [(row.get("rmse_ci95") or {}).get(channel) for _, row in found]
-            known = [
-                (y, factor * span[0], factor * span[1])
-                for y, span in zip(at, ends, strict=True)
-                if span
-            ]
-            spread += [whiskers(*zip(*known, strict=True))[::-1]] if known else []
-        curves.append(panel | {"interval": joined(spread)})
-        panels.append(
-            Panel(
-                "",
-                f"RMSE of {channel} [{unit}]",
-                text + (f"\n({group.replace('_', ' ')} runs)" if group != "all" else ""),
-                height=70 + 44 * len(models),
-                group=channel,
-                y_names=names_of(short_label(run, model) for model in models)
-                if not panels
-                else names_of("" for _ in models),
-                y_limits=(len(models) - 0.4, -0.6),
-            )
-        )
-    return Figure(
-        "bars",
-        "Free-run error by model",
-        f"Root mean square error under protocol {protocol} with 95 % intervals over free runs"
-        + (
-            f". {run.focus.capitalize()} bars well beyond the train bars would mean overfitting."
-            if len(run.sides) > 1
-            else f" ({run.focus} data)."
-        ),
-        {
-            split: Look(split, BLUE if split == run.focus else ORANGE, kind="fill", alpha=0.85)
-            for split in run.sides
-        }
-        | {"interval": Look("95 % interval", width=0.9, order=4)},
-        panels,
-        [Case("", curves)],
-        columns=3,
-    )
-
-
-def bar_group(run: RunFiles, protocol: str, channel: str) -> str:
-    """Return the group of manoeuvres that a channel is judged on.
-
-    Surge is judged on `speed` and the others on `steering`, where a run has both groups.
-    """
-    groups = set(run.manoeuvres(run.focus, protocol))
-    return ("speed" if channel == "u" else "steering") if {"speed", "steering"} <= groups else "all"
+def _error_panels(run: RunFiles, words: str, height: int) -> tuple[list[Panel], dict[str, float]]:
+    """Return a panel for the errors of each channel that moves, and its factor from SI by name."""
+    units, moved = units_of(run), _moved(run.live)
+    shown = [name for name in _ERRORS if name in moved]
+    panels = [_panel(f"{words}{_ERRORS[name]}", units[name], height) for name in shown]
+    panels[-2:] = [replace(one, x_label="time since the start [s]") for one in panels[-2:]]
+    return panels, {name: units[name][2] for name in shown}
 
 
 def residuals(run: RunFiles) -> Figure | None:
@@ -467,25 +375,28 @@ def residuals(run: RunFiles) -> Figure | None:
     models = [] if frame is None else [one for one in run.heads if (frame["model"] == one).any()]
     if not models:
         return None
-    axes = [_AXES[place] for place in run.live.learned]
-    cases, reach = [], dict.fromkeys((axis for axis, *_ in axes), 0.0)
-    for model in models:
-        panels, explained = [], []
-        for axis, name, _, factor in axes:
-            rows = frame[(frame["model"] == model) & (frame["axis"] == axis)]
-            target, predicted = factor * rows[["target", "predicted"]].to_numpy(float).T
-            panels.append({model: (predicted, target)} if len(rows) else {})
-            if len(rows):
-                # the outermost thousandth would shrink the cloud to a dot
-                outer = float(np.nanquantile(np.abs((target, predicted)), 0.999))
-                reach[axis] = max(reach[axis], 1.08 * outer)
-                explained.append(f"{name} {r_squared(target, predicted):.2f}")
-        cases.append(Case(run.label(model), panels, f"R²: {', '.join(explained)}."))
-    limits = {axis: value or 1.0 for axis, value in reach.items()}
-    line = {axis: np.array([-value, value]) for axis, value in limits.items()}
-    for case in cases:
-        for panel, (axis, *_) in zip(case.curves, axes, strict=True):
-            panel["equal"] = (line[axis], line[axis])  # type: ignore[index]
+    shown = [f"{name}_dot" for name in run.live.velocities]
+    curves: dict[str, dict[str, Curve]] = {model: {} for model in models}
+    limits = {}
+    for axis in shown:
+        reach = 0.0
+        for model, rows in frame[frame["axis"] == axis].groupby("model"):
+            predicted, target = AXES[axis][2] * rows[["predicted", "target"]].to_numpy(float).T
+            # the outermost thousandth would shrink the cloud to a dot
+            reach = max(reach, 1.08 * float(np.nanquantile(np.abs((target, predicted)), 0.999)))
+            curves.setdefault(str(model), {})[axis] = (predicted, target)
+        limits[axis] = np.array([-1.0, 1.0]) * (reach or 1.0)
+    cases = [
+        Case(
+            run.label(model),
+            [
+                {"equal": (limits[axis],) * 2} | ({model: of[axis]} if axis in of else {})
+                for axis in shown
+            ],
+        )
+        for model, of in curves.items()
+        if model in models
+    ]
     looks = model_looks(run)
     return Figure(
         "residuals",
@@ -505,10 +416,10 @@ def residuals(run: RunFiles) -> Figure | None:
                 name,
                 height=260,
                 group=axis,
-                x_limits=(-limits[axis], limits[axis]),
-                y_limits=(-limits[axis], limits[axis]),
+                x_limits=limits[axis].tolist(),
+                y_limits=limits[axis].tolist(),
             )
-            for axis, name, unit, _ in axes
+            for axis, (name, unit, _) in ((axis, AXES[axis]) for axis in shown)
         ],
         cases,
         "Head",
@@ -516,53 +427,38 @@ def residuals(run: RunFiles) -> Figure | None:
     )
 
 
-def r_squared(target: np.ndarray, predicted: np.ndarray) -> float:
-    """Return the share of the variance of the target [N] that the prediction [N] explains."""
-    spread = float(np.sum((target - target.mean()) ** 2))
-    return 1.0 - float(np.sum((target - predicted) ** 2)) / spread if spread > 0 else math.nan
-
-
 def bands(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the half width of the leading model's bands beside the errors that they are to hold."""
     model = run.lead
     known = (run.json("bands.json").get("models") or {}).get(model) or {}
-    cases, level, units = [], 0.0, units_of(run)
-    shown = _errors_of(run)
+    cases, level = [], 0.0
+    panels, factors = _error_panels(run, "", 165)
     for protocol, found in known.items():
         members = [one for one in windows if one.protocol == protocol and model in one.low]
         if not members:
             continue
         level = float(found["level"])
-        longest = max(window.t.size for window in members)
-        # u, v, r, heading, position, then what else moves
-        wide = members[0].measured.shape[1] - 1
-        error, width = np.full((2, len(members), longest, wide), np.nan)
-        for i, window in enumerate(members):
-            apart = np.abs(window.predicted[model] - window.measured)
-            radius = np.hypot(apart[:, 4], apart[:, 5])
-            errors = np.column_stack((apart[:, :4], radius, apart[:, 6:]))
-            errors[:, [0, 1, 4]] = np.where(window.usable[:, None], errors[:, [0, 1, 4]], np.nan)
-            error[i, : len(errors)] = errors
-            reach = 0.5 * (window.high[model] - window.low[model])
-            width[i, : len(errors)] = np.delete(reach, 5, axis=1)
-        time = np.arange(longest) * float(np.median(np.diff(members[0].t)))
-        held = np.full((longest, wide), np.nan)
-        for column in range(wide):
-            seen = np.isfinite(error[:, :, column]).any(axis=0)
-            held[seen, column] = np.nanquantile(error[:, seen, column], level, axis=0)
-        mean = np.nanmean(width, axis=0)
-        few = slice(1, None, max(longest // 200, 1))
-        panels: list[dict[str, Curve]] = []
-        for name, k in shown.items():
-            # heading before position there, behind it here
-            k, f = {3: 4, 4: 3}.get(k, k), units[name][2]
-            curves = {"width": mean, "errors": held}
-            panels.append({key: (time[few], f * of[few, k]) for key, of in curves.items()})
-        cases.append(Case(protocol, panels))
+        # of the position the box about the circle: half its width is the radius
+        widths = [
+            pd.DataFrame((one.high[model] - one.low[model]) / 2, columns=columns_of(run.live))
+            for one in members
+        ]
+        errors = [one.errors(model).abs() for one in members]
+        # by the number of the step
+        mean = pd.concat(widths).groupby(level=0).mean()
+        held = pd.concat(errors).groupby(level=0).quantile(level)
+        few = slice(1, None, max(len(mean) // 200, 1))
+        time = (mean.index.to_numpy() * float(np.median(np.diff(members[0].t))))[few]
+        curves = [
+            {
+                key: (time, factor * of[name].to_numpy()[few])
+                for key, of in (("width", mean), ("errors", held))
+            }
+            for name, factor in factors.items()
+        ]
+        cases.append(Case(protocol, curves))
     if not cases:
         return None
-    panels_of = [_panel(_ERRORS[name], units[name]) for name in shown]
-    panels_of[-2:] = [replace(one, x_label="time since the start [s]") for one in panels_of[-2:]]
     return Figure(
         "bands",
         "Band against horizon",
@@ -571,10 +467,10 @@ def bands(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
         " above the band means that these logs are unlike those that calibrated it; one well"
         " below, that they are easier.",
         {
-            "width": Look("half width of the band, mean", BLUE, width=1.6),
-            "errors": Look(f"{100 * level:.0f} % of the errors", ORANGE, "dashed", 1.6, order=4),
+            "width": replace(SOLID, label="half width of the band, mean"),
+            "errors": replace(DASHED, label=f"{100 * level:.0f} % of the errors"),
         },
-        panels_of,
+        panels,
         cases,
         "Protocol",
         columns=2,
