@@ -24,7 +24,6 @@ from residnet.report.figure import (
     Figure,
     Look,
     Panel,
-    Surface,
     band,
     bars,
     family,
@@ -91,26 +90,6 @@ def every_kind() -> Figure:
     )
 
 
-def surfaces() -> Figure:
-    x, y = (one.ravel() for one in np.meshgrid([1.0, 2.0, 3.0, 4.0], [0.0, 1.0, 2.0]))
-    empty = {"section": (np.empty(0), np.empty(0))}
-    cases = []
-    for number, title in enumerate(("surge", "sway")):
-        heights = np.outer([1.0, 2.0, 5.0], [3.0, 7.0, 11.0, 13.0]).ravel() * 10.0**number
-        chosen = {"mark": (np.array([2.0 + number]), np.array([1.0]))}
-        curves = [{"surface": (x, y), **empty, **chosen}, empty, empty]
-        cases.append(Case(title, curves, heights=heights, chosen=(2.0 + number, 1.0)))
-    looks = {"surface": Look("", kind="cells"), "section": Look("section", "#D55E00")}
-    looks["mark"] = Look("chosen", "#D55E00", kind="points", marker="x")
-    panels = [
-        Panel("order", "functions", kind="surface"),
-        Panel("", "functions", group="x", y_log=True),
-        Panel("", "order", group="y", y_log=True),
-    ]
-    surface = Surface("share [%]", (1.0, 900.0), (1.0, 1.0), log=True)
-    return Figure("surface", "Surface", "Look.", looks, panels, cases, "Of", surface=surface)
-
-
 def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
     given = every_kind()
     (written,) = write_figures(tmp_path, [given])
@@ -144,16 +123,6 @@ def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
         "foreign.json",
         "mine.png",
     }
-
-
-def test_no_cell_of_a_surface_is_thinned_out(tmp_path: Path) -> None:
-    x, y = (one.ravel() for one in np.meshgrid(np.arange(30.0), np.arange(31.0)))
-    figure = surfaces()
-    case = Case("yaw", [{"surface": (x, y)}, {}, {}], heights=x + y + 1.0, chosen=(1.0, 1.0))
-    write_figures(tmp_path, [replace(figure, cases=[case])])
-    (again,) = read_figures(tmp_path)
-    assert len(again.cases[0].curves[0]["surface"][0]) == len(again.cases[0].heights) == 930
-    assert json.loads(draw([again]).figures[again.key])["cases"][0]["title"] == "yaw"
 
 
 def test_still_pictures_show_what_is_switched_on() -> None:
@@ -195,18 +164,6 @@ def test_cases_on_a_page_hold_their_curves_to_a_part_in_sixty_thousand() -> None
     np.testing.assert_allclose(unpacked(one[1], "x of a")[: len(T)], T, atol=10 / 60_000)
     assert np.isnan(unpacked(two[1], "a")).all(), "a case without a curve draws none"
     assert draw([]) is None
-
-
-@pytest.mark.long
-@needs_browser
-def test_a_browser_draws_every_kind_and_cuts_a_surface(tmp_path: Path) -> None:
-    figures = write_figures(tmp_path / "figures", [surfaces(), every_kind()])
-    page = write_page(tmp_path, "Run", "", ["Done."], [Section("All", figures)])
-    found = layout(page, 390, tmp_path)
-    assert (found.overflow, found.broken) == (0, [])
-    assert found.panels == [True] * 7
-    assert found.used["cut"] == [["2", "1"], ["3", "1"]], "a slider chooses the next section"
-    assert found.used["section"] == pytest.approx([11.0, 22.0, 55.0], rel=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -332,6 +289,16 @@ def test_trials_of_a_sweep_over_their_keys() -> None:
     assert [values.tolist() for values in curves["best"]] == [[0, 1, 2], [1.0, 1.0, 1.0]]
     counts = {name: len(parts(*curve)) for name, curve in curves.items()}
     assert counts["best tenth"] + counts["better half"] + counts["worse half"] == len(trials)
+
+
+@pytest.mark.long
+@needs_browser
+def test_a_browser_draws_every_kind_of_curve(tmp_path: Path) -> None:
+    figures = write_figures(tmp_path / "figures", [every_kind()])
+    page = write_page(tmp_path, "Run", "", ["Done."], [Section("All", figures)])
+    found = layout(page, 390, tmp_path)
+    assert (found.overflow, found.broken) == (0, [])
+    assert found.panels == [True] * 4
 
 
 @pytest.mark.long

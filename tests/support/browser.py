@@ -27,20 +27,8 @@ const inked = canvas => {
   for (let i = 3; i < data.length; i += 4) count += data[i] > 0;
   return count > 200;
 };
-const cut = root => {
-  const sliders = [...root.querySelectorAll("input[type='range']")];
-  const told = () => [...root.querySelectorAll("output")].map(output => output.textContent);
-  if (sliders.length === 0) return {};
-  const first = told();
-  sliders[0].value = String(Number(sliders[0].value) + 1);
-  sliders[0].dispatchEvent(new Event("input"));
-  const plot = root.ownerDocument.defaultView.Bokeh.documents.map(
-    one => one.get_model_by_name(root.id + "-2")).find(found => found);
-  const curve = plot.renderers[0];
-  return {cut: [first, told()], section: Array.from(curve.data_source.data[curve.name])};
-};
 const use = async (page, pause) => {
-  const root = ["input[type='range']", ".note", "div"].map(part => page.querySelector(
+  const root = [".note", "div"].map(part => page.querySelector(
     `main > section:not(.opening) .explorer:has(${part})`)).find(found => found) || null;
   if (root === null) return {};
   const model = name => page.defaultView.Bokeh.documents.map(
@@ -57,15 +45,13 @@ const use = async (page, pause) => {
     return focused;
   };
   const focused = await press("Zoom in"), near = width();
-  const sections = cut(root);
   await press("Reset");
   const again = width(), box = root.querySelector("input");
   box.click();
   const hidden = plot.renderers.find(curve => curve.name === box.value).visible === false;
   const list = root.querySelector("select"), note = () => root.querySelector(".note").textContent;
   if (list === null || root.querySelector(".note") === null)
-    return {focused: focused, zoomed: near / begin, reset: again / begin, hidden: hidden,
-            ...sections};
+    return {focused: focused, zoomed: near / begin, reset: again / begin, hidden: hidden};
   const first = note();
   list.value = String(list.length - 1);
   list.dispatchEvent(new Event("change"));

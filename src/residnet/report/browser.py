@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from residnet.core.format import powers
-from residnet.report.figure import INK, Case, Figure
+from residnet.report.figure import INK, Case, Figure, Look
 from residnet.report.figure_files import packed
 
 if TYPE_CHECKING:
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 _FONT = "12px"
 _LETTER, _NARROW = 6.5, 260.0
 """Pixels of a letter of that font, and between the axes of a panel on a phone."""
-HEIGHT = "height of a cell"
-"""Name of the column of a surface's heights; of their logarithms on a page where they are so."""
 _DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
 _MARKERS = {"o": "circle", "s": "square", "x": "x", "^": "triangle"}
 
@@ -79,10 +77,10 @@ def _range(limits: Sequence[float]) -> Any:
 
 def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource) -> Canvas:
     from bokeh import models
-    from bokeh.models.annotations import ColorBar, Title
+    from bokeh.models.annotations import Title
     from bokeh.plotting import figure as new_canvas
 
-    panel, surface = figure.panels[number], figure.surface
+    panel = figure.panels[number]
     canvas = new_canvas(
         name=f"{figure.key}-{number}",
         title=Title(text=panel.words, text_font_size=_FONT),
@@ -102,29 +100,13 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
     )
     # the page scrolls under a finger; dragging zooms only after a button was pressed
     canvas.stylesheets = [":host .bk-events { touch-action: pan-y pinch-zoom; }"]
-    over = [_mark(figure, name, source, panel.kind == "surface") for name in figure.names(number)]
+    over = [_mark(name, figure.looks[name], source) for name in figure.names(number)]
     canvas.renderers.extend(over)
     # where places bear names, the name alone says what a mark is
     told = panel.kind == "curves" and not panel.y_names
     tips: Any = [("$name", "@$name{0.000 a}")] if told else [("", "$name")]
-    if panel.kind == "surface" and surface is not None:
-        colors = next(one for one in over if one.name == "surface").glyph.fill_color.transform
-        bar = ColorBar(
-            color_mapper=colors,
-            ticker=models.LogTicker(mantissas=[1, 3]) if surface.log else models.BasicTicker(),
-            width=12,
-            padding=4,
-            background_fill_color=None,
-            major_label_text_font_size=_FONT,
-        )
-        canvas.add_layout(bar, "right")
-        canvas.yaxis.axis_label = panel.y_label or None
-        height = f"@{{{HEIGHT}}}{{0.000 a}}"
-        tips = [(panel.x_label, "$x{0}"), (panel.y_label, "$y{0}"), (surface.height, height)]
     hover = models.HoverTool(
-        renderers=[
-            one for one in over if figure.looks[one.name].kind in ("line", "points", "cells")
-        ],
+        renderers=[one for one in over if figure.looks[one.name].kind in ("line", "points")],
         mode="vline" if told else "mouse",
         tooltips=tips,
         point_policy="follow_mouse",
@@ -163,13 +145,11 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
     return canvas
 
 
-def _mark(figure: Figure, name: str, source: ColumnDataSource, on_cells: bool) -> Any:
+def _mark(name: str, look: Look, source: ColumnDataSource) -> Any:
     """Return the renderer of what bears a name, added to nothing yet."""
     from bokeh import models
     from bokeh.models.renderers import GlyphRenderer
-    from bokeh.palettes import Viridis256
 
-    look, surface = figure.looks[name], figure.surface
     color, x = "#808080" if look.color == INK else look.color, f"x of {name}"
     # what is faint on paper stays to be seen on a screen
     alpha = max(look.alpha, 0.25)
@@ -181,20 +161,9 @@ def _mark(figure: Figure, name: str, source: ColumnDataSource, on_cells: bool) -
         "line_width": min(max(1.2 * look.width, 0.8), 2.4),
     }
     glyph: Any
-    if look.kind == "cells" and surface is not None:
-        mapper = models.LogColorMapper if surface.log else models.LinearColorMapper
-        low, high = surface.limits
-        shade: Any = {"field": HEIGHT, "transform": mapper(palette=Viridis256, low=low, high=high)}
-        width, height = surface.size
-        glyph = models.Rect(
-            x=x, y=name, width=width, height=height, fill_color=shade, line_color=None
-        )
-    elif look.kind == "points":
+    if look.kind == "points":
         marker: dict[str, Any] = {"marker": _MARKERS[look.marker], "size": max(look.size, 4)}
-        if on_cells:
-            # a mark stands out from cells of any colour
-            marker |= {"size": 10, "fill_color": color, "line_color": "white", "line_width": 2}
-        elif look.hollow or look.marker == "x":
+        if look.hollow or look.marker == "x":
             marker |= {"fill_color": None, "line_color": color}
         else:
             marker |= {"fill_color": color, "line_color": None, "fill_alpha": alpha}
@@ -220,8 +189,6 @@ def _columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarray]:
     for name in figure.names(panel):
         x, y = curves.get(name, (np.empty(0), np.empty(0)))
         columns |= {f"x of {name}": x, name: y}
-    if figure.surface is not None and panel == 0:
-        columns[HEIGHT] = np.log10(case.heights) if figure.surface.log else case.heights
     for name, values in columns.items():
         columns[name] = np.full(longest, np.nan)
         columns[name][: len(values)] = values
@@ -230,7 +197,6 @@ def _columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarray]:
 
 def _json(figure: Figure) -> str:
     """Return a figure as the page's script takes it."""
-    surface = figure.surface
     from bokeh.document import Document
 
     # models are numbered in their order, so that the same run has the same page
@@ -254,19 +220,10 @@ def _json(figure: Figure) -> str:
             name: {"color": look.color, "shown": look.shown} for name, look in figure.looks.items()
         },
         "panels": len(figure.panels),
-        "surface": surface
-        and {
-            "name": "surface",
-            "section": "section",
-            "heights": HEIGHT,
-            "size": surface.size,
-            "logarithmic": surface.log,
-        },
         "cases": [
             {
                 "title": case.title,
                 "note": case.note,
-                "chosen": case.chosen,
                 "panels": [
                     packed(_columns(figure, case, number)) for number in range(len(figure.panels))
                 ],

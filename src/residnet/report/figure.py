@@ -21,7 +21,7 @@ INK = "ink"
 """The colour of text: black on paper, light on a dark screen."""
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Horizontal and vertical values [T], NaN where there is a gap."""
-Kind: TypeAlias = Literal["line", "points", "fill", "across", "upright", "strip", "cells"]
+Kind: TypeAlias = Literal["line", "points", "fill", "across", "upright", "strip"]
 
 # Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies
 BLUE, ORANGE, VERMILLION, PURPLE, GREEN, SKY, GREY = (
@@ -47,8 +47,7 @@ class Look:
         dash: `solid`, `dashed`, `dotted`, `dashdot`, `long`, `short` or `dense`.
         width: of its line in points.
         kind: a `line`, `points`, a `fill` of outlines that gaps part; lines `across` at vertical
-            values or `upright` at horizontal ones; `strip`s from one horizontal value to another;
-            `cells` of a surface.
+            values or `upright` at horizontal ones; `strip`s from one horizontal value to another.
         shown: it is switched on at first, and drawn in still pictures.
         alpha: opacity.
         marker: of points: `o`, `s`, `x` or `^`.
@@ -116,7 +115,7 @@ class Panel:
     y_label: str = ""
     x_label: str = ""
     title: str = ""
-    kind: Literal["curves", "map", "surface"] = "curves"
+    kind: Literal["curves", "map"] = "curves"
     height: int = 165
     x_log: bool = False
     y_log: bool = False
@@ -134,27 +133,6 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Surface:
-    """What the first panel shows as the coloured cells of a grid.
-
-    The second panel shows the section along the horizontal axis, the third one that along the
-    vertical axis, through a cell that the reader chooses. Cells bear the name `surface`, sections
-    the name `section`.
-
-    Attributes:
-        height: what the colours tell, with its unit.
-        limits: heights of the first and the last colour.
-        size: width and height of a cell in the units of the axes.
-        log: whether colours and sections are logarithmic.
-    """
-
-    height: str
-    limits: tuple[float, float]
-    size: tuple[float, float]
-    log: bool = False
-
-
-@dataclass(frozen=True)
 class Case:
     """What all panels show at a time.
 
@@ -165,8 +143,6 @@ class Case:
         still: it has a still picture.
         texts: number of a panel, place and words of what is written into a still picture; a
             vertical place of NaN is the upper edge.
-        heights: of the surface's cells [T], in the order of their curve.
-        chosen: cell whose sections are shown first.
     """
 
     title: str
@@ -174,8 +150,6 @@ class Case:
     note: str = ""
     still: bool = True
     texts: Sequence[tuple[int, float, float, str]] = ()
-    heights: np.ndarray = field(default_factory=lambda: np.empty(0))
-    chosen: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
@@ -191,7 +165,6 @@ class Figure:
         cases: at least one.
         chooser: what the cases are, beside the list to choose from.
         columns: of panels beside each other.
-        surface: what the first panel shows; None where all panels are of curves.
         stills: pictures that were written of it.
     """
 
@@ -204,7 +177,6 @@ class Figure:
     cases: Sequence[Case]
     chooser: str = ""
     columns: int = 1
-    surface: Surface | None = None
     stills: Sequence[Path] = ()
 
     @property

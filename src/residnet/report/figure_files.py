@@ -15,7 +15,7 @@ import numpy as np
 from residnet.core.files import file_stem, whole
 from residnet.core.progress import begin
 from residnet.report.blocks import Section
-from residnet.report.figure import Case, Curve, Figure, Look, Panel, Surface, joined, parts, thinned
+from residnet.report.figure import Case, Curve, Figure, Look, Panel, joined, parts, thinned
 from residnet.report.still import save, still
 
 
@@ -56,20 +56,21 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
     """
     folder.mkdir(parents=True, exist_ok=True)
     name = file_stem(name or figure.name)
-    # the sections of a surface belong to the screen, its cases stand side by side
-    groups = [figure.cases] if figure.surface else [[case] for case in figure.cases if case.still]
-    stills = []
-    for number, cases in enumerate(groups, start=1):
-        path = folder / (f"{name}.png" if len(groups) == 1 else f"{name}_{number}.png")
-        title = figure.title + (f": {cases[0].title}" if len(groups) > 1 else "")
-        save(still(figure, cases), path, title, figure.caption)
+    stills, several = [], len(figure.pictured) > 1
+    for number, case in enumerate(figure.pictured, start=1):
+        path = folder / (f"{name}_{number}.png" if several else f"{name}.png")
+        title = figure.title + (f": {case.title}" if several else "")
+        save(still(figure, case), path, title, figure.caption)
         stills.append(path)
     content = {name: getattr(figure, name) for name in _PLAIN} | {
         "looks": {name: asdict(look) for name, look in figure.looks.items()},
         "panels": [asdict(panel) for panel in figure.panels],
-        "surface": figure.surface and asdict(figure.surface),
         "stills": [path.name for path in stills],
-        "cases": [_stored(figure, case) for case in figure.cases],
+        "cases": [
+            {"title": case.title, "note": case.note, "still": case.still}
+            | {"curves": [_stored(curves) for curves in case.curves]}
+            for case in figure.cases
+        ],
     }
     with whole(folder / f"{name}.json") as file:
         file.write_text(json.dumps(content, separators=(",", ":")), encoding="utf-8")
@@ -79,41 +80,15 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
 _PLAIN = ("name", "title", "caption", "chooser", "columns")
 
 
-def _stored(figure: Figure, case: Case) -> dict[str, Any]:
-    panels = []
-    for of_panel in case.curves:
-        # every cell of a surface has its height
-        light = {
-            name: curve if figure.looks[name].kind == "cells" else _light(*curve)
-            for name, curve in of_panel.items()
-        }
-        # packed curves of NaN alone are gaps
-        panels.append(
-            packed(
-                {
-                    f"{axis}{name}": np.asarray(values, dtype=float)
-                    for name, curve in light.items()
-                    for axis, values in zip("xy", curve, strict=True)
-                }
-            )
-        )
-    heights = np.log10(case.heights) if figure.surface and figure.surface.log else case.heights
-    return {
-        "title": case.title,
-        "note": case.note,
-        "still": case.still,
-        "chosen": list(map(float, case.chosen)),
-        "heights": packed({"heights": heights}),
-        "curves": panels,
-    }
-
-
-def _light(x: np.ndarray, y: np.ndarray) -> Curve:
-    """Return a curve with no more samples than a screen shows."""
-    pieces = parts(x, y)
-    most = max(20, min(600, 6_000 // max(len(pieces), 1)))
-    rows = [thinned(len(a), most) for a, _ in pieces]
-    return joined([(a[kept], b[kept]) for (a, b), kept in zip(pieces, rows, strict=True)])
+def _stored(curves: Mapping[str, Curve]) -> dict[str, Any]:
+    """Return the curves of a panel with no more samples than a screen shows, packed."""
+    columns = {}
+    for name, (x, y) in curves.items():
+        pieces = parts(x, y)
+        most = max(20, min(600, 6_000 // max(len(pieces), 1)))
+        light = joined(tuple(axis[thinned(len(axis), most)] for axis in piece) for piece in pieces)
+        columns |= {f"x{name}": light[0], f"y{name}": light[1]}
+    return packed(columns)
 
 
 def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
@@ -152,11 +127,7 @@ def figures_section(folder: Path) -> list[Section]:
 def _read(path: Path) -> Figure | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        surface = content["surface"] and Surface(**content["surface"])
-        cases = []
-        for case in content.pop("cases"):
-            heights = unpacked(case.pop("heights"), "heights")
-            case["heights"] = 10.0**heights if surface and surface.log else heights
+        for case in content["cases"]:
             case["curves"] = [
                 {
                     name[1:]: (unpacked(of, name), unpacked(of, f"y{name[1:]}"))
@@ -165,13 +136,11 @@ def _read(path: Path) -> Figure | None:
                 }
                 for of in case["curves"]
             ]
-            cases.append(Case(**case))
         return Figure(
             **{name: content[name] for name in _PLAIN},
             looks={name: Look(**look) for name, look in content["looks"].items()},
             panels=[Panel(**panel) for panel in content["panels"]],
-            cases=cases,
-            surface=surface,
+            cases=[Case(**case) for case in content["cases"]],
             stills=[path.parent / name for name in content["stills"]],
         )
     except (OSError, ValueError, TypeError, KeyError):

@@ -52,33 +52,25 @@ RC: Any = {
 }
 
 
-def still(figure: Figure, cases: Sequence[Case] = (), only: Sequence[int] = ()) -> Any:
+def still(figure: Figure, case: Case | None = None, only: Sequence[int] = ()) -> Any:
     """Return a matplotlib figure of a case: maps beside each other, other panels below.
 
     Args:
-        cases: one of them, the first where empty; several of a surface stand side by side.
+        case: one of the figure's, its first where None.
         only: numbers of the panels that are drawn, all where empty.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
-    cases = cases or figure.cases[:1]
-    shown = list(only) or [
-        i
-        for i in range(len(figure.panels))
-        if any(i < len(c.curves) and c.curves[i] for c in cases)
-    ]
-    if figure.surface:
-        maps, rest = [], [(case, 0) for case in cases]
-        columns, lines = len(cases), 1
-    else:
-        maps = [(cases[0], i) for i in shown if figure.panels[i].kind == "map"]
-        rest = [(cases[0], i) for i in shown if figure.panels[i].kind != "map"]
-        columns = min(figure.columns, max(len(rest), 1))
-        lines = -(-len(rest) // columns)
+    case = case or figure.cases[0]
+    shown = list(only) or [i for i, curves in enumerate(case.curves) if curves]
+    maps = [i for i in shown if figure.panels[i].kind == "map"]
+    rest = [i for i in shown if figure.panels[i].kind != "map"]
+    columns = min(figure.columns, max(len(rest), 1))
+    lines = -(-len(rest) // columns)
     heights = [
-        max(figure.panels[i].height for _, i in rest[columns * k : columns * (k + 1)]) / 110
+        max(figure.panels[i].height for i in rest[columns * k : columns * (k + 1)]) / 110
         for k in range(lines)
     ]
     across = max(len(maps), 1)
@@ -92,11 +84,11 @@ def still(figure: Figure, cases: Sequence[Case] = (), only: Sequence[int] = ()) 
             len(map_lines) + lines, across * columns, height_ratios=[*map_lines, *heights]
         )
         handles: dict[str, Any] = {}
-        for place, (case, number) in enumerate(maps):
+        for place, number in enumerate(maps):
             cell = grid[0, columns * place : columns * (place + 1)]
             _draw(canvas.add_subplot(cell), figure, case, number, handles)
         shared: dict[str, Any] = {}
-        for place, (case, number) in enumerate(rest):
+        for place, number in enumerate(rest):
             line, column = divmod(place, columns)
             cell = grid[len(map_lines) + line, across * column : across * (column + 1)]
             panel, below = figure.panels[number], rest[place + columns : place + columns + 1]
@@ -104,16 +96,9 @@ def still(figure: Figure, cases: Sequence[Case] = (), only: Sequence[int] = ()) 
             axes = canvas.add_subplot(cell, sharex=shared.get(group))
             shared.setdefault(group, axes)
             _draw(axes, figure, case, number, handles)
-            if below and figure.panels[below[0][1]].group == panel.group:
+            if below and figure.panels[below[0]].group == panel.group:
                 axes.tick_params(labelbottom=False)
                 axes.set_xlabel("")
-        if figure.surface:
-            from matplotlib.ticker import FuncFormatter
-
-            meshes = [axes.collections[0] for axes in canvas.axes]
-            bar = canvas.colorbar(meshes[0], ax=canvas.axes)
-            bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            bar.set_label(figure.surface.height if figure.surface else "")
         canvas.align_ylabels()
         labels = dict.fromkeys(look.label for look in figure.looks.values())
         _legend_above(canvas, {label: handles[label] for label in labels if label in handles})
@@ -128,15 +113,11 @@ def _draw(axes: Any, figure: Figure, case: Case, number: int, handles: dict[str,
     for name in figure.names(number):
         look = figure.looks[name]
         if name in case.curves[number] and look.shown:
-            if look.kind == "cells":
-                _cells(axes, figure, case)
-                continue
             x, y = (np.asarray(values, dtype=float) for values in case.curves[number][name])
             handle = _mark(axes, look, x, y)
             if look.label and handle is not None and np.isfinite(x).any():
                 handles.setdefault(look.label, handle)
-    surface = figure.surface is not None
-    axes.set_title(case.title if surface else panel.title, loc="left" if surface else "center")
+    axes.set_title(panel.title)
     axes.set(xlabel=powers(panel.x_label), ylabel=powers(panel.y_label))
     if panel.kind == "map":
         axes.set_aspect("equal", adjustable="datalim")
@@ -203,21 +184,6 @@ def _mark(axes: Any, look: Look, x: np.ndarray, y: np.ndarray) -> Any:
                 else axes.axvline(low, **stroke)
             )
     return drawn
-
-
-def _cells(axes: Any, figure: Figure, case: Case) -> None:
-    from matplotlib.colors import LogNorm, Normalize
-
-    surface = figure.surface
-    if surface is None:
-        return
-    x, y = case.curves[0]["surface"]
-    places = [np.unique(values) for values in (x, y)]
-    heights = np.full((len(places[1]), len(places[0])), np.nan)
-    heights[np.searchsorted(places[1], y), np.searchsorted(places[0], x)] = case.heights
-    norm = (LogNorm if surface.log else Normalize)(*surface.limits)
-    axes.pcolormesh(*places, heights, cmap="viridis", norm=norm, shading="nearest")
-    axes.grid(visible=False)
 
 
 def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:

@@ -45,7 +45,6 @@ from residnet.regression.estimator import Estimator, require_data
 from residnet.regression.least_squares import CentredLeastSquares, ElasticNet
 from residnet.regression.shrinkage import PLSR, Ridge, pls_path
 from residnet.regression.surface import Surface, SurfacePLSR
-from residnet.report import figure as drawing
 from residnet.report.blocks import Bullets, Section, Table, Text
 from residnet.report.figure import (
     BLUE,
@@ -58,6 +57,7 @@ from residnet.report.figure import (
     Look,
     Panel,
     bars,
+    joined,
     names_of,
 )
 from residnet.training.lag import fit_lag, followed
@@ -72,8 +72,8 @@ _LEAST_EARTH_FORCE_SPREAD = 0.02
 """Least root mean square that turning must leave of a unit force fixed in earth axes."""
 _SIDES = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 """Signs of surge, sway and yaw in the mirror."""
-_COLOURS_SPAN = (6.3, 316.0)
-"""Shares in % of the first and the last colour of a surface."""
+_SURFACE_SPAN = (6.3, 316.0)
+"""Shares in % that the axis of a surface analysis shows; single models lie orders above."""
 
 
 @dataclass(frozen=True)
@@ -802,34 +802,44 @@ def _surface(
     chosen: Mapping[str, Sequence[tuple[int, int]]],
 ) -> Figure:
     marks = (("x", VERMILLION), ("o", PURPLE), ("s", ORANGE))
-    looks = {"surface": Look("", kind="cells"), "section": Look("", BLUE)}
+    looks = {
+        "orders": Look("each model order", GREY, width=0.8),
+        "order": Look("order of this model", BLUE, width=1.6),
+    }
     for label, (marker, color) in zip(chosen, marks, strict=False):
         looks[label] = Look(
             label, color, kind="points", marker=marker, size=7, hollow=True, order=5
         )
-    cases = []
-    for axis, title in enumerate(AXES):
+    curves = []
+    for axis in range(3):
+        # [A, J] by model order, from 1 on, and number of basis functions
         share = 100.0 * error[axis].numpy() / unmodelled[axis]
-        orders, counts = np.meshgrid(*map(np.arange, share.shape), indexing="ij")
-        curves = {"surface": (counts.ravel().astype(float), orders.ravel() + 1.0)}
+        counts = np.arange(share.shape[1], dtype=float)
+        best, _ = chosen["chosen"][axis]
+        panel = {
+            "orders": joined((counts, row) for row in share),
+            "order": (counts, share[best - 1]),
+        }
         for label, picks in chosen.items():
             order, count = picks[axis]
-            curves[label] = (np.array([float(count)]), np.array([float(order)]))
-        best = [float(chosen["chosen"][axis][1]), float(chosen["chosen"][axis][0])]
-        cases.append(Case(title, [curves, {}, {}], heights=share.ravel(), chosen=best))
-    height = "share of the MSE that is left [%]"
+            panel[label] = (np.array([float(count)]), share[order - 1, [count]])
+        curves.append(panel)
     return Figure(
         f"surface_{name}",
         "Surface analysis",
-        "Share of the unmodelled residual's mean square that is left, by model order and"
-        " number of basis functions. Marks show what each rule chose.",
+        "Share of the unmodelled residual's mean square that is left, by number of basis functions,"
+        " a line for each model order. Marks show what each rule chose.",
         looks,
         [
-            Panel("model order", "basis functions", kind="surface", height=285),
-            Panel(height, "basis functions", y_log=True),
-            Panel(height, "model order", y_log=True),
+            Panel(
+                f"{axis}, share of the MSE left [%]",
+                "basis functions",
+                height=285,
+                y_log=True,
+                y_limits=_SURFACE_SPAN,
+            )
+            for axis in AXES
         ],
-        cases,
-        chooser="axis",
-        surface=drawing.Surface(height, _COLOURS_SPAN, (1.0, 1.0), log=True),
+        [Case("", curves)],
+        columns=3,
     )

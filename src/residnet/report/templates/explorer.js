@@ -54,9 +54,6 @@
     this.root.querySelectorAll("input[type='checkbox']").forEach(function (box) {
       box.addEventListener("change", function () { self.toggle(box.value, box.checked); });
     });
-    this.sliders().forEach(function (slider) {
-      slider.addEventListener("input", function () { self.cut(); });
-    });
     this.root.querySelectorAll("button[data-zoom]").forEach(function (button) {
       button.addEventListener("click", function () { self.zoom(Number(button.dataset.zoom)); });
     });
@@ -78,80 +75,15 @@
   };
 
   Explorer.prototype.show = function (number) {
-    var one = this.data.cases[number], self = this;
+    var one = this.data.cases[number];
     this.plots.forEach(function (plot, i) {
       var columns = one.panels[i], data = {};
       Object.keys(columns).forEach(function (name) { data[name] = unpack(columns[name], columns); });
-      if (self.data.surface && i === 0) { self.lay(data, one.chosen); }
       plot.renderers[0].data_source.data = data;
     });
-    if (this.data.surface) { this.cut(); }
     var note = this.root.querySelector(".note");
     if (note) { note.textContent = one.note; }
     this.reset();
-  };
-
-  function levels(values) {
-    return Array.from(new Set(values.filter(function (value) { return !isNaN(value); }))).sort(function (a, b) { return a - b; });
-  }
-
-  function nearest(places, value) {
-    var best = 0;
-    places.forEach(function (place, i) { if (Math.abs(place - value) < Math.abs(places[best] - value)) { best = i; } });
-    return best;
-  }
-
-  // the cells of a surface, and the cell that sections begin with
-  Explorer.prototype.lay = function (data, chosen) {
-    var surface = this.data.surface, x = "x of " + surface.name, self = this;
-    // numbers on a page are rounded to a part in 65000 of their range, places of cells are not
-    [x, surface.name].forEach(function (name, i) {
-      var first = levels(data[name])[0], size = surface.size[i];
-      data[name] = data[name].map(function (value) { return first + size * Math.round((value - first) / size); });
-    });
-    if (surface.logarithmic) { data[surface.heights] = data[surface.heights].map(function (value) { return Math.pow(10, value); }); }
-    this.grid = { x: levels(data[x]), y: levels(data[surface.name]), cells: data };
-    this.sliders().forEach(function (slider, i) {
-      var places = i === 0 ? self.grid.x : self.grid.y;
-      slider.max = String(places.length - 1);
-      slider.value = String(nearest(places, chosen[i]));
-    });
-  };
-
-  Explorer.prototype.sliders = function () {
-    return Array.prototype.slice.call(this.root.querySelectorAll("input[type='range']"));
-  };
-
-  // the sections through the chosen cell: along the horizontal axis, then along the vertical one
-  Explorer.prototype.cut = function () {
-    var surface = this.data.surface, grid = this.grid, cells = grid.cells, sliders = this.sliders();
-    var at = [grid.x[Number(sliders[0].value)], grid.y[Number(sliders[1].value)]];
-    var rows = [[[], []], [[], []]];
-    cells[surface.heights].forEach(function (height, i) {
-      var place = [cells["x of " + surface.name][i], cells[surface.name][i]];
-      [0, 1].forEach(function (axis) {
-        if (place[1 - axis] === at[1 - axis]) { rows[axis][0].push(place[axis]); rows[axis][1].push(height); }
-      });
-    });
-    var name = surface.section, x = "x of " + name, self = this;
-    rows.forEach(function (row, i) {
-      var data = {};
-      data[x] = row[0];
-      data[name] = row[1];
-      self.plots[1 + i].renderers[0].data_source.data = data;
-    });
-    var lines = Object.assign({}, cells), low = NaN, count = cells[name].length;
-    var ends = [grid.x[0], grid.x[grid.x.length - 1], low, at[0], at[0]];
-    var tops = [at[1], at[1], low, grid.y[0], grid.y[grid.y.length - 1]];
-    [[x, ends], [name, tops]].forEach(function (pair) {
-      lines[pair[0]] = Array.from({ length: count }, function (_, i) { return i < 5 ? pair[1][i] : NaN; });
-    });
-    this.plots[0].renderers[0].data_source.data = lines;
-    sliders.forEach(function (slider, i) {
-      var told = String(Number(at[i].toPrecision(6)));
-      slider.nextElementSibling.textContent = told;
-      slider.setAttribute("aria-valuetext", told);
-    });
   };
 
   Explorer.prototype.toggle = function (name, on) {
@@ -192,14 +124,13 @@
       (plot.above.concat(plot.below, plot.left, plot.right, plot.center)).forEach(function (part) {
         if (part.type === "Grid") { part.grid_line_color = line; }
         if (part.type === "Title") { part.text_color = ink; }
-        if (part.type === "ColorBar") { part.major_label_text_color = quiet; }
         if (/Axis$/.test(part.type)) {
           part.setv({ major_label_text_color: quiet, axis_label_text_color: ink, axis_line_color: quiet,
             major_tick_line_color: quiet, minor_tick_line_color: null });
         }
       });
       plot.renderers.forEach(function (curve) {
-        if (looks[curve.name].color !== "ink" || curve.glyph.type === "Rect") { return; }
+        if (looks[curve.name].color !== "ink") { return; }
         var glyph = curve.glyph, filled = glyph.fill_color && glyph.fill_color.value !== null && /^(Scatter|Patch|VStrip)$/.test(glyph.type);
         glyph[filled ? "fill_color" : "line_color"] = { value: ink };
       });
