@@ -82,7 +82,7 @@ _PLAIN = ("name", "title", "caption", "chooser", "columns")
 
 def _stored(curves: Mapping[str, Curve]) -> dict[str, Any]:
     """Return the curves of a panel with no more samples than a screen shows, packed."""
-    columns = {}
+    columns: dict[str, np.ndarray] = {}
     for name, (x, y) in curves.items():
         pieces = parts(x, y)
         most = max(20, min(600, 6_000 // max(len(pieces), 1)))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from residnet.core.config import Config, ExistingPath
@@ -16,7 +16,7 @@ from residnet.core.names import nearest, to_si
 from residnet.data.readers.texts import as_utf8
 from residnet.physics.actuators.identify import Estimate, fit_step, fit_throttle, fit_thrust
 from residnet.report.figure_files import write_figures
-from residnet.report.sections.actuators import actuator_tests
+from residnet.report.sections.actuators import actuator_tests, parameter_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 
@@ -164,63 +164,45 @@ class ActuatorsTaskConfig(Task):
         return [path for test in self._tests() for path in test.files]
 
     def carry_out(self, folder: RunFolder) -> Outcome:
-        """Identify the actuators, and write actuators.yaml, actuators.json and a figure.
+        """Identify the actuators, and write actuators.json, actuators.yaml and a figure.
 
-        The lines for the section `actuators` of a vessel file have intervals as comments.
+        actuators.yaml holds the lines for the section `actuators` of a vessel file.
 
         Raises:
             ResidnetError: where the logs cannot be used or do not determine the actuators.
         """
         throttle = step = pull = None
-        tests, figures = [], dict[str, MainFigure]()
+        tests, main = [], dict[str, Estimate]()
         numbers: dict[str, Any] = {"schema": "residnet.actuators/1"}
-        files = ", ".join(path.name for path in self.input_files())
-        lines = [f"# from {files}; intervals are 95 %"]
+        lines: dict[str, Any] = {}
         if self.throttle is not None:
             share, n = self.throttle.together()
             curve = fit_throttle(share, n)
-            throttle, slope, most = (share, n, curve), curve.slope, curve.n_max
-            figures["n_max"] = MainFigure(most.value, "1/s")
-            numbers["throttle"] = {
-                name: part._asdict() if isinstance(part, Estimate) else part
-                for name, part in curve._asdict().items()
-            }
-            largest = "largest measured: nothing saturated"
-            lines += [
-                f"# n = {slope.value * 60:.6g} rpm * throttle {curve.offset.value * 60:+.4g} rpm"
-                f" (slope {_ends(slope, 60, 6)})",
-                f"n_max: {most.value * 60:.5g} rpm "
-                f" # {_ends(most, 60, 5) if curve.saturated else largest}",
-            ]
+            throttle, main["n_max"] = (share, n, curve), curve.n_max
+            numbers["throttle"] = _plain(curve._asdict())
+            lines["n_max"] = f"{curve.n_max.value * 60:.5g} rpm"
             tests.append("throttle map")
         if self.step is not None:
             runs = [(t, command, n) for t, command, n in self.step.read()]
             answer = fit_step(runs)
-            step, rate, dead = (runs, answer), answer.rate, answer.dead_time
-            figures["n_rate"] = MainFigure(rate.value, "1/s^2")
-            figures["dead_time"] = MainFigure(dead.value, "s")
-            numbers["step"] = {name: part._asdict() for name, part in answer._asdict().items()}
-            lines += [
-                f"n_rate: {rate.value * 60:.5g} rpm/s  # {_ends(rate, 60, 5)}",
-                f"# dead_time: {dead.value:.3g} s  ({_ends(dead, 1, 3)})",
-            ]
+            step = (runs, answer)
+            main |= {"n_rate": answer.rate, "dead_time": answer.dead_time}
+            numbers["step"] = _plain(answer._asdict())
+            lines["n_rate"] = f"{answer.rate.value * 60:.5g} rpm/s"
             tests.append("step response")
         if self.bollard is not None:
             n, force = self.bollard.together()
             thrust = fit_thrust(n, force, self.bollard.thrusters)
             pull = (n, force / self.bollard.thrusters, thrust)
             for name, fit in zip(("forward", "reverse"), thrust, strict=True):
-                curves = {f"c{i}": c for i, c in enumerate(fit.coefficients)}
-                entries = {key: c._asdict() for key, c in curves.items()}
-                numbers[name] = entries | {"low": fit.low, "high": fit.high, "rms": fit.rms}
-                values = ", ".join(f"{c.value:.6g}" for c in fit.coefficients)
-                lines.append(f"{name}: [{values}]  # rms residual {fit.rms:.3g} N per thruster")
-                lines += [f"#   {key}: {_ends(c, 1, 6)} {c.unit}" for key, c in curves.items()]
-            low, high = thrust[1].low * 60, thrust[0].high * 60
-            lines.append(f"curve_range: [{low:.5g} rpm, {high:.5g} rpm]")
+                found = {f"c{i}": c for i, c in enumerate(fit.coefficients)}
+                numbers[name] = _plain({**found, "low": fit.low, "high": fit.high, "rms": fit.rms})
+                lines[name] = [float(f"{c.value:.6g}") for c in fit.coefficients]
+            ends = (thrust[1].low, thrust[0].high)
+            lines["curve_range"] = [f"{end * 60:.5g} rpm" for end in ends]
             tests.append("thrust curves")
-        lines.append(f"source: {json.dumps(f'identified by residnet, run {self.name}')}")
-        text = "\n".join(lines) + "\n"
+        lines["source"] = f"identified by residnet, run {self.name}"
+        text = yaml.safe_dump(lines, sort_keys=False, default_flow_style=None)
         folder.write(folder.path / "actuators.yaml", text)
         folder.write_json(folder.path / "actuators.json", numbers)
         write_figures(folder.figures, [actuator_tests(self.name, throttle, step, pull)])
@@ -228,11 +210,12 @@ class ActuatorsTaskConfig(Task):
             f"The tests gave {' and '.join(tests)}; actuators.yaml holds the lines for a vessel"
             " file."
         )
-        return Outcome([sentence], figures, text)
+        figures = {name: MainFigure(one.value, one.unit) for name, one in main.items()}
+        return Outcome([sentence], figures, f"{parameter_table(numbers).text()}\n\n{text}")
 
 
-def _ends(estimate: Estimate, factor: float, digits: int) -> str:
-    return f"{estimate.low * factor:.{digits}g} .. {estimate.high * factor:.{digits}g}"
+def _plain(parts: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: v._asdict() if isinstance(v, Estimate) else v for k, v in parts.items()}
 
 
 def _read(path: Path, columns: Sequence[Column]) -> tuple[np.ndarray, ...]:

@@ -15,6 +15,7 @@ from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.base import files_of
 from residnet.data.split import log_names
+from residnet.report.sections.import_logs import log_row, log_table, loud_lines
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 
@@ -70,33 +71,24 @@ class ImportConfig(Task):
         paths = self._paths()
         reader, names = self.reader.build(), log_names(paths)
         findings: dict[str, Any] = {}
-        lines: list[str] = []
-        loud = 0
+        rows = []
         for number, path in enumerate(paths):
             report("reading recordings", number, len(paths))
             log = reader.read(path).replace(name=names[path])
             log.save(folder.path / "logs" / f"{file_stem(log.name)}.parquet")
-            found = findings[log.name] = log.meta.get("findings", [])
-            told = [f"{f['level']}: {f['text']}" for f in found if f["level"] != "note"]
-            loud += bool(told)
-            span = float(log.t[-1] - log.t[0])
-            hard = [mask.sum() for reason, mask in log.masks.items() if reason.startswith("hard:")]
-            lines.append(
-                f"{log.name}: {len(log)} samples, step {span / (len(log) - 1):.4g} s, {span:.1f} s,"
-                f" {len(log.channels)} channels ({', '.join(log.channels)}), {sum(map(int, hard))}"
-                f" samples in gaps, {len(found) - len(told)} notes"
-            )
-            lines += [f"{log.name}: {text}" for text in told]
+            findings[log.name] = log.meta.get("findings", [])
+            rows.append(log_row(log, findings[log.name]))
         report("reading recordings", len(paths), len(paths))
         folder.write_json(folder.path / "findings.json", findings)
-        folder.write(folder.path / "import.txt", "\n".join(lines) + "\n")
+        loud = sum(row["loud"] > 0 for row in rows)
         sentence = (
             f"{len(paths)} recording{'s were' if len(paths) > 1 else ' was'} read;"
             f" {loud or 'none'} of them {'have findings' if loud != 1 else 'has findings'} that"
             " need a look."
         )
         figures = {"logs": MainFigure(len(paths)), "logs_with_findings": MainFigure(loud)}
-        return Outcome([sentence], figures, "\n".join(lines))
+        text = "\n".join([log_table(rows).text(), *loud_lines(findings)])
+        return Outcome([sentence], figures, text)
 
     def _paths(self) -> list[Path]:
         root = self.root or Path.cwd()

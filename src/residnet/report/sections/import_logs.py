@@ -10,7 +10,7 @@ import numpy as np
 
 from residnet.core.format import minus, number, shown_unit, whole
 from residnet.core.log import Log
-from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text, bad_where, table_of
+from residnet.report.blocks import Block, Bullets, Section, Table, Text, bad_where, table_of
 from residnet.report.figure import GLANCE, SOLID, START, Case, Curve, Figure, Panel
 from residnet.report.figure_files import write_figure
 from residnet.report.run_reader import RunFiles
@@ -23,13 +23,8 @@ def sections(run: RunFiles) -> list[Section]:
     findings: Mapping[str, Sequence[Mapping[str, Any]]] = run.json("findings.json")
     logs = [Log.load(path) for path in sorted((run.path / "logs").glob("*.parquet"))]
     channels = [Section(log.name, [channel_table(log)], folded=True) for log in logs]
-    table = log_table(logs, findings)
-    severe = [
-        f"{log}: {finding['level']}: {minus(str(finding['text']))}"
-        for log, found in findings.items()
-        for finding in found
-        if finding["level"] != _NOTE
-    ]
+    table = log_table([log_row(log, findings.get(log.name, [])) for log in logs])
+    severe = loud_lines(findings)
     blocks: list[Block] = (
         [Bullets(severe, warning=True)] if severe else [Text("Nothing needs a look.")]
     )
@@ -77,33 +72,42 @@ def motion(logs: Sequence[Log]) -> Figure:
     )
 
 
-def log_table(logs: Sequence[Log], findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
-    """Return a row for each log: samples, step, duration, gaps and number of findings."""
+def loud_lines(findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+    """Return a line for each finding above a note, by the name of its log."""
+    return [
+        f"{log}: {finding['level']}: {minus(str(finding['text']))}"
+        for log, found in findings.items()
+        for finding in found
+        if finding["level"] != _NOTE
+    ]
 
-    def notes(log: Log) -> int:
-        return sum(finding["level"] == _NOTE for finding in findings.get(log.name, []))
 
-    def severe(log: Log) -> Cell:
-        count = len(findings.get(log.name, [])) - notes(log)
-        return bad_where(count, count)
+def log_row(log: Log, findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what a log holds, and how many of its findings are above a note."""
+    return {
+        "log": log.name,
+        "samples": len(log),
+        "duration": float(log.t[-1] - log.t[0]),
+        "channels": len(log.channels),
+        "lost": sum(int(mask.sum()) for why, mask in log.masks.items() if why.startswith("hard:")),
+        "loud": sum(finding["level"] != _NOTE for finding in findings),
+        "findings": len(findings),
+    }
 
-    def lost(log: Log) -> int:
-        return sum(int(mask.sum()) for kind, mask in log.masks.items() if kind.startswith("hard:"))
 
-    def duration(log: Log) -> float:
-        return float(log.t[-1] - log.t[0])
-
+def log_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return a row for each log, as `log_row` describes it."""
     return table_of(
-        logs,
+        rows,
         [
-            ("log", lambda log: log.name),
-            ("samples", len, whole),
-            ("step [s]", lambda log: number(duration(log) / max(len(log) - 1, 1), 4), str),
-            ("duration [s]", lambda log: number(duration(log), 4), str),
-            ("channels", lambda log: len(log.channels), str),
-            ("samples in gaps", lost, whole),
-            ("to look at", severe),
-            ("notes", notes, str),
+            ("log", "log"),
+            ("samples", "samples", whole),
+            ("step [s]", lambda row: number(row["duration"] / max(row["samples"] - 1, 1), 4), str),
+            ("duration [s]", lambda row: number(row["duration"], 4), str),
+            ("channels", "channels", str),
+            ("samples in gaps", "lost", whole),
+            ("to look at", lambda row: bad_where(row["loud"], row["loud"])),
+            ("notes", lambda row: row["findings"] - row["loud"], str),
         ],
     )
 

@@ -14,7 +14,7 @@ from residnet.core.format import plural, signed
 from residnet.judge.metrics import blocks, intervals
 from residnet.report.blocks import Cell, Column, Section, Table, Text, nested, table_of
 from residnet.report.figure import BLUE, Case, Figure, Look, Panel, joined, names_of, whiskers
-from residnet.report.figure_files import read_figures, write_figures
+from residnet.report.figure_files import write_figures
 from residnet.report.run_reader import Content, RunFiles
 
 
@@ -177,7 +177,7 @@ def sections(run: RunFiles) -> list[Section]:
     """Return the variants with their errors, and the figure that stands in the folder."""
     content = run.json("study.json")
     rows = content["rows"]
-    write_figures(run.path / "figures", [differences(rows, content["reference"])])
+    drawn = write_figures(run.path / "figures", [differences(rows, content["reference"])])
     about = [
         f"Free-run NRMSE of model {content['model']} on {content['split']} data, mean over the"
         f" windows and {plural(rows[0]['seeds'], 'seed')}.",
@@ -186,7 +186,7 @@ def sections(run: RunFiles) -> list[Section]:
         " blocks of windows.",
     ]
     shown = variants_table(rows, content["reference"])
-    return [Section("", [shown, *read_figures(run.path / "figures"), Text(about, quiet=True)])]
+    return [Section("", [shown, *drawn, Text(about, quiet=True)])]
 
 
 def variants_table(rows: Sequence[Content], reference: str) -> Table:

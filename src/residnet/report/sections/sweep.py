@@ -25,7 +25,7 @@ from residnet.report.figure import (
     names_of,
     steps,
 )
-from residnet.report.figure_files import read_figures, write_figures
+from residnet.report.figure_files import write_figures
 from residnet.report.run_reader import Content, RunFiles
 
 _SHOWN = 15
@@ -171,14 +171,14 @@ def sections(run: RunFiles) -> list[Section]:
         figures = [parallel_coordinates(content), _course(content)]
         if content["importance"]:
             figures.append(_shares(content))
-    write_figures(run.path / "figures", figures)
+    figures = write_figures(run.path / "figures", figures)
     about = [
         f"Each trial is a run of its own below trials/; sought is the"
         f" {'least' if content['minimized'] else 'greatest'} {objective(content)}.",
         "best.yaml holds the config of the best trial with all its keys.",
     ]
     by_number = sorted(content["trials"], key=lambda row: int(row["number"]))
-    figures, first = read_figures(run.path / "figures"), trials_table(content)
+    first = trials_table(content)
     return [
         Section(
             "", [*figures[:1], first.part(0, 1 + len(content["keys"])), Text(about, quiet=True)]
