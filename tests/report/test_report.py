@@ -229,10 +229,6 @@ def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
     page = html.unescape(text)
     for part in (
         (
-            "end 0.37 m and 1.4 deg from the measured pose on average (root mean square 0.47 m, 1.8"
-            " deg)"
-        ),
-        (
             "3 pairs of stretches (zigzag 3) in 2 of the logs of all splits have commands within 5"
             " % of their range"
         ),

@@ -94,9 +94,7 @@ def _side_by_side(run: RunFiles, protocol: str, sides: Sequence[str]) -> Table:
     """Return the errors of all models, the splits side by side for each quantity."""
 
     def cell(model: str, key: str, split: str) -> Cell:
-        own = run.kinds[model] in ("zero", "baseline")
-        base = None if own else run.row(run.baseline, split, protocol)
-        return _quantity(run, key, run.row(model, split, protocol), base)
+        return _quantity(run, key, run.row(model, split, protocol))
 
     quantities = _quantities(run, "NRMSE, mean [-]")
     return table_of(
@@ -124,10 +122,10 @@ def errors_table(run: RunFiles, split: str) -> Table:
     ]
 
     def cell(row: Content, key: str) -> Cell:
-        found = _quantity(run, key, row, None)
-        if key in run.channels:
-            return Cell(found.text)
-        return Cell(found.text, diverged_note(row), found.mark) if key == "nrmse" else found
+        found = _quantity(run, key, row)
+        # a terminal has no room for what stands in small print, but for what diverged
+        note = diverged_note(row) if key == "nrmse" else ""
+        return Cell(found.text, note, "" if key in run.channels else found.mark)
 
     return table_of(
         rows,
@@ -156,18 +154,13 @@ def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
         first = f"{row['manoeuvre'].replace('_', ' ')}: " if row["model"] == models[0] else ""
         return first + run.label(row["model"])
 
-    def cell(row: Content, key: str) -> Cell:
-        own = run.kinds[row["model"]] == "baseline"
-        base = None if own else run.row(run.baseline, split, protocol, row["manoeuvre"])
-        return _quantity(run, key, row, base)
-
     return table_of(
         rows,
         [
             ("manoeuvre, model", label),
             ("runs", "windows", str),
             *(
-                (title, lambda row, key=key: cell(row, key))
+                (title, lambda row, key=key: _quantity(run, key, row))
                 for key, title in _quantities(run).items()
             ),
         ],
@@ -176,7 +169,8 @@ def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
     )
 
 
-def _quantity(run: RunFiles, key: str, row: Content | None, base: Content | None) -> Cell:
+def _quantity(run: RunFiles, key: str, row: Content | None) -> Cell:
+    """Return what a row says of a quantity, and its change against the baseline's on its data."""
     if row is None:
         return Cell(DASH)
     if key == "diverged":
@@ -192,6 +186,9 @@ def _quantity(run: RunFiles, key: str, row: Content | None, base: Content | None
         value, factor = row["rmse"].get(key), run.unit(key)[1]
         if value is None:
             return Cell(DASH)
+        where = (row["split"], row["protocol"], row.get("manoeuvre", "all"))
+        own = run.kinds[row["model"]] in ("zero", "baseline")
+        base = None if own else run.row(run.baseline, *where)
         worse = base is not None and value > 1.005 * base["rmse"][key]
         small = change(value, base["rmse"][key]) if base is not None else ""
     note = "; ".join(text for text in (small, lost) if text)
@@ -210,22 +207,11 @@ def limits(run: RunFiles) -> Section | None:
         row = run.row(lead, run.focus, protocol)
         if row is not None:
             known = (run.limits.get("splits") or {}).get(run.focus, {}).get(protocol, {})
-            out = []
-            if found := known.get("kinematics"):
-                out.append(
-                    "Consistency of the measured channels: the measured velocities, integrated over"
-                    " each window from its measured pose, end"
-                    f" {listed(run.sized(found, '{}_mean'))} from the measured pose on average"
-                    f" (root mean square {', '.join(run.sized(found, '{}_rms'))}). A model that"
-                    f" predicted the measured velocities exactly would be off by as much; {lead} is"
-                    f" off by {listed(run.sized(row, '{}_error_end'))}."
-                )
-            if repeats := (run.limits.get("repeatability") or {}).get(protocol):
-                out.append(_repeatability(run, repeats))
+            repeats = (run.limits.get("repeatability") or {}).get(protocol)
             blocks = [
                 _where(run, lead, protocol, known),
                 None if protocol == run.main else _worst(run, lead, known),
-                Text(out),
+                Text(_repeatability(run, repeats)) if repeats else None,
             ]
             title = f"Protocol {protocol}" + ("" if parts else f", {run.focus} data")
             parts.append(Section(title, blocks, folded=bool(parts)))
@@ -245,35 +231,30 @@ def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table:
     """Return the errors by kind of manoeuvre, speed and wind."""
     lines: list[Content] = []
     for kind in ["all", *distinct(run, run.focus, protocol)]:
-        row = run.row(lead, run.focus, protocol, kind)
-        if row is not None:
-            shown = {"by": "kind", "label": kind.replace("_", " "), "value": row["nrmse"]["mean"]}
-            lines.append(
-                {**shown, "windows": row["windows"], "difference": row.get("difference") or {}}
-            )
+        if row := run.row(lead, run.focus, protocol, kind):
+            about = {"by": "kind", "label": kind.replace("_", " "), "windows": row["windows"]}
+            apart = row.get("difference") or {}
+            lines.append({**about, "value": row["nrmse"]["mean"], "apart": apart})
     for band in known.get("bands") or []:
-        found = band["models"].get(lead)
-        if found is not None:
+        if found := band["models"].get(lead):
             label = f"{band['by']} {number(band['low'], 2)} to {number(band['high'], 2)} m/s"
-            shown = {"by": band["by"], "label": label, "value": found["nrmse_mean"]}
-            lines.append(
-                {**shown, "windows": band["windows"], "difference": found["difference"] or {}}
-            )
-    reference = next((line["difference"]["to"] for line in lines if line["difference"]), None)
+            about = {"by": band["by"], "label": label, "windows": band["windows"]}
+            apart = found["difference"] or {}
+            lines.append({**about, "value": found["nrmse_mean"], "apart": apart})
+    reference = next((line["apart"]["to"] for line in lines if line["apart"]), None)
 
     def ratio(line: Content) -> Cell:
-        value = line["difference"].get("ratio")
+        value = line["apart"].get("ratio")
         text = DASH if value is None else percent(100 * (value - 1))
-        return bad_where(text, line["difference"].get("worse"))
+        return bad_where(text, line["apart"].get("worse"))
 
     def span(line: Content) -> Cell:
-        bounds = line["difference"].get("ci95")
+        bounds = line["apart"].get("ci95")
         text = " to ".join(map(signed, bounds)) if bounds else DASH
-        return Cell(text, mark="best" if line["difference"].get("excludes_zero") else "")
+        return Cell(text, mark="best" if line["apart"].get("excludes_zero") else "")
 
-    def less(line: Content) -> str:
-        apart = line["difference"].get("nrmse_mean")
-        return number(None if apart is None else line["value"] - apart)
+    def less(line: Content) -> float:
+        return float(line["value"] - line["apart"].get("nrmse_mean", math.nan))
 
     columns: list[Column] = [
         ("windows of", "label"),
@@ -282,16 +263,12 @@ def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table:
     ]
     if reference:
         columns += [
-            (f"NRMSE of {reference}", less, str),
+            (f"NRMSE of {reference}", less, number),
             ("change", ratio),
-            ("difference", "difference.nrmse_mean", _signed),
+            ("difference", "apart.nrmse_mean", lambda by: DASH if by is None else signed(by)),
             ("paired 95 % interval", span),
         ]
     return table_of(lines, columns, rule=lambda line: line["by"])
-
-
-def _signed(value: float | None) -> str:
-    return DASH if value is None else signed(value)
 
 
 def worst(run: RunFiles, figures: Sequence[Figure]) -> Section | None:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from residnet.core.errors import ConfigError
-from residnet.core.format import DASH, interval, number
+from residnet.core.format import DASH, fixed, interval, number
 from residnet.core.format import whole as whole_number
 from residnet.core.names import CHANNEL_UNITS
 from residnet.judge.verdict import diverged_note
@@ -58,12 +58,11 @@ def _baselines(run: RunFiles) -> Section | None:
         notes = run.fit(model)
         if not notes.get("coefficients"):
             continue
-        parts: list[Block] = [_coefficients(notes, digits=3, weak_is_grey=True)]
+        parts: list[Block] = [_coefficients(notes)]
+        title = f"Parameters of {model}"
         if notes.get("refit"):
             parts.insert(0, Text(_after_refit(model, notes), quiet=True))
-        title = f"Parameters of {model}" + (
-            ", refitted through rollouts" if notes.get("refit") else ""
-        )
+            title += ", refitted through rollouts"
         blocks += parts if len(blocks) == 1 else [Section(title, parts, folded=True)]
     return Section("Baseline parameters", blocks) if len(blocks) > 1 else None
 
@@ -73,43 +72,31 @@ def _after_refit(model: str, notes: Content) -> str:
         ", ".join(f"{term} in {axis.replace('_dot', '')}′" for axis, term in notes.get(key) or [])
         for key in ("feeding", "open")
     )
-    said = f" Left out, for their sign would feed energy: {at_rest}." if at_rest else ""
-    if left_open:
-        said += f" The data leave open, and they stay near 0: {left_open}."
-    return said_of_refit(model) + said
-
-
-def said_of_refit(model: str) -> str:
-    """Return what holds of the table of every refitted baseline."""
-    return (
+    said = (
         f"{model}: values and standard errors are those after the refit through rollouts. The"
         " ratios of value to error keep the error of the least-squares fit before it."
     )
+    if at_rest:
+        said += f" Left out, for their sign would feed energy: {at_rest}."
+    if left_open:
+        said += f" The data leave open, and they stay near 0: {left_open}."
+    return said
 
 
-def _weak(entry: Content, text: str) -> Cell:
-    """Return a cell that is grey where a value cannot be told from zero."""
-    weak = abs(float(entry["value"])) < 2 * float(entry["standard_error"])
-    return Cell(text, mark="weak" if weak else "")
-
-
-def _coefficients(notes: Content, digits: int, *, weak_is_grey: bool) -> Table:
-    """Return coefficients with their standard errors and units."""
+def _coefficients(notes: Content) -> Table:
+    """Return coefficients with their standard errors, to two digits of these, and units."""
 
     def value(entry: Content) -> str:
         value, error = float(entry["value"]), float(entry["standard_error"])
-        if not weak_is_grey:
-            return number(value, digits)
-        decimals = min(max(1 - math.floor(math.log10(error)), 0), 12) if error > 0 else 4
-        shown = f"{value:.{decimals}f}" if decimals <= 6 else number(value, digits)
-        return shown.replace("-", "−")
+        decimals = max(1 - math.floor(math.log10(error)), 0) if error > 0 else 7
+        # an exact one has no error to tell its digits by
+        return fixed(value, decimals) if decimals <= 6 else number(value, 4)
 
     def ratio(entry: Content) -> Cell:
         value, error = abs(float(entry["value"])), float(entry["standard_error"])
-        if error <= 0 or (not weak_is_grey and error <= 1e-9 * value):
-            return Cell(DASH if weak_is_grey else "exact")
-        text = number(value / error, 2)
-        return _weak(entry, text) if weak_is_grey else Cell(text)
+        if error <= 1e-9 * value:
+            return Cell("exact")
+        return Cell(number(value / error, 2), mark="weak" if value < 2 * error else "")
 
     return table_of(
         notes["coefficients"],
@@ -241,7 +228,7 @@ def _equations(model: str, notes: Content) -> Section:
         [
             Text(about, quiet=True),
             Code("\n".join(one["text"] for one in notes["equations"].values()), wrap=True),
-            _coefficients(notes, digits=4, weak_is_grey=False),
+            _coefficients(notes),
             Text(remarks(notes), quiet=True),
         ],
     )
