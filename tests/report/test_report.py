@@ -10,16 +10,22 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_fit_page, write_json
+from made_series import autoregressive
 from read_page import Page, plain
 
 from residnet.core.errors import DataError, UsageError
-from residnet.core.format import change, number
+from residnet.core.format import change, interval, number
+from residnet.core.log import Log
+from residnet.data.doctor import inspect, inspect_together, inspection
+from residnet.judge.goodness import OneStep, content, table
 from residnet.judge.soundness import CHECKS, Finding, sanity_content
+from residnet.report.blocks import Section, Table, Text
 from residnet.report.fit import write_fit_figures
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.models import term_unit
+from residnet.report.sections.models import goodness, term_unit
 
 
 def shown(run: Path) -> str:
@@ -306,6 +312,62 @@ def test_physical_sanity_is_shown_as_the_fit_found_it(run: Path) -> None:
     page = html.unescape(shown(run))
     assert "Physical sanity" in page
     assert "plsr, damping: words on damping" in page
+
+
+def sick(name: str, gyro: float) -> Log:
+    t = np.arange(0.0, 100.0, 0.1)
+    turn = {"psi": 0.5 * np.sin(0.2 * t), "r": 0.1 * np.cos(0.2 * t) + gyro}
+    move = {"u": 1.0 + 0.1 * np.sin(0.1 * t), "v": 0.05 * np.sin(0.3 * t)}
+    return Log(name, t, {**turn, **move, "delta": 0.3 * np.sin(0.21 * t)})
+
+
+def test_findings_above_a_note_stand_in_a_table_and_notes_below(run: Path) -> None:
+    assert 'id="data-doctor"' not in shown(run)
+    logs = [sick("first", np.radians(0.5)), sick("second", 0.0)]
+    clock = logs[1].t.copy()
+    clock[500:] += 7.0
+    logs[1] = logs[1].replace(t=clock)
+    reports = [inspect(log) for log in logs]
+    write_json(run / "doctor.json", inspection(reports, inspect_together(logs)))
+    text = shown(run)
+    loud = {one.code for report in reports for one in report.findings if one.level != "note"}
+    assert "gaps" in loud
+    page = text.partition('<section id="data-doctor">')[2].partition("</section>")[0]
+    assert '<a href="#data-doctor">Data doctor</a>' in text
+    for code in loud:
+        assert f'<th class="label"><div>{code.replace("_", " ")}</div></th>' in page
+    assert "split the log there (mask kind: gap)" in page
+    assert "10 Hz over" in page
+
+
+def test_goodness_of_fit_is_as_the_file_says(run: Path) -> None:
+    assert 'id="goodness-of-fit"' not in shown(run)
+    target = autoregressive(0.9, 3, 800, seed=0).T
+    noise = 0.01 * np.random.default_rng(0).normal(size=target.shape)
+    models = [
+        OneStep("baseline", "baseline", [4, 4, 4], [0.5 * target]),
+        OneStep("plsr", "head", [9, 9, 9], [0.4 * target + noise], "baseline"),
+    ]
+    rows = table(models, [target], 0.1)
+    write_json(run / "goodness.json", content("made", {"train": rows, "test": rows}, 0.1))
+    found = goodness(RunFiles(run))
+    assert found is not None
+    parts = [part for part in found.shown if isinstance(part, Section)]
+    units = {"surge u′": "m/s²", "sway v′": "m/s²", "yaw r′": "deg/s²"}
+    assert [part.title for part in parts] == [f"{k} [{u}], test data" for k, u in units.items()]
+    fits, residuals, sentences = parts[2].shown
+    assert isinstance(fits, Table)
+    assert isinstance(residuals, Table)
+    assert isinstance(sentences, Text)
+    yaw = {line.label: line.cells for line in residuals.rows}
+    line = next(line for line in rows if (line["model"], line["axis"]) == ("plsr", "r_dot"))
+    texts = [cell.text for cell in fits.rows[1].cells]
+    assert texts[:3] == ["9.00", number(DEG * line["rmse"]), number(line["r2"])]
+    assert yaw["plsr"][1].text == interval(line["mae_ci95"], DEG)
+    assert (yaw["plsr"][-1].note, yaw["plsr"][-1].mark) == ("to baseline", "best")
+    assert yaw["baseline"][-1].text == "–"
+    assert "times too narrow" in sentences.lines[0]
+    assert 'id="goodness-of-fit"' in shown(run)
 
 
 def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> None:

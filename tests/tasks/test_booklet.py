@@ -175,13 +175,6 @@ def test_the_report_shows_it(run: Path) -> None:
     assert len(list((run / "figures").glob("*booklet*.png"))) == 3
 
 
-def test_the_model_must_have_been_refitted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert call(monkeypatch, "check", write(tmp_path, model="other")) == 2
-    assert "booklet.model: no refitted baseline is named 'other'" in capsys.readouterr().err
-
-
 def test_a_manoeuvre_that_does_not_end_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -146,16 +146,6 @@ def test_models_read_back_give_the_same_rows(
     assert rows(out) == rows(tiny_run)
 
 
-def test_resume_needs_the_same_configuration(
-    tiny_config: Path,
-    tiny_run: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert call(monkeypatch, "run", tiny_config, "-s", "seed=9", "--out", tiny_run, "--resume") == 2
-    assert "another configuration" in capsys.readouterr().err
-
-
 def test_exported_module_runs_without_residnet(tiny_run: Path) -> None:
     script = """
 import json, sys, torch

@@ -21,7 +21,7 @@ from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.names import CHANNEL_UNITS, END_UNITS, to_si
 from residnet.core.units import known_unit
 from residnet.judge.metrics import INPUT, columns_of
-from residnet.judge.verdict import by_windows, sized
+from residnet.judge.verdict import by_windows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -302,12 +302,6 @@ class RunFiles:
     def end(self, end: str) -> tuple[str, str, float]:
         """Return name, unit and the factor to it from SI of an error at the end of free runs."""
         return self.place if end == "position" else end, *shown_unit(END_UNITS[end])
-
-    def sized(self, errors: Content, key: str) -> list[str]:
-        """Return errors of the pose with their units, from their keys, such as `{}_mean`."""
-        return [
-            sized(end, errors[key.format(end)]) for end in self.ends if key.format(end) in errors
-        ]
 
     def row(
         self, model: str | None, split: str, protocol: str, manoeuvre: str = "all"

@@ -17,7 +17,7 @@ from residnet.core.format import (
     signed,
     title_of,
 )
-from residnet.judge.verdict import diverged_note
+from residnet.judge.verdict import diverged_note, sized
 from residnet.report.blocks import (
     Block,
     Bullets,
@@ -325,7 +325,7 @@ def _repeatability(run: RunFiles, found: Content) -> str:
     kinds = ", ".join(
         f"{name.replace('_', ' ')} {part['pairs']}" for name, part in found["manoeuvres"].items()
     )
-    ends = listed(run.sized(found, "{}"))
+    ends = listed([sized(end, found[end]) for end in run.ends if end in found])
     place = f" and {number(share * found['position'], 2)} m" if "position" in run.ends else ""
     exogenous = (run.resolved.get("signals") or {}).get("exogenous")
     wind = " A model that knows the wind, as these do, can do better." if exogenous else ""
