@@ -12,9 +12,7 @@ from typing import Any, final
 
 from markupsafe import Markup, escape
 
-from residnet.core.config import load_mapping
-from residnet.core.errors import UsageError
-from residnet.core.files import read_json, whole
+from residnet.core.files import whole
 from residnet.core.format import powers
 from residnet.judge.verdict import LEVELS
 from residnet.report.blocks import (
@@ -30,6 +28,7 @@ from residnet.report.blocks import (
 )
 from residnet.report.browser import Drawn, draw
 from residnet.report.figure import Figure
+from residnet.report.run_reader import RunFiles
 
 _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
 _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
@@ -83,8 +82,7 @@ def write_page(
     # jinja2 is only needed where a page is written, not where a config is checked
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    path = run / "provenance.json"
-    record: Mapping[str, Any] = read_json(path) if path.is_file() else {}
+    record = RunFiles(run).provenance
     environment = Environment(
         loader=PackageLoader("residnet.report", "templates"),
         autoescape=True,
@@ -120,13 +118,6 @@ def write_page(
     return path
 
 
-def title_and_description(run: Path) -> tuple[str, str]:
-    """Return name and description of a run as its `resolved.yaml` gives them."""
-    path = run / "resolved.yaml"
-    resolved = load_mapping(path) if path.is_file() else {}
-    return str(resolved.get("name") or run.name), str(resolved.get("description") or "")
-
-
 def _figures(blocks: Sequence[Block]) -> list[Figure]:
     """Return the figures among blocks and the sections that they hold."""
     found: list[Figure] = []
@@ -142,26 +133,19 @@ def exports_section(run: Path) -> Section | None:
     """Return what a run exported for controllers, and what it could not; None where nothing.
 
     Raises:
-        UsageError: where exports.json is not readable.
+        DataError: where exports.json is not readable.
     """
-    file = run / EXPORTS
-    if not file.is_file():
+    rows = RunFiles(run).json(EXPORTS).get("exports") or []
+    if not rows:
         return None
-    try:
-        rows = [
-            (str(row["model"]), str(row["file"] or ""), str(row["fault"] or ""))
-            for row in read_json(file)["exports"]
-        ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{file}: not readable as a list of exports ({error})") from None
-    faults = [f"Not exported: {fault}." for _, _, fault in rows if fault]
+    faults = [f"Not exported: {row['fault']}." for row in rows if row["fault"]]
 
-    def result(row: Sequence[str]) -> Cell:
-        if row[2]:
+    def result(row: Mapping[str, Any]) -> Cell:
+        if row["fault"]:
             return bad_where("not exported", True)
         return Cell("the file gives the model's own answers", mark="text")
 
-    columns = [("model", lambda row: row[0]), ("file", lambda row: row[1]), ("result", result)]
+    columns = [("model", "model"), ("file", lambda row: row["file"] or ""), ("result", result)]
     blocks: list[Block] = [Bullets(faults, warning=True)] if faults else []
     return Section("Exports for controllers", [*blocks, table_of(rows, columns)])
 

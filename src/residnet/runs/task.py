@@ -334,12 +334,14 @@ class Task(Config):
     def _write_page(
         cls, run: RunFolder, sections: Sequence[Section], drawn: Drawn | None = None
     ) -> Path:
-        from residnet.report.page import exports_section, title_and_description, write_page
+        from residnet.report.page import exports_section, write_page
+        from residnet.report.run_reader import RunFiles
 
-        exports, summary = exports_section(run.path), run.read_summary()
+        exports, summary, files = exports_section(run.path), run.read_summary(), RunFiles(run.path)
         return write_page(
             run.path,
-            *title_and_description(run.path),
+            files.title,
+            files.description,
             summary["verdict"],
             [*sections, *([] if exports is None else [exports])],
             drawn,

@@ -29,7 +29,7 @@ from residnet.data.readers import ReaderConfig
 from residnet.export import FORMATS
 from residnet.heads import HeadConfig
 from residnet.manoeuvres import ManoeuvreConfig
-from residnet.report.blocks import Cell, Table
+from residnet.report.blocks import table_of
 from residnet.runs.folder import RunFolder, seal
 from residnet.runs.task import Task
 
@@ -192,17 +192,19 @@ def runs_text(folder: Path, entries: Sequence[Mapping[str, Any]]) -> str:
     """Return the runs as a table for the terminal."""
     if not entries:
         return f"{folder}: no runs"
-    table = Table(["run", "task", "state", "best", "age"])
-    for entry in entries:
-        figure, best, age = "", entry["best"], entry["age"]
-        if best is not None:
-            unit = "" if best["unit"] == "-" else f" {best['unit']}"
-            value = "not finite" if best["value"] is None else f"{best['value']:.4g}{unit}"
-            figure = f"{best['name']} {value}"
-        unit, size = next((pair for pair in _UNITS if age >= pair[1]), _UNITS[-1])
-        cells = (entry["task"], entry["state"], figure, f"{age / size:.0f} {unit}")
-        table.add(str(entry["run"]), [Cell(str(text), mark="text") for text in cells])
-    return table.text()
+
+    def best(entry: Mapping[str, Any]) -> str:
+        if (figure := entry["best"]) is None:
+            return ""
+        value = "not finite" if figure["value"] is None else f"{figure['value']:.4g}"
+        return f"{figure['name']} {value} {figure['unit']}".removesuffix(" -")
+
+    def age(entry: Mapping[str, Any]) -> str:
+        unit, size = next((pair for pair in _UNITS if entry["age"] >= pair[1]), _UNITS[-1])
+        return f"{entry['age'] / size:.0f} {unit}"
+
+    shown = [(key, key) for key in ("run", "task", "state")]
+    return table_of(entries, [*shown, ("best", best), ("age", age)]).text()
 
 
 def _entry(folder: Path) -> dict[str, Any]:

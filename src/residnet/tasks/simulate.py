@@ -354,17 +354,15 @@ class SimulateConfig(ComputingTask):
             " their logs are in the folder logs."
         ]
         verdict += [f"{row['craft']}, {row['log']}: {row['fault']}." for row in faults[:5]]
-        failures: list[str] = []
-        for craft, flights in flown:
-            for number, flight in enumerate(flights):
-                line = f"{craft.name}, {flight.log.name}: {flight.fault}"
-                if flight.fault and number < listed:
-                    failures.append(line)
-                elif flight.fault:
-                    say(line)
-        # the last one is the error itself
-        for line in failures[:-1]:
+        told = [
+            (f"{craft.name}, {flight.log.name}: {flight.fault}", number < listed)
+            for craft, flights in flown
+            for number, flight in enumerate(flights)
+            if flight.fault
+        ]
+        for line, _ in told:
             say(line)
+        failures = [line for line, of_config in told if of_config]
         failure = failures and (
             f"{failures[-1]} ({len(failures)} of {count} flights did not end as they should; give"
             " more duration, drive or steer)"
