@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.format import DASH, DEG, fixed, interval, number, plural, shown_unit
+from residnet.core.format import DASH, DEG, interval, number, plural, shown_unit
 from residnet.core.log import Log
 from residnet.data.simulated import Flight
 from residnet.manoeuvres.closed_loop import Spiral, Zigzag
@@ -115,10 +115,8 @@ def _flights(content: Content) -> Table:
         return index_title(telling(row)) or "ended as it should"
 
     def value(row: Content) -> str:
-        if not (name := telling(row)):
-            return DASH
-        unit, factor = shown_unit(str(content["units"].get(name, "-")))
-        return f"{number(_times(factor, row['indices'][name]))} {unit}"
+        found = _entries(row).get(telling(row))
+        return DASH if found is None else "{} {}".format(*_shown(content, telling(row), found))
 
     rows = sorted(content["rows"], key=lambda row: not row["fault"])
     several = len({row["craft"] for row in rows}) > 1
@@ -154,6 +152,27 @@ def indices_text(content: Content) -> str:
     return "\n\n".join(f"{title}\n{table.text()}" for title, table in index_tables(content))
 
 
+def _entries(row: Content) -> dict[str, Content]:
+    """Return the indices of a flight that are one number, with lengths and limits beside them."""
+    found: Content = row["indices"]
+    return {
+        name: {
+            "value": value,
+            "lengths": found.get(f"{name}_lengths"),
+            **row["limits"].get(name, {}),
+        }
+        for name, value in found.items()
+        if not isinstance(value, list) and not name.endswith("_lengths")
+    }
+
+
+def _shown(content: Content, name: str, entry: Content, key: str = "value") -> tuple[str, str]:
+    """Return a number of an index and its unit, as they are shown."""
+    unit, factor = shown_unit(str(content["units"].get(name, "-")))
+    value = entry.get(key)
+    return number(None if value is None else factor * value, 4), unit
+
+
 def index_tables(content: Content) -> list[tuple[str, Table]]:
     """Return titles and tables of the manoeuvring indices of indices.json.
 
@@ -163,85 +182,87 @@ def index_tables(content: Content) -> list[tuple[str, Table]]:
     groups: dict[str, list[Content]] = {}
     few = len({row["log"] for row in content["rows"]}) <= _EACH
     for row in content["rows"]:
-        groups.setdefault(str(row["log" if few else "manoeuvre"]), []).append(row)
-    make = _of_log if few else _of_kind
-    tables = [(name.replace("_", " "), make(content, rows)) for name, rows in groups.items()]
-    return [(title, table) for title, table in tables if table.rows and len(table.columns) > 1]
+        if _entries(row):
+            groups.setdefault(str(row["log" if few else "manoeuvre"]), []).append(row)
+    return [
+        (
+            name.replace("_", " "),
+            _by_index(content, {row["craft"]: _entries(row) for row in rows})
+            if few
+            else _by_flight(content, rows),
+        )
+        for name, rows in groups.items()
+    ]
 
 
-def _of_log(content: Content, rows: Sequence[Content]) -> Table:
-    """Return a row for each index of one log; of two crafts the second is compared to the first."""
-    crafts = [str(row["craft"]) for row in rows]
-    units = {name: shown_unit(str(content["units"].get(name, "-"))) for name in _single(rows)}
+def _by_index(content: Content, crafts: Mapping[str, Mapping[str, Content]]) -> Table:
+    """Return a row for each index of one manoeuvre; of two crafts the second is compared to the
+    first.
 
-    def value(place: int, name: str) -> str:
-        return number(_times(units[name][1], rows[place]["indices"].get(name)), 4)
+    Args:
+        content: whose `units` are those of the indices.
+        crafts: of what flew it `value` by index, and what there is of `lengths`, `interval` over
+            draws, `ship` at full scale, `limit`, `kept` and `kept_share` of the draws.
+    """
+    every = [entry for of in crafts.values() for entry in of.values()]
+
+    def shown(craft: str, key: str = "value") -> Any:
+        return lambda name: _shown(content, name, crafts[craft].get(name, {}), key)[0]
+
+    def lengths(craft: str) -> Any:
+        return lambda name: (crafts[craft].get(name) or {}).get("lengths")
 
     def apart(name: str) -> str:
-        first, second = (row["indices"].get(name) for row in rows)
-        return number(None if None in (first, second) else units[name][1] * (second - first))
-
-    def lengths(place: int, name: str) -> str:
-        found = rows[place]["indices"].get(f"{name}_lengths")
-        return "" if found is None else fixed(found, 2)
+        first, second = (of.get(name, {}).get("value") for of in crafts.values())
+        known = None not in (first, second)
+        return _shown(content, name, {"value": second - first if known else None})[0]
 
     def limit(name: str) -> Cell:
-        limits = [row["limits"][name] for row in rows if name in row["limits"]]
-        if not limits:
+        found = [of[name] for of in crafts.values() if "limit" in of.get(name, {})]
+        if not found:
             return Cell("")
-        kept = all(one["kept"] for one in limits)
-        text = number(units[name][1] * limits[0]["limit"], 4)
-        return Cell(text, "kept" if kept else "exceeded", "" if kept else "bad")
+        kept = all(entry["kept"] for entry in found)
+        share = found[0].get("kept_share")
+        note = ("kept" if kept else "exceeded") if share is None else f"kept by {100 * share:.0f} %"
+        return Cell(_shown(content, name, found[0], "limit")[0], note, "" if kept else "bad")
 
-    columns: list[Column] = [("index", index_title), ("unit", lambda name: units[name][0], str)]
-    columns += [
-        (craft, lambda name, place=place: value(place, name), str)
-        for place, craft in enumerate(crafts)
+    def within(name: str) -> str:
+        (of,) = crafts.values()
+        return interval(of[name].get("interval"), shown_unit(content["units"][name])[1])
+
+    columns: list[Column] = [
+        ("index", index_title),
+        ("unit", lambda name: _shown(content, name, {})[1], str),
+        *((craft, shown(craft), str) for craft in crafts),
     ]
-    if len(rows) == 2:
-        columns.append(("difference", apart, str))
-    if any(f"{name}_lengths" in row["indices"] for row in rows for name in units):
-        columns += [
-            (f"{craft} [L]", lambda name, place=place: lengths(place, name), str)
-            for place, craft in enumerate(crafts)
-        ]
-    if any(row["limits"] for row in rows):
+    columns += [("difference", apart, str)] * (len(crafts) == 2)
+    if any("interval" in entry for entry in every):
+        columns.append((f"{100 * content['level']:.0f} % interval", within, str))
+    if any(entry.get("lengths") is not None for entry in every):
+        columns += [(f"{craft} [L]", lengths(craft), 2) for craft in crafts]
+    if float(content.get("scale", 1)) != 1:
+        columns += [("ship", shown(craft, "ship"), str) for craft in crafts]
+    if any("limit" in entry for entry in every):
         columns.append(("IMO limit", limit))
-    return table_of(units, columns)
+    return table_of(dict.fromkeys(name for of in crafts.values() for name in of), columns)
 
 
-def _of_kind(content: Content, rows: Sequence[Content]) -> Table:
+def _by_flight(content: Content, rows: Sequence[Content]) -> Table:
     """Return a row for each flight of one kind of manoeuvre."""
     several = len({row["craft"] for row in rows}) > 1
 
-    def cell(row: Content, name: str, factor: float) -> Cell:
-        text = number(_times(factor, row["indices"].get(name)), 4)
-        beyond = name in row["limits"] and not row["limits"][name]["kept"]
-        return Cell(text, "beyond the IMO limit", "bad") if beyond else Cell(text)
+    def cell(row: Content, name: str) -> Cell:
+        entry = _entries(row).get(name, {})
+        text, _ = _shown(content, name, entry)
+        return Cell(text) if entry.get("kept", True) else Cell(text, "beyond the IMO limit", "bad")
 
     columns: list[Column] = [
         ("log", lambda row: f"{row['log']} ({row['craft']})" if several else row["log"])
     ]
-    for name in _single(rows):
-        unit, factor = shown_unit(str(content["units"].get(name, "-")))
-        title = f"{index_title(name)} [{unit}]"
-        columns.append((title, lambda row, name=name, factor=factor: cell(row, name, factor)))
+    for name in dict.fromkeys(name for row in rows for name in _entries(row)):
+        title = f"{index_title(name)} [{_shown(content, name, {})[1]}]"
+        columns.append((title, lambda row, name=name: cell(row, name)))
     return table_of(rows, columns)
-
-
-def _single(rows: Sequence[Content]) -> list[str]:
-    """Return the names of indices that are one number each; lengths are shown beside them."""
-    names = dict.fromkeys(name for row in rows for name in row["indices"])
-    return [
-        name
-        for name in names
-        if not name.endswith("_lengths")
-        and not any(isinstance(row["indices"].get(name), list) for row in rows)
-    ]
-
-
-def _times(factor: float, value: float | None) -> float | None:
-    return None if value is None else factor * value
 
 
 def flight_figures(flown: Mapping[str, Sequence[Flight]]) -> Iterator[Figure]:
@@ -378,7 +399,7 @@ def booklet(run: RunFiles) -> Section | None:
     blocks: list[Block] = [Text(about)]
     for page in content["pages"]:
         if not page["split"]:
-            parts: list[Block] = [_standard(content, page)]
+            parts: list[Block] = [_by_index(content, {content["model"]: page["indices"]})]
             if page["faults"]:
                 draws = plural(page["faults"], "draw")
                 text = f"The intervals leave out {draws} that did not end the manoeuvre."
@@ -404,40 +425,6 @@ def page_title(page: Content) -> str:
     """Return the name of a page, with the split of a measured log."""
     name = str(page["name"])
     return f"{name} ({page['split']})" if page["split"] else name.replace("_", " ")
-
-
-def _standard(content: Content, page: Content) -> Table:
-    """Return the indices of a standard manoeuvre with intervals and limits, a row for each."""
-    found = {
-        name: {"name": name, "factor": shown_unit(content["units"][name])[1], **entry}
-        for name, entry in page["indices"].items()
-    }
-
-    def value(key: str, absent: str = "") -> Any:
-        def text(row: Content) -> str:
-            return number(row["factor"] * row[key]) if key in row else absent
-
-        return text
-
-    def kept(row: Content) -> Cell:
-        share = row.get("kept_share")
-        text = "" if share is None else f"{100 * share:.0f} % of draws"
-        return Cell(text, mark="" if row.get("kept", True) else "bad")
-
-    columns: list[Column] = [
-        ("index", lambda row: index_title(row["name"])),
-        ("value", value("value"), str),
-        (
-            f"{100 * content['level']:.0f} % interval",
-            lambda row: interval(row.get("interval"), row["factor"]),
-            str,
-        ),
-        ("unit", lambda row: shown_unit(content["units"][row["name"]])[0], str),
-        ("lengths", lambda row: number(row["lengths"]) if "lengths" in row else "", str),
-    ]
-    columns += [("ship", value("ship"), str)] if float(content["scale"]) != 1 else []
-    columns += [("IMO limit", value("limit"), str), ("kept by", kept)]
-    return table_of(found.values(), columns)
 
 
 def _repeated(content: Content, pages: Sequence[Content]) -> Table:
