@@ -66,7 +66,8 @@ def write_page(
     `resolved.yaml`.
 
     Args:
-        description: what the run was made for, empty where nothing is to be said.
+        title: of the page, empty for the name of the run in the folder.
+        description: what the page is of, empty for what the run was made for.
         verdict: sentences that stand first, the first of them in bold.
         sections: from top to bottom. One without a title is the rest of the first screen: its
             first block stands beside the others where there is room.
@@ -82,7 +83,8 @@ def write_page(
     # jinja2 is only needed where a page is written, not where a config is checked
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    record = RunFiles(run).provenance
+    files = RunFiles(run)
+    record = files.provenance
     environment = Environment(
         loader=PackageLoader("residnet.report", "templates"),
         autoescape=True,
@@ -101,8 +103,8 @@ def write_page(
     }
     parts = [*sections, *_made_of(run, record)]
     text = environment.get_template("page.html.j2").render(
-        title=title,
-        description=description,
+        title=title or files.title,
+        description=description or files.description,
         version=str(record.get("residnet") or ""),
         date=str(record.get("started") or "")[:10],
         verdict=[sentence for sentence in verdict if sentence],

@@ -335,13 +335,12 @@ class Task(Config):
         cls, run: RunFolder, sections: Sequence[Section], drawn: Drawn | None = None
     ) -> Path:
         from residnet.report.page import exports_section, write_page
-        from residnet.report.run_reader import RunFiles
 
-        exports, summary, files = exports_section(run.path), run.read_summary(), RunFiles(run.path)
+        exports, summary = exports_section(run.path), run.read_summary()
         return write_page(
             run.path,
-            files.title,
-            files.description,
+            "",
+            "",
             summary["verdict"],
             [*sections, *([] if exports is None else [exports])],
             drawn,

@@ -146,9 +146,12 @@ def paired(runs: Sequence[JudgedRun]) -> dict[str, dict[str, Any]]:
     out: dict[str, dict[str, Any]] = {}
     scales = _scales(runs)
     for protocol, windows in _common(runs).items():
-        errors = [
-            np.array([_size(run.of[window].errors(run.model), scales) for window in windows])
+        squares = [
+            [run.of[window].errors(run.model)[scales.index].pow(2).mean() for window in windows]
             for run in runs
+        ]
+        errors = [
+            (pd.DataFrame(of_run).pow(0.5) / scales).mean(axis=1).to_numpy() for of_run in squares
         ]
         logs = list(dict.fromkeys(window[0] for window in windows))
         resampled = blocks([logs.index(window[0]) for window in windows])
@@ -166,11 +169,6 @@ def paired(runs: Sequence[JudgedRun]) -> dict[str, dict[str, Any]]:
 def _scales(runs: Sequence[JudgedRun]) -> pd.Series:
     """Return the first run's scales of what moves in all runs."""
     return pd.Series(runs[0].metrics["scales"], dtype=float)[shared_channels(runs)]
-
-
-def _size(errors: pd.DataFrame, scales: pd.Series) -> float:
-    """Return the mean over some channels of the root mean square over the samples that count."""
-    return float((errors[scales.index].pow(2).mean().pow(0.5) / scales).mean())
 
 
 def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> Table:

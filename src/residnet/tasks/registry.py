@@ -199,12 +199,13 @@ def runs_text(folder: Path, entries: Sequence[Mapping[str, Any]]) -> str:
         value = "not finite" if figure["value"] is None else f"{figure['value']:.4g}"
         return f"{figure['name']} {value} {figure['unit']}".removesuffix(" -")
 
-    def age(entry: Mapping[str, Any]) -> str:
-        unit, size = next((pair for pair in _UNITS if entry["age"] >= pair[1]), _UNITS[-1])
-        return f"{entry['age'] / size:.0f} {unit}"
+    columns = [*((key, key) for key in ("run", "task", "state")), ("best", best), ("age", _age)]
+    return table_of(entries, columns).text()
 
-    shown = [(key, key) for key in ("run", "task", "state")]
-    return table_of(entries, [*shown, ("best", best), ("age", age)]).text()
+
+def _age(entry: Mapping[str, Any]) -> str:
+    unit, size = next((pair for pair in _UNITS if entry["age"] >= pair[1]), _UNITS[-1])
+    return f"{entry['age'] / size:.0f} {unit}"
 
 
 def _entry(folder: Path) -> dict[str, Any]:

@@ -213,9 +213,9 @@ def _by_index(content: Content, crafts: Mapping[str, Mapping[str, Content]]) -> 
         return lambda name: (crafts[craft].get(name) or {}).get("lengths")
 
     def apart(name: str) -> str:
-        first, second = (of.get(name, {}).get("value") for of in crafts.values())
-        known = None not in (first, second)
-        return _shown(content, name, {"value": second - first if known else None})[0]
+        values: list[Any] = [of.get(name, {}).get("value") for of in crafts.values()]
+        difference = None if None in values else values[1] - values[0]
+        return _shown(content, name, {"value": difference})[0]
 
     def limit(name: str) -> Cell:
         found = [of[name] for of in crafts.values() if "limit" in of.get(name, {})]
