@@ -30,8 +30,12 @@ from residnet.report.browser import Drawn, draw
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
 
-_FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
-_FACTS = ("residnet", "git", "seed", "python", "machine", "started")
+_FACTS = {
+    **{"residnet": "residnet", "git": "git revision", "seed": "seed", "python": "Python"},
+    **{"machine": "machine", "started": "started (UTC)", "seconds": "duration"},
+    **{"packages": "packages", "config": "configuration", "overrides": "overrides"},
+}
+"""What is told of provenance.json, and its title."""
 
 
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
@@ -170,22 +174,13 @@ def _made_of(run: Path, record: Mapping[str, Any]) -> list[Section]:
 
 def provenance_facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return name and text of each fact of `provenance.json` that a reader may want."""
-    facts = [
-        (_FACT_TITLES.get(key, key), str(record[key]))
-        for key in _FACTS
-        if record.get(key) is not None
-    ]
-    if record.get("seconds") is not None:
-        facts.append(("duration", f"{record['seconds']:.0f} s"))
-    packages = record.get("packages") or {}
-    if packages:
-        known = [f"{name} {version}" for name, version in packages.items() if version]
-        facts.append(("packages", ", ".join(known)))
-    if record.get("config"):
-        facts.append(("configuration", str(record["config"])))
-    if record.get("overrides"):
-        facts.append(("overrides", " ".join(record["overrides"])))
-    return facts
+    packages = (record.get("packages") or {}).items()
+    told = {**record, "overrides": " ".join(record.get("overrides") or ())}
+    if (seconds := record.get("seconds")) is not None:
+        told["seconds"] = f"{seconds:.0f} s"
+    told["packages"] = ", ".join(f"{name} {version}" for name, version in packages if version)
+    known = {title: told.get(key) for key, title in _FACTS.items()}
+    return [(title, str(value)) for title, value in known.items() if value not in (None, "")]
 
 
 def _breakable(text: str) -> Markup:
