@@ -17,7 +17,7 @@ from made_series import autoregressive
 from read_page import Page, plain
 
 from residnet.core.errors import DataError, UsageError
-from residnet.core.format import change, interval, number
+from residnet.core.format import interval, number
 from residnet.core.log import Log
 from residnet.data.doctor import inspect, inspect_together, inspection
 from residnet.judge.goodness import OneStep, content, table
@@ -167,14 +167,7 @@ def limits_file() -> dict[str, Any]:
             "position_error_end": 4.2,
         }
     ]
-    kinematics = {
-        "windows": 6,
-        "position_mean": 0.37,
-        "position_rms": 0.47,
-        "heading_mean": 1.35 / DEG,
-        "heading_rms": 1.8 / DEG,
-    }
-    part = {"kinematics": kinematics, "bands": bands, "worst": {"plsr": worst}}
+    part = {"bands": bands, "worst": {"plsr": worst}}
     tolerance = {"command_share_of_range": 0.05, "start": {"u": 0.125, "v": 0.0625, "r": 0.0625}}
     motion = {"u": 0.04, "v": 0.02, "r": 1 / DEG, "position": 2.0, "heading": 5 / DEG, "nrmse": 0.2}
     repeats = {
@@ -428,13 +421,6 @@ def test_folders_that_cannot_be_read_are_refused_by_name(tmp_path: Path) -> None
 )
 def test_rounding(value: float | None, text: str) -> None:
     assert number(value) == text
-
-
-def test_changes() -> None:
-    assert change(0.5, 1.0) == "−50 %"
-    assert change(1.02, 1.0) == "+2 %"
-    assert change(0.9999, 1.0) == "0 %"
-    assert change(1.0, 0.0) == ""
 
 
 @pytest.mark.parametrize(

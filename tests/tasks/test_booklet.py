@@ -105,15 +105,11 @@ def write(folder: Path, **changes: Any) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("booklet")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        assert call(monkeypatch, "run", write(folder), "--out", folder / "run") == 0
-    return folder / "run"
-
-
-def test_pages_hold_values_within_intervals_and_limits(run: Path) -> None:
+def test_pages_hold_values_with_intervals_and_limits_beside_measured_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    assert call(monkeypatch, "run", write(tmp_path), "--out", run) == 0
     booklet = json.loads((run / "booklet.json").read_text())
     pages = {page["name"]: page for page in booklet["pages"]}
     assert booklet["draws"] == 20
@@ -131,6 +127,22 @@ def test_pages_hold_values_within_intervals_and_limits(run: Path) -> None:
     assert circle["time_90"]["ship"] == pytest.approx(2.0 * circle["time_90"]["value"])
     assert zigzag["initial_turning_distance"]["limit"] == pytest.approx(2.5 * 24.0)
     assert zigzag["first_overshoot"]["kept"] in (True, False)
+    repeated = [page for page in booklet["pages"] if page["split"]]
+    assert {page["split"] for page in repeated} == {"validation", "test"}
+    assert len(repeated) == 6
+    for page in repeated:
+        found = page["indices"]
+        # the form of the model is nearly the plant's: what is left is within the turning of one
+        # sample and of the gear's response (0.2 s each), which a rate alone leaves out
+        assert (
+            abs(found["first_overshoot"]["difference"])
+            < 0.4 * found["largest_yaw_rate"]["measured"]
+        ), page["name"]
+        assert found["first_overshoot"]["measured"] > 0.02
+    text = plain(run / "report.html")
+    assert "Manoeuvring booklet" in text
+    assert "tactical diameter" in text
+    assert len(list((run / "figures").glob("*booklet*.png"))) == 3
 
 
 def test_a_vessel_that_rolls(
@@ -150,29 +162,6 @@ def test_a_vessel_that_rolls(
     assert "they narrow the intervals of predictions" in capsys.readouterr().out
     tracks = (tmp_path / "plan" / "next_tracks.csv").read_text()
     assert tracks.count("\n") > 100
-
-
-def test_measured_zigzags_are_repeated(run: Path) -> None:
-    booklet = json.loads((run / "booklet.json").read_text())
-    repeated = [page for page in booklet["pages"] if page["split"]]
-    assert {page["split"] for page in repeated} == {"validation", "test"}
-    assert len(repeated) == 6
-    for page in repeated:
-        found = page["indices"]
-        # the form of the model is nearly the plant's: what is left is within the turning of one
-        # sample and of the gear's response (0.2 s each), which a rate alone leaves out
-        assert (
-            abs(found["first_overshoot"]["difference"])
-            < 0.4 * found["largest_yaw_rate"]["measured"]
-        ), page["name"]
-        assert found["first_overshoot"]["measured"] > 0.02
-
-
-def test_the_report_shows_it(run: Path) -> None:
-    text = plain(run / "report.html")
-    assert "Manoeuvring booklet" in text
-    assert "tactical diameter" in text
-    assert len(list((run / "figures").glob("*booklet*.png"))) == 3
 
 
 def test_a_manoeuvre_that_does_not_end_is_named(
