@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,7 +13,7 @@ import numpy as np
 
 from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
-from residnet.core.files import read_table
+from residnet.core.files import file_stem, read_table
 from residnet.core.format import SHOWN_UNITS, shown_unit
 from residnet.core.frames import wrap_array
 from residnet.core.layout import ALIVE, SIX, Live
@@ -362,23 +361,11 @@ class RunFiles:
         notes: Content = self.json(f"models/{model}/fit.json")
         return notes
 
-    def manoeuvre_of(self, log: str) -> str:
-        """Return the kind of manoeuvre of a log.
-
-        It is the recorded one, else the one that its name begins with, else its name without a
-        number.
-        """
-        recorded = {entry["log"]: entry.get("manoeuvre") for entry in self.quality}
-        if recorded.get(log):
-            return str(recorded[log])
-        known = {str(row.get("manoeuvre", "all")) for row in self.rows} - {"all"}
-        fitting = sorted((name for name in known if log.startswith(name)), key=len)
-        return fitting[-1] if fitting else re.sub(r"[_-]?\d+$", "", log) or log
-
     def windows(self, split: str) -> list[StoredWindow]:
         """Return all stored free runs of a split, in the order of the file names."""
         out: list[StoredWindow] = []
         names = columns_of(self.live)
+        kinds = {file_stem(entry["log"]): entry.get("manoeuvre") for entry in self.quality}
         for path in sorted((self.path / "rollouts" / split).glob("*.parquet")):
             table = read_table(path)
             for (protocol, number), group in table.groupby(["protocol", "window"], sort=True):
@@ -387,7 +374,7 @@ class RunFiles:
                 out.append(
                     StoredWindow(
                         log=path.stem,
-                        manoeuvre=self.manoeuvre_of(path.stem),
+                        manoeuvre=str(kinds.get(path.stem) or "unknown"),
                         protocol=str(protocol),
                         number=int(str(number)),
                         t=first["t"].to_numpy(float),

@@ -29,7 +29,6 @@ def fitted_on_what(run: RunFiles) -> Section | None:
     """Return the section on the data, None where the folder says nothing about them."""
     baseline = run.resolved.get("baseline") or {}
     samples = run.fit(run.baseline or "baseline").get("samples")
-    fit = f", fitted on {samples} samples" if samples else ""
     logs: dict[str, list[Content]] = {}
     for entry in run.quality:
         logs.setdefault(entry["split"], []).append(entry)
@@ -37,40 +36,35 @@ def fitted_on_what(run: RunFiles) -> Section | None:
         f"{split} {len(members)} logs, {sum(log['seconds'] for log in members) / 60:.1f} min"
         for split, members in logs.items()
     ]
-    protocols = run.evaluation.get("protocols") or {}
     scales = [
         f"{name} {number(run.unit(name)[1] * value)} {run.unit(name)[0]}"
         for name, value in (run.metrics.get("scales") or {}).items()
     ]
     signals = run.resolved.get("signals") or {}
-    text = ", ".join(signals.get("inputs") or [])
-    if signals.get("exogenous"):
-        text += "; exogenous: " + ", ".join(signals["exogenous"])
-    if signals.get("forces"):
-        text += (
-            f"; forces from the thrusters of {signals['forces']}"
-            if isinstance(signals["forces"], str)
-            else "; forces from given thrusters"
-        )
-    facts = [
-        ("data", _data(run)),
-        ("splits", "; ".join(splits)),
-        ("inputs", text),
-        ("velocities", run.live.text),
-        *_model(run),
-    ]
-    facts.append(("baseline", str(baseline.get("kind", "")) + fit if baseline else ""))
-    for name, protocol in protocols.items():
-        facts.append(
-            (
-                f"protocol {name}",
-                _protocol(protocol)
-                + ("; selects the model" if name == run.evaluation.get("selection") else ""),
-            )
-        )
-    facts.append(("NRMSE divides by", ", ".join(scales)))
-    facts = [(name, text) for name, text in facts if text]
-    blocks: list[Block] = [Facts(facts)] if facts else []
+    forces = signals.get("forces")
+    thrusters = f"the thrusters of {forces}" if isinstance(forces, str) else "given thrusters"
+    inputs = (
+        ", ".join(signals.get("inputs") or []),
+        "exogenous: " + ", ".join(signals["exogenous"]) if signals.get("exogenous") else "",
+        f"forces from {thrusters}" if forces else "",
+    )
+    fit = f", fitted on {samples} samples" if samples else ""
+    facts = {
+        "data": _data(run),
+        "splits": "; ".join(splits),
+        "inputs": "; ".join(filter(None, inputs)),
+        "velocities": run.live.text,
+        **_model(run),
+        "baseline": str(baseline.get("kind", "")) + fit if baseline else "",
+        **{
+            f"protocol {name}": _protocol(protocol)
+            + ("; selects the model" if name == run.evaluation.get("selection") else "")
+            for name, protocol in (run.evaluation.get("protocols") or {}).items()
+        },
+        "NRMSE divides by": ", ".join(scales),
+    }
+    known = [(name, text) for name, text in facts.items() if text]
+    blocks: list[Block] = [Facts(known)] if known else []
     if run.quality:
         short, full = quality_tables(run)
         short.caption = (
@@ -124,10 +118,10 @@ def _data(run: RunFiles) -> str:
     return text + f"; data seed {data.get('seed')}"
 
 
-def _model(run: RunFiles) -> list[tuple[str, str]]:
+def _model(run: RunFiles) -> dict[str, str]:
     card = run.card(run.baseline or "baseline")
     if not card:
-        return []
+        return {}
     signals = card.get("signals") or {}
     names = [*run.live.moving, *(signals.get("inputs") or []), *(signals.get("exogenous") or [])]
     ranges = []
@@ -138,10 +132,10 @@ def _model(run: RunFiles) -> list[tuple[str, str]]:
         ranges.append(
             f"{name} {number(factor * low)} to {number(factor * high)} {unit}".removesuffix(" -")
         )
-    return [
-        ("model step", f"{card['dt']:g} s, {card['integrator']}; inputs held over a step"),
-        ("training range", "; ".join(ranges)),
-    ]
+    return {
+        "model step": f"{card['dt']:g} s, {card['integrator']}; inputs held over a step",
+        "training range": "; ".join(ranges),
+    }
 
 
 def _protocol(protocol: Content) -> str:

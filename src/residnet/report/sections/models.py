@@ -199,22 +199,24 @@ def _foundation(run: RunFiles, model: str) -> str:
     return inputs if below == "baseline" else f"{inputs}; {below}"
 
 
+_COMPLEXITY = {
+    "terms": "{} basis functions",
+    "order": "order {} (latent variables)",
+    "penalty": "penalty {}",
+    "hidden": "layers of {}",
+    "hidden_size": "{} hidden units",
+}
+"""What notes and cards of heads hold, and how it is told."""
+
+
 def _complexity(run: RunFiles, model: str) -> str:
-    notes, head = run.fit(model), run.card(model).get("head") or {}
-    parts = []
-    if "terms" in notes:
-        parts.append(f"{notes['terms']} basis functions")
-    if "order" in notes:
-        parts.append(f"order {notes['order']} (latent variables)")
-    if "penalty" in notes:
-        penalties = notes["penalty"] if isinstance(notes["penalty"], list) else [notes["penalty"]]
-        parts.append("penalty " + ", ".join(f"{value:g}" for value in penalties))
-    if "hidden" in head:
-        parts.append("layers of " + ", ".join(str(units) for units in head["hidden"]))
-    if "hidden_size" in head:
-        each = " for each axis" if head.get("per_axis") else ""
-        parts.append(f"{head['hidden_size']} hidden units{each}")
-    return "; ".join(parts) or DASH
+    head = run.card(model).get("head") or {}
+    known, parts = {**head, **run.fit(model)}, []
+    for key, words in _COMPLEXITY.items():
+        if key in known:
+            values = known[key] if isinstance(known[key], list) else [known[key]]
+            parts.append(words.format(", ".join(f"{value:g}" for value in values)))
+    return ("; ".join(parts) or DASH) + (" for each axis" if head.get("per_axis") else "")
 
 
 def _equations(model: str, notes: Content) -> Section:
