@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from exported_policies import DT, GAIN, LIMIT, SPEED, TIME, observed
 
-from residnet.control.heading.controllers import ObservedPolicySpec, PtosConfig
 from residnet.control.heading.policies import NetworkPolicy
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.dynamics.store import save_model
@@ -21,7 +21,7 @@ from residnet.export.policy import ExportedHeading
 from residnet.physics.vessel import load_vessel
 
 SOURCE = Path(__file__).parents[2] / "examples" / "autopilot_cpp"
-GAIN, TIME, SPEED, DT, HEADING = 3.47, 3.94, 3.2, 0.02, math.radians(30)
+HEADING = math.radians(30)
 
 pytestmark = [
     pytest.mark.long,
@@ -36,16 +36,9 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     build = tmp_path_factory.mktemp("build")
+    prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
     for words in (
-        [
-            "cmake",
-            "-S",
-            str(SOURCE),
-            "-B",
-            str(build),
-            f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}",
-            "-DCMAKE_BUILD_TYPE=Debug",
-        ],
+        ["cmake", "-S", str(SOURCE), "-B", str(build), prefix, "-DCMAKE_BUILD_TYPE=Debug"],
         ["cmake", "--build", str(build)],
     ):
         done = subprocess.run(words, capture_output=True, text=True)
@@ -56,11 +49,9 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     vessel = SteeredPlant(load_vessel("nomoto_oceanos").build())
-    limit = math.radians(5)
     torch.manual_seed(0)
-    own = NetworkPolicy(
-        vessel.state, turning=vessel.turning(limit, 60.0), limit=limit, dt=DT, units=4
-    )
+    turning = vessel.turning(LIMIT, 60.0)
+    own = NetworkPolicy(vessel.state, turning=turning, limit=LIMIT, dt=DT, units=4)
     with torch.no_grad():
         own.network.out.weight.copy_(0.05 * torch.randn_like(own.network.out.weight))
     file = tmp_path_factory.mktemp("policy") / "policy.pt"
@@ -107,17 +98,7 @@ def test_an_observed_policy_steers_alike_with_delay_and_noise(
     """The example's own comparison: the same track in C++ and in Python, with commands 0.2 s late
     and noise of 0.1 deg and 0.1 deg/s.
     """
-    law = PtosConfig(
-        lag=0.3, steepness=37.0, share=0.65, damping=0.88, heading_rate=2.0, yaw_rate_rate=5.0,
-        push_rate=1.0, cross_rate=0.3,
-    )  # fmt: skip
-    torch.manual_seed(0)
-    spec = ObservedPolicySpec(
-        state=("psi", "u", "r"), gain=GAIN, time=TIME, speed=SPEED, limit=math.radians(5),
-        rate=None, dt=DT, trained_at=0.04, law=law, units=4,
-    )  # fmt: skip
-    own = spec.build().requires_grad_(False)
-    own.network.out.weight.normal_(std=0.02)
+    spec, own = observed(None)
     save_model(tmp_path / "models" / "p", spec, own)
     file = tmp_path / "exports" / "p.pt"
     file.parent.mkdir()

@@ -1,4 +1,4 @@
-"""The band of an exported model: a method in TorchScript, a table in the card."""
+"""The band of an exported model: a method in TorchScript and in C, a table in the card."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from residnet.dynamics.store import BandTable
 from residnet.export import exporter, vessel
 from residnet.export.c import compile_shared
-from residnet.export.vessel import ExportedModel, ExportedVessel
+from residnet.export.vessel import ExportedVessel
 from residnet.physics.signals import SignalsConfig
 from residnet.testing.checks import ROLLING, SIGNALS, SUBMERGED, example_model, example_spec
 
@@ -31,22 +31,14 @@ ROLLS = TABLE.model_copy(update={"p": (0.01, 0.03, 0.03), "phi": (0.001, 0.02, 0
 SIX = ROLLS.model_copy(
     update={"w": (0.1, 0.2, 0.3), "q": (0.01, 0.02, 0.03), "z": (0.1, 0.3, 0.9), "theta": ROLLS.phi}
 )
-CASES = pytest.mark.parametrize(
+LAYOUTS = (SIGNALS, ROLLING, SUBMERGED)
+
+
+@pytest.mark.parametrize(
     ("table", "signals"),
-    [
-        (TABLE, SIGNALS),
-        (None, SIGNALS),
-        (ROLLS, ROLLING),
-        (None, ROLLING),
-        (SIX, SUBMERGED),
-        (None, SUBMERGED),
-    ],
-    ids=["band", "none", "roll", "none of roll", "six", "none of six"],
+    [(TABLE, SIGNALS), (ROLLS, ROLLING), (SIX, SUBMERGED), *((None, s) for s in LAYOUTS)],
 )
-
-
-@CASES
-def test_half_widths_are_those_of_the_table(
+def test_half_widths_are_those_of_the_table_in_torchscript_and_in_c(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     table: BandTable | None,
@@ -54,48 +46,27 @@ def test_half_widths_are_those_of_the_table(
 ) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 5)
     spec = example_spec(None, signals).model_copy(update={"band": table})
-    exported = ExportedVessel(spec, example_model(spec))
+    exported, file = ExportedVessel(spec, example_model(spec)), tmp_path / "boat.c"
     card = exporter("torchscript").export(exported, tmp_path / "model.pt")
     loaded = torch.jit.load(str(tmp_path / "model.pt"))
-    assert loaded.band(0).tolist() == [0.0] * len(signals.live.layout.banded)
+    exporter("c").export(exported, file)
+    library = ctypes.CDLL(str(compile_shared([file], tmp_path / "boat.so", ["-DEXAMPLE_DOUBLE"])))
+    half = np.zeros(len(signals.live.layout.banded))
+    for k in (-3, 0, 1, 7, 10, 20, 29, 30, 60):
+        library.example_band(k, half.ctypes.data_as(ctypes.c_void_p))
+        assert half.tolist() == pytest.approx(loaded.band(k).tolist(), rel=1e-6)
+    assert loaded.band(0).tolist() == [0.0] * len(half)
     if table is None:
         assert card["band"] is None
         assert torch.isinf(loaded.band(7)).all()
         return
-    wanted = torch.tensor(table.columns).T
-    torch.testing.assert_close(loaded.band(1), wanted[0])
-    torch.testing.assert_close(loaded.band(10), wanted[1])
-    torch.testing.assert_close(loaded.band(20), 0.5 * (wanted[1] + wanted[2]))
-    torch.testing.assert_close(loaded.band(30), wanted[2])
-    torch.testing.assert_close(loaded.band(60), 2.0 * wanted[2])
+    first, middle, last = torch.tensor(table.columns).T
+    wanted = {1: first, 10: middle, 20: 0.5 * (middle + last), 30: last, 60: 2.0 * last}
+    for k, row in wanted.items():
+        torch.testing.assert_close(loaded.band(k), row)
     assert card["band"]["horizon"] == pytest.approx(30 * spec.dt)
     assert card["band"]["cautions"] == ["It is a test."]
     assert ("phi" in card["band"]) == signals.live.rolls
-
-
-@CASES
-def test_c_has_the_same_half_widths(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    table: BandTable | None,
-    signals: SignalsConfig,
-) -> None:
-    monkeypatch.setattr(vessel, "PARITY_STEPS", 5)
-    spec = example_spec(None, signals).model_copy(update={"band": table})
-    model = example_model(spec)
-    exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
-    library = ctypes.CDLL(
-        str(compile_shared([tmp_path / "boat.c"], tmp_path / "boat.so", ["-DEXAMPLE_DOUBLE"]))
-    )
-    half = np.zeros(len(signals.live.layout.banded))
-
-    def band(k: int) -> list[float]:
-        library.example_band(k, half.ctypes.data_as(ctypes.c_void_p))
-        return half.tolist()
-
-    exported = ExportedModel(model.float(), spec)
-    for k in (-3, 0, 1, 7, 10, 20, 29, 30, 60):
-        assert band(k) == pytest.approx(exported.band(k).tolist(), rel=1e-6)
 
 
 def test_a_column_of_another_length_is_refused() -> None:

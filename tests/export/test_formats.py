@@ -130,12 +130,11 @@ def test_torchscript_is_the_model(variant: str, tmp_path: Path) -> None:
 
 
 def test_what_is_worse_than_nothing_is_withheld_or_marked() -> None:
+    made = exported("lstm")
     with pytest.raises(WithheldError, match=r"model mine is withheld: it drifts; .* --anyway"):
-        released(exported("lstm"), ["it drifts"], anyway=False)
-    assert released(exported("lstm"), ["it drifts"], anyway=True).card()["objections"] == [
-        "it drifts"
-    ]
-    assert released(exported("lstm"), [], anyway=False).card()["objections"] == []
+        released(made, ["it drifts"], anyway=False)
+    assert released(made, ["it drifts"], anyway=True).card()["objections"] == ["it drifts"]
+    assert released(made, [], anyway=False).card()["objections"] == []
 
 
 def test_the_card_says_what_a_controller_needs() -> None:
@@ -179,14 +178,11 @@ def test_outside_flags_each_channel_beyond_its_range() -> None:
 
 
 def test_an_ensemble_exports_and_names_its_members(tmp_path: Path) -> None:
-    parts = [built("mlp"), built("lstm")]
-    members = tuple(
-        spec.model_copy(update={"name": name})
-        for (spec, _), name in zip(parts, ("one", "two"), strict=True)
-    )
+    parts = dict(zip(("one", "two"), (built("mlp"), built("lstm")), strict=True))
+    members = tuple(part.model_copy(update={"name": name}) for name, (part, _) in parts.items())
     spec = spec_of(None, role="ensemble", baseline={"kind": "still"})
     spec = spec.model_copy(update={"members": members})
-    made = ExportedVessel(spec, mean_of([model for _, model in parts]))
+    made = ExportedVessel(spec, mean_of([model for _, model in parts.values()]))
     card = exporter("torchscript").export(made, tmp_path / "mean.pt")
     told = [(member["name"], member["head"]["kind"]) for member in card["members"]]
     assert told == [("one", "mlp"), ("two", "lstm")]

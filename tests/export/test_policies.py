@@ -11,18 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from exported_policies import DEG, DT, GAIN, LIMIT, SETTINGS, SPEED, TIME, observed
 from s_functions import SFunction
 from torch import Tensor
 
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance import CourseGuidance, DriftEstimate
-from residnet.control.heading.controllers import (
-    DepthPolicySpec,
-    NetworkPolicySpec,
-    ObservedPolicySpec,
-    PtosConfig,
-)
-from residnet.control.heading.policies import FIXED, ObservedPolicy
+from residnet.control.heading.controllers import DepthPolicySpec, NetworkPolicySpec
+from residnet.control.heading.policies import FIXED
 from residnet.core.errors import UsageError
 from residnet.export import exporter, policy
 from residnet.export.base import Loaded
@@ -30,30 +26,12 @@ from residnet.export.c import CompiledModel, compile_shared
 from residnet.export.policy import COURSE, ExportedController, ExportedCoursePolicy, ExportedHeading
 from residnet.testing.checks import check_bad_measurements
 
-DEG = math.pi / 180
-DT, GAIN, TIME, SPEED, LIMIT = 0.02, 3.47, 3.94, 3.2, 5 * DEG
 FAR = 12_000.0
 """Metres from the origin of the chart, where single precision resolves a millimetre."""
-LAW = PtosConfig(
-    lag=0.3, steepness=37.0, share=0.65, damping=0.88, heading_rate=2.0, yaw_rate_rate=5.0,
-    push_rate=1.0, cross_rate=0.3,
-)  # fmt: skip
-SETTINGS: dict[str, Any] = {
-    "state": ("psi", "u", "r"), "gain": GAIN, "time": TIME, "speed": SPEED, "limit": LIMIT,
-    "dt": DT, "trained_at": 0.04, "units": 4,
-}  # fmt: skip
-
-
-def observed(rate: float | None = 10 * DEG) -> ObservedPolicy:
-    torch.manual_seed(0)
-    spec = ObservedPolicySpec(rate=rate, law=LAW, **SETTINGS)
-    made = spec.build().requires_grad_(False)
-    made.network.out.weight.normal_(std=0.02)
-    return made
 
 
 def heading(rate: float | None = 10 * DEG) -> ExportedHeading:
-    return ExportedHeading("pilot", observed(rate), safe="hold", about={}, metrics=[])
+    return ExportedHeading("pilot", observed(rate)[1], safe="hold", about={}, metrics=[])
 
 
 def network() -> ExportedHeading:
@@ -64,13 +42,12 @@ def network() -> ExportedHeading:
 
 
 def depth() -> ExportedHeading:
+    law, _ = observed(None, state=("psi", "u", "r", "z", "theta", "q"), righting=0.3)
     torch.manual_seed(0)
-    seen = {"state": ("psi", "u", "r", "z", "theta", "q"), "righting": 0.3}
-    law = ObservedPolicySpec(rate=None, law=LAW, **SETTINGS | seen)
     sight = {"lookahead": 8.0, "depth_rate": 2.0, "drift_rate": 0.2}
     made = DepthPolicySpec(law=law, steepest=0.5, sight=sight).build().requires_grad_(False)
-    observed: Any = made.law
-    observed.network.out.weight.normal_(std=0.02)
+    inner: Any = made.law
+    inner.network.out.weight.normal_(std=0.02)
     return ExportedHeading("pilot", made, safe="amidships", about={}, metrics=[])
 
 
@@ -81,7 +58,7 @@ def along() -> ExportedCoursePolicy:
     guidance = CourseGuidance(course, 10.0, tuple(COURSE), DriftEstimate(10.0, 0.8, DT))
     about = {"vessel": "x"}
     return ExportedCoursePolicy(
-        "along", observed(), guidance, course, safe="hold", about=about, metrics=[]
+        "along", observed(10 * DEG)[1], guidance, course, safe="hold", about=about, metrics=[]
     )
 
 
@@ -248,7 +225,7 @@ def closed(rate: float | None, seconds: float, gap: tuple[float, float]) -> tupl
     """Headings, commands and flags of a loop with delay, noise and half a degree of bias."""
     random, module = (
         torch.Generator().manual_seed(2),
-        policy.for_export(observed(rate), "amidships"),
+        policy.for_export(observed(rate)[1], "amidships"),
     )
     psi = r = 0.0
     late, decay = [0.0] * 10, math.exp(-DT / TIME)
@@ -282,7 +259,7 @@ def test_it_settles_and_takes_up_the_course_after_a_gap(rate: float | None) -> N
 
 
 def test_a_lost_estimate_begins_anew_and_keeps_the_push() -> None:
-    made = observed(None).double()
+    made = observed(None)[1].double()
     s = made.initial_state(torch.tensor([[0.0, SPEED, 0.0]], dtype=torch.float64))
     s[:, FIXED.index("push")] = 0.01
     turned = torch.tensor([[2.0, SPEED, 0.1]], dtype=torch.float64)

@@ -56,7 +56,7 @@ def foreign(data: bytes) -> bytes:
     return json.dumps(content).encode()
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", ["torchscript", "c", "parameters"])
 @pytest.mark.parametrize(
     ("part", "change", "words"),
     [
@@ -93,24 +93,16 @@ def test_a_format_writes_a_model_or_says_why_not(
     name: str, variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 40)
-    if variant == "none":
-        spec = spec_of(None)
-        model = spec.build()
-    else:
-        spec, model = built(variant)
-    file = tmp_path / f"boat{exporter(name).suffix}"
-    assert (said := refusal(name, spec, model, file)) is None or spec.name in said
-    assert file.is_file() == (said is None)
-    assert bool(list(tmp_path.iterdir())) == (said is None)
-
-
-def refusal(name: str, spec: ModelSpec, model: HybridDynamics, file: Path) -> str | None:
-    """Return why a format does not write a model, in its one line; None where it does."""
+    spec = spec_of(None)
+    spec, model = (spec, spec.build()) if variant == "none" else built(variant)
+    file, said = tmp_path / f"boat{exporter(name).suffix}", ""
     try:
         exporter(name).export(ExportedVessel(spec, model), file)
     except ResidnetError as error:
-        return str(error).splitlines()[-1]
-    return None
+        said = str(error).splitlines()[-1]
+        assert spec.name in said
+    assert file.is_file() == (not said)
+    assert bool(list(tmp_path.iterdir())) == (not said)
 
 
 def swept(spec: ModelSpec, model: HybridDynamics) -> float:

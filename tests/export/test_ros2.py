@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from exported_policies import DT, LIMIT, SPEED, observed
 
-from residnet.control.heading.controllers import ObservedPolicySpec, PtosConfig
 from residnet.export import exporter, policy
 from residnet.export.c import compile_shared
 from residnet.export.policy import ExportedHeading
@@ -19,7 +19,6 @@ from residnet.export.policy import ExportedHeading
 ROOT = Path(__file__).parents[2]
 NODE = ROOT / "examples" / "ros2_autopilot" / "src" / "steering_node.c"
 HARNESS = ROOT / "tests" / "support" / "rclc"
-DT, SPEED, LIMIT = 0.02, 3.2, math.radians(5)
 STEPS, ASKED, LAST, AGAIN = 400, 60, 199, 301
 """A heading is asked for; odometry comes a last time, and again."""
 
@@ -29,17 +28,8 @@ def test_the_node_answers_as_the_policy(
     safe: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(policy, "PARITY_STEPS", 60)
-    law = PtosConfig(
-        lag=0.3, steepness=37.0, share=0.65, damping=0.88, heading_rate=2.0, yaw_rate_rate=5.0,
-        push_rate=1.0, cross_rate=0.3,
-    )  # fmt: skip
-    spec = ObservedPolicySpec(
-        state=("psi", "u", "r"), gain=3.47, time=3.94, speed=SPEED, limit=LIMIT,
-        rate=math.radians(10), dt=DT, trained_at=0.04, law=law, units=4,
-    )  # fmt: skip
-    exported = ExportedHeading(
-        "pilot", spec.build().requires_grad_(False), safe=safe, about={}, metrics=[]
-    )
+    own = observed(math.radians(10))[1]
+    exported = ExportedHeading("pilot", own, safe=safe, about={}, metrics=[])
     exporter("c").export(exported, tmp_path / "pilot.c")
     flags = [
         f"-I{HARNESS}", f"-I{tmp_path}", "-Dmain=node_main", "-DMODEL=pilot",
@@ -70,7 +60,7 @@ def test_the_node_answers_as_the_policy(
     at = [ctypes.c_void_p(part.ctypes.data) for part in (rows, out)]
     assert library.drive(at[0], STEPS, at[1]) == pytest.approx(DT)
 
-    own: Any = exported.controller(torch.float64)
+    module: Any = exported.controller(torch.float64)
     within = policy.PARITY_TOLERANCE * LIMIT
     s, seen, age, asked = None, torch.zeros(1, 3).double(), 0.0, math.nan
     for k in range(STEPS):
@@ -78,7 +68,7 @@ def test_the_node_answers_as_the_policy(
             heading = math.remainder(psi[k], 2.0 * math.pi)
             seen, age = torch.tensor([[heading, SPEED, r[k]]]).double(), 0.0
             if s is None:
-                s, asked = own.initial_state(seen), heading
+                s, asked = module.initial_state(seen), heading
         asked = rows[k, 8] if rows[k, 7] else asked
         if s is None:
             assert out[k].tolist() == [0.0, 1.0]
@@ -87,7 +77,7 @@ def test_the_node_answers_as_the_policy(
             seen = torch.full_like(seen, math.nan)
         age += DT
         with torch.no_grad():
-            command, s, fault = own.step(seen, torch.tensor([[asked]]).double(), s)
+            command, s, fault = module.step(seen, torch.tensor([[asked]]).double(), s)
         assert out[k, 0] == pytest.approx(float(command), abs=within), k
         # it is too old after a second
         assert bool(out[k, 1]) == bool(fault) == (LAST + 50 <= k < AGAIN), k

@@ -32,6 +32,7 @@ from typing import Any, ClassVar, TypeVar, final
 import numpy as np
 import numpy.typing as npt
 import torch
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from torch import nn
 
 from residnet.core.errors import ExportError, WithheldError
@@ -215,6 +216,19 @@ def name_of(dtype: torch.dtype) -> str:
     return "float64" if dtype == torch.float64 else "float32"
 
 
+def filled(template: str, **given: Any) -> str:
+    """Return a text file of a format, filled in; values are escaped in XML."""
+    environment = Environment(
+        loader=PackageLoader("residnet", "export"),
+        undefined=StrictUndefined,
+        autoescape=select_autoescape(("xml.jinja",)),
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template(f"{template}.jinja").render(given)
+
+
 def write_card(file: Path, card: Mapping[str, Any]) -> None:
-    """Write a card beside its file."""
+    """Write a card beside its file, in a folder that may not exist yet."""
+    file.parent.mkdir(parents=True, exist_ok=True)
     file.with_suffix(".card.json").write_text(json.dumps(card, indent=1) + "\n")

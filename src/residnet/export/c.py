@@ -32,6 +32,7 @@ from residnet.export.base import (
     Exporter,
     Loaded,
     Numbers,
+    filled,
     in_precision,
     name_of,
     write_card,
@@ -505,9 +506,8 @@ class CExporter(Exporter):
             if dtype == torch.float64:
                 card |= {"dtype": name_of(dtype)}
             card |= {"size": footprint(partial), "parity": parity}
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.with_suffix(".h").write_text(written.header)
             write_card(file, card)
+            file.with_suffix(".h").write_text(written.header)
             file.write_text(written.source)
         return card
 
@@ -545,146 +545,39 @@ class CasadiExporter(Exporter):
                 "parity": parity,
                 "safety": "The file holds expressions only.",
             }
-            file.parent.mkdir(parents=True, exist_ok=True)
             write_card(file, card)
             file.write_bytes(partial.read_bytes())
         return card
 
 
-_S_FUNCTION = """/* {about}, as a level-2 S-function; written by residnet.
-   In MATLAB, with the files beside it: mex {name}.c {name}_model.c
-   {ports}
-   Sample time {dt} s. SI units and radians. {parameter} */
-#define S_FUNCTION_NAME {name}
-#define S_FUNCTION_LEVEL 2
-#include "simstruc.h"
-#include "{name}_model.h"
-
-#define KEPT {kept}
-
-static void mdlInitializeSizes(SimStruct *S) {{
-    ssSetNumSFcnParams(S, {parameters});
-    if (ssGetNumSFcnParams(S) != ssGetSFcnParamsCount(S)) return;
-    ssSetNumContStates(S, 0);
-    ssSetNumDiscStates(S, KEPT);
-    if (!ssSetNumInputPorts(S, {inputs})) return;
-{input_ports}    if (!ssSetNumOutputPorts(S, {outputs})) return;
-{output_ports}    ssSetNumSampleTimes(S, 1);
-    ssSetNumRWork(S, {next});
-    ssSetOptions(S, SS_OPTION_EXCEPTION_FREE_CODE);
-}}
-
-static void mdlInitializeSampleTimes(SimStruct *S) {{
-    ssSetSampleTime(S, 0, {dt});
-    ssSetOffsetTime(S, 0, 0.0);
-}}
-
-#define MDL_INITIALIZE_CONDITIONS
-static void mdlInitializeConditions(SimStruct *S) {{
-    real_T *kept = ssGetRealDiscStates(S);
-    int k;
-    for (k = 0; k < KEPT; k++) kept[k] = 0.0;
-{begin}}}
-
-static void mdlOutputs(SimStruct *S, int_T tid) {{
-    real_T *kept = ssGetRealDiscStates(S);
-{given}{taken}    (void)tid;
-{answer}}}
-
-#define MDL_UPDATE
-static void mdlUpdate(SimStruct *S, int_T tid) {{
-    real_T *kept = ssGetRealDiscStates(S);
-{update}    (void)tid;
-}}
-
-static void mdlTerminate(SimStruct *S) {{ (void)S; }}
-
-#ifdef MATLAB_MEX_FILE
-#include "simulink.c"
-#else
-#include "cg_sfun.h"
-#endif
-"""
-
-
 def s_function(exported: Exported, prefix: str, name: str, sizes: Mapping[str, int]) -> str:
     """Return the source of the S-function of a vessel or a controller.
+
+    A vessel's output is its state, which it keeps beside the memory, and its flags; a controller's
+    its first result and the flags.
 
     Args:
         exported: with its step.
         prefix: of the functions in the C file.
+        sizes: of the step's results.
     """
     given = dict(exported.arguments)
     vessel = isinstance(exported, ExportedVessel)
-    held = ["x", "s"] if vessel else ["s"]
-    ports = [part for part in given if part not in held]
-    out = ["x"] if vessel else [one for one in exported.results if one in sizes][:1]
-    widths = [given["x"]] if vessel else [sizes[one] for one in out]
-    at, place = {}, 0
-    for one in held:
-        at[one], place = place, place + given[one]
-    flags = len(exported.flags)
-    kept = place + (flags if vessel else 1)
-    read = "".join(
-        f"    const real_T *{one} = (const real_T *)ssGetInputPortSignal(S, {k});\n"
-        for k, one in enumerate(ports)
-    )
-    begin = f"    {prefix}_initial_state(kept + {at['s']});\n"
-    if vessel:
-        step = ", ".join(["kept", "w", f"kept + {at['s']}", "kept", f"kept + {at['s']}"])
-        begin = (
-            f"    for (k = 0; k < {given['x']}; k++) kept[k] = mxGetPr(ssGetSFcnParam(S, 0))[k];\n"
-            + begin
-        )
-        answer = (
-            f"    int k;\n    for (k = 0; k < {given['x']}; k++) x[k] = kept[k];\n"
-            f"    flags[0] = kept[{place}];\n"
-        )
-        update = f"{read}    kept[{place}] = {prefix}_step({step});\n"
-        read, work = "", 0
-    else:
-        begin, work = "", given["s"]
-        named = {"s": f"kept + {at['s']}"}
-        called = [*(named.get(one, one) for one in given), out[0], "ssGetRWork(S)"]
-        more = "".join(f"    flags[{k}] = flag_{k};\n" for k in range(1, flags))
-        declared = "".join(f"    int flag_{k};\n" for k in range(1, flags))
-        called += [f"&flag_{k}" for k in range(1, flags)]
-        answer = (
-            f"{declared}    if (kept[{place}] == 0.0) {prefix}_initial_state("
-            f"{ports[0]}, kept + {at['s']});\n"
-            f"    flags[0] = {prefix}_step({', '.join(called)});\n{more}"
-        )
-        update = (
-            f"    int k;\n    for (k = 0; k < {given['s']}; k++) kept[k] = ssGetRWork(S)[k];\n"
-            f"    kept[{place}] = 1.0;\n"
-        )
-    told = [f"{one} [{given[one]}]" for one in ports]
-    return _S_FUNCTION.format(
+    held = [given.pop(name) for name in (("x", "s") if vessel else ("s",))]
+    out = "x" if vessel else next(one for one in exported.results if one in sizes)
+    return filled(
+        "s_function.c",
         about=exported.what,
+        vessel=vessel,
+        prefix=prefix,
         name=name,
-        ports=f"Inputs: {', '.join(told)}. Outputs: {out[0]} [{widths[0]}],"
-        f" {', '.join(exported.flags)}.",
         dt=repr(float(exported.dt or 0.0)),
-        parameter=f"Parameter: the state [{given['x']}] to start from." if vessel else "",
-        parameters=int(vessel),
-        kept=kept,
-        inputs=len(ports),
-        input_ports="".join(
-            f"    ssSetInputPortWidth(S, {k}, {given[one]});\n"
-            f"    ssSetInputPortRequiredContiguous(S, {k}, 1);\n"
-            f"    ssSetInputPortDirectFeedThrough(S, {k}, {int(not vessel)});\n"
-            for k, one in enumerate(ports)
-        ),
-        outputs=2,
-        output_ports=f"    ssSetOutputPortWidth(S, 0, {widths[0]});\n"
-        f"    ssSetOutputPortWidth(S, 1, {flags});\n",
-        next=work,
-        begin=begin,
-        given=read,
-        taken=f"    real_T *{out[0]} = ssGetOutputPortRealSignal(S, 0);\n"
-        "    real_T *flags = ssGetOutputPortRealSignal(S, 1);\n",
-        answer=answer,
-        update=update,
+        ports=list(given.items()),
+        out=out,
+        width=held[0] if vessel else sizes[out],
+        flags=exported.flags,
+        memory=held[-1],
+        kept=sum(held),
     )
 
 
@@ -717,9 +610,8 @@ class SimulinkExporter(Exporter):
             loaded = CompiledModel(library, exported, torch.float64)
             card |= {"parity": exported.check(loaded, "the S-function's code", torch.float64)}
         text = s_function(exported, written.prefix, name, loaded.outputs)
-        file.parent.mkdir(parents=True, exist_ok=True)
+        write_card(file, card)
         file.with_name(f"{name}_model.c").write_text(written.source)
         file.with_name(f"{name}_model.h").write_text(written.header)
-        write_card(file, card)
         file.write_text(text)
         return card

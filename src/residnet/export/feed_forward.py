@@ -18,7 +18,7 @@ from residnet.core.layout import PLANAR, RANGE_VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exported, Exporter, Loaded, released
-from residnet.export.guard import replaced, widening
+from residnet.export.guard import Ranges, widening
 from residnet.export.torchscript import TorchScriptExporter, require_shape, size
 from residnet.export.vessel import ExportedVessel
 from residnet.heads.force import ForceHead
@@ -118,20 +118,8 @@ class GuardedForce(nn.Module):
         self.model = model
         low, high = torch.tensor(ranges, dtype=torch.float64).T
         reach = torch.tensor([widening(*limits) for limits in ranges], dtype=torch.float64)
-        for name, value in {
-            "low": low,
-            "high": high,
-            "least": low - reach,
-            "most": high + reach,
-            "middle": 0.5 * (low + high),
-            "width": (high - low).clamp(min=1e-9),
-        }.items():
-            self.register_buffer(name, value.clone())
-        self.low: Tensor
-        self.high: Tensor
-        self.least: Tensor
-        self.most: Tensor
-        self.middle: Tensor
+        self.ranges = Ranges(low, high, reach, torch.float64)
+        self.register_buffer("width", (high - low).clamp(min=1e-9))
         self.width: Tensor
         self.dof = PLANAR.dof
         self.fade, self.edge, self.effort = FADE, _EDGE, EFFORT
@@ -145,10 +133,10 @@ class GuardedForce(nn.Module):
         require_shape("nu_dot", nu_dot, [rows, self.dof])
         require_shape("nu", nu, [rows, self.dof])
         seen = torch.cat((nu_dot, nu), dim=-1).to(torch.float64)
-        used = replaced(seen, self.low, self.high, self.least, self.most, self.middle)
+        low, high, used = self.ranges.low, self.ranges.high, self.ranges.replaced(seen)
         believed, more = self.model.parts(used[:, : self.dof], used[:, self.dof :])
         # how deep inside the range in widths, the least of all channels; negative outside
-        depth = torch.minimum((seen - self.low) / self.width, (self.high - seen) / self.width)
+        depth = torch.minimum((seen - low) / self.width, (high - seen) / self.width)
         depth = torch.nan_to_num(depth, nan=-1.0).amin(dim=-1, keepdim=True)
         force = believed + (1.0 + depth / self.fade).clamp(0.0, 1.0) * more
         free = (depth / self.edge).clamp(0.0, 1.0)
@@ -159,7 +147,7 @@ class GuardedForce(nn.Module):
         most = self.effort * torch.minimum(believed.abs(), least)
         most = most + free * (believed.abs() + more.abs())
         force = torch.minimum(torch.maximum(force, -most), most)
-        return force, ~((seen >= self.low) & (seen <= self.high)).all(dim=-1)
+        return force, ~self.ranges.inside(seen)
 
 
 def required_force(
@@ -258,8 +246,8 @@ class ExportedForce(Exported):
 
     def contents(self) -> dict[str, Any]:
         """Return what a controller needs to know."""
-        guarded = GuardedForce(self.inner, self.ranges)
-        accepted = torch.stack((guarded.least, guarded.most), dim=1).tolist()
+        known = GuardedForce(self.inner, self.ranges).ranges
+        accepted = torch.stack((known.least, known.most), dim=1).tolist()
         return {
             "schema": "residnet.feed_forward/1",
             "arguments": {

@@ -26,7 +26,7 @@ import math
 from typing import final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.core.columns import actuators, motion, pose, velocities, velocities_on
 from residnet.core.layout import ATTITUDE, PLANAR, POSITION
@@ -42,6 +42,47 @@ _FARTHEST = 1e5
 _TURNS = 2000.0 * math.pi
 """Largest heading in rad."""
 _TURN = 2.0 * math.pi
+
+
+@final
+class Ranges(nn.Module):
+    """Training range [low, high] and accepted range [least, most] of values [k].
+
+    Args:
+        reach: how far beyond the training range a value is accepted [k].
+        dtype: of the numbers.
+    """
+
+    def __init__(self, low: Tensor, high: Tensor, reach: Tensor, dtype: torch.dtype) -> None:
+        super().__init__()
+        for name, value in {
+            "low": low,
+            "high": high,
+            "least": low - reach,
+            "most": high + reach,
+            "middle": 0.5 * (low + high),
+        }.items():
+            self.register_buffer(name, value.to(dtype))
+        self.low: Tensor
+        self.high: Tensor
+        self.least: Tensor
+        self.most: Tensor
+        self.middle: Tensor
+
+    def inside(self, seen: Tensor) -> Tensor:
+        """Return which rows [...] of values [..., k] lie in the training range."""
+        return ((seen >= self.low) & (seen <= self.high)).all(dim=-1)
+
+    def accepted(self, seen: Tensor) -> Tensor:
+        """Return which rows [...] of values [..., k] are accepted."""
+        # comparisons with what is no number are false
+        return ((seen >= self.least) & (seen <= self.most)).all(dim=-1)
+
+    def replaced(self, seen: Tensor) -> Tensor:
+        """Return values [..., k] with those that are no measurements replaced, as stated above."""
+        known = (seen >= self.least) & (seen <= self.most)
+        nearest = torch.minimum(torch.maximum(seen, self.low), self.high)
+        return torch.where(known, seen, torch.where(torch.isnan(seen), self.middle, nearest))
 
 
 @final
@@ -71,23 +112,17 @@ class GuardedDynamics(Dynamics):
             # no training range bounds the depth
             depth = spec.signals.live.moving.index("z")
             low[depth], high[depth], reach[depth] = -_FARTHEST, _FARTHEST, 0.0
+        low, high = torch.cat((-far, low)), torch.cat((far, high))
+        reach = torch.cat((torch.zeros_like(far), reach))
+        self.ranges = Ranges(low, high, reach, torch.float32)
+        n = len(spec.signals.live.states)
+        self.of_state = Ranges(low[:n], high[:n], reach[:n], torch.float32)
         first, last = model.memory_range()
-        for name, value in {
-            "low": torch.cat((-far, low)),
-            "high": torch.cat((far, high)),
-            "least": torch.cat((-far, low - reach)),
-            "most": torch.cat((far, high + reach)),
-            "middle": torch.cat((0.0 * far, 0.5 * (low + high))),
-            # finite, so that comparisons alone tell what is no number
-            "memory_low": (first - 1e-3 * first.abs()).clamp(min=-_LARGEST),
-            "memory_high": (last + 1e-3 * last.abs()).clamp(max=_LARGEST),
-        }.items():
-            self.register_buffer(name, value.to(torch.float32))
-        self.low: Tensor
-        self.high: Tensor
-        self.least: Tensor
-        self.most: Tensor
-        self.middle: Tensor
+        # finite, so that comparisons alone tell what is no number
+        smallest = (first - 1e-3 * first.abs()).clamp(min=-_LARGEST)
+        largest = (last + 1e-3 * last.abs()).clamp(max=_LARGEST)
+        self.register_buffer("memory_low", smallest.to(torch.float32))
+        self.register_buffer("memory_high", largest.to(torch.float32))
         self.memory_low: Tensor
         self.memory_high: Tensor
 
@@ -103,15 +138,12 @@ class GuardedDynamics(Dynamics):
 
     def measured(self, x: Tensor, w: Tensor) -> Tensor:
         """Return which samples [...] are measurements in all entries of x and w [..., m]."""
-        seen = torch.cat((x, w), dim=-1)
-        # comparisons with what is no number are false
-        return ((seen >= self.least) & (seen <= self.most)).all(dim=-1)
+        return self.ranges.accepted(torch.cat((x, w), dim=-1))
 
     def accept(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return state [B, 3 + n], inputs [B, m] and memory as they are used, and the flag [B]."""
         seen = torch.cat((x, w), dim=-1)
-        used = replaced(seen, self.low, self.high, self.least, self.most, self.middle)
-        inside = ((seen >= self.low) & (seen <= self.high)).all(dim=-1)
+        used, inside = self.ranges.replaced(seen), self.ranges.inside(seen)
         # no reductions over nothing: not every format has them
         if self.n_state > 0:
             remembers = self.remembers(s)
@@ -121,14 +153,7 @@ class GuardedDynamics(Dynamics):
 
     def accept_state(self, x: Tensor) -> Tensor:
         """Return a state [B, 3 + n] as it is used."""
-        return replaced(
-            x,
-            motion(self.low, self.dof),
-            motion(self.high, self.dof),
-            motion(self.least, self.dof),
-            motion(self.most, self.dof),
-            motion(self.middle, self.dof),
-        )
+        return self.of_state.replaced(x)
 
     def remembers(self, s: Tensor) -> Tensor:
         """Return which rows [B] of a memory [B, n_state] the head can have come to."""
@@ -142,12 +167,11 @@ class GuardedDynamics(Dynamics):
             after: what the model made of it [B, 3 + n].
             s: memory after the step [B, n_state].
         """
-        least, most = motion(self.least, self.dof), motion(self.most, self.dof)
-        kept = ((after >= least) & (after <= most)).all(dim=-1, keepdim=True)
+        kept = self.of_state.accepted(after).unsqueeze(-1)
         new = velocities_on(after)
         held = torch.where(torch.isnan(new), velocities(x, self.dof), new)
         coasting = torch.cat((pose(x) + self.dt * self.kinematics(x), held), dim=-1)
-        coasting = torch.minimum(torch.maximum(coasting, least), most)
+        coasting = torch.minimum(torch.maximum(coasting, self.of_state.least), self.of_state.most)
         if self.n_state == 0:
             return torch.where(kept, after, coasting), s, ~kept.squeeze(-1)
         known = (s.abs() <= self.largest).all(dim=-1, keepdim=True)
@@ -189,24 +213,6 @@ class GuardedDynamics(Dynamics):
         s = self.model.warmup(y, w)
         known = (good.any(dim=1) & torch.isfinite(s).all(dim=-1)).unsqueeze(-1)
         return torch.where(known, s, torch.zeros_like(s))
-
-
-def replaced(
-    seen: Tensor, low: Tensor, high: Tensor, least: Tensor, most: Tensor, middle: Tensor
-) -> Tensor:
-    """Return values [..., k] with those that are no measurements replaced, as stated above.
-
-    Args:
-        seen: values [..., k].
-        low: smallest of the training data [k].
-        high: largest of the training data [k].
-        least: smallest accepted value [k].
-        most: largest accepted value [k].
-        middle: what stands for a value that is no number [k].
-    """
-    known = (seen >= least) & (seen <= most)
-    nearest = torch.minimum(torch.maximum(seen, low), high)
-    return torch.where(known, seen, torch.where(torch.isnan(seen), middle, nearest))
 
 
 def widening(low: float, high: float) -> float:

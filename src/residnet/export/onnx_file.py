@@ -110,7 +110,8 @@ class OnnxExporter(Exporter):
                         random.uniform(0.0, 0.1, (3, count)) for _, count in exported.arguments
                     ]
                     together, alone = loaded.rows(*given), Loaded.rows(loaded, *given)
-                    if not all(map(_alike, together, alone)):
+                    pairs = zip(together, alone, strict=True)
+                    if not all(np.allclose(*pair, rtol=1e-5, atol=1e-5) for pair in pairs):
                         raise ExportError(
                             f"{exported.what}: the ONNX file gives other answers for several rows"
                             " at once than for each alone"
@@ -141,10 +142,6 @@ class OnnxExporter(Exporter):
             with whole(file) as ready:
                 onnx.save(graph, str(ready))
         return card
-
-
-def _alike(one: Numbers, other: Numbers) -> bool:
-    return bool(np.allclose(one, other, rtol=1e-5, atol=1e-5))
 
 
 def _write(exported: Exported, file: Path, dtype: torch.dtype) -> None:

@@ -25,7 +25,7 @@ from residnet.core.errors import UsageError
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export.base import Exported, Exporter
+from residnet.export.base import Exported, Exporter, filled
 from residnet.export.c import identifier
 from residnet.export.vessel import ExportedVessel
 from residnet.physics.signals import FORCE_CHANNELS
@@ -128,95 +128,44 @@ def _unplaced(theta: Matrix, terms: list[str]) -> dict[str, list[str]]:
 
 _PLACES = (0, 1, 5)
 """Of surge, sway and yaw among six degrees of freedom."""
-
-_VEHICLE = '''"""{name}: a vessel of PythonVehicleSimulator, written by residnet.
-
-M nu_dot + C(nu) nu + D nu + D_n |nu| nu = tau in surge, sway and yaw; SI units.
-"""
-
-import numpy as np
+_SIMPLE = ("xDotU", "yDotV", "nDotR", "xU", "yV", "nR")
+"""What VRX knows under the names that Gazebo has for it."""
 
 
-class {title}:
-    """The controls are the forces tau_x, tau_y in N and the moment tau_n in N m."""
+def texts(name: str, found: Coefficients, rigid: Mapping[str, float]) -> dict[str, str]:
+    """Return what the simulators read by the ends of file names.
 
-    def __init__(self):
-        self.name = "{name}"
-        self.controls = ["tau_x (N)", "tau_y (N)", "tau_n (N m)"]
-        self.dimU = 3
-        self.nu = np.zeros(6)
-        self.u_actual = np.zeros(3)
-        self.M = np.array({mass})
-        self.D = np.array({linear})
-        self.Dn = np.array({quadratic})
-
-    def dynamics(self, eta, nu, u_actual, u_control, sampleTime):
-        """Return nu and u_actual one sample later (forward Euler), nu = [u v w p q r]."""
-        u, v, r = nu[0], nu[1], nu[5]
-        planar = np.array([u, v, r])
-        a = self.M[1, 1] * v + 0.5 * (self.M[1, 2] + self.M[2, 1]) * r
-        b = self.M[0, 0] * u
-        C = np.array([[0, 0, -a], [0, 0, b], [a, -b, 0]])
-        tau = np.asarray(u_control, dtype=float)
-        force = tau - C @ planar - self.D @ planar - self.Dn @ (np.abs(planar) * planar)
-        planar = planar + sampleTime * np.linalg.solve(self.M, force)
-        nu = np.array(nu, dtype=float)
-        nu[[0, 1, 5]] = planar
-        return nu, tau
-'''
-
-
-def mss(name: str, found: Coefficients) -> str:
-    """Return a MATLAB function with the six-by-six matrices that MSS' vessels have."""
-
-    def six(matrix: Matrix) -> str:
-        whole = np.zeros((6, 6))
-        whole[np.ix_(_PLACES, _PLACES)] = matrix
-        rows = (" ".join(repr(float(value)) for value in row) for row in whole)
-        return "[" + "; ".join(rows) + "]"
-
-    return (
-        f"function [M, D, Dn] = {name}_parameters()\n"
-        f"% {name}: M nu_dot + C(nu) nu + D nu + Dn abs(nu).*nu = tau, C = m2c(M, nu)\n"
-        "% surge, sway and yaw; heave, roll and pitch are zero: take rows and columns [1 2 6].\n"
-        f"M = {six(found.mass)};\nD = {six(found.linear)};\nDn = {six(found.quadratic)};\nend\n"
-    )
-
-
-def gazebo(name: str, found: Coefficients, rigid: Mapping[str, float]) -> str:
-    """Return the plugins of Gazebo and VRX as SDF, with the masses of the rigid body.
-
-    Gazebo's coefficients are forces, and so negative; those of VRX are resistances.
+    The plugins of Gazebo and VRX as SDF, with the masses of the rigid body: Gazebo's coefficients
+    are forces, and so negative; those of VRX are resistances. A MATLAB function with the six-by-six
+    matrices that MSS' vessels have. A vehicle of PythonVehicleSimulator.
     """
-    added = (
-        found.mass[0, 0] - rigid["mass"],
-        found.mass[1, 1] - rigid["mass"],
-        found.mass[2, 2] - rigid["inertia"],
-    )
-    entries = {
-        name: float(value) for name, value in zip(("xDotU", "yDotV", "nDotR"), added, strict=True)
-    }
+    matrices = {"M": found.mass, "D": found.linear, "Dn": found.quadratic}
+    six = {letter: np.zeros((6, 6)) for letter in matrices}
+    for letter, matrix in matrices.items():
+        six[letter][np.ix_(_PLACES, _PLACES)] = matrix
+    own = (rigid["mass"], rigid["mass"], rigid["inertia"])
+    added = (found.mass.diagonal() - own).tolist()
+    entries = dict(zip(_SIMPLE, added, strict=False))
     for i, axis in enumerate("xyn"):
         for j, speed in enumerate("UVR"):
             if found.linear[i, j] or found.quadratic[i, j]:
                 entries[f"{axis}{speed}"] = float(found.linear[i, j])
                 entries[f"{axis}{speed}abs{speed}"] = float(found.quadratic[i, j])
-    general = "\n".join(f"  <{key}>{-value!r}</{key}>" for key, value in entries.items())
-    doubled = {f"{a}{s}abs{s}": f"{a}{s}{s}" for a, s in ("xU", "yV", "nR")}
-    own = ("xDotU", "yDotV", "nDotR", "xU", "yV", "nR", *doubled)
-    simple = "\n".join(
-        f"  <{doubled.get(key, key)}>{entries.get(key, 0.0)!r}</{doubled.get(key, key)}>"
-        for key in own
-    )
-    return (
-        f"<!-- {name}: rigid body mass {rigid['mass']!r} kg, inertia about z {rigid['inertia']!r}"
-        " kg m^2 in the link's inertial -->\n"
-        '<plugin filename="gz-sim-hydrodynamics-system" name="gz::sim::systems::Hydrodynamics">\n'
-        f"  <link_name>base_link</link_name>\n{general}\n</plugin>\n"
-        "<!-- the same for VRX, which has no damping across sway and yaw -->\n"
-        '<plugin filename="libSimpleHydrodynamics.so" name="vrx::SimpleHydrodynamics">\n'
-        f"  <link_name>base_link</link_name>\n{simple}\n</plugin>\n"
-    )
+    simple = {key: key for key in _SIMPLE}
+    simple |= {f"{key}{key[-1]}": f"{key}abs{key[-1]}" for key in _SIMPLE[3:]}
+    title = "".join(part.capitalize() for part in name.split("_"))
+    lists = {
+        "mass": found.mass.tolist(),
+        "linear": found.linear.tolist(),
+        "quadratic": found.quadratic.tolist(),
+    }
+    return {
+        ".sdf": filled("gazebo.sdf", name=name, rigid=rigid, entries=entries, simple=simple),
+        "_parameters.m": filled(
+            "parameters.m", name=name, six={key: value.tolist() for key, value in six.items()}
+        ),
+        "_vehicle.py": filled("vehicle.py", name=name, title=title, **lists),
+    }
 
 
 _RIGID = {"mass": "kg", "inertia": "kg m^2 about z"}
@@ -258,22 +207,10 @@ class ParametersExporter(Exporter):
             "terms_left_out": found.terms_left_out,
             "head_left_out": None if spec.head is None else spec.head.kind,
         }
-        title = "".join(part.capitalize() for part in name.split("_"))
-        texts = {
-            f"{stem}.sdf": gazebo(name, found, rigid),
-            f"{name}_parameters.m": mss(name, found),
-            f"{name}_vehicle.py": _VEHICLE.format(
-                name=name,
-                title=title,
-                mass=found.mass.tolist(),
-                linear=found.linear.tolist(),
-                quadratic=found.quadratic.tolist(),
-            ),
-            file.name: json.dumps(card, indent=1) + "\n",
-        }
         file.parent.mkdir(parents=True, exist_ok=True)
-        for part, text in texts.items():
-            file.with_name(part).write_text(text)
+        for end, text in texts(name, found, rigid).items():
+            file.with_name(f"{stem if end == '.sdf' else name}{end}").write_text(text)
+        file.write_text(json.dumps(card, indent=1) + "\n")
         return card
 
 

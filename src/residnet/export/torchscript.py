@@ -220,7 +220,6 @@ class AotiExporter(Exporter):
                 " In C++: libtorch.",
                 "parity": parity,
             }
-            file.parent.mkdir(parents=True, exist_ok=True)
             write_card(file, card)
             file.write_bytes(partial.read_bytes())
         return card

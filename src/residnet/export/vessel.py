@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from residnet.core.columns import motion
 from residnet.core.errors import ExportError
 from residnet.core.layout import SURGE
 from residnet.core.progress import say
@@ -227,13 +226,13 @@ class ExportedVessel(Exported):
         """Return all that a user needs to drive the model, and how good it is."""
         spec, band = self.spec, self.spec.band
         units, live = spec.signals.units(), spec.signals.live
-        guard = GuardedDynamics(self.model, spec)
-        accepted = torch.stack((guard.least, guard.most), dim=1).tolist()
+        known = GuardedDynamics(self.model, spec).ranges
+        accepted = torch.stack((known.least, known.most), dim=1).tolist()
         table: dict[str, Any] | None = None
         if band is not None:
             horizon = band.steps[-1] * spec.dt
-            known = band.model_dump(mode="json", exclude_none=True)
-            table = {"about": _BAND, "horizon": horizon, **known}
+            widths = band.model_dump(mode="json", exclude_none=True)
+            table = {"about": _BAND, "horizon": horizon, **widths}
         return {
             "schema": "residnet.card/1",
             "model": spec.name,
@@ -260,7 +259,7 @@ class ExportedVessel(Exported):
             "bad_inputs": {
                 "rules": _RULES,
                 "accepted": dict(zip(units, accepted, strict=True)),
-                "substitute": dict(zip(units, guard.middle.tolist(), strict=True)),
+                "substitute": dict(zip(units, known.middle.tolist(), strict=True)),
             },
             "baseline": spec.baseline.model_dump(mode="json"),
             "head": None if spec.head is None else spec.head.model_dump(mode="json"),
@@ -324,8 +323,8 @@ class ExportedVessel(Exported):
         if dtype in self._free:
             return self._free[dtype]
         model = self.at(dtype)
-        guard = GuardedDynamics(self.model, self.spec)
-        least, most = (motion(part, guard.dof) for part in (guard.least, guard.most))
+        accepted = GuardedDynamics(self.model, self.spec).of_state
+        least, most = accepted.least, accepted.most
         for share in _SWEEPS:
             y, w = self.drive(dtype, share)
             with torch.no_grad():
@@ -389,10 +388,8 @@ class ExportedVessel(Exported):
         found = loaded.memory(y, w)
         if found is not None:
             return found
-        guard = GuardedDynamics(self.model, self.spec)
-        seen = np.concatenate((y, w), axis=1)
-        within = (seen >= guard.least.numpy()) & (seen <= guard.most.numpy())
-        good = [bool(sample.all()) for sample in within]
+        ranges = GuardedDynamics(self.model, self.spec).ranges
+        good = ranges.accepted(torch.from_numpy(np.concatenate((y, w), axis=1))).tolist()
         s, at = np.zeros(self.model.n_state, y.dtype), good.index(True) if any(good) else 0
         for k in range(len(y) if any(good) else 0):
             at = k if good[k] else at

@@ -664,7 +664,7 @@ def check_bad_inputs(
     random = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         first, n = PLANAR.pose_columns.stop, guard.dof
-        low, high = guard.low[first:], guard.high[first:]
+        low, high = guard.ranges.low[first:], guard.ranges.high[first:]
         share = 0.05 + 0.9 * torch.rand(cases, _BEFORE + _AFTER, low.numel(), generator=random)
         seen = low + share * (high - low)
         pose = 40.0 * torch.rand(cases, _BEFORE + _AFTER, 3, generator=random) - 20.0
@@ -702,8 +702,8 @@ def _check_steps(
         before, inputs, memory = x, w[:, k], s
         if k == _BAD_STEP:
             where = torch.rand(3, len(x), 1, generator=random) < 0.5
-            before = torch.where(where[0], _damage(x, guard.high[:columns], 0.4, random), x)
-            edge = guard.high[columns:]
+            before = torch.where(where[0], _damage(x, guard.ranges.high[:columns], 0.4, random), x)
+            edge = guard.ranges.high[columns:]
             inputs = torch.where(where[1], _damage(inputs, edge, 0.5, random), inputs)
             edge = guard.memory_high
             memory = torch.where(where[2], _damage(s, edge, 1.0 / (1 + s.shape[1]), random), s)
@@ -711,7 +711,7 @@ def _check_steps(
         _check_answer(guard, (before, inputs, memory), (x, s, outside), f"{who}, step {k}")
         if k == _BAD_STEP:
             # what the controller measures next is good again, and so is what it remembers
-            middle = 0.5 * (guard.low + guard.high).expand(len(x), -1)
+            middle = 0.5 * (guard.ranges.low + guard.ranges.high).expand(len(x), -1)
             measured, inputs = middle[:, :columns], middle[:, columns:]
             for kept in (s, exported.initial_state(len(x))):
                 answer = exported.step(measured, inputs, kept)
@@ -732,12 +732,16 @@ def _check_answer(
     require_finite(after, f"{who}: a state is not finite")
     require_finite(memory, f"{who}: a memory is not finite")
     seen = torch.cat((x, w), dim=-1)
-    inside = ((seen >= guard.low) & (seen <= guard.high)).all(dim=-1)
+    inside = ((seen >= guard.ranges.low) & (seen <= guard.ranges.high)).all(dim=-1)
     inside &= guard.remembers(s)
     missed = ~inside & ~outside
     require(not bool(missed.any()), f"{who}: {int(missed.sum())} bad samples are not flagged")
     own, left = guard.model.step(x, w, s)
-    sound = inside & (own >= guard.least[:6]).all(dim=-1) & (own <= guard.most[:6]).all(dim=-1)
+    sound = (
+        inside
+        & (own >= guard.ranges.least[:6]).all(dim=-1)
+        & (own <= guard.ranges.most[:6]).all(dim=-1)
+    )
     false = sound & outside
     require(not bool(false.any()), f"{who}: {int(false.sum())} good samples are flagged")
     require_equal(after[sound], own[sound], 1e-4, f"{who}: a good sample is answered otherwise")
