@@ -60,7 +60,7 @@ from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.identification import fit, settings
 from residnet.identification.identified import candidates
 from residnet.judge.freerun import Errors, Prediction, free_run
-from residnet.judge.protocol import Window, all_windows, overlapping
+from residnet.judge.protocol import Window, all_windows
 
 CHANNELS = {
     "esso_osaka": {
@@ -314,7 +314,7 @@ def missed(models: Any, split: str, *, dense: bool) -> dict[str, np.ndarray]:
     data, found = models.data, models.identified
     config, step, logs = data.evaluation, data.prepare.grid.step, data.logs(split)
     protocol = config.protocols[config.selection]
-    windows = all_windows(overlapping(protocol) if dense else protocol, logs, step, split)
+    windows = all_windows(protocol, logs, step, split, dense=dense)
     judged = [replace(one, members=()) for one in candidates(found.values()) if one.name != "mean"]
     out = {}
     for name, predictions in free_run(judged, windows, logs, step, found.limit).items():

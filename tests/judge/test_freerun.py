@@ -8,25 +8,24 @@ import numpy as np
 import pytest
 import torch
 from made_logs import made, prepared, random_states
-from torch import Tensor
 
 from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.log import Log
-from residnet.dynamics.base import Integrator
+from residnet.data.prepare import Prepared
+from residnet.dynamics.base import Dynamics, Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.judge import freerun
-from residnet.judge.freerun import Candidate, free_run, integrate
+from residnet.judge.freerun import Candidate, Prediction, free_run, integrate
 from residnet.judge.protocol import Window
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
 STEP = 0.1
-LIMIT = np.array([1e6, 1e6, 1e6])
 SIGNALS = SignalsConfig(inputs=("tau_x", "tau_n"))
 
 
@@ -46,6 +45,17 @@ def hybrid(theta: np.ndarray, head: ResidualHead | None = None) -> HybridDynamic
     baseline = RegressorBaseline([("u", "v", "r", "tau_x", "tau_n", "1")] * 3, signals.names)
     baseline.theta.data.copy_(torch.from_numpy(theta))
     return HybridDynamics(signals, baseline, head or ZeroHead(), STEP)
+
+
+def ran(
+    model: Dynamics,
+    windows: list[Window],
+    logs: list[Prepared],
+    limit: float = 1e6,
+    dtype: torch.dtype = torch.float64,
+) -> list[Prediction]:
+    limits = np.full(3, limit)
+    return free_run([Candidate("m", "head", model)], windows, logs, STEP, limits, dtype)["m"]
 
 
 @pytest.mark.parametrize("rate", [0.05, -0.2])
@@ -75,7 +85,8 @@ def test_integrate_straight_and_accelerating() -> None:
     assert integrate(np.array([1.0, 2.0, 3.0]), np.ones((1, 3)), STEP).tolist() == [[1.0, 2.0, 3.0]]
 
 
-def test_free_run_of_a_linear_model_in_closed_form() -> None:
+@pytest.mark.parametrize(("dtype", "near"), [(torch.float64, 1e-6), (torch.float32, 1e-5)])
+def test_free_run_of_a_linear_model_in_closed_form(dtype: torch.dtype, near: float) -> None:
     """u' = -u + 2, measured velocities never looked at after the start; windows of different
     lengths in one batch.
     """
@@ -87,12 +98,11 @@ def test_free_run_of_a_linear_model_in_closed_form() -> None:
         window(1, 10, 15, nu=(4.0, 0.0, 0.2)),
         window(0, 20, 60),
     ]
-    run = free_run([Candidate("m", "baseline", hybrid(theta))], windows, logs, STEP, LIMIT)
-    for w, p in zip(windows, run["m"], strict=True):
+    for w, p in zip(windows, ran(hybrid(theta), windows, logs, dtype=dtype), strict=True):
         t = STEP * np.arange(w.stop - w.start)
         assert not p.diverged
-        np.testing.assert_allclose(p.states[:, 3], 2 + (w.nu[0] - 2) * np.exp(-t), atol=1e-6)
-        np.testing.assert_allclose(p.states[:, 4:], np.tile(w.nu[1:], (len(t), 1)), atol=1e-12)
+        np.testing.assert_allclose(p.states[:, 3], 2 + (w.nu[0] - 2) * np.exp(-t), atol=near)
+        np.testing.assert_allclose(p.states[:, 4:], np.tile(w.nu[1:], (len(t), 1)), atol=near)
         np.testing.assert_array_equal(p.states[0, :3], logs[w.log].y[w.start, :3])
         np.testing.assert_allclose(
             p.states[:, :3], integrate(logs[w.log].y[w.start, :3], p.states[:, 3:], STEP)
@@ -106,10 +116,7 @@ def test_inputs_are_held_from_their_own_sample() -> None:
     theta = np.zeros((3, 6))
     theta[0, 3] = 1.0
     w = np.random.default_rng(0).normal(size=(50, 2))
-    log = made(np.zeros((50, 6)), STEP, w=w)
-    (p,) = free_run(
-        [Candidate("m", "baseline", hybrid(theta))], [window(0, 7, 30)], [log], STEP, LIMIT
-    )["m"]
+    (p,) = ran(hybrid(theta), [window(0, 7, 30)], [made(np.zeros((50, 6)), STEP, w=w)])
     expected = 1.0 + STEP * np.concatenate(([0.0], np.cumsum(w[7:29, 0])))
     np.testing.assert_allclose(p.states[:, 3], expected, atol=1e-12)
 
@@ -149,8 +156,7 @@ def test_a_window_beyond_short_training_logs_is_no_divergence() -> None:
     fast = float(np.abs(log.y[:, 3]).max())
     theta = np.zeros((3, 6))
     windows = [window(0, 0, 80, nu=(fast, 0.0, 0.0)), window(0, 0, 80, nu=(2.1 * fast, 0.0, 0.0))]
-    limit = np.full(3, 0.1 * fast)
-    found = free_run([Candidate("m", "head", hybrid(theta))], windows, [log], STEP, limit)["m"]
+    found = ran(hybrid(theta), windows, [log], 0.1 * fast)
     assert [p.diverged for p in found] == [False, True]
 
 
@@ -161,15 +167,9 @@ def test_divergence_is_judged_within_the_window_only() -> None:
     theta = np.zeros((3, 6))
     theta[0, 0] = 1.0
     log = made(random_states(80, np.random.default_rng(4)), STEP)
-    run = free_run(
-        [Candidate("m", "head", hybrid(theta))],
-        [window(0, 0, 20), window(0, 0, 80)],
-        [log],
-        STEP,
-        np.array([10.0, 10.0, 10.0]),
-    )
-    assert [p.diverged for p in run["m"]] == [False, True]
-    assert run["m"][0].states[-1, 3] == pytest.approx(np.exp(1.9), rel=1e-5)
+    short, long = ran(hybrid(theta), [window(0, 0, 20), window(0, 0, 80)], [log], 10.0)
+    assert (short.diverged, long.diverged) == (False, True)
+    assert short.states[-1, 3] == pytest.approx(np.exp(1.9), rel=1e-5)
 
 
 def test_a_memory_is_warmed_up_by_the_measured_past() -> None:
@@ -179,8 +179,7 @@ def test_a_memory_is_warmed_up_by_the_measured_past() -> None:
     rng = np.random.default_rng(5)
     log = made(0.3 * random_states(60, rng), STEP, w=rng.normal(size=(60, 2)))
     windows = [window(0, 20, 40, past=5), window(0, 30, 50, past=15)]
-    run = free_run([Candidate("m", "head", model)], windows, [log], STEP, LIMIT)["m"]
-    for w, p in zip(windows, run, strict=True):
+    for w, p in zip(windows, ran(model, windows, [log]), strict=True):
         s = model.warmup(
             torch.from_numpy(log.y[None, w.past : w.start]),
             torch.from_numpy(log.w[None, w.past : w.start]),
@@ -194,129 +193,61 @@ def test_a_memory_is_warmed_up_by_the_measured_past() -> None:
                 x, s = model.step(x, torch.from_numpy(log.w[None, k]), s)
 
 
-def test_a_window_does_not_depend_on_its_neighbours() -> None:
-    """Windows with pasts of different length, alone and in one batch."""
-    torch.manual_seed(1)
-    model = hybrid(
-        np.zeros((3, 6)), LstmConfig(hidden_size=6).build(SIGNALS.build().names)
-    ).double()
-    rng = np.random.default_rng(6)
-    log = made(0.3 * random_states(60, rng), STEP, w=rng.normal(size=(60, 2)))
-    windows = [window(0, 20, 40, past=5), window(0, 8, 25, past=6), window(0, 0, 10, past=0)]
-    together = free_run([Candidate("m", "head", model)], windows, [log], STEP, LIMIT)["m"]
-    for w, p in zip(windows, together, strict=True):
-        (alone,) = free_run([Candidate("m", "head", model)], [w], [log], STEP, LIMIT)["m"]
-        np.testing.assert_allclose(p.states, alone.states, rtol=1e-9, atol=1e-9)
-
-
-def test_single_precision_is_close() -> None:
-    theta = np.zeros((3, 6))
-    theta[0, 0], theta[0, 5] = -1.0, 2.0
-    log = made(random_states(60, np.random.default_rng(7)), STEP)
-    one = free_run([Candidate("m", "head", hybrid(theta))], [window(0, 0, 60)], [log], STEP, LIMIT)[
-        "m"
-    ][0]
-    two = free_run(
-        [Candidate("m", "head", hybrid(theta))],
-        [window(0, 0, 60)],
-        [log],
-        STEP,
-        LIMIT,
-        dtype=torch.float32,
-    )["m"][0]
-    np.testing.assert_allclose(two.states, one.states, atol=1e-5)
-
-
-def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
-    """The candidate `truth`: actuator states from the log, commands as inputs, no more known."""
-    plant = load_vessel("wam_v_cal").build()
-    model = PlantDynamics(plant, STEP, 2)
-    count = 80
-    w = torch.zeros(1, count, len(plant.inputs), dtype=torch.float64)
-    w[0, :, 0] = 20 + 10 * torch.sin(torch.arange(count) * 0.1)
-    w[0, :, 1] = 15.0
-    x = torch.zeros(1, 8, dtype=torch.float64)
-    states: list[Tensor] = []
-    with torch.no_grad():
-        for k in range(count):
-            states.append(x[0])
-            x, _ = model.step(x, w[:, k], x[:, :0])
-    truth = torch.stack(states).numpy()
-    channels = dict(zip(plant.state, truth.T, strict=True)) | {
-        "cmd_port": w[0, :, 0].numpy(),
-        "cmd_stbd": w[0, :, 1].numpy(),
-    }
-    log = Log("trial", STEP * np.arange(count), channels)
-    good = np.ones(count, dtype=bool)
-    trial = prepared(log, truth[:, :6], np.zeros((count, 2)), good, np.zeros(count, dtype=int))
-    candidate = Candidate(
-        "truth", "truth", model, plant.state, plant.inputs[:2], len(plant.inputs) - 2
-    )
-    windows = [window(0, s, s + 30, nu=tuple(truth[s, 3:6])) for s in (0, 25, 50)]
-    for w_, p in zip(
-        windows, free_run([candidate], windows, [trial], STEP, LIMIT)["truth"], strict=True
-    ):
-        np.testing.assert_allclose(p.states[:, 3:], truth[w_.start : w_.stop, 3:6], atol=1e-12)
-        np.testing.assert_allclose(p.states[:, :3], truth[w_.start : w_.stop, :3], atol=2e-3)
-
-
-def test_a_vessel_that_rolls_starts_from_the_logs_roll_too() -> None:
-    """The truth of a 4-DOF vessel, whose state has phi and p among x, y, psi, u, v, r: its free run
-    is the log itself.
+@pytest.mark.parametrize(("vessel", "start"), [("wam_v_cal", 0.0), ("patrol_p06", 7.0)])
+def test_the_plant_itself_predicts_its_own_noise_free_trial(vessel: str, start: float) -> None:
+    """The candidate `truth`: what the measured state lacks (actuators, phi and p of a vessel that
+    rolls) from the log, commands as inputs, no more known.
     """
-    plant = load_vessel("patrol_p06").build()
+    plant, count = load_vessel(vessel).build(), 200
     model = PlantDynamics(plant, STEP, 2)
-    count = 200
     w = torch.zeros(1, count, len(plant.inputs), dtype=torch.float64)
-    w[0, :, 0] = 0.1 * torch.sign(torch.sin(torch.arange(count) * 0.05))
-    w[0, :, 1] = 1e5
-    x, states = plant.approach(1), []
+    swing = torch.sin(torch.arange(count) * 0.1)
+    w[0, :, 0] = 0.1 * torch.sign(swing) if start else 20 + 10 * swing
+    w[0, :, 1] = 1e5 if start else 15.0
+    x, states = plant.approach(1) if start else torch.zeros(1, 8, dtype=torch.float64), []
     with torch.no_grad():
         for k in range(count):
             states.append(x[0])
             x, _ = model.step(x, w[:, k], x[:, :0])
-    truth = torch.stack(states).numpy()
-    channels = dict(zip(plant.state, truth.T, strict=True)) | {
-        name: w[0, :, i].numpy() for i, name in enumerate(plant.inputs[:2])
-    }
+    channels = dict(zip(plant.state, torch.stack(states).numpy().T, strict=True))
+    channels |= {name: w[0, :, i].numpy() for i, name in enumerate(plant.inputs[:2])}
     log = Log("trial", STEP * np.arange(count), channels)
-    motion = log.stack(("x", "y", "psi", "u", "v", "r"))
-    trial = prepared(
-        log, motion, np.zeros((count, 2)), np.ones(count, dtype=bool), np.zeros(count, dtype=int)
-    )
-    candidate = Candidate(
-        "truth", "truth", model, plant.state, plant.inputs[:2], len(plant.inputs) - 2
-    )
+    motion, whole = log.stack(("x", "y", "psi", "u", "v", "r")), np.ones(count, dtype=bool)
+    trial = prepared(log, motion, np.zeros((count, 2)), whole, np.zeros(count, dtype=int))
+    truth = Candidate("truth", "truth", model, plant.state, plant.inputs[:2], len(plant.inputs) - 2)
     windows = [window(0, s, s + 60, nu=tuple(motion[s, 3:])) for s in (0, 70, 130)]
-    for w_, p in zip(
-        windows, free_run([candidate], windows, [trial], STEP, LIMIT)["truth"], strict=True
-    ):
-        np.testing.assert_allclose(p.states[:, 3:], motion[w_.start : w_.stop, 3:], atol=1e-12)
-    assert np.abs(log["phi"]).max() > 0.01
+    found = free_run([truth], windows, [trial], STEP, np.full(3, 1e6))["truth"]
+    for one, p in zip(windows, found, strict=True):
+        seen = motion[one.start : one.stop]
+        np.testing.assert_allclose(p.states[:, 3:], seen[:, 3:], atol=1e-12)
+        np.testing.assert_allclose(p.states[:, :3], seen[:, :3], atol=2e-3 * max(start, 1.0))
+    assert not start or np.abs(log["phi"]).max() > 0.01
 
 
-def test_windows_run_together_as_they_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Long windows, short ones and little memory: batches differ, predictions do not."""
+@pytest.mark.parametrize("remembers", [False, True])
+def test_windows_run_together_as_they_run_alone(
+    remembers: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Long windows, short ones, pasts of any length and little memory: batches differ, predictions
+    do not.
+    """
     random = np.random.default_rng(4)
     theta = np.concatenate((-np.eye(3), 0.1 * random.normal(size=(3, 3))), axis=1)
+    torch.manual_seed(1)
+    head = LstmConfig(hidden_size=6).build(SIGNALS.build().names) if remembers else None
+    model = hybrid(theta, head).double()
     ready = [
-        made(random_states(300, np.random.default_rng(i)), STEP, name=str(i)) for i in range(2)
+        made(0.3 * random_states(300, random), STEP, w=random.normal(size=(300, 2)), name=str(i))
+        for i in range(2)
     ]
     lengths = (2, 3, 290, 40, 12, 11, 150, 60)
-    windows = [window(i % 2, i, i + length) for i, length in enumerate(lengths)]
-    model = hybrid(theta)
-    candidate = Candidate("m", "baseline", model)
-
-    def states(together: list[Window]) -> list[np.ndarray]:
-        found = free_run([candidate], together, ready, STEP, LIMIT)["m"]
-        return [prediction.states for prediction in found]
-
-    alone = [states([one])[0] for one in windows]
+    windows = [window(i % 2, i, i + length, past=max(i - 3, 0)) for i, length in enumerate(lengths)]
+    alone = [ran(model, [one], ready)[0].states for one in windows]
     for largest in (30_000_000, 1_000):
         monkeypatch.setattr(freerun, "_LARGEST", largest)
-        for one, other, length in zip(states(windows), alone, lengths, strict=True):
-            assert one.shape == (length, 6)
-            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+        for one, other, length in zip(ran(model, windows, ready), alone, lengths, strict=True):
+            assert one.states.shape == (length, 6)
+            np.testing.assert_allclose(one.states, other, rtol=1e-9, atol=1e-9)
     assert model.positions, "the judged model itself is left as it is"
 
 

@@ -1,4 +1,4 @@
-"""Metrics of hand-made predictions against numbers worked out by hand and plain loops."""
+"""Metrics and limits of hand-made predictions against numbers by hand and plain loops."""
 
 from __future__ import annotations
 
@@ -9,25 +9,27 @@ import pytest
 from made_logs import made, random_states
 
 from residnet.baselines.given import StillConfig
+from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ZeroHead
 from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction
-from residnet.judge.metrics import Judged, find, new_trials
-from residnet.judge.protocol import Window
+from residnet.judge.metrics import Judged, find, metrics_content, metrics_table, new_trials
+from residnet.judge.protocol import Window, Windows
+from residnet.judge.selection import blocks_of, shares
 from residnet.physics.signals import SignalsConfig
 
 SIGNALS = SignalsConfig(inputs=("delta",)).build()
 SCALES = {"u": 0.5, "v": 0.25, "r": 0.1}
+RANGES = {"u": (0.5, 2.0), "v": (-1.0, 1.0), "r": (-1.0, 1.0), "n": (0.0, 8.0)}
 
 
 def window(log: int, start: int, stop: int) -> Window:
     return Window(log, start, stop, start, np.zeros(3))
 
 
-def candidate(name: str) -> Candidate:
-    return Candidate(
-        name, "head", HybridDynamics(SIGNALS, StillConfig().build(()), ZeroHead(), 0.1, "euler")
-    )
+def candidate(name: str, reference: str | None = None, kind: str = "head") -> Candidate:
+    model = HybridDynamics(SIGNALS, StillConfig().build(()), ZeroHead(), 0.1, "euler")
+    return Candidate(name, kind, model, reference=reference, ranges=RANGES)
 
 
 def test_by_hand() -> None:
@@ -142,7 +144,7 @@ def test_differences_are_paired_by_window_and_kind() -> None:
         name: (Errors.of(run.windows, run.predictions[name], logs).rmse / [0.5, 0.25, 0.1]).mean(1)
         for name in "ab"
     }
-    compared = replace(candidate("a"), reference="b")
+    compared = candidate("a", "b")
     table = Judged(run, [compared, candidate("b")], logs, SCALES).rows({})
     for row in table:
         chosen = [row["manoeuvre"] in ("all", logs[w.log].log.manoeuvre) for w in run.windows]
@@ -165,18 +167,6 @@ def test_differences_are_paired_by_window_and_kind() -> None:
         assert (found["ci95"] is None) == (row["manoeuvre"] != "all")
     lost = Judged(run, [replace(compared, reference="absent")], logs, SCALES).rows({})
     assert {row["difference"] for row in lost} == {None}
-
-
-def test_perfect_predictions_have_no_error() -> None:
-    run, logs = made_run()
-    exact = FreeRun(
-        "T3",
-        "test",
-        run.windows,
-        {"a": [Prediction(logs[w.log].y[w.start : w.stop], False) for w in run.windows]},
-    )
-    row = find(Judged(exact, [candidate("a")], logs, SCALES).rows({}), model="a")
-    assert row["nrmse"]["mean"] == row["position_error_end"] == row["heading_error_end"] == 0.0
 
 
 def test_find_wants_exactly_one() -> None:
@@ -214,3 +204,257 @@ def test_what_ran_away_or_is_exact_leaves_the_intervals_of_others() -> None:
     assert spans[:2] == plain
     assert spans[2] == [0.0, 0.0]
     assert new_trials(values[:6], numbers[:6]) == [None] * 4
+
+
+def test_a_table_has_one_column_per_number_and_the_file_marks_the_selected_model() -> None:
+    run, logs = made_run()
+    rows = Judged(run, [candidate("a"), candidate("b")], logs, SCALES).rows({})
+    table = metrics_table(rows)
+    assert table["model"].tolist() == [row["model"] for row in rows]
+    assert table["rmse_r"].tolist() == [row["rmse"]["r"] for row in rows]
+    assert table["nrmse_mean"].tolist() == [row["nrmse"]["mean"] for row in rows]
+    assert table["note"][0] == f"{rows[0]['diverged']}/12 diverged"
+    assert "selected" not in table
+    assert table.notna().to_numpy().all()
+    content = metrics_content("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", "c", rows)
+    assert content["schema"] == "residnet.metrics/1"
+    assert (content["selected"], content["selected_ensemble"]) == ("b", "c")
+    marked = metrics_table(content["rows"])["selected"].tolist()
+    assert marked == [row["model"] == "b" for row in rows]
+    assert "selected" not in rows[0]
+
+
+def straight(
+    speed: float, drift: float = 0.0, turned: float = 0.0, count: int = 21, step: float = 0.1
+) -> np.ndarray:
+    """States of a straight run north whose measured position gains `drift` m/s eastwards and whose
+    heading gains `turned` rad, unseen by u, v, r.
+    """
+    t = step * np.arange(count)
+    return np.stack((speed * t, drift * t, turned * t / t[-1], 0 * t + speed, 0 * t, 0 * t), axis=1)
+
+
+def test_consistency_by_hand() -> None:
+    logs = [made(straight(1.0, drift=0.3, turned=0.02), 0.1), made(straight(2.0, drift=0.4), 0.1)]
+    windows = [window(0, 0, 21), window(1, 0, 21)]
+    found = Judged(FreeRun("T2", "test", windows), [], logs, SCALES).kinematics(0.1)
+    # after 2 s the position is off by 0.6 m and 0.8 m, the heading by 0.02 rad and nothing
+    assert found["windows"] == 2
+    assert found["position_mean"] == pytest.approx(0.7)
+    assert found["position_rms"] == pytest.approx(np.sqrt((0.36 + 0.64) / 2))
+    assert found["heading_mean"] == pytest.approx(0.01)
+    assert found["heading_rms"] == pytest.approx(0.02 / np.sqrt(2))
+
+
+def nine(wind: list[float] | None = None) -> tuple[FreeRun, list[Prepared]]:
+    """Nine logs of one window each at speeds 1 .. 9 m/s; `a` is off by 0.01, 0.02, .. m/s in u, `b`
+    by twice that.
+    """
+    logs = [made(straight(k + 1.0), 0.1, w=np.zeros((21, 1)), name=f"log{k}") for k in range(9)]
+    if wind is not None:
+        logs = [
+            replace(
+                p,
+                log=p.log.replace(channels={**p.log.channels, "wind_speed": np.full(21, wind[k])}),
+            )
+            for k, p in enumerate(logs)
+        ]
+    windows = [window(k, 0, 21) for k in range(9)]
+
+    def off(factor: float) -> list[Prediction]:
+        out = []
+        for k, p in enumerate(logs):
+            states = p.y.copy()
+            states[:, 3] += factor * 0.01 * (k + 1)
+            out.append(Prediction(states, False))
+        return out
+
+    return FreeRun("T2", "test", windows, {"a": off(1), "b": off(2)}), logs
+
+
+def test_bands_are_thirds_of_the_windows() -> None:
+    run, logs = nine(wind=[3.0, 1.0, 2.0] * 3)
+    found = Judged(run, [candidate("a", "b"), candidate("b")], logs, SCALES).bands()
+    assert [(band["by"], band["low"], band["high"], band["windows"]) for band in found] == [
+        ("speed", 1.0, 3.0, 3),
+        ("speed", 4.0, 6.0, 3),
+        ("speed", 7.0, 9.0, 3),
+        ("wind", 1.0, 1.0, 3),
+        ("wind", 2.0, 2.0, 3),
+        ("wind", 3.0, 3.0, 3),
+    ]
+    # u alone is off: nrmse of a window is a third of its error over the scale
+    levels = [
+        np.mean(ks) * 0.01 / 0.5 / 3
+        for ks in ((1, 2, 3), (4, 5, 6), (7, 8, 9), (2, 5, 8), (3, 6, 9), (1, 4, 7))
+    ]
+    assert [band["models"]["a"]["nrmse_mean"] for band in found] == pytest.approx(levels)
+    for band, level in zip(found, levels, strict=True):
+        paired = band["models"]["a"]["difference"]
+        assert paired["to"] == "b"
+        assert paired["nrmse_mean"] == pytest.approx(-level)
+        assert paired["ratio"] == pytest.approx(0.5)
+        assert band["models"]["b"]["difference"] is None
+
+
+def test_bands_without_windows_enough_or_without_wind_are_left_out() -> None:
+    run, logs = nine()
+    assert {band["by"] for band in Judged(run, [candidate("a")], logs, SCALES).bands()} == {"speed"}
+    few = FreeRun("T2", "test", run.windows[:8], {"a": run.predictions["a"][:8]})
+    # 8 windows: thirds of 3, 2 and 3
+    assert [band["low"] for band in Judged(few, [candidate("a")], logs, SCALES).bands()] == [
+        1.0,
+        6.0,
+    ]
+    # one speed: no breakdown at all
+    still = [made(straight(1.0), 0.1) for _ in range(9)]
+    assert Judged(run, [candidate("a")], still, SCALES).bands() == []
+
+
+def test_worst_windows_are_named() -> None:
+    run, logs = nine()
+    found = Judged(run, [candidate("a")], logs, SCALES).limits(0.1)["worst"]["a"]
+    assert [entry["log"] for entry in found] == ["log8", "log7", "log6"]
+    # u alone is off, by 0.09, 0.08 and 0.07 m/s
+    worst = [0.01 * k / 0.5 / 3 for k in (9, 8, 7)]
+    assert [entry["nrmse"] for entry in found] == pytest.approx(worst)
+    assert found[0]["t"] == pytest.approx(3.0)
+    assert found[0]["rmse"]["u"] == pytest.approx(0.09)
+    assert found[0]["manoeuvre"] == "zigzag"
+
+
+STEP = 0.5
+CANDIDATES = [
+    candidate("zero", kind="zero"),
+    candidate("baseline", kind="baseline"),
+    candidate("mlp"),
+]
+
+
+@pytest.fixture(scope="module")
+def logs() -> list[Prepared]:
+    """Logs of 41 s, each at a speed of its own."""
+    speeds = [0.6 + 0.3 * number for number in range(6)]
+    return [
+        made(straight(speed, count=82, step=STEP), STEP, w=np.full((82, 1), 5.0))
+        for speed in speeds
+    ]
+
+
+@pytest.fixture(scope="module")
+def run(logs: list[Prepared]) -> FreeRun:
+    """The error of zero is 0.1 throughout; the model's grows with time and passes it at 12 s."""
+    protocol = Windows(length=20.0, first=0.0, history=0.0)
+    windows = [w for i, prepared in enumerate(logs) for w in protocol.windows(prepared, i, STEP)]
+    out = FreeRun("T20", "test", windows)
+    for name in ("zero", "baseline", "mlp"):
+        out.predictions[name] = []
+        for window in windows:
+            states = logs[window.log].y[window.start : window.stop].copy()
+            age = STEP * np.arange(len(states))
+            error = {"zero": 0.1 + 0 * age, "baseline": 0.09 + 0 * age, "mlp": 0.1 * age / 12.0}
+            # a little of its own for each log, so that there is a spread
+            states[:, 3] += (1.0 + 0.01 * window.log) * error[name]
+            out.predictions[name].append(Prediction(states, False))
+    return out
+
+
+def test_errors_of_the_pose_are_told_after_the_times_that_matter(
+    run: FreeRun, logs: list[Prepared]
+) -> None:
+    """Windows of 20 s; the model's position is put 3 m and its heading 200 deg off after 10 s."""
+    for prediction in run.predictions["mlp"]:
+        prediction.states[20, :2] += np.array([3.0, 4.0])
+        prediction.states[20, 2] += np.radians(200.0)
+    entries = Judged(run, CANDIDATES, logs, SCALES).horizons(STEP)
+    for prediction in run.predictions["mlp"]:
+        prediction.states[20, :2] -= np.array([3.0, 4.0])
+        prediction.states[20, 2] -= np.radians(200.0)
+    assert [entry["seconds"] for entry in entries] == [10.0, 20.0]
+    first = entries[0]
+    assert (first["windows"], first["logs"]) == (12, 6)
+    assert first["slowest"] == pytest.approx(0.6)
+    assert first["sailed"] == pytest.approx(1.35 * 10.5)
+    own = first["models"]["mlp"]
+    assert own["position"] == pytest.approx(5.0)
+    # a turn too many is no error
+    assert np.degrees(own["heading"]) == pytest.approx(160.0)
+    low, high = own["intervals"]["position"]
+    assert low <= 5.0 <= high
+    # velocities were made from the positions
+    assert first["floor"]["position"] == pytest.approx(0.0, abs=1e-9)
+    assert first["models"]["zero"]["position"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[Prepared]) -> None:
+    pairs = list(zip(run.windows, run.predictions["mlp"], strict=True))
+    for window, prediction in pairs:
+        prediction.states[20, 2] += 0.5 * (window.log + 1)
+    entries = Judged(run, CANDIDATES, logs, SCALES).horizons(STEP)
+    for window, prediction in pairs:
+        prediction.states[20, 2] -= 0.5 * (window.log + 1)
+    assert entries[0]["models"]["mlp"]["intervals"]["heading"][1] == pytest.approx(np.pi)
+
+
+@pytest.mark.parametrize("count", [3, 4, 6])
+def test_intervals_hold_the_mean_over_as_many_new_logs(logs: list[Prepared], count: int) -> None:
+    """Forty sets of logs are judged, and forty others fall into the intervals as often as told."""
+    logs = logs[:count]
+    random, hits = np.random.default_rng(0), 0
+    protocol = Windows(length=20.0, first=0.0, history=0.0)
+    windows = [w for i, prepared in enumerate(logs) for w in protocol.windows(prepared, i, STEP)]
+
+    def drawn() -> FreeRun:
+        out = FreeRun("T20", "test", windows)
+        by_log = random.gamma(2.0, 1.0, len(logs))
+        out.predictions["mlp"] = []
+        for window in windows:
+            states = logs[window.log].y[window.start : window.stop].copy()
+            states[:, 0] += by_log[window.log] * random.gamma(4.0, 0.25)
+            out.predictions["mlp"].append(Prediction(states, False))
+        return out
+
+    trials = 40
+    for _ in range(trials):
+        seen, new = (
+            Judged(drawn(), [CANDIDATES[2]], logs, SCALES).horizons(STEP) for _ in range(2)
+        )
+        low, high = seen[-1]["models"]["mlp"]["intervals"]["position"]
+        hits += low <= new[-1]["models"]["mlp"]["position"] <= high
+    assert hits >= 0.85 * trials
+
+
+def test_every_model_is_compared_with_zero_and_the_first_baseline(
+    run: FreeRun, logs: list[Prepared]
+) -> None:
+    judged = Judged(run, CANDIDATES, logs, SCALES)
+    found = judged.compared()
+    assert set(found["mlp"]) == {"zero", "baseline"}
+    assert set(found["baseline"]) == {"zero"}
+    apart = found["baseline"]["zero"]["nrmse_mean"]
+    # u alone is off, by 0.09 and 0.1 m/s, and the more the later the log
+    expected = np.array([(1.0 + 0.01 * w.log) * -0.01 / 0.5 / 3 for w in run.windows])
+    assert judged.nrmse["zero"][0] == pytest.approx(0.1 / 0.5 / 3)
+    assert apart == pytest.approx(expected.mean())
+
+
+def test_samples_outside_the_training_range_are_counted(run: FreeRun, logs: list[Prepared]) -> None:
+    # one of six logs is faster than 2 m/s
+    found = Judged(run, CANDIDATES, logs, SCALES).outside()
+    assert found["share"] == pytest.approx(1 / 6)
+    assert found["channels"] == {"u": pytest.approx(1 / 6)}
+
+
+@pytest.mark.parametrize(("count", "of", "blocks"), [(6, "logs", 6), (2, "stretches", 8)])
+def test_shares_of_blocks_sum_to_the_mean_error(
+    run: FreeRun, logs: list[Prepared], count: int, of: str, blocks: int
+) -> None:
+    few = [i for i, window in enumerate(run.windows) if window.log < count]
+    part = FreeRun("T20", "test", [run.windows[i] for i in few])
+    part.predictions["mlp"] = [run.predictions["mlp"][i] for i in few]
+    found, labels = blocks_of(part)
+    assert (found.of, len(found.weights)) == (of, blocks)
+    assert found.weights.sum() == pytest.approx(1.0)
+    own = shares(part, "mlp", logs, SCALES, labels, blocks)
+    expected = Judged(part, [CANDIDATES[2]], logs, SCALES).nrmse["mlp"].mean()
+    assert own.sum() == pytest.approx(expected)

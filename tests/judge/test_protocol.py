@@ -76,16 +76,6 @@ def test_windows_never_cross_a_break() -> None:
     assert found > 300
 
 
-def test_back_to_back_windows_share_their_end_point() -> None:
-    log = made(np.zeros((301, 6)), STEP)
-    windows = Windows(length=10.0, first=0.0).windows(log, 0, STEP)
-    assert [(w.start, w.stop) for w in windows] == [(0, 101), (100, 201), (200, 301)]
-    # one sample less and the tail is incomplete
-    assert (
-        len(Windows(length=10.0, first=0.0).windows(made(np.zeros((300, 6)), STEP), 0, STEP)) == 2
-    )
-
-
 def test_history_does_not_reach_across_a_break() -> None:
     """What warms up a memory must be an uninterrupted past."""
     piece = np.repeat([0, -1, 1], 100)

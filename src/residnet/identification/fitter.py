@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from residnet.identification.recipe import Facts
 from residnet.identification.settings import FitSettings
 from residnet.judge.band import Band
 from residnet.judge.freerun import Candidate, Errors, free_run
-from residnet.judge.protocol import EvaluationConfig, all_windows, overlapping
+from residnet.judge.protocol import EvaluationConfig, all_windows
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.sparse import coefficient_row
 from residnet.training.config import TrainingConfig
@@ -162,9 +163,7 @@ class ValidationScore:
         self.limit = limit
         self.scales = config.scales.array()
         protocol = config.protocols[config.selection]
-        self.windows = all_windows(
-            overlapping(protocol) if dense else protocol, logs, step, config.selection
-        )
+        self.windows = all_windows(protocol, logs, step, config.selection, dense=dense)
 
     def __call__(self, model: HybridDynamics) -> Score:
         """Return the divergences and the mean nrmse of the validation windows, run in float32."""
@@ -236,7 +235,7 @@ def choose_solution(
         if better is centre:
             break
         centre = better
-    best = min(tried, key=_score)[0] if tried else solutions[0]
+    best = min(tried, key=itemgetter(1))[0] if tried else solutions[0]
     part.load_state_dict(best.state, strict=False)
     scores = [
         {**solution.choice, "validation": found.error, "diverged": found.diverged}
@@ -245,15 +244,13 @@ def choose_solution(
     return best, {"free_run_choice": scores} if scores else {}
 
 
-def _score(tried: tuple[Solution, Score]) -> Score:
-    return tried[1]
-
-
 def _best_with_neighbours(tried: Sequence[tuple[Solution, Score]]) -> tuple[Solution, Score] | None:
     """The best of those that have neighbours; one that has none, such as no residual at all, does
     not end the search.
     """
-    return min((pair for pair in tried if pair[0].neighbours is not None), key=_score, default=None)
+    return min(
+        (pair for pair in tried if pair[0].neighbours is not None), key=itemgetter(1), default=None
+    )
 
 
 class Fitter:

@@ -245,27 +245,15 @@ class Band:
 
     def table(self) -> BandTable:
         """Return what an exported model carries: half widths that take every run for the same."""
-        return BandTable.model_validate(
-            {
-                "level": self.level,
-                "steps": self.steps.tolist(),
-                **{
-                    name: column.tolist()
-                    for name, column in zip(self.channels, self.plain.T, strict=True)
-                },
-                "logs": self.logs,
-                "cautions": self.cautions,
-            }
-        )
+        columns = dict(zip(self.channels, self.plain.T.tolist(), strict=True))
+        about = {"level": self.level, "logs": self.logs, "cautions": self.cautions}
+        return BandTable.model_validate({**about, "steps": self.steps.tolist(), **columns})
 
     def content(self) -> dict[str, Any]:
         """Return the band as JSON takes it."""
 
-        def named(rows: np.ndarray) -> dict[str, list[float]]:
-            return {name: rows[:, i].tolist() for i, name in enumerate(self.channels)}
-
-        def single(values: np.ndarray) -> dict[str, float]:
-            return dict(zip(self.channels, map(float, values), strict=True))
+        def named(values: np.ndarray) -> dict[str, Any]:
+            return dict(zip(self.channels, values.T.tolist(), strict=True))
 
         moving = [name for name in self.channels if name not in ("heading", "position")]
         return {
@@ -278,9 +266,9 @@ class Band:
             "steps": self.steps.tolist(),
             "half_width": named(self.width),
             "half_width_of_any_run": named(self.plain),
-            "whole_run_factor": single(self.whole),
-            "constant_half_width": single(self.constant),
-            "score_unit": single(self.unit),
+            "whole_run_factor": named(self.whole),
+            "constant_half_width": named(self.constant),
+            "score_unit": named(self.unit),
             "activity": {
                 "measures": [*moving, *(f"{name}_dot" for name in moving)],
                 "floor": self.activity.floor.tolist(),
@@ -294,32 +282,28 @@ class Band:
     @classmethod
     def read(cls, content: Mapping[str, Any]) -> Band:
         """Return the band from what `content` gave."""
+        channels, activity = tuple(content["half_width"]), content["activity"]
 
-        channels = tuple(content["half_width"])
+        def table(named: Mapping[str, Any]) -> np.ndarray:
+            return np.array([named[channel] for channel in channels]).T
 
-        def table(name: str) -> np.ndarray:
-            return np.array([content[name][channel] for channel in channels]).T
-
-        def single(name: str) -> np.ndarray:
-            return np.array([content[name][channel] for channel in channels])
-
-        activity = content["activity"]
+        # files of earlier versions hold no usual spread
+        usual = content.get("usual_spread")
         return cls(
             float(content["level"]),
             float(content["step"]),
             np.array(content["steps"]),
-            table("half_width"),
-            table("half_width_of_any_run"),
-            single("whole_run_factor"),
-            single("constant_half_width"),
-            single("score_unit"),
+            table(content["half_width"]),
+            table(content["half_width_of_any_run"]),
+            table(content["whole_run_factor"]),
+            table(content["constant_half_width"]),
+            table(content["score_unit"]),
             Activity(*(np.array(activity[key]) for key in ("floor", "centre", "spread"))),
-            np.array([activity["slope"][channel] for channel in channels]).T,
+            table(activity["slope"]),
             int(content["logs"]),
             float(content["independent_scores"]),
             tuple(content["cautions"]),
-            # files of earlier versions hold none
-            table("usual_spread") if content.get("usual_spread") else None,
+            table(usual) if usual else None,
             channels,
         )
 

@@ -221,12 +221,10 @@ class _Runs:
 
     def where(self, chosen: np.ndarray) -> _Runs:
         """Return those runs that are chosen [W] bool."""
-        names = [name for name, wanted in zip(self.names, chosen, strict=True) if wanted]
-        weight = self.weight[chosen] / self.weight[chosen].sum()
         return replace(
             self,
-            names=names,
-            weight=weight,
+            names=[name for name, wanted in zip(self.names, chosen, strict=True) if wanted],
+            weight=self.weight[chosen] / self.weight[chosen].sum(),
             error=self.error[chosen],
             measures=self.measures[chosen],
         )
@@ -243,14 +241,15 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
     """
     whole_error = _at_horizons(runs, step)
     names, weight, channels = whole_error.names, whole_error.weight, runs[0].live.layout.banded
-    spread = _spreads(runs, whole_error)
-    usual = None if spread is None else _usual(spread, whole_error)
     given = whole_error
-    if spread is not None and usual is not None:
+    usual: np.ndarray | None = None
+    spreads = [run.spread for run in runs if run.spread is not None]
+    if len(spreads) == len(runs):
+        spread = _at(spreads, given.steps)
+        usual = _rms(spread, given)
         # what the disagreement of models explains is no error that the rest of the band must hold
         explained = np.nan_to_num(disagreement(spread, usual, level, channels))
-        left = np.sqrt(np.maximum(given.error**2 - explained, 0.0))
-        given = replace(given, error=left)
+        given = replace(given, error=np.sqrt(np.maximum(given.error**2 - explained, 0.0)))
     shape, slope = _scale(given)
     scale = _scales_of_others(given)
     inside = np.nanmean(covered(given.error, _quantiles(given, scale, level) * scale), axis=(1, 2))
@@ -287,22 +286,21 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
     return replace(band, whole=whole, cautions=few(band.logs))
 
 
-def _spreads(runs: Sequence[RunErrors], given: _Runs) -> np.ndarray | None:
-    """Return how far unlike models lie apart in each run [W, G, c]; None where there are none."""
-    out = np.full_like(given.error, np.nan)
-    for run, row in zip(runs, out, strict=True):
-        if run.spread is None:
-            return None
-        reached = given.steps[given.steps <= len(run)] - 1
-        row[: len(reached)] = run.spread[reached]
+def _at(rows: Sequence[np.ndarray], steps: np.ndarray) -> np.ndarray:
+    """Return rows [L, c] of each run at some steps [W, G, c]; NaN beyond its end."""
+    out = np.full((len(rows), len(steps), rows[0].shape[1]), np.nan)
+    for one, row in zip(out, rows, strict=True):
+        reached = steps[steps <= len(row)] - 1
+        one[: len(reached)] = row[reached]
     return out
 
 
-def _usual(spread: np.ndarray, given: _Runs) -> np.ndarray:
-    """Return the root mean square [G, c] of a spread [W, G, c] over runs."""
-    weight = np.where(np.isfinite(spread), given.weight[:, None, None], 0.0)
-    total = (weight * np.nan_to_num(spread) ** 2).sum(axis=0)
-    return np.asarray(np.sqrt(_smooth(total / np.maximum(weight.sum(axis=0), 1e-300), given.steps)))
+def _rms(values: np.ndarray, given: _Runs) -> np.ndarray:
+    """Return the root mean square [G, c] of values [W, G, c] over runs, smoothed over horizons."""
+    weight = np.where(np.isfinite(values), given.weight[:, None, None], 0.0)
+    total = weight.sum(axis=0)
+    sums = np.where(total > 0, (weight * np.nan_to_num(values) ** 2).sum(axis=0), np.nan)
+    return np.asarray(np.sqrt(_smooth(sums / np.where(total > 0, total, 1.0), given.steps)))
 
 
 def _largest(error: np.ndarray, width: np.ndarray) -> np.ndarray:
@@ -354,22 +352,14 @@ def _at_horizons(runs: Sequence[RunErrors], step: float) -> _Runs:
     weight = run_weights(names)
     squares = [mean_squares(run.states, step) for run in runs]
     activity = Activity.of(squares, weight)
-    error = np.full((len(runs), len(steps), runs[0].error.shape[1]), np.nan)
-    measures = np.zeros((len(runs), len(steps), squares[0].shape[1]))
-    for i, run in enumerate(runs):
-        reached = steps[steps <= len(run)] - 1
-        error[i, : len(reached)] = run.error[reached]
-        measures[i, : len(reached)] = activity.standard(squares[i][reached])
+    error, measures = _at([run.error for run in runs], steps), _at(squares, steps)
+    measures = np.nan_to_num(activity.standard(measures))
     return _Runs(names, weight, steps, error, measures, activity)
 
 
 def _shape(given: _Runs, slope: np.ndarray) -> np.ndarray:
     """Return the root mean square [G, c] of errors over what liveliness explains, smoothed."""
-    scaled = (given.error / factor(given.measures, slope)) ** 2
-    weight = np.where(np.isfinite(scaled), given.weight[:, None, None], 0.0)
-    total = weight.sum(axis=0)
-    mean = np.where(total > 0, (weight * np.nan_to_num(scaled)).sum(axis=0), np.nan)
-    root = np.sqrt(_smooth(mean / np.where(total > 0, total, 1.0), given.steps))
+    root = _rms(given.error / factor(given.measures, slope), given)
     return np.asarray(np.maximum(root, 1e-12 + 1e-6 * np.nan_to_num(root).max(axis=0)))
 
 
@@ -387,12 +377,8 @@ def _smooth(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     known = np.isfinite(values)
     count = close @ known.astype(float)
     mean = (close @ np.where(known, values, 0.0)) / np.maximum(count, 1.0)
-    for column in range(values.shape[1]):
-        good = count[:, column] > 0
-        if good.any():
-            mean[:, column] = np.interp(steps, steps[good], mean[good, column])
-        else:
-            mean[:, column] = np.nan
+    for column, good in zip(mean.T, (count > 0).T, strict=True):
+        column[:] = np.interp(steps, steps[good], column[good]) if good.any() else np.nan
     return np.asarray(mean)
 
 

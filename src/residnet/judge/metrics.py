@@ -18,7 +18,7 @@ from residnet.core.names import END_UNITS
 from residnet.data.prepare import Prepared
 from residnet.judge.band import Bands
 from residnet.judge.bands import count_bands, limits
-from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction, drift
+from residnet.judge.freerun import Candidate, Errors, FreeRun, drift
 from residnet.judge.verdict import FEW_LOGS, diverged_note
 
 if TYPE_CHECKING:
@@ -321,61 +321,33 @@ class Judged:
             measured velocities are off in each of `Live.ends`; and by model the mean of each over
             the windows, with `intervals` for as many new logs, see `new_trials`.
         """
-        counts, speeds = (
-            np.array([part.stop - part.start for _, part in self.parts]),
-            self._speeds(),
-        )
-        longest = int(counts.max()) - 1
+        laid, speeds = next(iter(self.found.values())), self._speeds()
+        longest = int(laid.counts.max()) - 1
         after = [round(seconds / step) for seconds in _HORIZONS]
         out = []
         for k in [*(k for k in after if 0 < k < longest), longest]:
-            there = counts > k
-            ends = np.array([self.parts[i][1].start + k for i in np.flatnonzero(there)])
-            logs = [self.parts[i][0] for i in np.flatnonzero(there)]
-            there[there] = [bool(log.usable[end]) for log, end in zip(logs, ends, strict=True)]
+            there = laid.counts > k
+            there[there] = laid.usable[(laid.begins + k)[there]]
             if not there.any():
                 continue
             numbers = self.numbers[there]
-
-            def off(
-                errors: Mapping[str, Mapping[str, np.ndarray]], numbers: np.ndarray = numbers
-            ) -> dict[str, dict[str, Any]]:
-                """Return means and intervals of sizes [W] of errors of the pose, by name."""
-                values = np.column_stack([one for of in errors.values() for one in of.values()])
-                means = iter(values.mean(0).tolist())
-                told = iter(new_trials(values, numbers))
-                out: dict[str, dict[str, Any]] = {}
-                for model, of in errors.items():
-                    ends = {name: next(told) for name in of}
-                    for angle in ("heading", "attitude"):
-                        if (found := ends.get(angle)) is not None:
-                            # it is off by half a turn at most
-                            found[1] = min(found[1], math.pi)
-                    out[model] = {name: next(means) for name in of} | {"intervals": ends}
-                return out
-
-            measured = [
-                log.y[part.start : part.start + k + 1]
-                for (log, part), taken in zip(self.parts, there, strict=True)
-                if taken
-            ]
-            floor = drift(np.stack(measured), self.live, step)
+            lasting = (self.parts[i] for i in np.flatnonzero(there).tolist())
+            measured = [log.y[part][: k + 1] for log, part in lasting]
             sailed = [float(np.hypot(*y[:, VELOCITIES][:, :2].T).sum()) * step for y in measured]
+            models = {
+                name: found.ends((found.begins + k)[there]) for name, found in self.found.items()
+            }
+            floor = {"floor": drift(np.stack(measured), self.live, step)}
             out.append(
                 {
                     "seconds": k * step,
-                    "windows": int(there.sum()),
+                    "windows": len(measured),
                     "logs": len(set(numbers.tolist())),
                     "slowest": float(speeds[there].min()),
                     "fastest": float(speeds[there].max()),
                     "sailed": float(np.mean(sailed)),
-                    "floor": off({"floor": floor})["floor"],
-                    "models": off(
-                        {
-                            name: found.ends((found.begins + k)[there])
-                            for name, found in self.found.items()
-                        }
-                    ),
+                    "floor": _sizes(floor, numbers)["floor"],
+                    "models": _sizes(models, numbers),
                 }
             )
         return out
@@ -504,6 +476,24 @@ class Judged:
         }
 
 
+def _sizes(
+    errors: Mapping[str, Mapping[str, np.ndarray]], numbers: np.ndarray
+) -> dict[str, dict[str, Any]]:
+    """Return means and intervals of sizes [W] of errors of the pose, by model and name."""
+    values = np.column_stack([one for of in errors.values() for one in of.values()])
+    told = zip(values.mean(0).tolist(), new_trials(values, numbers), strict=True)
+    out: dict[str, dict[str, Any]] = {}
+    for model, of in errors.items():
+        found = {name: next(told) for name in of}
+        # an angle is off by half a turn at most
+        most = {name: math.pi if END_UNITS[name] == "rad" else math.inf for name in of}
+        intervals = {
+            name: ends and [ends[0], min(ends[1], most[name])] for name, (_, ends) in found.items()
+        }
+        out[model] = {name: mean for name, (mean, _) in found.items()} | {"intervals": intervals}
+    return out
+
+
 def _equal_parts(values: np.ndarray, count: int) -> list[np.ndarray]:
     """[W] bool of each of so many equal parts, lowest first; equal values stay together."""
     edges = np.quantile(values, np.arange(1, count) / count)
@@ -616,62 +606,40 @@ def write_rollouts(
     import pyarrow.parquet as pq
 
     folder.mkdir(parents=True, exist_ok=True)
+    known = bands or {}
     for number, log in enumerate(logs):
-        parts: dict[str, list[np.ndarray]] = {
-            name: [] for name in ("protocol", "model", "window", "t", "usable", "diverged")
-        }
-        measured: list[np.ndarray] = []
-        predicted: list[np.ndarray] = []
-        given: list[np.ndarray] = []
-        low: list[np.ndarray] = []
-        high: list[np.ndarray] = []
+        parts: list[dict[str, np.ndarray]] = []
+        order = {name: log.live.states.index(name) for name in columns_of(log.live)}
         for run in runs:
             of_log = [i for i, window in enumerate(run.windows) if window.log == number]
             for model, predictions in run.predictions.items():
+                band = known.get(model, {}).get(run.protocol)
                 for place, i in enumerate(of_log):
-                    rows = slice(run.windows[i].start, run.windows[i].stop)
-                    length = rows.stop - rows.start
-                    labels: dict[str, object] = {
-                        "protocol": run.protocol,
-                        "model": model,
-                        "window": place,
-                        "diverged": predictions[i].diverged,
-                    }
-                    for key, label in labels.items():
-                        parts[key].append(np.full(length, label))
-                    parts["t"].append(log.log.t[rows])
-                    parts["usable"].append(log.usable[rows])
-                    measured.append(log.y[rows])
-                    given.append(log.w[rows])
-                    predicted.append(predictions[i].states)
-                    least, most = _limits(predictions[i], model, run.protocol, bands or {})
-                    low.append(least)
-                    high.append(most)
-        if not measured:
+                    rows, found = slice(run.windows[i].start, run.windows[i].stop), predictions[i]
+                    labels = {"protocol": run.protocol, "model": model, "window": place}
+                    tables = {"": log.y[rows], "_hat": found.states}
+                    if any(known.values()):
+                        low = high = np.full_like(found.states, np.nan)
+                        if band is not None:
+                            width = band.half_widths(found.states, found.spread)
+                            low, high = limits(found.states, width)
+                        tables |= {"_low": low, "_high": high}
+                    parts.append(
+                        {name: np.full(len(found.states), label) for name, label in labels.items()}
+                        | {"t": log.log.t[rows], "usable": log.usable[rows]}
+                        | {"diverged": np.full(len(found.states), found.diverged)}
+                        | {
+                            f"{name}{ending}": values[:, column]
+                            for ending, values in tables.items()
+                            for name, column in order.items()
+                        }
+                        | {f"{INPUT}{n}": log.w[rows, k] for k, n in enumerate(inputs)}
+                    )
+        if not parts:
             continue
-        columns = {name: np.concatenate(values) for name, values in parts.items()}
-        y, y_hat = np.concatenate(measured), np.concatenate(predicted)
-        order = {name: log.live.states.index(name) for name in columns_of(log.live)}
-        columns |= {name: y[:, place] for name, place in order.items()}
-        columns |= {f"{name}_hat": y_hat[:, place] for name, place in order.items()}
-        if any((bands or {}).values()):
-            for ending, parts_of in (("low", low), ("high", high)):
-                reached = np.concatenate(parts_of)
-                columns |= {f"{n}_{ending}": reached[:, place] for n, place in order.items()}
-        w = np.concatenate(given)
-        columns |= {f"{INPUT}{name}": w[:, place] for place, name in enumerate(inputs)}
-        table = pa.table({name: pa.array(values) for name, values in columns.items()})
+        table = pa.table(
+            {name: pa.array(np.concatenate([one[name] for one in parts])) for name in parts[0]}
+        )
         with whole(folder / f"{file_stem(log.log.name)}.parquet") as file:
             # dictionaries of numbers that do not repeat take time and room
             pq.write_table(table, file, compression="zstd", use_dictionary=["protocol", "model"])
-
-
-def _limits(
-    prediction: Prediction, model: str, protocol: str, bands: Bands
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper limits [L, 3 + n] of a prediction; NaN where it has no band."""
-    band = bands.get(model, {}).get(protocol)
-    if band is None:
-        unknown = np.full_like(prediction.states, np.nan)
-        return unknown, unknown
-    return limits(prediction.states, band.half_widths(prediction.states, prediction.spread))

@@ -58,9 +58,16 @@ class Windows(Config):
         """Return the windows of one log; none where it is too short."""
         return self._laid(log, number, step, self.length)
 
-    def overlapping(self, log: Prepared, number: int, step: float, every: float) -> list[Window]:
-        """Return windows of the same length that start every so often, in s."""
-        return self._laid(log, number, step, min(every, self.length))
+    def overlapping(
+        self, log: Prepared, number: int, step: float, every: float | None = None
+    ) -> list[Window]:
+        """Return windows of the same length that start every so often, in s.
+
+        Every quarter of a length where not given, for choices among models: back-to-back windows of
+        a few logs are few; what is left of a log behind the last one tells nothing.
+        """
+        every = self.length / 4 if every is None else min(every, self.length)
+        return self._laid(log, number, step, every)
 
     def _laid(self, log: Prepared, number: int, step: float, every: float) -> list[Window]:
         steps, start, out = round(self.length / step), round(self.first / step), []
@@ -128,29 +135,14 @@ class WholeManoeuvre(Config):
             begin = stop
         return out
 
-    def overlapping(self, log: Prepared, number: int, step: float, every: float) -> list[Window]:
+    def overlapping(
+        self, log: Prepared, number: int, step: float, every: float | None = None
+    ) -> list[Window]:
         """Return the windows themselves: a manoeuvre is one free run from its beginning."""
         return self.windows(log, number, step)
 
 
 ProtocolConfig = Annotated[Windows | WholeManoeuvre, Field(discriminator="kind")]
-
-
-def overlapping(protocol: Windows | WholeManoeuvre) -> Windows | WholeManoeuvre:
-    """Return a protocol whose windows start four times as often, for choices among models.
-
-    Back-to-back windows of a few logs are few; what is left of a log behind the last one tells
-    nothing. Whole manoeuvres stay as they are.
-    """
-    return Overlapping(**protocol.model_dump()) if isinstance(protocol, Windows) else protocol
-
-
-class Overlapping(Windows):
-    """A protocol of windows that start every quarter of their length."""
-
-    def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
-        """Return the windows of one log, by their start; none where it is too short."""
-        return self.overlapping(log, number, step, self.length / 4)
 
 
 def longest_stretch(log: Prepared) -> int:
@@ -159,16 +151,24 @@ def longest_stretch(log: Prepared) -> int:
 
 
 def all_windows(
-    protocol: Windows | WholeManoeuvre, logs: Sequence[Prepared], step: float, name: str
+    protocol: Windows | WholeManoeuvre,
+    logs: Sequence[Prepared],
+    step: float,
+    name: str,
+    *,
+    dense: bool = False,
 ) -> list[Window]:
     """Return the windows of a protocol over several logs.
+
+    Args:
+        name: of the protocol.
+        dense: whether they overlap, see `Windows.overlapping`.
 
     Raises:
         DataError: where no log is long enough for a single one.
     """
-    out = [
-        window for number, log in enumerate(logs) for window in protocol.windows(log, number, step)
-    ]
+    laid = protocol.overlapping if dense else protocol.windows
+    out = [window for number, log in enumerate(logs) for window in laid(log, number, step)]
     if not out:
         longest = max(logs, key=len)
         whole = max(map(longest_stretch, logs))

@@ -169,18 +169,23 @@ def steady_runs(logs: Sequence[Prepared], step: float, shortest: float = 5.0) ->
     for log in logs:
         for begin, end in _held(log, tolerance, round(shortest / step)):
             rows = slice(begin + int(_SETTLING * (end - begin)), end)
-            y = log.smooth[rows]
+            y, lateral = log.smooth[rows], log.smooth[rows, LATERAL]
             x = y.mean(0)
             x[POSE] = 0.0
-            lateral = y[:, LATERAL]
             third = max(len(lateral) // 3, 1)
-            left = np.abs(lateral[-third:] - lateral[-third:].mean(0)).mean(0)
+            first, last = lateral[:third].mean(0), lateral[-third:].mean(0)
             entry = log.smooth[begin : begin + max(third // 10, 1), LATERAL]
-            began = np.abs(entry - lateral[-third:].mean(0)).mean(0)
+            began, left, early, late = (
+                np.abs(part - centre).mean(0)
+                for part, centre in (
+                    (entry, last),
+                    (lateral[-third:], last),
+                    (lateral[:third], first),
+                    (lateral[-third:], first),
+                )
+            )
             decay = float((began / np.maximum(left, 1e-9)).max())
-            apart = np.abs(lateral - lateral[:third].mean(0))
-            first, last = apart[:third].mean(0), apart[-third:].mean(0)
-            growth = float((last / np.maximum(first, 1e-9)).max())
+            growth = float((late / np.maximum(early, 1e-9)).max())
             w, scatter = log.w[rows].mean(0), lateral.std(0)
             out.append(SteadyRun(log.log.name, len(y) * step, x, w, decay, growth, scatter))
     return out
@@ -218,18 +223,17 @@ def check_model(
     # products this small only lose time to a second thread
     torch.set_num_threads(1)
     # the memory of a mean is too large for a Jacobian at each point; free runs show what it does
-    told = ""
-    if isinstance(model, MeanOfTrajectories):
-        told = "not looked at: the mean of several models, whose free runs are bounded or not"
-    straight = spec.signals.velocities == ("u",)
-    told = "not looked at: the model neither sways nor turns" if straight else told
+    mean = "not looked at: the mean of several models, whose free runs are bounded or not"
+    straight = "not looked at: the model neither sways nor turns"
+    straight = straight if spec.signals.velocities == ("u",) else ""
+    unstable = straight or (mean if isinstance(model, MeanOfTrajectories) else "")
     try:
         return [
             check_damping(spec, model, recorded),
-            Finding(spec.name, STABILITY, None, told)
-            if told
+            Finding(spec.name, STABILITY, None, unstable)
+            if unstable
             else check_stability(spec, model, recorded),
-            Finding(spec.name, SYMMETRY, None, told)
+            Finding(spec.name, SYMMETRY, None, straight)
             if straight
             else check_symmetry(spec, model, recorded),
             check_bounded(spec, model, recorded, divergence),
@@ -299,9 +303,7 @@ class OperatingPoint:
     w: Tensor
     inside: bool
 
-    @property
-    def text(self) -> str:
-        """The point as words of a sentence."""
+    def __str__(self) -> str:
         name = f"{self.label}, " if self.label else ""
         outside = "" if self.inside else " (outside the training data)"
         return f"{name}u = {number(self.speed)} m/s{outside}"
@@ -351,36 +353,33 @@ def check_stability(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) 
     words = {"v": "sway", "r": "yaw", "p": "roll"}
     moved = " and ".join(words[name] for name in words if name in spec.signals.velocities)
     are = "are" if " " in moved else "is"
-    points = operating_points(spec, model)
-    rates = [growth_rate(model, point.x, point.w) for point in points]
+    found = [
+        (growth_rate(model, point.x, point.w), point) for point in operating_points(spec, model)
+    ]
     summary = "; ".join(
-        f"{point.text}: slowest mode "
+        f"{point}: slowest mode "
         + (
             f"halves in {number(-math.log(2) / rate, 2)} s"
             if rate < 0
             else f"has rate {rate:+.2g} 1/s"
         )
-        for point, rate in zip(points, rates, strict=True)
+        for rate, point in found
         if point.label
     )
     fault = contradiction(model, recorded.steady)
-    unstable = [
-        (point, rate)
-        for point, rate in zip(points, rates, strict=True)
-        if rate > math.log(2.0) / _DOUBLING
-    ]
-    if not unstable:
+    growing = [one for one in found if one[0] > math.log(2.0) / _DOUBLING]
+    if not growing:
+        speeds = interval([found[0][1].speed, found[-1][1].speed], digits=2)
         text = (
-            f"{moved} {are} stable in straight running at"
-            f" {interval([points[0].speed, points[-1].speed], digits=2)} m/s (no mode doubles"
-            f" within {_DOUBLING:.0f} s). {summary}"
+            f"{moved} {are} stable in straight running at {speeds} m/s (no mode doubles within"
+            f" {_DOUBLING:.0f} s). {summary}"
         )
         return _found(spec, STABILITY, True, text, fault)
-    inside = [(point, rate) for point, rate in unstable if point.inside]
-    worst, rate = max(inside or unstable, key=lambda pair: pair[1])
+    inside = [one for one in growing if one[1].inside]
+    rate, worst = max(inside or growing, key=lambda one: one[0])
     where = "inside the training data" if inside else "only outside the training data"
     text = (
-        f"{moved} unstable in straight running, {where}: worst at {worst.text}, a disturbance"
+        f"{moved} unstable in straight running, {where}: worst at {worst}, a disturbance"
         f" doubles in {number(math.log(2) / rate, 2)} s. Some full hulls are so in truth; otherwise"
         f" do not trust long free runs there. {summary}"
     )
@@ -496,13 +495,12 @@ def check_symmetry(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) -
     # the torque of a lone propeller heels the vessel to one side
     torque = {"p"} if heeling(model.signals.names) else set()
     judged = [name for name in live.velocities if name not in torque]
-    shares = dict(zip(live.moving, zip(typical, largest, strict=True), strict=True))
-    worst = max(float(shares[name][0]) for name in judged)
-    ok = worst <= _ASYMMETRY
+    pairs = (100 * torch.stack((typical, largest), dim=1)).tolist()
+    shares = dict(zip(live.moving, pairs, strict=True))
+    worst = max(shares[name][0] for name in judged)
+    ok = worst <= 100 * _ASYMMETRY
     parts = ", ".join(
-        f"{name}′ {100 * float(shares[name][0]):.1f} % (largest"
-        f" {100 * float(shares[name][1]):.1f} %)"
-        for name in live.velocities
+        "{}′ {:.1f} % (largest {:.1f} %)".format(name, *shares[name]) for name in live.velocities
     )
     parts += "; a propeller's torque heels, so that the roll is not judged" if torque else ""
     reason = (
@@ -510,7 +508,7 @@ def check_symmetry(spec: ModelSpec, model: HybridDynamics, recorded: Recorded) -
     )
     text = (
         f"port and starboard {'alike' if ok else 'differ'}: the uneven part of the acceleration is"
-        f" up to {100 * worst:.0f} % of its spread. {'' if ok else reason}RMS over"
+        f" up to {worst:.0f} % of its spread. {'' if ok else reason}RMS over"
         f" {int(inside.sum())} points of the training data: {parts}"
     )
     return Finding(spec.name, SYMMETRY, ok, text)
