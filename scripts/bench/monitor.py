@@ -28,7 +28,7 @@ from residnet.data.prepare import Prepared, prepare
 from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.identification.fit import fit
 from residnet.identification.fitter import FittedModel
-from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher, pieces
+from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher
 from residnet.identification.prepared import prepare_logs, through_currents
 from residnet.identification.settings import FitSettings
 
@@ -162,12 +162,12 @@ def cases(
 
 def watched(watch: Watch, settings: FitSettings, logs: Sequence[Log]) -> list[Verdict]:
     """Return what the monitor says, window by window."""
-    watcher = Watcher(watch, 0)
+    watcher = Watcher(watch)
     out = []
     for log in logs:
         watcher.restart()
         known = prepare(log, "external", settings.signals.columns, settings.prepare)
-        out += [watcher.take(sums) for sums in watch.sums(pieces(known, watcher.steps, 0))]
+        out += [watcher.take(sums) for sums in watch.sums(watch.windows(known))]
     return out
 
 
@@ -202,8 +202,7 @@ def main() -> None:
                 sailed = str(scattered(vessel, random, Path(folder), ("added_mass", "damping")))
             settings, model, clean = identified(vessel, sailed, 100 + given.seed)
             config = MonitorConfig()
-            steps = round(config.window / STEP)
-            watch = Watch(model.spec, model.model, [pieces(log, steps, 0) for log in clean], config)
+            watch = Watch.of(model.spec, model.model, clean, config)
             print(f"{vessel}: threshold {watch.threshold:.2f}", flush=True)
             planted = cases(vessel, sailed, Path(folder)) if given.seeds else {}
             for name, (flown, change, right) in planted.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -146,9 +147,9 @@ def test_a_monitor_tells_stiffness_from_damping(
     watch = Watch(spec, model, logs(Change("none", "", "", 1.0), 30, 0), MonitorConfig())
     assert list(watch.seen) == [*live.channels, "heading"]
     for cause in names:
-        watcher = Watcher(watch, 0)
+        watcher = Watcher(watch)
         (known,) = (one for one in watch.causes if one.name == cause)
-        for log in logs(known.of_size(-0.3), 5, 1):
+        for log in logs(replace(known, size=-0.3), 5, 1):
             watcher.restart()
             for sums in watch.sums(log):
                 verdict = watcher.take(sums)

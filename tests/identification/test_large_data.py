@@ -11,17 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import TINY
+from tiny_fit import DATA, logs_of, settings_of
 
 from residnet.core.arrays import paged
-from residnet.core.config import validate
 from residnet.core.log import Log
-from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.data.windows import WindowStore
 from residnet.identification.fit import fit
 from residnet.identification.prepared import prepare_logs, shortened, through_currents
-from residnet.identification.settings import FitSettings
 from residnet.regression.estimator import Estimator, Pieces
 from residnet.regression.least_squares import LeastSquares
 from residnet.regression.shrinkage import PLSR, Ridge
@@ -36,12 +33,8 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.long
 def test_a_fit_from_disk_is_the_fit_from_memory(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    wanted: dict[str, Any] = {
-        key: TINY[key] for key in ("prepare", "signals", "baseline", "evaluation")
-    }
-    heads = {"plsr": {"kind": "plsr"}, "ridge": {"kind": "ridge"}}
-    settings = validate(wanted | {"heads": heads}, FitSettings, "here")
-    read = read_logs(validate(TINY["data"], SimulatedTrials, "here"))
+    settings = settings_of(heads={"plsr": {"kind": "plsr"}, "ridge": {"kind": "ridge"}})
+    read = read_logs(DATA)
     on_disk = {split: [log.on_disk() for log in logs] for split, logs in read.items()}
     prepared = prepare_logs(on_disk, settings)
     assert all(paged.lies_on_disk(log.y) for logs in prepared.values() for log in logs)
@@ -103,11 +96,17 @@ def test_arrays_on_disk_keep_their_values_when_memory_is_given_back() -> None:
     assert not paged.lies_on_disk(values)
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="pages are counted on Linux only")
-def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    def pages() -> int:
-        return int(Path("/proc/self/statm").read_text().split()[2]) * mmap.PAGESIZE
+LINUX = pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="pages are counted on Linux only"
+)
 
+
+def pages() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[2]) * mmap.PAGESIZE
+
+
+@LINUX
+def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paged, "_RESIDENT", 1 << 24)
     before = pages()
     values = paged.empty((1 << 23,))
@@ -138,11 +137,8 @@ def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.Monkey
     assert len(placed) == 2
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="pages are counted on Linux only")
+@LINUX
 def test_a_look_at_each_item_holds_the_pages_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    def pages() -> int:
-        return int(Path("/proc/self/statm").read_text().split()[2]) * mmap.PAGESIZE
-
     def most(items: list[np.ndarray]) -> int:
         paged.forget()
         before, found = pages(), []
@@ -162,11 +158,7 @@ def test_a_look_at_each_item_holds_the_pages_of_one(monkeypatch: pytest.MonkeyPa
 
 
 def test_prepared_logs_are_gone_through_one_by_one() -> None:
-    settings = validate(
-        {key: TINY[key] for key in ("prepare", "signals", "baseline", "evaluation")},
-        FitSettings,
-        "here",
-    )
-    prepared = prepare_logs(read_logs(validate(TINY["data"], SimulatedTrials, "here")), settings)
+    settings = settings_of()
+    prepared = logs_of(settings)
     for logs in (prepared, through_currents(prepared, settings)[0]):
         assert all(isinstance(members, paged.OneByOne) for members in logs.values())

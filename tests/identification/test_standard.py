@@ -17,6 +17,7 @@ from residnet.core.config import validate
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.layout import ALIVE
 from residnet.core.log import Log
+from residnet.core.samples import Samples
 from residnet.data.prepare import samples
 from residnet.dynamics.hybrid import Missed
 from residnet.identification.fit import Identified, fit
@@ -72,22 +73,23 @@ def logs() -> PreparedSplits:
 
 
 @pytest.fixture(scope="module")
+def known(logs: PreparedSplits) -> Samples:
+    return samples(logs["train"], settings().signals.build())
+
+
+@pytest.fixture(scope="module")
 def identified(logs: PreparedSplits) -> Identified:
     return fit(logs, settings())
 
 
 @pytest.mark.long
-def test_a_portfolio_stands_in_place_of_the_parts(identified: Identified) -> None:
+def test_the_mean_is_reported_first_and_a_hull_that_does_not_run_away_beside_it(
+    identified: Identified, logs: PreparedSplits
+) -> None:
     assert list(identified)[:2] == ["zero", "baseline"]
     assert set(NAMES) <= set(identified)
     assert {identified[name].notes["prior"] for name in ("baseline", "hull")} == {1.0}
     assert all(np.isfinite(model.notes.get("validation", 0.0)) for model in identified.values())
-
-
-@pytest.mark.long
-def test_the_mean_is_reported_first_and_a_single_model_is_chosen_beside_it(
-    identified: Identified, logs: PreparedSplits
-) -> None:
     judged = identified.evaluate({split: logs[split] for split in ("train", "validation")})
     chosen = identified.select(judged)
     families = {entry.name: entry.family for entry in chosen.contenders}
@@ -95,13 +97,6 @@ def test_the_mean_is_reported_first_and_a_single_model_is_chosen_beside_it(
     assert (chosen.selected, families["hull"]) == ("hull", "refitted baseline")
     assert families["hull_network"] == families["mean"] == "ensemble"
     assert identified["mean"].notes["members"] == ["hull", "hull_network"]
-
-
-@pytest.mark.long
-def test_a_hull_that_runs_away_is_not_the_single_model(
-    identified: Identified, logs: PreparedSplits
-) -> None:
-    judged = identified.evaluate({"validation": logs["validation"]})
     found = judged["validation"].runs[0].predictions
     found["hull"] = [replace(one, diverged=True) for one in found["hull"]]
     assert identified.select(judged).selected == "baseline"
@@ -139,28 +134,19 @@ def test_the_mean_is_that_of_the_trajectories_of_its_members(
 
 
 @pytest.mark.long
-def test_members_that_run_away_are_left_out_of_the_mean(
+def test_members_that_run_away_or_harm_the_mean_are_left_out(
     identified: Identified, logs: PreparedSplits
 ) -> None:
     fitter = Fitter(logs, settings(), FitStore())
+    zero, hull, network = (identified[name] for name in ("zero", "hull", "hull_network"))
     lost = replace(identified["baseline"], notes={"validation_diverged": 1})
-    members = [identified["hull"], identified["hull_network"], lost]
-    assert fitter.mean("mean", members).notes["members"] == ["hull", "hull_network"]
-    with pytest.raises(FitError, match="no mean errs less"):
-        fitter.mean("mean", [identified["hull"], lost])
-
-
-@pytest.mark.long
-def test_members_that_harm_the_mean_are_left_out(
-    identified: Identified, logs: PreparedSplits
-) -> None:
-    fitter = Fitter(logs, settings(), FitStore())
-    zero, hull = identified["zero"], identified["hull"]
+    assert fitter.mean("mean", [hull, network, lost]).notes["members"] == ["hull", "hull_network"]
     zero = replace(zero, notes={"validation": fitter.validate(zero.model).error})
-    found = fitter.mean("mean", [hull, identified["hull_network"], zero])
+    found = fitter.mean("mean", [hull, network, zero])
     assert (found.notes["members"], found.notes["left_out"]) == (["hull", "hull_network"], ["zero"])
-    with pytest.raises(FitError, match="no mean errs less"):
-        fitter.mean("mean", [hull, zero])
+    for one in (lost, zero):
+        with pytest.raises(FitError, match="no mean errs less"):
+            fitter.mean("mean", [hull, one])
     fitter.seen = True
     assert fitter.mean("mean", [hull, zero]).notes["left_out"] == []
 
@@ -265,9 +251,8 @@ def test_terms_whose_power_has_one_sign(term: str, axis: int, known: bool) -> No
     assert dissipates(term, axis, ("u", "v", "r", "n")) == known
 
 
-def test_terms_that_would_feed_energy_are_left_out(logs: PreparedSplits) -> None:
+def test_terms_that_would_feed_energy_are_left_out(known: Samples) -> None:
     config = RegressorsConfig(terms=("1", "u", "v", "r", "u|u|", "left"), dissipative=True)
-    known = samples(logs["train"], settings().signals.build())
     # accelerations that grow with the speed, and fall with its square
     speed = known.z[:, 0]
     target = torch.stack((0.3 * speed - 0.2 * speed * speed.abs(), -known.z[:, 1], speed), dim=1)
@@ -278,8 +263,7 @@ def test_terms_that_would_feed_energy_are_left_out(logs: PreparedSplits) -> None
     assert not baseline.feeding()
 
 
-def test_a_bounded_model_comes_back_from_anywhere(logs: PreparedSplits) -> None:
-    known = samples(logs["train"], settings().signals.build())
+def test_a_bounded_model_comes_back_from_anywhere(known: Samples) -> None:
     config = RegressorsConfig(terms=("1", "u", "u|u|", "v", "r", "v|v|"), bounded=True)
     baseline = config.build(known.names)
     config.fit(baseline, known)
@@ -291,8 +275,7 @@ def test_a_bounded_model_comes_back_from_anywhere(logs: PreparedSplits) -> None:
     torch.testing.assert_close(baseline(known.z), inside(known.z))
 
 
-def test_a_bounded_model_holds_inputs_half_a_range_beyond_the_data(logs: PreparedSplits) -> None:
-    known = samples(logs["train"], settings().signals.build())
+def test_a_bounded_model_holds_inputs_half_a_range_beyond_the_data(known: Samples) -> None:
     config = RegressorsConfig(terms=("1", "u", "v", "r", "left", "left|left|"), bounded=True)
     baseline = config.build(known.names)
     config.fit(baseline, known)
@@ -309,10 +292,8 @@ def test_a_bounded_model_holds_inputs_half_a_range_beyond_the_data(logs: Prepare
     assert not torch.allclose(at(edge), at(high))
 
 
-def test_a_mirror_symmetric_model_has_no_asymmetry(logs: PreparedSplits) -> None:
-    names = settings().signals.build().names
-    known = samples(logs["train"], settings().signals.build())
-    baseline = RegressorsConfig(terms=("1", "u", "r", "left", "right")).build(names)
+def test_a_mirror_symmetric_model_has_no_asymmetry(known: Samples) -> None:
+    baseline = RegressorsConfig(terms=("1", "u", "r", "left", "right")).build(known.names)
     theta = torch.tensor(
         [[0.1, -0.5, 0.0, 2.0, 2.0], [0.0, 0.0, 0.3, 0.1, -0.1], [0.0, 0.0, -1.0, 0.4, -0.4]],
         dtype=torch.float64,
@@ -338,8 +319,7 @@ def test_what_was_predicted_wrong_of_the_past_is_told_and_fades() -> None:
     torch.jit.script(missed)
 
 
-def test_a_term_that_turns_the_damping_about_is_left_out(logs: PreparedSplits) -> None:
-    known = samples(logs["train"], settings().signals.build())
+def test_a_term_that_turns_the_damping_about_is_left_out(known: Samples) -> None:
     speed, sway, rate = (known.z[:, i] for i in range(3))
     # fed by u r, and damped by |u| r where nobody has been
     target = torch.stack((-speed, -sway, 0.4 * speed * rate - 0.1 * rate), dim=1)

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 import torch
 from tiny import TINY
+from tiny_fit import logs_of, settings_of
 
-from residnet.core.config import validate
 from residnet.data.prepare import channels, samples
-from residnet.data.simulated import SimulatedTrials
-from residnet.data.sources import read_logs
 from residnet.data.windows import WindowStore
 from residnet.identification.fit import fit
 from residnet.identification.identified import (
@@ -20,27 +18,23 @@ from residnet.identification.identified import (
     teacher_forced,
     term_table,
 )
-from residnet.identification.prepared import PreparedSplits, prepare_logs
-from residnet.identification.settings import FitSettings
+from residnet.identification.prepared import PreparedSplits
 
-SETTINGS = {
-    "prepare": {**TINY["prepare"], "hold": "mean"},  # type: ignore[dict-item]
-    "signals": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
-    "baseline": {"kind": "regressors", "terms": ["u", "v", "r", "tau_x", "tau_n"]},
-    "heads": {"ridge": {"kind": "ridge"}},
-    "evaluation": TINY["evaluation"],
-}
+SETTINGS = settings_of(
+    prepare={**TINY["prepare"], "hold": "mean"},
+    baseline={"kind": "regressors", "terms": ["u", "v", "r", "tau_x", "tau_n"]},
+    heads={"ridge": {"kind": "ridge"}},
+)
 
 
 @pytest.fixture(scope="module")
 def logs() -> PreparedSplits:
-    data = validate(TINY["data"], SimulatedTrials, "here")
-    return prepare_logs(read_logs(data), validate(SETTINGS, FitSettings, "here"))
+    return logs_of(SETTINGS)
 
 
 @pytest.fixture(scope="module")
 def identified(logs: PreparedSplits) -> Identified:
-    return fit(logs, validate(SETTINGS, FitSettings, "here"))
+    return fit(logs, SETTINGS)
 
 
 def test_inputs_move_on_within_a_step(logs: PreparedSplits) -> None:
@@ -63,7 +57,7 @@ def test_accelerations_are_those_of_the_models_rate_at_the_sample(
 
 
 def test_training_sees_the_channels_of_the_closed_forms(logs: PreparedSplits) -> None:
-    signals = validate(SETTINGS, FitSettings, "here").signals.build()
+    signals = SETTINGS.signals.build()
     store = WindowStore.gather(logs["train"], torch.float64)
     z = signals(store.smooth, signals.prepare(store.recorded))[store.good]
     torch.testing.assert_close(z, samples(logs["train"], signals).z, rtol=1e-12, atol=1e-12)

@@ -14,7 +14,7 @@ from torch import Tensor
 from residnet.api.data import Data
 from residnet.api.values import PathGiven, described, path
 from residnet.core.config import validate
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import UsageError
 from residnet.core.files import read_json
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
@@ -24,14 +24,7 @@ from residnet.export import exporter
 from residnet.export.base import released
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.fitter import FittedModel
-from residnet.identification.monitoring import (
-    MonitorConfig,
-    Verdict,
-    Watch,
-    Watcher,
-    past_of,
-    pieces,
-)
+from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher
 from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
 from residnet.judge.band import read_bands
 from residnet.judge.verdict import UNSEEN, Evidence, objections
@@ -341,11 +334,9 @@ class Monitor:
         require(model, Model, "Monitor: expected a model")
         require(clean, Data, "Monitor: expected data from residnet.prepare")
         config = validate(settings, MonitorConfig, "Monitor")
-        module, past = copy.deepcopy(model.module), past_of(model.module)
-        steps = round(config.window / model.dt)
         logs = [log for split in ("train", "validation") for log in clean.splits.get(split, ())]
-        watch = Watch(model.spec, module, [pieces(log, steps, past) for log in logs], config)
-        self._model, self._past, self._watcher = model, past, Watcher(watch, past)
+        watch = Watch.of(model.spec, copy.deepcopy(model.module), logs, config)
+        self._model, self._watcher = model, Watcher(watch)
         self.verdict: Verdict | None = None
 
     @property
@@ -384,14 +375,8 @@ class Monitor:
             DataError: where a log holds no window.
         """
         require(new, Data, "Monitor.refit: expected data from residnet.prepare")
-        watch, windows = self._watcher.watch, []
-        for log in (log for members in new.splits.values() for log in members):
-            windows.append(pieces(log, self._watcher.steps, self._past))
-            if not windows[-1]:
-                raise DataError(
-                    f"log {log.log.name}: holds no window of {watch.config.window:g} s without a"
-                    " break; leave it out"
-                )
+        watch = self._watcher.watch
+        windows = [watch.windows(log) for members in new.splits.values() for log in members]
         refit = recursive_refit(watch, windows)
         return Model(refitted(self._model.fitted, refit)), refit
 

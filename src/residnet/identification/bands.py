@@ -265,8 +265,8 @@ class _Calibration:
         logs = len({run.log for run in runs})
         if reference not in known or not self.validated.get(reference):
             band = calibrate(runs, self.config.level, self.step, unit)
-            why = self.failed.get(entry.name, "")
-            return replace(band, cautions=(*_alone(logs, why), *few(logs)))
+            why = f" ({self.failed[entry.name]})" if entry.name in self.failed else ""
+            return replace(band, cautions=(_ALONE.format(logs, why), *few(logs)))
         single = known[reference]
         ratio = _level(runs, single, self.config.level) / _level(
             self.validated[reference], single, self.config.level
@@ -278,10 +278,19 @@ class _Calibration:
             plain=single.plain * ratio,
             constant=single.constant * ratio,
             logs=logs,
-            cautions=(*_scaled(reference, logs), *few(logs)),
+            cautions=(_SCALED.format(reference, logs), *few(logs)),
         )
 
 
+_SCALED = (
+    "This model was not fitted again without the logs that calibrate: its band has the form of that"
+    " of {}, and its width from {} validation logs, which also chose between models or stopped the"
+    " training early."
+)
+_ALONE = (
+    "Only {} validation logs calibrate this band: no model could be fitted without some of the"
+    " training logs{}. They also chose between models or stopped the training early."
+)
 _BORROWED = (
     "Short logs leave none that this model was not fitted on: its band is that of {}, which was"
     " fitted again without some of them."
@@ -298,19 +307,3 @@ def _level(runs: Sequence[RunErrors], band: Band, level: float) -> np.ndarray:
     joined = np.concatenate(ratios)
     share = np.repeat(weight, [len(ratio) for ratio in ratios])
     return np.array([quantile(joined[:, i], share, raised) for i in range(joined.shape[1])])
-
-
-def _scaled(reference: str, logs: int) -> tuple[str, ...]:
-    return (
-        "This model was not fitted again without the logs that calibrate: its band has the form of"
-        f" that of {reference}, and its width from {logs} validation logs, which also chose"
-        " between models or stopped the training early.",
-    )
-
-
-def _alone(logs: int, why: str) -> tuple[str, ...]:
-    return (
-        f"Only {logs} validation logs calibrate this band: no model could be fitted without some of"
-        f" the training logs{f' ({why})' if why else ''}. They also chose between models or stopped"
-        " the training early.",
-    )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, final
 
 import torch
 from torch import Tensor
@@ -24,20 +24,20 @@ _TAKEN = {"u": 0.1}
 
 @dataclass(frozen=True)
 class Change:
-    """A small change of a vessel, of its commands, of its surroundings or of a sensor.
+    """A change of a vessel, of its commands, of its surroundings or of a sensor.
 
     Attributes:
         name: short, for tables.
         words: what it is, completing "the logs look as if ...".
         unit: of its size.
-        size: that its effect is computed with.
-        heavier: added to the inertia of all axes, as a share.
-        damping: velocity whose damping changes; empty for none.
+        size: of the change; a small one, where its effect is to be computed.
+        heavier: share of the size that is added to the inertia of all axes.
+        damping: velocity whose damping changes by the size, a share of what the model has; empty
+            for none.
         by: what damps it: itself where empty, or an angle that holds it back.
-        damped: added to that, as a share of what the model has.
-        push: acceleration to north and east, m/s^2.
-        gain: added to the gain of inputs, by their number.
-        offset: added to inputs, by their number.
+        push: shares of the size that push to north and east.
+        gain: number of the input whose gain changes by the size; None for none.
+        offset: number of the input that the size is added to; None for none.
         sensor: what a sensor adds: `gyro_scale`, `gyro_offset`, `speed_scale`, `lag`, or
             `current_north`, `current_east` for water that moves; empty for none.
     """
@@ -49,55 +49,39 @@ class Change:
     heavier: float = 0.0
     damping: str = ""
     by: str = ""
-    damped: float = 0.0
     push: tuple[float, float] = (0.0, 0.0)
-    gain: Mapping[int, float] = field(default_factory=dict)
-    offset: Mapping[int, float] = field(default_factory=dict)
+    gain: int | None = None
+    offset: int | None = None
     sensor: str = ""
-
-    def of_size(self, size: float) -> Change:
-        """Return the same change of another size, in its unit."""
-        k = size / self.size
-        return replace(
-            self,
-            size=size,
-            heavier=k * self.heavier,
-            damped=k * self.damped,
-            push=(k * self.push[0], k * self.push[1]),
-            gain={place: k * value for place, value in self.gain.items()},
-            offset={place: k * value for place, value in self.offset.items()},
-        )
 
 
 def causes(signals: SignalsConfig) -> list[Change]:
     """Return the changes that a monitor looks for, given the inputs of a model."""
-    units = signals.units()
-    out = [Change("mass", "the vessel has become heavier", "share", 0.02, heavier=0.02)]
-    live = signals.live
+
+    def share(name: str, words: str, **what: Any) -> Change:
+        return Change(name, words, "share", 0.02, **what)
+
+    units, live = signals.units(), signals.live
+    out = [share("mass", "the vessel has become heavier", heavier=1.0)]
     for axis in live.velocities:
         words = f"the damping in {_AXES[axis]} has grown"
-        out.append(
-            Change(f"damping {_AXES[axis]}", words, "share", 0.02, damping=axis, damped=0.02)
-        )
+        out.append(share(f"damping {_AXES[axis]}", words, damping=axis))
     if live.rolls:
-        stiff = Change("restoring", "the vessel has become stiffer in roll", "share", 0.02)
-        out.append(replace(stiff, damping="p", by="phi", damped=0.02))
+        words = "the vessel has become stiffer in roll"
+        out.append(share("restoring", words, damping="p", by="phi"))
     if live.spatial:
-        stiff = Change("restoring pitch", "the vessel has become stiffer in pitch", "share", 0.02)
-        out.append(replace(stiff, damping="q", by="theta", damped=0.02))
+        words = "the vessel has become stiffer in pitch"
+        out.append(share("restoring pitch", words, damping="q", by="theta"))
     for place, name in enumerate(signals.inputs):
-        words = f"{name} has grown stronger than it was"
-        out.append(Change(f"gain {name}", words, "share", 0.02, gain={place: 0.02}))
+        out.append(share(f"gain {name}", f"{name} has grown stronger than it was", gain=place))
         if units.get(name) == "rad":
             words = f"{name} has an offset"
-            out.append(Change(f"offset {name}", words, "rad", 0.01, offset={place: 0.01}))
+            out.append(Change(f"offset {name}", words, "rad", 0.01, offset=place))
     gyro = [
-        Change("gyro scale", "the gyro shows too much", "share", 0.02, sensor="gyro_scale"),
+        share("gyro scale", "the gyro shows too much", sensor="gyro_scale"),
         Change("gyro offset", "the gyro has an offset", "rad/s", 0.001, sensor="gyro_offset"),
     ]
-    speed = Change(
-        "speed scale", "u and v are shown too large", "share", 0.02, sensor="speed_scale"
-    )
+    speed = share("speed scale", "u and v are shown too large", sensor="speed_scale")
     lag = Change("lag", "velocities come late", "s", 0.1, sensor="lag")
     return [*out, *gyro * live.turns, *[speed] * live.moves, lag]
 
@@ -107,8 +91,8 @@ def surroundings() -> list[Change]:
     return [
         Change("current north", "", "m/s", 0.05, sensor="current_north"),
         Change("current east", "", "m/s", 0.05, sensor="current_east"),
-        Change("push north", "", "m/s^2", 0.005, push=(0.005, 0.0)),
-        Change("push east", "", "m/s^2", 0.005, push=(0.0, 0.005)),
+        Change("push north", "", "m/s^2", 0.005, push=(1.0, 0.0)),
+        Change("push east", "", "m/s^2", 0.005, push=(0.0, 1.0)),
     ]
 
 
@@ -163,9 +147,15 @@ class ChangedDynamics(Dynamics):
             table = torch.tensor(values, dtype=torch.float64)
             return table.repeat_interleave(rows, dim=0)
 
-        span = range(inputs)
-        self.inertia = each([[1.0 + change.heavier] for change in changes])
-        damped = [k for k, change in enumerate(changes) if change.damping]
+        def changed(of: Callable[[Change], int | None]) -> Tensor:
+            span = range(inputs)
+            return each([[one.size * (of(one) == i) for i in span] for one in changes])
+
+        self.inertia = each([[1.0 + one.size * one.heavier] for one in changes])
+        self.push = each([[one.size * axis for axis in one.push] for one in changes])
+        self.gain = 1.0 + changed(lambda one: one.gain)
+        self.offset = changed(lambda one: one.offset)
+        damped = [k for k, one in enumerate(changes) if one.damping]
         self.damps = len(damped) > 0
         self.damped_rows = torch.tensor(damped).repeat_interleave(rows) * rows + torch.arange(
             rows
@@ -178,10 +168,7 @@ class ChangedDynamics(Dynamics):
         self.damping = of_damped([moving.index(changes[k].damping) for k in damped], torch.long)
         self.by = of_damped([moving.index(name) for name in by], torch.long)
         self.taken = of_damped([_TAKEN.get(name, 1.0) for name in by])
-        self.damped = of_damped([changes[k].damped for k in damped])
-        self.push = each([change.push for change in changes])
-        self.gain = each([[1.0 + change.gain.get(i, 0.0) for i in span] for change in changes])
-        self.offset = each([[change.offset.get(i, 0.0) for i in span] for change in changes])
+        self.damped = of_damped([changes[k].size for k in damped])
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return state and memory one step later, with the changed acceleration."""

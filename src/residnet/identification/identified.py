@@ -177,67 +177,6 @@ _CHECKED = ("train", "validation")
 """Splits whose windows may not diverge; what the test data show comes too late for a choice."""
 
 
-def select(
-    fitted: Iterable[FittedModel],
-    judged: Mapping[str, Evaluation],
-    findings: Mapping[str, Sequence[Finding]],
-    config: EvaluationConfig,
-) -> Selection:
-    """Choose among the models of a fit by their free runs over the validation logs.
-
-    Args:
-        fitted: models to choose from, `zero` among them.
-        judged: their free runs by split; `validation` is needed, `train` shows divergences too.
-        findings: of the checks for physical sanity, by model.
-        config: its `selection` protocol decides.
-
-    Raises:
-        UsageError: where the validation logs have not been judged.
-    """
-    validation = judged.get("validation")
-    runs = [] if validation is None else validation.runs
-    run = next((run for run in runs if run.protocol == config.selection), None)
-    if validation is None or run is None:
-        raise UsageError(
-            f"select: no free runs over validation logs by protocol '{config.selection}'; evaluate"
-            " the validation split first"
-        )
-    blocks, labels = blocks_of(run)
-    counted = {split: judged[split].runs for split in _CHECKED if split in judged}
-    scales = config.scales.named()
-    models = {entry.name: entry for entry in fitted}
-    parts = {
-        name: shares(run, name, validation.logs, scales, labels, len(blocks.weights))
-        for name in models
-    }
-    scores = log_errors(parts, blocks.weights)
-    contenders = []
-    for entry in models.values():
-        lost = [
-            (split, free.protocol, diverged, len(free.windows))
-            for split, runs in counted.items()
-            for free in runs
-            if (diverged := sum(p.diverged for p in free.predictions[entry.name]))
-        ]
-        faults = [
-            f"{diverged} of its {count} {split} windows diverged ({protocol})"
-            for split, protocol, diverged, count in lost
-        ]
-        faults += [finding.fault for finding in findings.get(entry.name, ()) if finding.fault]
-        contenders.append(
-            Contender(
-                entry.name,
-                family(entry),
-                parameter_count(entry.model),
-                float(parts[entry.name].sum()),
-                scores[entry.name],
-                sum(diverged for _, _, diverged, _ in lost),
-                tuple(faults),
-            )
-        )
-    return choose(contenders, blocks)
-
-
 def family(entry: FittedModel) -> str:
     """Return what a model is, in the words of `residnet.judge.selection.FAMILIES`."""
     if isinstance(entry.model, MeanOfTrajectories):
@@ -311,7 +250,7 @@ class Identified(Mapping[str, FittedModel]):
         }
 
     def select(self, judged: Mapping[str, Evaluation]) -> Selection:
-        """Choose a single model and an ensemble by their free runs.
+        """Choose a single model and an ensemble by their free runs over the validation logs.
 
         The recipe chooses neither: the evidence is smaller than its noise. Its hull is the single
         model, unless it diverged in a window, and its mean the ensemble.
@@ -323,7 +262,44 @@ class Identified(Mapping[str, FittedModel]):
         Raises:
             UsageError: where the validation logs have not been judged.
         """
-        found = select(self.values(), judged, self.findings, self.settings.evaluation)
+        config = self.settings.evaluation
+        validation = judged.get("validation")
+        runs = [] if validation is None else validation.runs
+        run = next((run for run in runs if run.protocol == config.selection), None)
+        if validation is None or run is None:
+            raise UsageError(
+                f"select: no free runs over validation logs by protocol '{config.selection}';"
+                " evaluate the validation split first"
+            )
+        blocks, labels = blocks_of(run)
+        counted = {split: judged[split].runs for split in _CHECKED if split in judged}
+        scales = config.scales.named()
+        parts = {
+            name: shares(run, name, validation.logs, scales, labels, len(blocks.weights))
+            for name in self
+        }
+        scores = log_errors(parts, blocks.weights)
+        contenders = []
+        for entry in self.values():
+            lost = [
+                (n, f"{n} of its {len(free.windows)} {split} windows diverged ({free.protocol})")
+                for split, runs in counted.items()
+                for free in runs
+                if (n := sum(one.diverged for one in free.predictions[entry.name]))
+            ]
+            found_wrong = [one.fault for one in self.findings.get(entry.name, ()) if one.fault]
+            contenders.append(
+                Contender(
+                    entry.name,
+                    family(entry),
+                    parameter_count(entry.model),
+                    float(parts[entry.name].sum()),
+                    scores[entry.name],
+                    sum(n for n, _ in lost),
+                    (*(said for _, said in lost), *found_wrong),
+                )
+            )
+        found = choose(contenders, blocks)
         if self.settings.recipe is None or MEAN not in self.models:
             return found
         found = replace(found, selected_ensemble=MEAN, leading=MEAN)

@@ -186,12 +186,8 @@ class Sums:
     count: int
 
     def __add__(self, other: Sums) -> Sums:
-        return Sums(
-            self.score + other.score,
-            self.information + other.information,
-            self.squares + other.squares,
-            self.count + other.count,
-        )
+        parts = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Sums(*(one + another for one, another in parts))
 
 
 def weighed(
@@ -214,33 +210,35 @@ def weighed(
         a = (effects.reshape(windows, count, -1, size) @ matrix.T).reshape(effects.shape)
         looks.append((np.einsum("bqn,bn->bq", a, e), a @ a.swapaxes(1, 2), e**2))
         number += values
-    score = np.sum([one for one, _, _ in looks], axis=0)
-    information = np.sum([one for _, one, _ in looks], axis=0)
-    squares = np.sum([one.sum(axis=1) for _, _, one in looks], axis=0)
+    scores, informations, squares = zip(*looks, strict=True)
+    score, information = np.sum(scores, axis=0), np.sum(informations, axis=0)
     own = np.linalg.solve(information + belief, score[..., None])[..., 0]
-    left = (squares - (score * own).sum(axis=1)) / number
-    weight = 1.0 / np.maximum(left, 1.0)
+    left = np.sum([one.sum(axis=1) for one in squares], axis=0) - (score * own).sum(axis=1)
+    weight = 1.0 / np.maximum(left / number, 1.0)
     return Sums(
         weight @ score,
         np.tensordot(weight, information, 1),
-        looks[0][2].sum(axis=0),
-        len(looks[0][2]),
+        squares[0].sum(axis=0),
+        len(squares[0]),
     )
 
 
-def apart_from(sums: Sums, count: int, belief: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return scores [Q] and information [Q, Q] once what follows has taken what it can explain.
+def apart_from(
+    score: np.ndarray, information: np.ndarray, count: int, belief: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return scores [..., Q] and information [..., Q, Q] once others have taken what they can.
 
     Args:
-        sums: of Q changes, then of what surrounds the vessel.
+        score: of Q changes, then of what surrounds the vessel [..., Q + n].
+        information: about them [..., Q + n, Q + n].
         count: Q.
-        belief: precision of the sizes of what surrounds the vessel.
+        belief: precision of the sizes of what surrounds the vessel [n, n].
     """
-    matrix = sums.information
-    own = np.linalg.solve(matrix[count:, count:] + belief, matrix[count:, :count])
-    score = sums.score[:count] - own.T @ sums.score[count:]
-    information = matrix[:count, :count] - matrix[:count, count:] @ own
-    return score, information + 1e-300 * np.eye(count)
+    known, beside = information[..., :count, :count], information[..., count:, :count]
+    own = np.linalg.solve(information[..., count:, count:] + belief, beside)
+    left = known - information[..., :count, count:] @ own
+    taken = np.einsum("...np,...n->...p", own, score[..., count:])
+    return score[..., :count] - taken, left + 1e-300 * np.eye(count)
 
 
 def always_wrong(
@@ -300,23 +298,35 @@ _ROUNDS = 8
 
 
 @dataclass(frozen=True)
-class Group:
-    """Scores of a group of windows, what surrounds the vessel taken out.
+class Groups:
+    """Scores of G groups of windows, what surrounds the vessel taken out.
 
     Attributes:
-        log: number of the log that they are of.
-        score: of each cause [Q].
-        information: about them [Q, Q].
+        log: number of the log that each is of [G].
+        score: of each cause [G, Q]; [G, F, Q] where there are several readings of it.
+        information: about them [G, Q, Q].
     """
 
-    log: int
+    log: np.ndarray
     score: np.ndarray
     information: np.ndarray
 
+    def __getitem__(self, chosen: np.ndarray | slice) -> Groups:
+        return Groups(self.log[chosen], self.score[chosen], self.information[chosen])
+
     @property
     def own(self) -> np.ndarray:
-        """Information about each cause alone [Q], never zero."""
-        return np.diag(self.information) + _NOTHING
+        """Information about each cause alone [G, Q], never zero."""
+        return np.diagonal(self.information, axis1=1, axis2=2) + _NOTHING
+
+    def without(self, bias: np.ndarray) -> Groups:
+        """Return the groups without what sizes [Q], such as clean logs ask for, say of them."""
+        return replace(self, score=self.score - self.information @ bias)
+
+    def by_log(self, values: np.ndarray) -> np.ndarray:
+        """Return the sums of values [G, ...] over the groups of each log [K, ...]."""
+        logs = dict.fromkeys(self.log.tolist())
+        return np.stack([values[self.log == log].sum(axis=0) for log in logs])
 
 
 @dataclass(frozen=True)
@@ -338,7 +348,7 @@ class Scatter:
     shared: np.ndarray
     known: np.ndarray
     correlation: np.ndarray
-    count: int = 10**9
+    count: int
     wider: float = 1.0
 
     def variance(self, own: np.ndarray) -> np.ndarray:
@@ -356,7 +366,31 @@ class Scatter:
         left = max(self.count - size - 1, 1)
         return max((self.count - 1) / left, 1.0) * self.count / (left + 1)
 
-    def together(self, groups: Sequence[Group]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def of(self, causes: Sequence[int]) -> Scatter:
+        """Return what is known of some causes alone, by their numbers."""
+        some = list(causes)
+        of_each = {
+            name: getattr(self, name)[some] for name in ("noise", "apart", "shared", "known")
+        }
+        return replace(self, correlation=self.correlation[np.ix_(some, some)], **of_each)
+
+    def by_log(self, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return scores [K, ..., Q] and information [K, Q, Q] of each log, weighed by the scatter.
+
+        Groups of one log say in part the same: how many times over [K, Q] comes with them.
+        """
+        own = groups.own
+        variance = self.variance(own)
+        deviation = np.sqrt(variance)
+        covariance = self.correlation * deviation[:, :, None] * deviation[:, None, :]
+        gain = np.linalg.solve(covariance, groups.information).swapaxes(1, 2)
+        told = groups.by_log(np.einsum("gqp,g...p->g...q", gain, groups.score))
+        sure = groups.by_log(gain @ groups.information)
+        count = groups.by_log(np.ones_like(own))
+        alike = groups.by_log(self.shared * own**2 / variance) / count
+        return told, sure, 1.0 + (count - 1.0) * alike
+
+    def together(self, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the size of each cause alone [Q], its error, and how much it explains.
 
         The scores of all causes tell better than each for itself which it is, and that there is
@@ -364,26 +398,11 @@ class Scatter:
         compared on the same scores: neither how well logs agree on the size of one, nor how surely
         clean logs asked for none of it, says that another one is more likely.
         """
-        told, weight = [], []
-        for log in dict.fromkeys(group.log for group in groups):
-            part, sure = 0.0, 0.0
-            alike: list[np.ndarray] = []
-            for group in groups:
-                if group.log == log:
-                    variance = self.variance(group.own)
-                    deviation = np.sqrt(variance)
-                    covariance = self.correlation * np.outer(deviation, deviation)
-                    weighed = np.linalg.solve(covariance, group.information)
-                    part = part + weighed.T @ group.score
-                    sure = sure + np.einsum("pq,pq->q", group.information, weighed)
-                    alike.append(self.shared * group.own**2 / variance)
-            # groups of one log say in part the same
-            again = 1.0 + (len(alike) - 1) * np.mean(alike, axis=0)
-            told.append(part / again)
-            weight.append(sure / again + _NOTHING)
-        size, agreed = _agreed(np.stack(told), np.stack(weight))
+        told, sure, again = self.by_log(groups)
+        told, weight = told / again, np.diagonal(sure, axis1=1, axis2=2) / again + _NOTHING
+        size, agreed = _agreed(told, weight)
         inflation = self.inflation * self.wider**2
-        explained = np.sum(told, axis=0) ** 2 / np.sum(weight, axis=0) / inflation
+        explained = told.sum(axis=0) ** 2 / weight.sum(axis=0) / inflation
         return size, np.sqrt((1.0 / agreed + self.known) * inflation), explained
 
 
@@ -407,61 +426,48 @@ def _agreed(told: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return size, (trusted * weight).sum(axis=0)
 
 
-def scattered(groups: Sequence[Group]) -> Scatter:
+def scattered(groups: Groups) -> Scatter:
     """Return how the scores of groups of clean windows scatter about zero."""
-    score = np.stack([group.score for group in groups])
-    own = np.stack([group.own for group in groups])
+    score, own = groups.score, groups.own
     count, size = score.shape
-    noise, apart = np.empty(size), np.empty(size)
-    for cause in range(size):
-        noise[cause], apart[cause] = _likeliest(score[:, cause], own[:, cause])
-    alone = Scatter(noise, apart, 0.0 * apart, 0.0 * apart, np.eye(size))
-    deviation = np.sqrt(alone.variance(own))
-    unit = score / deviation
+    noise, apart = np.array([_likeliest(*one) for one in zip(score.T, own.T, strict=True)]).T
+    variance = noise * own + apart * own**2
+    unit = score / np.sqrt(variance)
     second = unit.T @ unit / count
     root = np.sqrt(np.diag(second)) + _NOTHING
     # few groups say little about how scores scatter together
     kept = count / (count + size)
     correlation = kept * second / np.outer(root, root) + (1.0 - kept) * np.eye(size)
     np.fill_diagonal(correlation, 1.0)
-    shared = _shared(groups, alone)
-    whole = Scatter(noise, apart, shared, 0.0 * apart, correlation)
-    return Scatter(noise, apart, shared, 1.0 / _told(groups, whole)[1], correlation, count)
+    # what pairs of groups of one log have in common; where no log holds two, all is taken for it
+    common, weight = (
+        (groups.by_log(one) ** 2 - groups.by_log(one**2)).sum(axis=0)
+        for one in (own * score / variance, own**2 / variance)
+    )
+    shared = np.clip(common / np.maximum(weight, 1e-300), 0.0, apart) if weight.any() else apart
+    sure = groups.by_log(own**2 / (variance - shared * own**2))
+    known = 1.0 / (_NOTHING + (sure / (1.0 + shared * sure)).sum(axis=0))
+    return Scatter(noise, apart, shared, known, correlation, count)
 
 
-def wider(held: Sequence[Sequence[Group]], size: int) -> float:
+def wider(groups: Groups, fold: np.ndarray, size: int) -> float:
     """Return how many times as far scores of clean stretches lie as other clean logs say.
 
     Wind, waves and what a model does not know differ from log to log and last for minutes, so what
     groups say of a whole stretch is put to the test on logs that were left out.
 
     Args:
-        held: groups of clean windows in the order of time, those that are left out together by
-            themselves.
+        groups: of clean windows in the order of time.
+        fold: number of each; those of a number are left out together [G].
+        size: groups of a stretch.
     """
     found = []
-    for fold, own in enumerate(held):
-        others = [group for k, some in enumerate(held) if k != fold for group in some]
-        scatter = scattered(others)
+    for k in np.unique(fold):
+        own, scatter = np.flatnonzero(fold == k), scattered(groups[fold != k])
         for first in range(0, len(own), size):
-            mean, error, _ = scatter.together(own[first : first + size])
+            mean, error, _ = scatter.together(groups[own[first : first + size]])
             found.append(mean / error)
     return max(1.0, float(np.sqrt(np.mean(np.square(found)))))
-
-
-def _told(groups: Sequence[Group], scatter: Scatter) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighed sum of sizes [Q] and the sum of weights, the inverse variance."""
-    told, weight = np.zeros(len(scatter.noise)), np.full(len(scatter.noise), _NOTHING)
-    for log in dict.fromkeys(group.log for group in groups):
-        part, sure = 0.0, 0.0
-        for group in groups:
-            if group.log == log:
-                alone = scatter.variance(group.own) - scatter.shared * group.own**2
-                part = part + group.own * group.score / alone
-                sure = sure + group.own**2 / alone
-        told += part / (1.0 + scatter.shared * sure)
-        weight += sure / (1.0 + scatter.shared * sure)
-    return told, weight
 
 
 def _likeliest(score: np.ndarray, own: np.ndarray) -> tuple[float, float]:
@@ -476,24 +482,6 @@ def _likeliest(score: np.ndarray, own: np.ndarray) -> tuple[float, float]:
     possible = unlikely <= unlikely.min() + _LEFT_OPEN
     i, j = np.unravel_index(int(np.where(possible, scatter, -np.inf).argmax()), unlikely.shape)
     return float(_NOISE[i]), float(apart[j])
-
-
-def _shared(groups: Sequence[Group], scatter: Scatter) -> np.ndarray:
-    """Return the variance of sizes [Q] that the groups of one log share.
-
-    Where no clean log holds two groups nothing tells, and all is taken to be shared.
-    """
-    told, weight = np.zeros(len(scatter.noise)), np.zeros(len(scatter.noise))
-    for i, one in enumerate(groups):
-        for other in groups[:i]:
-            if other.log == one.log:
-                variance = scatter.variance(one.own) * scatter.variance(other.own)
-                product = one.own * other.own
-                told += product * one.score * other.score / variance
-                weight += product**2 / variance
-    if not weight.any():
-        return scatter.apart
-    return np.clip(told / np.maximum(weight, 1e-300), 0.0, scatter.apart)
 
 
 _OVERLAP = 3.0
@@ -594,82 +582,98 @@ class Watch:
     ) -> None:
         self.model = model.to(torch.float64).eval()
         self.config = config
-        self.dt = spec.dt
         self.causes = causes(spec.signals)
         self.seen = seen_of(spec.signals.live)
         self.others = surroundings()
         outside = [_CURRENT**-2] * 2 + [_PUSH**-2] * 2
         self.belief = np.diag(outside)
-        self.possible = np.diag([*((BELIEVED * one.size) ** -2 for one in self.causes), *outside])
+        believed = [(BELIEVED * one.size) ** -2 for one in self.causes]
+        self.possible = np.diag([*believed, *outside])
+        self.steps, self.past = round(config.window / spec.dt), past_of(model)
         cut = [(k, part) for k, log in enumerate(clean) for part in self.groups(log)]
-        groups, of = [group for _, group in cut], np.array([log for log, _ in cut])
-        if len(groups) < _FEWEST:
+        if len(cut) < _FEWEST:
             raise DataError(
-                f"the clean logs hold {len(groups)} stretches of {config.group:g} s; a monitor"
+                f"the clean logs hold {len(cut)} stretches of {config.group:g} s; a monitor"
                 f" needs at least {_FEWEST} to know how innovations scatter"
             )
-        most = np.max([np.abs(p.y).max(axis=0) for log in clean for p in log], axis=0)
+        log = np.array([k for k, _ in cut])
+        most = np.max([np.abs(p.y).max(axis=0) for _, part in cut for p in part], axis=0)
         most[HEADING] = _TURN
         self.limit = _FAR * most[[*self.seen.values()]]
-        self.parts = [1, _PARTS] if round(config.window / spec.dt) >= _LEAST_PART * _PARTS else [1]
-        found = [[self.innovations(group, parts) for parts in self.parts] for group in groups]
+        self.parts = [1, _PARTS] if self.steps >= _LEAST_PART * _PARTS else [1]
+        found = [[self.innovations(part, parts) for parts in self.parts] for _, part in cut]
         lost = np.concatenate([(group[0][0] == 0.0).all(axis=1) for group in found])
         if lost.mean() > _MOST_LOST:
             raise DataError(
                 f"model {spec.name}: free runs of {config.window:g} s run away in {lost.sum()} of"
                 f" {len(lost)} clean windows; watch with another model, or with a shorter window"
             )
-        self.always = self._wrong(found)
+        always = self._wrong(found)
         self.whiten = [
             whitening(
-                np.concatenate([group[i][0] - self.expected(group[i][1], i) for group in found]),
+                np.concatenate([own[i][0] - self.expected(own[i][1], always[i]) for own in found]),
                 parts,
             )
             for i, parts in enumerate(self.parts)
         ]
-        known = self.always
+
+        def learned(always: list[np.ndarray], kept: np.ndarray) -> tuple[np.ndarray, Groups]:
+            """Return the sizes [Q] that groups ask for together, and all groups without these."""
+            groups = self._groups(log, [self._sums(one, always) for one in found])
+            # two causes that are wrong alike, such as damping and gain, must not look like one
+            matrix = groups.information[kept].sum(axis=0) + np.diag(believed)
+            bias = np.linalg.solve(matrix, groups.score[kept].sum(axis=0))
+            return bias, groups.without(bias)
+
+        self.usual = [(always, learned(always, log >= 0)[0])]
         # groups of one log are alike
-        fold = (of if len(set(of)) >= _FOLDS else np.arange(len(found))) % _FOLDS
-        self.bias = self._bias([self._sums(group) for group in found])
-        held: list[list[Group]] = []
-        self.by_fold: list[tuple[list[np.ndarray], np.ndarray]] = []
+        fold = (log if len(set(log)) >= _FOLDS else np.arange(len(found))) % _FOLDS
+        held = []
         # scores scatter more where others say what is always wrong, as they do in service
         for k in range(_FOLDS):
-            self.always = self._wrong(
-                [one for one, own in zip(found, fold, strict=True) if own != k]
-            )
-            others = [self._sums(one) for one in found]
-            bias = self._bias([one for one, own in zip(others, fold, strict=True) if own != k])
-            self.by_fold.append((self.always, bias))
-            own = np.flatnonzero(fold == k)
-            held.append([self._group(int(of[i]), others[i], bias) for i in own])
-        self.always = known
-        apart = [group for some in held for group in some]
+            always = self._wrong([one for one, own in zip(found, fold, strict=True) if own != k])
+            bias, groups = learned(always, fold != k)
+            self.usual.append((always, bias))
+            held.append(vars(groups[fold == k]).values())
+        apart = Groups(*(np.concatenate(parts) for parts in zip(*held, strict=True)))
         size = max(round(config.stretch / config.group), 1)
-        self.scatter = replace(scattered(apart), wider=wider(held, size))
+        self.scatter = replace(scattered(apart), wider=wider(apart, np.sort(fold), size))
         looks = config.false_alarm / config.stretch * _OVERLAP * len(self.causes)
-        self.threshold = float(scipy.stats.t.isf(0.5 / looks, len(apart) - 1))
+        self.threshold = float(scipy.stats.t.isf(0.5 / looks, len(found) - 1))
 
     def _wrong(self, found: Sequence[Sequence[_Innovations]]) -> list[np.ndarray]:
         """Return what the model has always got wrong, by innovations of groups of clean windows."""
-        return [
-            always_wrong(
-                np.concatenate([group[i][0] for group in found]),
-                np.concatenate([group[i][1] for group in found]),
-                self.causes,
-                len(self.seen),
-            )
-            for i in range(len(self.parts))
-        ]
+        out = []
+        for look in zip(*found, strict=True):
+            error, effects = map(np.concatenate, zip(*look, strict=True))
+            out.append(always_wrong(error, effects, self.causes, len(self.seen)))
+        return out
 
-    def _bias(self, groups: Sequence[Sums]) -> np.ndarray:
-        """Return the sizes [Q] of all causes together that clean logs ask for."""
-        parts = [self._alone(group) for group in groups]
-        matrix = np.sum([part[1] for part in parts], axis=0)
-        believed = np.diag([change.size**-2 / BELIEVED**2 for change in self.causes])
-        # two causes that are wrong alike, such as damping and gain, must not look like one of them
-        score = np.sum([part[0] for part in parts], axis=0)
-        return np.asarray(np.linalg.solve(matrix + believed, score))
+    @classmethod
+    def of(
+        cls,
+        spec: ModelSpec,
+        model: HybridDynamics,
+        clean: Sequence[Prepared],
+        config: MonitorConfig,
+    ) -> Watch:
+        """Return the watch over a model by its clean logs, prepared as those of the fit."""
+        steps, past = round(config.window / spec.dt), past_of(model)
+        return cls(spec, model, [pieces(log, steps, past) for log in clean], config)
+
+    def windows(self, log: Prepared) -> list[Piece]:
+        """Return the windows of a new log.
+
+        Raises:
+            DataError: where it holds none.
+        """
+        found = pieces(log, self.steps, self.past)
+        if not found:
+            raise DataError(
+                f"log {log.log.name}: holds no window of {self.config.window:g} s without a break;"
+                " shorten the window or leave the log out"
+            )
+        return found
 
     @property
     def changes(self) -> list[Change]:
@@ -691,7 +695,10 @@ class Watch:
         """Return the scores of each of several windows."""
         found = [self.innovations(pieces, parts) for parts in self.parts]
         return [
-            self._sums([(error[i : i + 1], effects[i : i + 1]) for error, effects in found])
+            self._sums(
+                [(error[i : i + 1], effects[i : i + 1]) for error, effects in found],
+                self.usual[0][0],
+            )
             for i in range(len(pieces))
         ]
 
@@ -710,32 +717,31 @@ class Watch:
         error[lost], effects[lost] = 0.0, 0.0
         return error, effects
 
-    def expected(self, effects: np.ndarray, i: int, always: np.ndarray | None = None) -> np.ndarray:
+    def expected(self, effects: np.ndarray, always: np.ndarray) -> np.ndarray:
         """Return what innovations [B, n] are of clean logs, by their effects [B, C, n].
 
         Args:
-            i: number of the look: whole windows, or their parts.
-            always: what the model has always got wrong [Q, 4]; by all clean logs where None.
+            always: what the model has always got wrong in this look [Q, 4].
         """
-        wrong = self.always[i] if always is None else always
-        share = np.tile(wrong, effects.shape[2] // len(self.seen))
+        share = np.tile(always, effects.shape[2] // len(self.seen))
         return np.asarray((effects[:, : len(self.causes)] * share).sum(axis=1))
 
-    def _sums(self, found: Sequence[_Innovations]) -> Sums:
+    def _sums(self, found: Sequence[_Innovations], always: Sequence[np.ndarray]) -> Sums:
         """Return the sums of the same windows as a whole and in parts."""
         left = [
-            (error - self.expected(effects, i), effects) for i, (error, effects) in enumerate(found)
+            (error - self.expected(effects, wrong), effects)
+            for (error, effects), wrong in zip(found, always, strict=True)
         ]
         return weighed(left, self.whiten, self.possible)
 
-    def _alone(self, sums: Sums) -> tuple[np.ndarray, np.ndarray]:
+    def _groups(self, logs: Sequence[int] | np.ndarray, sums: Sequence[Sums]) -> Groups:
         """Return scores and information of the causes once the surroundings have had their part."""
-        return apart_from(sums, len(self.causes), self.belief)
-
-    def _group(self, log: int, sums: Sums, bias: np.ndarray) -> Group:
-        """Return scores and information of a group, what clean logs always ask for taken out."""
-        score, information = self._alone(sums)
-        return Group(log, score - information @ bias, information)
+        score, information = (
+            np.stack([getattr(one, name) for one in sums]) for name in ("score", "information")
+        )
+        return Groups(
+            np.asarray(logs), *apart_from(score, information, len(self.causes), self.belief)
+        )
 
     def judge(self, logs: Sequence[int], sums: Sequence[Sums]) -> Verdict:
         """Return the verdict on groups of windows; wind and current are their own in each.
@@ -743,7 +749,7 @@ class Watch:
         Args:
             logs: number of the log that each group is of.
         """
-        groups = [self._group(log, one, self.bias) for log, one in zip(logs, sums, strict=True)]
+        groups = self._groups(logs, sums).without(self.usual[0][1])
         size, error, explains = self.scatter.together(groups)
         suspects = [
             Suspect(change, float(abs(a) / b), float(a), float(b), float(c))
@@ -769,13 +775,11 @@ class Watcher:
     the threshold.
 
     Args:
-        past: samples before a window that warm a memory up.
+        watch: what is known of clean logs.
     """
 
-    def __init__(self, watch: Watch, past: int) -> None:
-        self.watch = watch
-        self.past = past
-        self.steps = round(watch.config.window / watch.dt)
+    def __init__(self, watch: Watch) -> None:
+        self.watch, self.past, self.steps = watch, watch.past, watch.steps
         self.size = max(round(watch.config.group / watch.config.window), 1)
         self.windows = max(round(watch.config.stretch / watch.config.window), 1)
         self.recent: deque[tuple[int, Sums]] = deque()

@@ -113,42 +113,39 @@ def candidates(limits: TrialLimits, live: Live = ALIVE) -> list[Manoeuvre]:
     """
     out: list[Manoeuvre] = []
     time, full = limits.time, limits.rudder
+    early: dict[str, Any] = {"duration": time, "start": 0.05 * time}
+    late: dict[str, Any] = {"duration": time, "start": 0.1 * time}
     for drive in (0.4, 0.7, 1.0) if live.moves else (1.0,):
-        per = f"{round(100 * drive)}"
-        for angle in (10.0, 20.0) if live.turns else ():
-            for share in (0.5, 1.0):
-                name = f"zigzag_{angle:.0f}_steer_{round(100 * share * full)}_drive_{per}"
-                out.append(
-                    Zigzag(
-                        name=name,
-                        drive=drive,
-                        steer=share * full,
-                        heading=math.radians(angle),
-                        start=0.1 * time,
-                        duration=time,
-                    )
-                )
-        for side in (1.0, -1.0) if live.turns else ():
-            name = f"turn_{'starboard' if side > 0 else 'port'}_drive_{per}"
-            out.append(
-                TurningCircle(
-                    name=name, drive=drive, steer=side * full, start=0.1 * time, duration=time
-                )
-            )
-        for unit in (0.02, 0.05):
-            out.append(
-                ThreeTwoOneOne(
-                    name=f"3211_{unit * time:.0f}s_drive_{per}",
+        per = f"drive_{round(100 * drive)}"
+        if live.turns:
+            out += [
+                Zigzag(
+                    name=f"zigzag_{angle:.0f}_steer_{round(100 * share * full)}_{per}",
                     drive=drive,
-                    steer=full,
-                    unit=unit * time,
-                    start=0.05 * time,
-                    duration=time,
+                    steer=share * full,
+                    heading=math.radians(angle),
+                    **late,
                 )
+                for angle in (10.0, 20.0)
+                for share in (0.5, 1.0)
+            ]
+            out += [
+                TurningCircle(name=f"turn_{word}_{per}", drive=drive, steer=side * full, **late)
+                for word, side in (("starboard", 1.0), ("port", -1.0))
+            ]
+        out += [
+            ThreeTwoOneOne(
+                name=f"3211_{unit * time:.0f}s_{per}",
+                drive=drive,
+                steer=full,
+                unit=unit * time,
+                **early,
             )
+            for unit in (0.02, 0.05)
+        ]
         out.append(
             MultiSine(
-                name=f"multi_sine_drive_{per}",
+                name=f"multi_sine_{per}",
                 drive=0.5 * drive,
                 drive_amplitude=0.5 * drive,
                 steer_amplitude=full,
@@ -156,13 +153,13 @@ def candidates(limits: TrialLimits, live: Live = ALIVE) -> list[Manoeuvre]:
                 duration=time,
             )
         )
-    if not live.moves:
-        return out
-    levels = (1.0, 0.0, 0.6, 0.2)
-    times = tuple(0.25 * time * k for k in range(4))
-    out.append(
-        AccelerationDeceleration(name="speed_changes", times=times, levels=levels, duration=time)
-    )
+    if live.moves:
+        times, levels = tuple(0.25 * time * k for k in range(4)), (1.0, 0.0, 0.6, 0.2)
+        out.append(
+            AccelerationDeceleration(
+                name="speed_changes", times=times, levels=levels, duration=time
+            )
+        )
     return out
 
 
@@ -270,20 +267,16 @@ def plan(
     spec.signals.live.require_on_surface("the plan of a trial")
     horizon = round(refit.horizon / spec.dt)
     divisor, offered = torch.from_numpy(scales), candidates(limits, spec.signals.live)
-    flown = [
-        (flight, _path(flight, spec.signals))
-        for flight in _flights(
-            fitted, shares, Aim(sorted(offered, key=lambda one: one.kind), limits.time, {})
-        )
-    ]
-    kept = [(flight, states, w) for flight, (states, w) in flown if _allowed(states, limit, limits)]
+    # those of one kind fly together
+    every = Aim(sorted(offered, key=lambda one: one.kind), limits.time, {})
+    flown = [(flight, *_path(flight, spec.signals)) for flight in _flights(fitted, shares, every)]
+    kept = [one for one in flown if _allowed(one[1], limit, limits)]
     if not kept:
         raise DataError(
             f"none of {len(flown)} candidates stays within the limits; allow more area, speed or"
             " rudder, or less time"
         )
     told = moments(model, [(states, w) for _, states, w in kept], horizon, divisor)
-    found = [(flight, states, own) for (flight, states, _), own in zip(kept, told, strict=True)]
     # so many samples hang together that they count as one
     each = spec.dt / refit.correlation / max(open_.square, 1e-12)
     goal = told.sum(dim=0)
@@ -298,19 +291,11 @@ def plan(
             " rudder angles, or shorten refit.horizon"
         )
     trials = []
-    for flight, states, own in found:
-        minutes = (len(states) - 1) * spec.dt / 60.0
-        later = spread(after(open_.covariance, each * own), goal)
-        trials.append(
-            Trial(
-                flight,
-                each * own,
-                minutes,
-                volume_gain(open_.covariance, each * own) / minutes,
-                1.0 - later / before,
-                _reach(states),
-            )
-        )
+    for (flight, states, _), own in zip(kept, told, strict=True):
+        minutes, told_of = (len(states) - 1) * spec.dt / 60.0, each * own
+        volume = volume_gain(open_.covariance, told_of) / minutes
+        shrinks = 1.0 - spread(after(open_.covariance, told_of), goal) / before
+        trials.append(Trial(flight, told_of, minutes, volume, shrinks, _reach(states)))
     trials.sort(key=lambda trial: -trial.shrinks / trial.minutes)
     chosen: list[Trial] = []
     now = open_.covariance

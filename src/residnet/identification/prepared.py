@@ -163,19 +163,15 @@ def through_currents(
     values, table = estimate_currents(
         baseline, signals, every[:fitted], settings.current, every[fitted:]
     )
-    say(f"  {_summary(table)}")
+    north, east = (
+        np.array([row[f"current_{axis}"] for row in table]) for axis in ("north", "east")
+    )
+    speed = np.hypot(north, east)
+    say(
+        f"  currents of {len(table)} logs: {speed.mean():.3f} m/s on average, at most"
+        f" {speed.max():.3f} m/s"
+    )
     moved = iter(
         [through_water(log, value, signals) for log, value in zip(every, values, strict=True)]
     )
     return {split: paged.OneByOne([next(moved) for _ in logs[split]]) for split in order}, table
-
-
-def _summary(table: list[dict[str, Any]]) -> str:
-    north, east = (
-        np.array([row[name] for row in table]) for name in ("current_north", "current_east")
-    )
-    speed = np.hypot(north, east)
-    return (
-        f"currents of {len(table)} logs: {speed.mean():.3f} m/s on average, at most"
-        f" {speed.max():.3f} m/s"
-    )

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 
@@ -27,6 +27,7 @@ from residnet.identification.changes import Change, ChangedDynamics
 from residnet.identification.fitter import FittedModel
 from residnet.identification.monitoring import (
     BELIEVED,
+    Groups,
     Piece,
     Verdict,
     Watch,
@@ -234,7 +235,7 @@ class _Filter:
             sizes = np.where(np.abs(self.size) > self.steps, self.size, self.steps)
             self.directions = torch.stack(
                 [
-                    _direction(self.watch.model, change.of_size(float(size)), groups)[0]
+                    _direction(self.watch.model, replace(change, size=float(size)), groups)[0]
                     for change, size in zip(self.changes, sizes, strict=True)
                 ],
                 dim=1,
@@ -258,7 +259,7 @@ class _Filter:
         Free runs have the sizes known by then, or, where these are `fixed`, those of the start.
         """
         precision = np.diag((BELIEVED * self.steps) ** -2.0)
-        told, size = np.zeros((1 + len(self.watch.by_fold), len(self.size))), self.size
+        told, size = np.zeros((len(self.watch.usual), len(self.size))), self.size
         after: list[np.ndarray] = []
         for log in dict.fromkeys(number for number, _ in groups):
             self._place(self.size)
@@ -276,21 +277,10 @@ class _Filter:
 
     def _log(self, parts: Sequence[Sequence[Piece]]) -> tuple[np.ndarray, np.ndarray]:
         """Return scores [1 + F, Q] and information of a log, weighed by how clean logs scatter."""
-        scatter, places = self.watch.scatter, self.places
-        scores = np.zeros((1 + len(self.watch.by_fold), len(places)))
-        sure, alike = np.zeros((len(places), len(places))), []
-        for part in parts:
-            told, information = self._told(part)
-            own = np.diag(information) + 1e-12
-            variance = scatter.noise[places] * own + scatter.apart[places] * own**2
-            deviation = np.sqrt(variance)
-            covariance = scatter.correlation[np.ix_(places, places)]
-            gain = np.linalg.solve(covariance * np.outer(deviation, deviation), information).T
-            scores, sure = scores + told @ gain.T, sure + gain @ information
-            alike.append(scatter.shared[places] * own**2 / variance)
-        # windows of one log say in part the same
-        again = 1.0 + (len(alike) - 1) * float(np.mean(alike))
-        return scores / again, sure / again
+        score, information = (np.stack(one) for one in zip(*map(self._told, parts), strict=True))
+        groups = Groups(np.zeros(len(parts)), score, information)
+        told, sure, again = self.watch.scatter.of(self.places).by_log(groups)
+        return told[0] / again.mean(), sure[0] / again.mean()
 
     def _place(self, size: np.ndarray) -> None:
         """Give the model its parameters for changes of some sizes."""
@@ -306,8 +296,7 @@ class _Filter:
         Scores [1 + F, Q] are by what all clean logs say is always wrong, then without each fold.
         """
         watch = self.watch
-        usual = [(watch.always, watch.bias), *watch.by_fold]
-        looks: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in usual]
+        looks: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in watch.usual]
         for i, parts in enumerate(watch.parts):
             _, known = watch.innovations(part, parts)
             # windows in which a free run ran away have no effects, and tell nothing
@@ -323,15 +312,18 @@ class _Filter:
             count, changes = len(part), every.shape[1]
             every = every.reshape(count, parts, changes, -1).swapaxes(1, 2)
             every = every.reshape(count, changes, -1) * sound[:, None, None]
-            for look, (always, bias) in zip(looks, usual, strict=True):
+            for look, (always, bias) in zip(looks, watch.usual, strict=True):
                 # what clean logs ask for too is no change
-                wrong = watch.expected(known, i, always[i])
+                wrong = watch.expected(known, always[i])
                 wrong = wrong + np.einsum("q,bqn->bn", bias, known[:, : len(watch.causes)])
                 look.append(((error.reshape(count, -1) - wrong) * sound[:, None], every))
         own = [*self.places, *range(len(watch.causes), len(watch.changes))]
         possible = watch.possible[np.ix_(own, own)]
-        told = [
-            apart_from(weighed(look, watch.whiten, possible), len(self.size), watch.belief)
-            for look in looks
-        ]
-        return np.stack([score for score, _ in told]), told[0][1]
+        told = [weighed(look, watch.whiten, possible) for look in looks]
+        score, information = apart_from(
+            np.stack([one.score for one in told]),
+            np.stack([one.information for one in told]),
+            len(self.size),
+            watch.belief,
+        )
+        return score, information[0]

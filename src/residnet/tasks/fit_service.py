@@ -20,18 +20,10 @@ from residnet.core.format import fixed, number, plural
 from residnet.core.layout import SIX
 from residnet.core.names import nearest
 from residnet.core.progress import say
-from residnet.data.prepare import Prepared, samples
+from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
 from residnet.identification.identified import candidates, evaluate
-from residnet.identification.monitoring import (
-    MonitorConfig,
-    Piece,
-    Verdict,
-    Watch,
-    Watcher,
-    past_of,
-    pieces,
-)
+from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher
 from residnet.identification.planning import Aim, Plan, TrialLimits, plan, shares_of
 from residnet.identification.prepared import prepare_logs, require_window, through_currents
 from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
@@ -138,30 +130,14 @@ class Service:
         store = FolderStore(run)
         name = str(run.read_metrics()["selected"]) if model == "selected" else model
         if name not in store.names():
-            known = ["selected", *store.names()]
-            raise UsageError(f"{run.path}: no model '{name}'{nearest(name, known)}")
+            valid = ["selected", *store.names()]
+            raise UsageError(f"{run.path}: no model '{name}'{nearest(name, valid)}")
         self.config, self.run, self.fitted = config, run, store.load(name)
-        self.past = past_of(self.fitted.model)
-        self._steps = round(chosen.window / self.fitted.spec.dt)
         self.files, _, self.logs = external_logs(config, paths)
         # clean logs over ground, as new ones are: a current is taken out of either alike
         clean = prepare_logs(config.logs(), config)
-        found = [pieces(p, self._steps, self.past) for p in (*clean["train"], *clean["validation"])]
-        self.watch = Watch(self.fitted.spec, self.fitted.model, found, chosen)
-
-    def windows(self, log: Prepared) -> list[Piece]:
-        """Return the windows of a new log.
-
-        Raises:
-            DataError: where it holds none.
-        """
-        found = pieces(log, self._steps, self.past)
-        if not found:
-            raise DataError(
-                f"log {log.log.name}: holds no window of {self.watch.config.window:g} s without a"
-                " break; shorten --window or leave it out"
-            )
-        return found
+        known = [*clean["train"], *clean["validation"]]
+        self.watch = Watch.of(self.fitted.spec, self.fitted.model, known, chosen)
 
     def watched(self) -> list[WatchedLog]:
         """Watch the logs one after the other; what is looked back over goes on between them.
@@ -169,9 +145,9 @@ class Service:
         Raises:
             DataError: where a log holds no window.
         """
-        watcher, out = Watcher(self.watch, self.past), []
+        watcher, out = Watcher(self.watch), []
         for log in self.logs:
-            found = self.windows(log)
+            found = self.watch.windows(log)
             watcher.restart()
             verdicts = [watcher.take(sums) for sums in self.watch.sums(found)]
             alarms = np.flatnonzero([verdict.alarm for verdict in verdicts])
@@ -351,7 +327,7 @@ def refit_run(service: Service, out: Path) -> RefitRun:
     held = max(len(service.logs) // _HELD, 1)
     used, kept = service.logs[:-held], service.logs[-held:]
     say(f"recursive refit of {old.name} on {len(used)} logs, {held} held out")
-    found = recursive_refit(service.watch, [service.windows(log) for log in used])
+    found = recursive_refit(service.watch, [service.watch.windows(log) for log in used])
     if not found.moved:
         return RefitRun(found)
     new = refitted(old, found)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from residnet.identification.monitoring import Group, scattered, wider
+from residnet.identification.monitoring import Groups, scattered, wider
 
 CAUSES = 3
 ALIKE = np.array([[1.0, 0.8, 0.0], [0.8, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -20,17 +20,19 @@ def groups(
     change: np.ndarray,
     apart: float,
     shared: float = 0.0,
-) -> list[Group]:
+) -> Groups:
     """Groups whose information varies a hundredfold, logs and groups of sizes of their own."""
-    out = []
-    for log in range(logs):
-        common = shared * random.normal(size=CAUSES)
-        for _ in range(each):
-            information = ALIKE * 10.0 ** random.uniform(0, 2)
-            size = change + common + apart * random.normal(size=CAUSES)
-            noise = np.linalg.cholesky(information) @ random.normal(size=CAUSES)
-            out.append(Group(log, information @ size + noise, information))
-    return out
+    log = np.arange(logs).repeat(each)
+    information = ALIKE * 10.0 ** random.uniform(0, 2, (logs * each, 1, 1))
+    size = change + (shared * random.normal(size=(logs, CAUSES)))[log]
+    size = size + apart * random.normal(size=(len(log), CAUSES))
+    noise = np.linalg.cholesky(information) @ random.normal(size=(len(log), CAUSES, 1))
+    return Groups(log, (information @ size[..., None] + noise)[..., 0], information)
+
+
+def joined(*parts: Groups) -> Groups:
+    each = zip(*(vars(part).values() for part in parts), strict=True)
+    return Groups(*(np.concatenate(one) for one in each))
 
 
 def test_much_information_about_a_wrong_model_is_no_alarm() -> None:
@@ -65,24 +67,24 @@ def test_what_lasts_for_a_stretch_makes_its_scores_lie_wider() -> None:
     """Logs left out tell it: pairs of groups of a long log share less than those of a stretch."""
     random = np.random.default_rng(3)
 
-    def sailed(logs: int, legs: int) -> list[Group]:
-        out = []
-        for log in range(logs):
-            for _ in range(legs):
-                leg = groups(random, 1, 5, np.zeros(CAUSES), 0.05, shared=0.5)
-                out += [Group(log, one.score, one.information) for one in leg]
-        return out
+    def sailed(logs: int, legs: int) -> Groups:
+        parts = [
+            groups(random, 1, 5, np.zeros(CAUSES), 0.05, shared=0.5) for _ in range(logs * legs)
+        ]
+        return replace(joined(*parts), log=np.arange(logs).repeat(5 * legs))
 
-    held = [sailed(2, 4) for _ in range(5)]
-    scatter = scattered([group for some in held for group in some])
+    held = joined(*(sailed(2, 4) for _ in range(5)))
+    fold = np.arange(5).repeat(40)
+    scatter = scattered(held)
     scores = []
     for _ in range(300):
         size, error, _ = scatter.together(sailed(1, 1))
         scores.append(size / error)
-    factor = wider(held, 5)
+    factor = wider(held, fold, 5)
     assert np.std(scores) > 1.3
     assert 0.75 < np.std(scores) / factor < 1.25
-    assert wider([groups(random, 8, 1, np.zeros(CAUSES), 0.5) for _ in range(5)], 5) < 1.2
+    free = joined(*(groups(random, 8, 1, np.zeros(CAUSES), 0.5) for _ in range(5)))
+    assert wider(free, np.arange(5).repeat(8), 5) < 1.2
 
 
 def test_all_scores_together_name_the_cause() -> None:
@@ -105,10 +107,9 @@ def test_one_log_at_odds_with_the_others_does_not_speak_for_all() -> None:
     changed, strange = [], []
     for _ in range(50):
         known = groups(random, 5, 1, np.zeros(CAUSES), 0.1)
-        odd = known[-1]
         # a manoeuvre that no clean log held asks for ten standard deviations alone
-        pushed = odd.score + 10.0 * np.sqrt(scatter.variance(odd.own))
-        size, error, _ = scatter.together([*known[:-1], Group(odd.log, pushed, odd.information)])
+        known.score[-1] += 10.0 * np.sqrt(scatter.variance(known.own))[-1]
+        size, error, _ = scatter.together(known)
         strange.append(np.abs(size / error).max())
         size, error, _ = scatter.together(groups(random, 5, 1, np.array([0.0, 0.0, 2.0]), 0.1))
         changed.append(size[2] / error[2])
