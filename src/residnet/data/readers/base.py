@@ -12,10 +12,10 @@ from typing import Any, Literal, final
 import numpy as np
 
 from residnet.core.config import Config
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.files import sha256
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, nearest
+from residnet.core.names import CHANNEL_UNITS, nearest, shown
 from residnet.core.progress import report
 
 # recordings below this size are read before anybody waits, bytes
@@ -195,12 +195,28 @@ def progress(name: str, size: int, total: float) -> Iterator[Advance]:
     report(stage, 100.0, 100.0)
 
 
-def missing_package(extra: str, package: str, name: str) -> UsageError:
-    """Return the error for a format whose package is not installed."""
-    return UsageError(
-        f"{name} needs the package {package}, which is not installed; install it with: pip install"
-        f' "residnet[{extra}]"'
-    )
+@contextmanager
+def package(extra: str, package: str, name: str) -> Iterator[None]:
+    """Import the package of a format; where it is not installed, say which extra brings it."""
+    try:
+        yield
+    except ImportError as error:
+        raise UsageError(
+            f"{name} needs the package {package}, which is not installed; install it with: pip"
+            f' install "residnet[{extra}]"'
+        ) from error
+
+
+@contextmanager
+def readable(path: Path, what: str) -> Iterator[None]:
+    """Damaged files fail in every layer of a library: tell so in one line, as what they are not."""
+    try:
+        yield
+    except ResidnetError:
+        raise
+    except Exception as error:
+        reason = shown(f"{type(error).__name__}: {' '.join(str(error).split())}", 200)
+        raise DataError(f"{path}: damaged or not {what} ({reason})") from error
 
 
 class CanonicalConfig(Config):

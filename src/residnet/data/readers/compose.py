@@ -35,13 +35,13 @@ from residnet.data.readers.quantities import (
     OfTopic,
     Plan,
     PositionConfig,
-    Quaternion,
     Source,
     Uniform,
     VelocityConfig,
     at_centre,
     body_velocity,
     fixes_on_plane,
+    given_by,
     unit_quaternion,
     yaw_of,
 )
@@ -108,8 +108,7 @@ class RecordingConfig(Config, ABC):
                 "velocity: kind 'derived' needs a uniform clock; set clock: {kind: uniform, step:"
                 " 0.1 s}"
             )
-        sources = {("x", "y"): self.position, ("psi",): self.heading, ("u", "v"): self.velocity}
-        given = [name for names, source in sources.items() if source for name in names]
+        given = given_by(self.position, self.heading, self.velocity)
         if double := ", ".join(name for name in given if name in self.channels):
             raise ValueError(
                 f"channels: {double} given here and by position, heading or velocity; take one of"
@@ -160,7 +159,6 @@ class RecordingReader(LogReader):
         if config.standard_messages:
             plan = standard_plan(recording, plan)
         log = compose(recording, plan, config.clock, config.longest_gap)
-        require_samples(path, log.t)
         rest: set[str] = set()
         if not Live.told(log.channels).spatial:
             # of a vessel that does not dive nobody asked for these
@@ -267,10 +265,7 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
         t = times - times[:1]
         if isinstance(clock, Uniform):
             t = clock.step * np.arange(times.size)
-    if len(t) < 2:
-        raise DataError(
-            f"{recording.path}: {len(t)} samples on the log's clock, at least 2 are needed"
-        )
+    require_samples(recording.path, t)
     for name, channel in values.items():
         if not np.isfinite(channel).any():
             raise DataError(
@@ -376,18 +371,15 @@ def _channel_parts(
 
 def _present(recording: Recording, channels: Mapping[str, FieldMap]) -> dict[str, FieldMap]:
     """Return the channels without those that may be missing and are."""
-    out = {}
-    for name, entry in channels.items():
-        if not entry.required:
-            first = next(iter(recording.series), None)
-            topic = first if entry.topic is None else same_topic(entry.topic, recording.series)
-            series = recording.series.get(topic or "")
-            if series is None or not series.has(entry.field) or len(series) < 2:
-                continue
-            if not np.isfinite(series[entry.field]).any():
-                continue
-        out[name] = entry
-    return out
+
+    def there(entry: FieldMap) -> bool:
+        names = recording.series
+        topic = next(iter(names), "") if entry.topic is None else same_topic(entry.topic, names)
+        series = recording.series.get(topic or "")
+        found = series is not None and series.has(entry.field) and len(series) > 1
+        return bool(found and series is not None and np.isfinite(series[entry.field]).any())
+
+    return {name: entry for name, entry in channels.items() if entry.required or there(entry)}
 
 
 def _moved(lever: Lever, what: str) -> tuple[str, ...]:
@@ -432,11 +424,36 @@ def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float
     series = recording[config.topic]
     values: dict[str, np.ndarray] = {}
     remarks: list[Remark] = []
+    offset = 0.0
     if isinstance(config, Angle):
-        yaw = _numbers(recording, series, config.field, config.unit)
+        yaw, offset = _numbers(recording, series, config.field, config.unit), config.offset
     else:
-        yaw, values, remarks = _attitude(recording, series, config)
-    offset = config.offset if isinstance(config, Angle) else 0.0
+        parts = unit_quaternion(
+            *(_numbers(recording, series, f"{config.field}.{axis}") for axis in "xyzw")
+        )
+        x, y, z, w = parts
+        empty = int(np.isnan(w).sum())
+        if empty == w.size:
+            raise DataError(
+                f"{recording.path}: topic {series.name}: '{config.field}' holds no orientation, all"
+                " quaternions are empty"
+            )
+        if flips := int((sum(part[1:] * part[:-1] for part in parts) < 0.0).sum()):
+            text = (
+                f"topic {series.name}: the quaternion changes sign {flips} times (both signs are"
+                " one attitude); the heading is taken through"
+            )
+            remarks.append(remark("note", "quaternion_flips", text, flips=flips))
+        if empty:
+            text = f"topic {series.name}: {empty} quaternions are empty; no heading there"
+            remarks.append(remark("note", "empty_quaternions", text, rows=empty))
+        yaw = yaw_of(*parts)
+        if config.roll:
+            # roll about the forward axis has one sign in both frames, pitch about the sideways one
+            # has not
+            pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+            values["phi"] = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+            values["theta"] = -pitch if config.frame == "enu" else pitch
     psi = unwrap((np.pi / 2 - yaw if config.frame == "enu" else yaw) + offset)
     if np.isfinite(psi).any():
         # a heading of zero with rounding stays zero
@@ -446,39 +463,6 @@ def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float
     text = "psi: counter-clockwise from east (REP-103) to clockwise from north"
     conversion = (text,) if config.frame == "enu" else ()
     return _part(recording, series, values, longest_gap, conversion, remarks)
-
-
-def _attitude(
-    recording: Recording, series: Series, config: Quaternion
-) -> tuple[np.ndarray, dict[str, np.ndarray], list[Remark]]:
-    """Return yaw, roll and pitch where wanted, and remarks from the quaternions of a topic."""
-    parts = unit_quaternion(
-        *(_numbers(recording, series, f"{config.field}.{axis}") for axis in "xyzw")
-    )
-    x, y, z, w = parts
-    known = np.isfinite(w)
-    if not known.any():
-        raise DataError(
-            f"{recording.path}: topic {series.name}: '{config.field}' holds no orientation, all"
-            " quaternions are empty"
-        )
-    remarks = []
-    flips = int((sum(part[1:] * part[:-1] for part in parts) < 0.0).sum())
-    if flips:
-        text = (
-            f"topic {series.name}: the quaternion changes sign {flips} times (both signs are one"
-            " attitude); the heading is taken through"
-        )
-        remarks.append(remark("note", "quaternion_flips", text, flips=flips))
-    if not known.all():
-        empty = int((~known).sum())
-        text = f"topic {series.name}: {empty} quaternions are empty; no heading there"
-        remarks.append(remark("note", "empty_quaternions", text, rows=empty))
-    # roll about the forward axis has one sign in both frames, pitch about the sideways one has not
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    pitch = -pitch if config.frame == "enu" else pitch
-    return yaw_of(*parts), {"phi": roll, "theta": pitch} if config.roll else {}, remarks
 
 
 def _velocity_part(

@@ -276,15 +276,16 @@ def clock_shift(log: Log, other: Log) -> Shift:
         inside = (at[begin] >= other.t[0]) & (at[begin + size] <= other.t[-1])
         if inside.sum() < 3 * (own.shape[1] + 3 * len(driving) + len(gains)) or not total:
             return 0.0
+
+        def seen(values: np.ndarray) -> np.ndarray:
+            there = np.isfinite(values)
+            return np.asarray(np.interp(at, other.t[there], values[there]))
+
         columns = [own[inside]]
-        for values in gains:
-            there = np.isfinite(values)
-            w = np.interp(at, other.t[there], values[there])
-            columns.append((w[begin + size] - w[begin])[inside, None])
-        for values in driving:
-            there = np.isfinite(values)
-            w = np.interp(at, other.t[there], values[there])
-            columns.append(over(np.stack((w, w * np.abs(w), w * u), axis=1))[inside])
+        columns += [(w[begin + size] - w[begin])[inside, None] for w in map(seen, gains)]
+        columns += [
+            over(np.stack((w, w * np.abs(w), w * u), axis=1))[inside] for w in map(seen, driving)
+        ]
         x, y = np.concatenate(columns, axis=1), gained[inside]
         x = x / np.maximum(np.abs(x).max(axis=0), 1e-12)
         left = y - x @ np.linalg.lstsq(x, y, rcond=1e-9)[0]
@@ -317,7 +318,9 @@ def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
     members = list(groups.values())
     if not 2 <= len(members) <= 6:
         return {}
-    held = [_words(group) for group in members]
+    named = [[set(re.findall(r"[^\W\d_]+", path.stem)) for path in group] for group in members]
+    # the longest words that the names of all files of a group hold go first
+    held = [sorted(set.intersection(*one), key=lambda w: (-len(w), w)) for one in named]
     shared = Counter(word for words in held for word in words)
     words = [[word for word in own if shared[word] == 1] for own in held]
     if not all(words):
@@ -329,9 +332,3 @@ def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
     first, *rest = trips.values()
     whole = [trip for trip in first if all(trip in other for other in rest)]
     return {word: [of[trip] for trip in whole] for word, of in trips.items()} if whole else {}
-
-
-def _words(group: list[Path]) -> list[str]:
-    """Return the words that the names of all files of a group hold, the longest first."""
-    held = [set(re.findall(r"[^\W\d_]+", path.stem)) for path in group]
-    return sorted(set.intersection(*held), key=lambda word: (-len(word), word))

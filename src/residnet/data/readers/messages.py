@@ -25,6 +25,7 @@ from residnet.data.readers.quantities import (
     Local,
     Plan,
     Quaternion,
+    given_by,
 )
 from residnet.data.readers.recording import Recording, Series, key_of, remark
 
@@ -98,19 +99,18 @@ def _orientation(s: Series, path: str) -> Quaternion | None:
     return Quaternion(topic=s.name, field=path, frame="enu", roll=tilted)
 
 
-def _pose(s: Series) -> Plan:
+def _navigation(s: Series) -> Plan:
+    """A pose, a twist, or both."""
     at = _prefix(s, ("pose.pose.", "pose.", ""), "position.x")
-    place = Local(topic=s.name, north=f"{at}position.y", east=f"{at}position.x")
-    return Plan(
-        _depth(s, f"{at}position.z", frame="enu"), place, _orientation(s, f"{at}orientation")
-    )
-
-
-def _twist(s: Series) -> Plan:
+    moves = _prefix(s, ("twist.twist.", "twist.", ""), "linear.x")
+    if s.has(f"{at}position.x"):
+        place = Local(topic=s.name, north=f"{at}position.y", east=f"{at}position.x")
+        channels = _body(s, moves) | _depth(s, f"{at}position.z", frame="enu")
+        return Plan(channels, place, _orientation(s, f"{at}orientation"))
     if s.sender is not None and len(s.sender) and str(s.sender[0]).strip("/").lower() in _WORLD:
         # along the axes of the earth, which is left to the config
         return Plan()
-    return Plan(_body(s, _prefix(s, ("twist.twist.", "twist.", ""), "linear.x")))
+    return Plan(_body(s, moves))
 
 
 def _imu(s: Series) -> Plan:
@@ -192,13 +192,6 @@ def _revolutions(s: Series) -> Plan:
     return Plan(channels)
 
 
-def _odometry(s: Series) -> Plan:
-    at = "pose.pose.position"
-    place = Local(topic=s.name, north=f"{at}.y", east=f"{at}.x")
-    channels = _body(s, "twist.twist.") | _depth(s, f"{at}.z", frame="enu")
-    return Plan(channels, place, _orientation(s, "pose.pose.orientation"))
-
-
 def _earth_fixed(s: Series, north: str, east: str) -> EarthFixed | None:
     return EarthFixed(topic=s.name, north=north, east=east) if s.has(north) else None
 
@@ -230,19 +223,23 @@ def _local(north: str, east: str, down: str, v_north: str, v_east: str) -> Calla
 
 MESSAGES = (
     Message(
-        "Odometry", ("Odometry",), _odometry, _ROS, ("pose.pose.position.x", "twist.twist.linear.x")
+        "Odometry",
+        ("Odometry",),
+        _navigation,
+        _ROS,
+        ("pose.pose.position.x", "twist.twist.linear.x"),
     ),
     Message(
         "Pose",
         ("PoseStamped", "Pose", "PoseWithCovarianceStamped"),
-        _pose,
+        _navigation,
         _ROS,
         ("pose.position.x", "pose.orientation.w"),
     ),
     Message(
         "Twist",
         ("TwistStamped", "Twist", "TwistWithCovarianceStamped"),
-        _twist,
+        _navigation,
         _ROS,
         ("twist.linear.x", "twist.angular.z"),
     ),
@@ -346,10 +343,7 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
             remarks.append(remark("will mislead", "several_tables", text, tables=len(alike)))
         for series in sorted(fitting, key=lambda s: (-len(s), s.name)):
             offered = message.plan(series)
-            present = set(plan.channels)
-            present |= {"x", "y"} if plan.position else set()
-            present |= {"psi"} if plan.heading else set()
-            present |= {"u", "v"} if plan.velocity else set()
+            present = {*plan.channels, *given_by(plan.position, plan.heading, plan.velocity)}
             present |= {"r"} if isinstance(plan.velocity, Derived) else set()
             # a field that is taken under one name is not offered under another
             used = {(entry.topic, entry.field, entry.sender) for entry in plan.channels.values()}
@@ -361,16 +355,14 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
             position = None if {"x", "y"} & present else offered.position
             heading = None if "psi" in present else offered.heading
             velocity = None if {"u", "v"} & (present | set(new)) else offered.velocity
-            found = {("x", "y"): position, ("psi",): heading, ("u", "v"): velocity}
-            taken = [name for names, source in found.items() if source for name in names]
-            joined = dataclasses.replace(
+            plan = dataclasses.replace(
                 plan,
                 channels={**plan.channels, **new},
                 position=plan.position or position,
                 heading=plan.heading or heading,
                 velocity=plan.velocity or velocity,
             )
-            plan, taken = joined, [*taken, *new]
+            taken = [*given_by(position, heading, velocity), *new]
             if taken:
                 of = f"{', '.join(taken)}: {message.name} of {series.name}"
                 conversions.append(f"{of}, {message.conversion}")

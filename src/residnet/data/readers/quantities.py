@@ -15,7 +15,7 @@ from residnet.core.config import Config, Metres, Radians, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import known_unit, si_unit, to_si
-from residnet.data.readers.base import missing_package, unwrap
+from residnet.data.readers.base import package, unwrap
 from residnet.data.readers.recording import Remark
 from residnet.data.readers.written import Form, LetterO
 
@@ -449,6 +449,14 @@ VelocityConfig = Annotated[Derived | EarthFixed | CourseSpeed, Field(discriminat
 """Where u, v (and r) come from; velocities in body axes are plain channels."""
 
 
+def given_by(
+    position: PositionConfig | None, heading: HeadingConfig | None, velocity: VelocityConfig | None
+) -> list[str]:
+    """Return the channels that sources give."""
+    sources = {("x", "y"): position, ("psi",): heading, ("u", "v"): velocity}
+    return [name for names, source in sources.items() if source is not None for name in names]
+
+
 @final
 class Uniform(Config):
     """A uniform grid; where the recording has dates, on whole multiples of its step in Unix time.
@@ -517,10 +525,8 @@ def tangent_plane(
     Raises:
         UsageError: where pyproj is not installed.
     """
-    try:
+    with package("geo", "pyproj", "a position in latitude and longitude"):
         from pyproj import Transformer
-    except ImportError as error:
-        raise missing_package("geo", "pyproj", "a position in latitude and longitude") from error
     origin = (
         f"+lat_0={float(np.degrees(latitude_0))!r} +lon_0={float(np.degrees(longitude_0))!r} +h_0=0"
     )

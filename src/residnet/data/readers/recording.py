@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable
+from array import array
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 
@@ -25,6 +26,32 @@ def remark(level: Level, code: str, text: str, **figures: float) -> Remark:
     It has level, code, text and figures (SI).
     """
     return {"level": level, "code": code, "text": text, "figures": figures}
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """The times of a column.
+
+    Attributes:
+        ns: [T] int64, whole ns; Unix time where `absolute`, and any number where a time is missing.
+        absolute: whether the source gave dates or Unix time.
+        known: [T] bool, where there is a time; None where there is one everywhere.
+        remarks: what was noticed.
+        seconds: [T] numbers that are seconds without a date as they stand, to the last bit.
+    """
+
+    ns: np.ndarray
+    absolute: bool
+    known: np.ndarray | None = None
+    remarks: tuple[Remark, ...] = ()
+    seconds: np.ndarray | None = None
+
+    def since(self, start: int | None) -> np.ndarray:
+        """Return the times [T] in s from `start`, Unix time in ns, where they are absolute."""
+        if self.seconds is not None:
+            return self.seconds
+        seconds: np.ndarray = (self.ns - (start or 0 if self.absolute else 0)) * 1e-9
+        return seconds if self.known is None else np.where(self.known, seconds, np.nan)
 
 
 @dataclass(frozen=True)
@@ -90,6 +117,12 @@ class Series:
         )
         fields = {path: values[keep] for path, values in self.fields.items()}
         return dataclasses.replace(self, fields=fields, stamp=stamp, arrival=arrival, sender=sender)
+
+    def earlier(self, stamp: float, arrival: float) -> Series:
+        """Return the series with stamps and arrivals moved back by so many s."""
+        clocks = ((self.stamp, stamp), (self.arrival, arrival))
+        moved = [None if clock is None else clock - seconds for clock, seconds in clocks]
+        return dataclasses.replace(self, stamp=moved[0], arrival=moved[1])
 
     def of_sender(self, sender: str) -> Series:
         """Return the rows of one sender.
@@ -167,6 +200,63 @@ class Recording:
                 f"{self.path}: no topic '{topic}'{nearest(topic, (*self.series, *self.listed))}"
             )
         return self.series[name]
+
+
+@final
+class Columns:
+    """Messages of one kind as they come: whole ns, and a row of numbers each."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.names = list(names)
+        self.ns, self._rows = array("q"), array("d")
+
+    def add(self, ns: int, numbers: Iterable[float]) -> None:
+        """Append one message."""
+        self.ns.append(ns)
+        self._rows.extend(numbers)
+
+    @property
+    def times(self) -> np.ndarray:
+        """Whole ns [T]."""
+        return np.frombuffer(self.ns, dtype=np.int64)
+
+    @property
+    def fields(self) -> dict[str, np.ndarray]:
+        """Name -> numbers [T]."""
+        rows = np.frombuffer(self._rows, dtype=np.float64).reshape(len(self.ns), len(self.names))
+        return {name: rows[:, i] for i, name in enumerate(self.names)}
+
+
+class Rows(NamedTuple):
+    """A series whose times are whole ns, before it is known where the recording begins.
+
+    Attributes are those of `Series`.
+    """
+
+    kind: str
+    fields: dict[str, np.ndarray]
+    stamp: Stamps | None = None
+    arrival: Stamps | None = None
+    sender: np.ndarray | None = None
+    remarks: tuple[Remark, ...] = ()
+
+
+def recording_of(
+    path: Path,
+    topics: Mapping[str, Rows],
+    files: tuple[Path, ...],
+    remarks: Iterable[Remark] = (),
+    listed: Iterable[str] = (),
+) -> Recording:
+    """Return the recording of series whose times count from the first whole second of all dates."""
+    clocks = [clock for one in topics.values() for clock in one[2:4] if clock is not None]
+    first = [int(one.ns.min()) for one in clocks if one.absolute and one.ns.size]
+    epoch = min(first) // 10**9 * 10**9 if first else None
+    series = {}
+    for name, one in topics.items():
+        stamp, arrival = (None if clock is None else clock.since(epoch) for clock in one[2:4])
+        series[name] = Series(name, one.kind, one.fields, stamp, arrival, one.sender, one.remarks)
+    return Recording(path, series, epoch, files, tuple(remarks), tuple(listed))
 
 
 def same_topic(topic: str, names: Iterable[str]) -> str | None:

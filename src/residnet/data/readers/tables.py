@@ -10,7 +10,6 @@ import codecs
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
@@ -19,7 +18,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from residnet.core.config import Config
-from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import nearest, shown
 from residnet.core.units import known_unit, to_si
@@ -28,9 +27,10 @@ from residnet.data.motion import with_true_wind
 from residnet.data.readers.base import (
     Advance,
     LogReader,
-    missing_package,
+    package,
     progress,
     provenance,
+    readable,
     require_file,
     require_increasing,
     require_samples,
@@ -239,8 +239,8 @@ class ParquetConfig(TableConfig):
         """Return the columns of a Parquet file."""
         import pyarrow.parquet as pq
 
-        with _readable(path, "not a readable Parquet file"):
-            positions(path, pq.read_schema(path).names, columns)
+        positions(path, _parquet_names(path), columns)
+        with readable(path, "a Parquet file"):
             with pq.ParquetFile(path, page_checksum_verification=True) as file:
                 table = file.read(columns=sorted(set(columns)))
             wanted: pd.DataFrame = table.to_pandas(ignore_metadata=True)[list(columns)]
@@ -295,6 +295,8 @@ class TableReader(LogReader):
             DataError: where the file is empty, a cell is no finite number or none that a vessel can
                 have, a channel holds no number, or time is missing, repeats or runs backwards.
         """
+        import pandas as pd
+
         require_file(path)
         config, maps = self._config, self._config.channels
         columns = [*config.time.columns, *(entry.column for entry in maps.values())]
@@ -339,9 +341,7 @@ class TableReader(LogReader):
             kept = kept[fresh]
         held = [name for name in raw if maps[name].hold]
         for name in held:
-            at = np.arange(raw[name].size)
-            last = np.maximum.accumulate(np.where(np.isfinite(raw[name]), at, -1))
-            raw[name] = raw[name][np.where(last < 0, at, last)]
+            raw[name] = pd.Series(raw[name]).ffill().to_numpy()
         if held and len(held) < len(raw):
             # a row of commands alone belongs to the next sample of the motion
             moving = [values[kept] for name, values in raw.items() if name not in held]
@@ -358,15 +358,21 @@ class TableReader(LogReader):
             require_values(path, name, maps[name].column, channels[name])
             if name == "psi" and (text := told_headings(own, channels[name])):
                 findings.append(remark("note", "heading_interpolated", text))
-        units = {name: entry.si(name) for name, entry in maps.items()}
-        findings += _placed(path, channels, units)
-        _headed(path, channels, units, maps)
+        channels, said = _placed(path, channels, maps)
+        findings += said
+        if channels.keys() >= {*QUATERNION} and "psi" not in channels:
+            # where qw has the frame `enu`, the heading counts anticlockwise from east
+            yaw = yaw_of(*unit_quaternion(*(channels.pop(name) for name in QUATERNION)))
+            if not np.isfinite(yaw).any():
+                columns = [maps[name].column for name in QUATERNION]
+                raise DataError(f"{path}: {', '.join(columns)} hold no attitude, all are empty")
+            channels["psi"] = unwrap(np.pi / 2.0 - yaw if maps["qw"].frame == "enu" else yaw)
         for name in [one.removesuffix(COSINE) for one in channels if one.endswith(COSINE)]:
             if name + SINE in channels and name not in channels:
                 sine, cosine = channels.pop(name + SINE), channels.pop(name + COSINE)
                 channels[name] = unwrap(np.arctan2(sine, cosine))
-                del units[name + SINE], units[name + COSINE]
-                units[name] = "rad"
+        made = {"x": "m", "y": "m"}
+        units = {n: maps[n].si(n) if n in maps else made.get(n, "rad") for n in channels}
         if cut:
             text = "the file ends within its last line, which is left out"
             findings.append(remark("note", "cut_line", text))
@@ -489,26 +495,22 @@ def _at(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return values if every else np.asarray(values[rows])
 
 
-def _placed(path: Path, channels: dict[str, np.ndarray], units: dict[str, str]) -> list[Remark]:
-    """Put x, y in place of latitude and longitude, and tell from where; others are left alone."""
-    if not set(FIX) <= set(channels) or {"x", "y"} & set(channels):
-        return []
-    latitude, longitude = (channels.pop(name) for name in FIX)
-    unit, _ = (units.pop(name) for name in FIX)
+def _placed(
+    path: Path, channels: dict[str, np.ndarray], maps: Mapping[str, ChannelMap]
+) -> tuple[dict[str, np.ndarray], list[Remark]]:
+    """Return channels with x, y in place of latitude and longitude, and where they count from."""
+    if not channels.keys() >= {*FIX} or {"x", "y"} & channels.keys():
+        return channels, []
+    latitude, longitude = (channels[name] for name in FIX)
     north, east, origin, none = fixes_on_plane(latitude, longitude)
     most = float(np.abs(latitude[np.isfinite(latitude)]).max(initial=0.0))
-    if unit != "rad" or most > np.pi / 2:
+    if maps["latitude"].si("latitude") != "rad" or most > np.pi / 2:
         raise DataError(
             f"{path}: latitude reaches {np.degrees(most):.4g} deg, which none does; give the unit"
             " of its column (deg), and `form: ddmm` for degrees and minutes in one number"
         )
     if origin is None:
         raise DataError(f"{path}: latitude and longitude hold no fix")
-    rest, rest_units = dict(channels), dict(units)
-    channels.clear()
-    units.clear()
-    channels |= {"x": north, "y": east} | rest
-    units |= {"x": "m", "y": "m"} | rest_units
     where = [float(np.degrees(angle)) for angle in origin]
     text = (
         f"x, y are north and east of the first fix, latitude {where[0]:.6f} deg, longitude"
@@ -518,47 +520,8 @@ def _placed(path: Path, channels: dict[str, np.ndarray], units: dict[str, str]) 
     if none:
         text = f"{none} fixes at latitude 0, longitude 0 are no fixes; left empty"
         remarks.append(remark("note", "no_fix", text, count=float(none)))
-    return remarks
-
-
-def _headed(
-    path: Path,
-    channels: dict[str, np.ndarray],
-    units: dict[str, str],
-    maps: Mapping[str, ChannelMap],
-) -> None:
-    """Put psi in place of qx, qy, qz, qw where there is no heading.
-
-    Where qw has the frame `enu`, the heading counts anticlockwise from east.
-    """
-    if not set(QUATERNION) <= set(channels) or "psi" in channels:
-        return
-    yaw = yaw_of(*unit_quaternion(*(channels.pop(name) for name in QUATERNION)))
-    if not np.isfinite(yaw).any():
-        columns = ", ".join(maps[name].column for name in QUATERNION)
-        raise DataError(f"{path}: {columns} hold no attitude, all quaternions are empty")
-    channels["psi"] = unwrap(np.pi / 2.0 - yaw if maps["qw"].frame == "enu" else yaw)
-    for name in QUATERNION:
-        del units[name]
-    units["psi"] = "rad"
-
-
-@contextmanager
-def _readable(path: Path, what: str) -> Iterator[None]:
-    """Damaged files fail in every layer of a library: tell so in one line."""
-    try:
-        yield
-    except ResidnetError:
-        raise
-    except UnicodeDecodeError as error:
-        name = shown(bytes(error.object).decode("latin-1"), 60)
-        raise DataError(
-            f"{path}: '{name}', the name of a column, is no UTF-8 text; rename it where it is"
-            " written"
-        ) from error
-    except Exception as error:
-        reason = shown(" ".join(str(error).split()) or type(error).__name__, 200)
-        raise DataError(f"{path}: {what} ({reason})") from error
+    rest = {name: values for name, values in channels.items() if name not in FIX}
+    return {"x": north, "y": east, **rest}, remarks
 
 
 def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.DataFrame:
@@ -580,7 +543,7 @@ def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.Da
     names = sheet_names(path)
     if sheet is not None and sheet not in names:
         raise UsageError(f"{path}: no sheet '{sheet}'{nearest(sheet, names)}")
-    with _readable(path, "damaged or not an Excel file"):
+    with readable(path, "an Excel file"):
         cells = pd.read_excel(
             path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl", header=None
         )
@@ -604,12 +567,24 @@ def sheet_names(path: Path) -> list[str]:
         UsageError: where openpyxl is not installed.
         DataError: where the file cannot be read.
     """
-    try:
+    with package("excel", "openpyxl", "an Excel sheet"):
         import openpyxl
-    except ImportError as error:
-        raise missing_package("excel", "openpyxl", "an Excel sheet") from error
-    with _readable(path, "damaged or not an Excel file"):
+    with readable(path, "an Excel file"):
         return [str(name) for name in openpyxl.load_workbook(path, read_only=True).sheetnames]
+
+
+def _parquet_names(path: Path) -> list[str]:
+    import pyarrow.parquet as pq
+
+    with readable(path, "a Parquet file"):
+        try:
+            return list(pq.read_schema(path).names)
+        except UnicodeDecodeError as error:
+            name = shown(bytes(error.object).decode("latin-1"), 60)
+            raise DataError(
+                f"{path}: '{name}', the name of a column, is no UTF-8 text; rename it where it is"
+                " written"
+            ) from error
 
 
 def parquet_rows(path: Path, rows: int) -> pd.DataFrame:
@@ -621,7 +596,7 @@ def parquet_rows(path: Path, rows: int) -> pd.DataFrame:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    with _readable(path, "not a readable Parquet table"):
+    with readable(path, "a Parquet file"):
         # an index of pandas is a column as its reader sees it
         batch = next(pq.ParquetFile(path).iter_batches(batch_size=rows))
         table: pd.DataFrame = pa.Table.from_batches([batch]).to_pandas(ignore_metadata=True)
@@ -646,10 +621,7 @@ def column_names(path: Path) -> tuple[str, ...]:
     """Return what tells tables of the same columns: their names, or the first line of a text."""
     kind = TABLES.get(path.suffix.lower(), "csv")
     if kind == "parquet":
-        import pyarrow.parquet as pq
-
-        with _readable(path, "not a readable Parquet file"):
-            return tuple(pq.read_schema(path).names)
+        return tuple(_parquet_names(path))
     if kind != "csv":
         return ()
     with path.open("rb") as stream:

@@ -230,7 +230,10 @@ def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
             cell = re.sub(between, "", cell)
         return cell.replace(decimal, ".") if re.search(r"\w", cell) else np.nan
 
-    if pd.api.types.is_numeric_dtype(cells.dtype) or not cells.dropna().map(_is_text).all():
+    if (
+        pd.api.types.is_numeric_dtype(cells.dtype)
+        or not cells.dropna().map(lambda cell: isinstance(cell, str | float | int)).all()
+    ):
         return cells, ""
     unit, told = _without_unit(cells)
     signs = {len(re.findall(r"[^\d+-]", str(cell).strip())) for cell in told.dropna()}
@@ -238,11 +241,6 @@ def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
     values = pd.to_numeric(bare, errors="coerce")
     plain = (unit or signs != {1}) and values.isna().sum() == bare.isna().sum()
     return (values, unit) if plain else (cells, "")
-
-
-def _is_text(cell: object) -> bool:
-    """Return whether a cell is a text or a number, and no date."""
-    return isinstance(cell, str | float | int)
 
 
 def _without_unit(cells: pd.Series) -> tuple[str, pd.Series]:
@@ -673,12 +671,14 @@ def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
     """
     name = codecs.lookup(encoding or encoding_of(path)).name
     wide = name.startswith(("utf-16", "utf-32"))
-    size = path.stat().st_size - (0 if wide else _zeros_at_end(path))
-    if name in ("utf-8", "utf-8-sig", "ascii") and size == path.stat().st_size:
+    with path.open("rb") as stream:
+        stream.seek(max(0, path.stat().st_size - 1))
+        zeros = not wide and stream.read() == b"\0"
+    if name in ("utf-8", "utf-8-sig", "ascii") and not zeros:
         yield path
         return
-    with path.open("rb") as stream:
-        content = stream.read(size)
+    content = path.read_bytes()
+    content = content.rstrip(b"\0") if zeros else content
     try:
         # half a sign at the end is left out
         text = codecs.getincrementaldecoder(name)().decode(content)
@@ -692,18 +692,6 @@ def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
         copy = Path(folder) / path.name
         copy.write_bytes(text.encode("utf-8"))
         yield copy
-
-
-def _zeros_at_end(path: Path) -> int:
-    with path.open("rb") as stream:
-        size = at = stream.seek(0, 2)
-        while at:
-            at = max(0, at - _HEAD)
-            stream.seek(at)
-            filled = stream.read(_HEAD).rstrip(b"\0")
-            if filled:
-                return size - at - len(filled)
-    return size
 
 
 def _told(head: bytes) -> str | None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.data.readers.recording import Recording, Remark, Series, key_of, remark, same_topic
+from residnet.data.readers.written import as_before
 
 # zones differ by whole quarters of an hour
 _QUARTER = 900.0
@@ -62,16 +63,20 @@ def align_clocks(
     latency = max(0.0, float(np.median(usual))) if usual else 0.0
     out = {}
     for name, topic in series.items():
-        if topic.arrival is not None:
-            topic = dataclasses.replace(topic, arrival=topic.arrival - shift)
-        if name in late and topic.arrival is not None and topic.stamp is not None:
-            moved = topic.arrival - topic.stamp
-            topic = topic.noting(*_latency(name, moved, prompt[name] - shift))
+        topic = topic.earlier(0.0, shift)
+        if topic.stamp is not None and topic.arrival is not None and len(topic):
+            late_by = topic.arrival - topic.stamp
+            topic = topic.noting(*_latency(name, late_by, prompt[name] - shift))
         given = [seconds for asked, seconds in delays.items() if same_topic(asked, [name])]
         delay = given[0] if given else 0.0
         if delay is None:
             delay = latency if topic.stamp is None else 0.0
-        out[name] = _moved(_ordered(topic), delay)
+        topic = _ordered(topic)
+        if delay:
+            text = f"topic {name}: moved back by {delay:g} s, as the config asks"
+            said = remark("note", "delay_corrected", text, delay=delay)
+            topic = topic.earlier(delay, delay).noting(said)
+        out[name] = topic
     return dataclasses.replace(recording, series=out, remarks=(*recording.remarks, *remarks))
 
 
@@ -138,19 +143,13 @@ def _ordered(topic: Series) -> Series:
     behind = int((back < 0.0).sum())
     if behind:
         topic = _sorted(topic, behind, -float(back.min()))
-    same = np.append(False, np.diff(topic.clock) == 0.0)
-    if not same.any():
+    again = np.flatnonzero(np.diff(topic.clock) == 0.0) + 1
+    if not again.size:
         return topic
-    rows = np.stack(list(topic.fields.values())) if topic.fields else np.zeros((1, len(topic)))
-    equal = same & np.append(
-        False,
-        ((rows[:, 1:] == rows[:, :-1]) | (np.isnan(rows[:, 1:]) & np.isnan(rows[:, :-1]))).all(
-            axis=0
-        ),
-    )
-    copies, others = int(equal.sum()), int((same & ~equal).sum())
+    equal = as_before(topic.fields.values(), again)
+    copies, others = int(equal.sum()), int((~equal).sum())
     # of rows with one time the last is the newest
-    kept = topic.where(np.append(~same[1:], True))
+    kept = topic.where(np.append(np.diff(topic.clock) != 0.0, True))
     if copies:
         text = f"topic {topic.name}: {copies} rows repeat the row before; left out"
         kept = kept.noting(remark("note", "duplicate_rows", text, rows=copies))
@@ -165,46 +164,24 @@ def _ordered(topic: Series) -> Series:
 
 def _sorted(topic: Series, behind: int, farthest: float) -> Series:
     figures = {"steps": float(behind), "farthest": farthest}
-    if behind <= max(1.0, _FEW * len(topic)) and farthest <= _NEAR:
+    back = f"backwards {behind} times, by up to {farthest:.3g} s"
+    mends = behind <= max(1.0, _FEW * len(topic)) and farthest <= _NEAR
+    arrival, stamp = topic.arrival, topic.stamp
+    if stamp is not None and arrival is not None and not mends and (np.diff(arrival) >= 0.0).all():
+        usual = float(np.median(arrival - stamp))
         text = (
-            f"topic {topic.name}: time runs backwards {behind} times, by up to {farthest:.3g} s;"
-            " rows are sorted"
+            f"topic {topic.name}: header stamps run {back}; arrival times less the median latency"
+            f" of {usual:.3g} s are used instead"
         )
-        return topic.where(np.argsort(topic.clock, kind="stable")).noting(
-            remark("note", "out_of_order", text, **figures)
-        )
-    if (
-        topic.stamp is not None
-        and topic.arrival is not None
-        and (np.diff(topic.arrival) >= 0.0).all()
-    ):
-        usual = float(np.median(topic.arrival - topic.stamp))
-        text = (
-            f"topic {topic.name}: header stamps run backwards {behind} times, by up to"
-            f" {farthest:.3g} s; arrival times less the median latency of {usual:.3g} s are"
-            " used instead"
-        )
-        figures["latency"] = usual
-        topic = dataclasses.replace(topic, stamp=topic.arrival - usual)
-        return topic.noting(remark("will mislead", "stamps_run_backwards", text, **figures))
-    text = (
-        f"topic {topic.name}: time runs backwards {behind} times, by up to {farthest:.3g} s; split"
-        " the recording where its clock restarts"
-    )
-    return topic.where(np.argsort(topic.clock, kind="stable")).noting(
-        remark("fatal", "time_runs_backwards", text, **figures)
-    )
-
-
-def _moved(topic: Series, delay: float) -> Series:
-    if not delay:
-        return topic
-    stamp = None if topic.stamp is None else topic.stamp - delay
-    arrival = None if topic.arrival is None else topic.arrival - delay
-    text = f"topic {topic.name}: moved back by {delay:g} s, as the config asks"
-    return dataclasses.replace(topic, stamp=stamp, arrival=arrival).noting(
-        remark("note", "delay_corrected", text, delay=delay)
-    )
+        found = remark("will mislead", "stamps_run_backwards", text, **figures, latency=usual)
+        return dataclasses.replace(topic, stamp=arrival - usual).noting(found)
+    text = f"topic {topic.name}: time runs {back}; "
+    if mends:
+        found = remark("note", "out_of_order", f"{text}rows are sorted", **figures)
+    else:
+        text += "split the recording where its clock restarts"
+        found = remark("fatal", "time_runs_backwards", text, **figures)
+    return topic.where(np.argsort(topic.clock, kind="stable")).noting(found)
 
 
 def traffic(series: Series) -> list[Remark]:

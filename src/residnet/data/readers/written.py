@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.names import shown
-from residnet.data.readers.recording import Remark, remark
+from residnet.data.readers.recording import Remark, Stamps, remark
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -88,34 +87,6 @@ _READ = (
 )
 
 
-@dataclass(frozen=True)
-class Stamps:
-    """The times of a column.
-
-    Attributes:
-        ns: [T] int64, whole ns; Unix time where `absolute`, and any number where a time is missing.
-        absolute: whether the source gave dates or Unix time.
-        known: [T] bool, where there is a time; None where there is one everywhere.
-        remarks: what was noticed.
-    """
-
-    ns: np.ndarray
-    absolute: bool
-    known: np.ndarray | None = None
-    remarks: tuple[Remark, ...] = ()
-
-    def since(self, start: int | None) -> np.ndarray:
-        """Return the times [T] in s from `start`, Unix time in ns, where they are absolute."""
-        seconds: np.ndarray = (self.ns - (start or 0 if self.absolute else 0)) * 1e-9
-        return seconds if self.known is None else np.where(self.known, seconds, np.nan)
-
-
-def whole_second(stamps: list[Stamps]) -> int | None:
-    """Return the whole second, in ns, at or before the first of absolute times; None for none."""
-    first = [int(one.ns.min()) for one in stamps if one.absolute and one.ns.size]
-    return min(first) // _NS * _NS if first else None
-
-
 def zone_of(name: str) -> ZoneInfo:
     """Return a time zone by its name, for example `Europe/Berlin`.
 
@@ -142,7 +113,9 @@ def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
         raise DataError(f"{int((~np.isfinite(values)).sum())} rows have no time")
     unit = unix_unit(values) if factor is None else None
     if unit is None:
-        return Stamps(np.rint(values * ((factor or 1.0) * _NS)).astype(np.int64), False)
+        ns = np.rint(values * ((factor or 1.0) * _NS)).astype(np.int64)
+        seconds = factor in (None, 1.0) and values.dtype.kind == "f"
+        return Stamps(ns, False, seconds=values.astype(np.float64) if seconds else None)
     scale = _UNITS[unit]
     whole = values if values.dtype.kind in "iu" else np.floor(values)
     rest = np.rint((values - whole) * (_NS // scale)).astype(np.int64)
@@ -485,7 +458,7 @@ _USUAL_STEPS = 3.0
 """Usual steps within which the clock has gone on where its counter began anew."""
 
 
-def _as_before(columns: Iterable[np.ndarray], at: np.ndarray) -> np.ndarray:
+def as_before(columns: Iterable[np.ndarray], at: np.ndarray) -> np.ndarray:
     """Return [K] bool: at rows [K] every column [T] holds what it holds in the row before."""
     same = np.ones(at.size, dtype=bool)
     for values in columns:
@@ -505,7 +478,7 @@ def first_of_copies(t: np.ndarray, columns: Iterable[np.ndarray]) -> np.ndarray:
     """
     again = np.flatnonzero(np.diff(t) == 0.0) + 1
     first = np.ones(t.size, dtype=bool)
-    first[again] = ~_as_before(columns, again)
+    first[again] = ~as_before(columns, again)
     return first if (np.diff(t[first]) != 0.0).all() else np.ones_like(first)
 
 
@@ -583,7 +556,7 @@ def steady_clock(
     each = int(np.median(counts))
     if stamps.size < 3 or each < 2 or (np.diff(t) < 0.0).any():
         return t, remarks
-    if _as_before(columns, shared).mean() > 0.5:
+    if as_before(columns, shared).mean() > 0.5:
         return t, remarks
     coarse = float(np.median(np.diff(stamps)))
     # a last stamp has none after it; a first one may have begun before the recording did

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import re
 from array import array
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, ClassVar, Literal, final
 
@@ -12,11 +13,21 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.stretches import stretch_bounds
-from residnet.data.readers.base import REPORT_EVERY, missing_package, progress, require_file
+from residnet.data.readers.base import REPORT_EVERY, package, progress, require_file
 from residnet.data.readers.compose import RecordingConfig
-from residnet.data.readers.recording import EVERYTHING, Recording, Remark, Series, Wanted, remark
+from residnet.data.readers.recording import (
+    EVERYTHING,
+    Columns,
+    Recording,
+    Remark,
+    Rows,
+    Stamps,
+    Wanted,
+    recording_of,
+    remark,
+)
 from residnet.data.readers.texts import as_utf8, encoding_of_head
-from residnet.data.readers.written import Stamps, parse_texts, whole_second
+from residnet.data.readers.written import parse_texts
 
 _SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2,4},[\x20-\x7e]*)")
 # a sentence, to its checksum where it has one, at the start of a line or behind a time
@@ -63,10 +74,8 @@ class NmeaConfig(RecordingConfig):
             DataError: where it holds no sentence, or none that tells the time.
         """
         require_file(path)
-        try:
+        with package("nmea", "pynmea2", "a file of NMEA 0183 sentences"):
             import pynmea2
-        except ImportError as error:
-            raise missing_package("nmea", "pynmea2", "a file of NMEA 0183 sentences") from error
         lines = _Lines()
         size, done, bad = path.stat().st_size, 0, 0
         # a shell of Windows may have written them as UTF-16
@@ -103,20 +112,14 @@ class NmeaConfig(RecordingConfig):
 
 @final
 class _Sentence:
-    """The sentences of one kind: numbers row by row, and their times.
+    """The sentences of one kind: their numbers and times.
 
     A time is the sentence's own or -1; beside it stands how many timed sentences went before.
     """
 
-    def __init__(self, names: list[str]) -> None:
-        self.names = names
-        self.rows, self.own, self.after = array("d"), array("q"), array("q")
+    def __init__(self, names: Iterable[str]) -> None:
+        self.columns, self.after = Columns(names), array("q")
         self.before: list[str] = []
-
-    def fields(self) -> dict[str, np.ndarray]:
-        """Return the fields [T] by name."""
-        table = np.frombuffer(self.rows, dtype=np.float64).reshape(-1, len(self.names))
-        return {name: table[:, i] for i, name in enumerate(self.names)}
 
 
 @final
@@ -148,12 +151,12 @@ class _Lines:
             fix = fix and str(getattr(message, "gps_qual", "1")) != "0"
             here = (message.latitude, message.longitude) if fix else (float("nan"), float("nan"))
             out["latitude"], out["longitude"] = here
-        name, values = str(message.sentence_type), out
-        if not wanted(name) or not values:
+        name = str(message.sentence_type)
+        if not wanted(name) or not out:
             return
-        one = self.series.setdefault(name, _Sentence(list(values)))
-        one.rows.extend([values.get(field, np.nan) for field in one.names])
-        one.own.append(-1 if at is None else at)
+        one = self.series.setdefault(name, _Sentence(out))
+        numbers = [out.get(field, np.nan) for field in one.columns.names]
+        one.columns.add(-1 if at is None else at, numbers)
         one.after.append(len(self._ticks) - 1)
         one.before.append(before)
 
@@ -183,9 +186,9 @@ class _Lines:
         Raises:
             DataError: where nothing tells the time.
         """
-        ticks = Stamps(np.frombuffer(self._ticks, dtype=np.int64), self._dated)
+        ticks = np.frombuffer(self._ticks, dtype=np.int64)
         stamped = all(all(one.before) for one in self.series.values())
-        if not ticks.ns.size and not stamped:
+        if not ticks.size and not stamped:
             raise DataError(
                 f"{path}: no sentence tells the time (RMC, GGA, ZDA, ...), and the lines do not"
                 " begin with one"
@@ -194,33 +197,37 @@ class _Lines:
         if bad:
             text = f"{bad} lines are no NMEA sentence or fail their checksum; left out"
             remarks.append(remark("note", "bad_lines", text, lines=bad))
-        if not self._dated and ticks.ns.size:
-            text = "no sentence tells the date; time counts from midnight"
-            remarks.append(remark("note", "undated", text))
         arrivals = {
             name: parse_texts(np.array(one.before, dtype=object))
             for name, one in self.series.items()
             if stamped
         }
-        epoch = whole_second([ticks, *arrivals.values()])
-        series = {}
+        begun, day = [int(one.ns.min()) for one in arrivals.values() if one.absolute], 0
+        if ticks.size and not self._dated:
+            if begun:
+                # the times before the lines tell the day that the sentences do not
+                day = round((min(begun) - int(ticks[0])) / _DAY) * _DAY
+            else:
+                text = "no sentence tells the date; time counts from midnight"
+                remarks.append(remark("note", "undated", text))
+        topics = {}
         for name, one in sorted(self.series.items()):
-            times = np.frombuffer(one.own, dtype=np.int64)
-            said: tuple[Remark, ...] = ()
+            times, said = one.columns.times, tuple[Remark, ...]()
             timed = bool((times >= 0).all())
             if not timed and not stamped:
-                times = _between(np.frombuffer(one.after, dtype=np.int64), ticks.ns)
+                times = _between(np.frombuffer(one.after, dtype=np.int64), ticks)
                 text = (
                     f"topic {name}: its sentences tell no time; they are spread between the timed"
                     " ones before and after"
                 )
                 said = (remark("note", "estimated_times", text, rows=times.size),)
-            stamp = (times - (epoch or 0)) * 1e-9 if timed or not stamped else None
-            arrival = arrivals[name].since(epoch) if stamped else None
-            fields = one.fields()
-            senders = _senders(fields)
-            series[name] = Series(name, f"nmea/{name}", fields, stamp, arrival, senders, said)
-        return Recording(path, series, epoch, (path,), tuple(remarks))
+            stamp = (
+                Stamps(times + day, self._dated or bool(begun)) if timed or not stamped else None
+            )
+            fields = one.columns.fields
+            sender = _senders(fields)
+            topics[name] = Rows(f"nmea/{name}", fields, stamp, arrivals.get(name), sender, said)
+        return recording_of(path, topics, (path,), remarks)
 
 
 def _senders(fields: dict[str, np.ndarray]) -> np.ndarray | None:

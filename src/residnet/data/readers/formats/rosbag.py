@@ -11,17 +11,28 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import numpy as np
 
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import UsageError
 from residnet.data.readers.base import (
     REPORT_EVERY,
     files_of,
-    missing_package,
+    package,
     progress,
+    readable,
     require_file,
     total_size,
 )
 from residnet.data.readers.compose import RecordingConfig
-from residnet.data.readers.recording import EVERYTHING, Recording, Remark, Series, Wanted, remark
+from residnet.data.readers.recording import (
+    EVERYTHING,
+    Columns,
+    Recording,
+    Remark,
+    Rows,
+    Stamps,
+    Wanted,
+    recording_of,
+    remark,
+)
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -55,30 +66,17 @@ class RosbagConfig(RecordingConfig):
             UsageError: where the bag is missing or rosbags is not installed.
             DataError: where it cannot be read.
         """
-        try:
-            from rosbags.highlevel import AnyReader, AnyReaderError
+        with package("ros", "rosbags", "a ROS bag or MCAP file"):
+            from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise missing_package("ros", "rosbags", "a ROS bag or MCAP file") from error
         if not path.is_dir():
             require_file(path)
         elif not (path / "metadata.yaml").is_file():
             raise UsageError(f"{path}: is a folder without metadata.yaml, a ROS 2 bag has one")
         store = None if path.suffix == ".bag" else get_typestore(Stores.LATEST)
-        try:
-            with AnyReader([path], default_typestore=store) as reader:
-                return _read(path, reader, wanted)
-        except (DataError, UsageError):
-            raise
-        except AnyReaderError as error:
-            reason = " ".join(str(error).split())[:200]
-            raise DataError(f"{path}: not a readable bag ({reason})") from error
         # a damaged bag fails in many ways inside rosbags and SQLite, no fault of residnet
-        except Exception as error:
-            raise DataError(
-                f"{path}: damaged or not a bag ({type(error).__name__}:"
-                f" {' '.join(str(error).split())[:200]})"
-            ) from error
+        with readable(path, "a bag"), AnyReader([path], default_typestore=store) as reader:
+            return _read(path, reader, wanted)
 
 
 def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
@@ -89,7 +87,7 @@ def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
         raise UsageError(
             f"{path}: none of its topics is wanted (it holds {', '.join(not_wanted) or 'none'})"
         )
-    columns: dict[str, _Columns] = {}
+    columns: dict[str, _Messages] = {}
     failed: dict[str, str] = {}
     files = tuple(files_of(path))
     start, span = reader.start_time, max(1, reader.end_time - reader.start_time)
@@ -100,53 +98,50 @@ def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
             name, kind = connection.topic, connection.msgtype
             if name in failed:
                 continue
-            if name not in columns:
-                columns[name] = _Columns(name, kind, wanted, shared=topics.count(name) > 1)
             try:
-                columns[name].add(reader.deserialize(raw, kind), arrival, connection)
+                message = reader.deserialize(raw, kind)
+                if name not in columns:
+                    shared = topics.count(name) > 1
+                    columns[name] = _Messages(name, kind, message, wanted, shared=shared)
+                columns[name].add(message, arrival, connection)
             except Exception as error:
                 failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
     remarks: list[Remark] = []
     for name, why in failed.items():
-        rows = len(columns.pop(name).arrival)
+        unread = columns.pop(name, None)
+        rows = len(unread.columns.ns) if unread else 0
         text = f"topic {name}: message {rows + 1} cannot be read ({why}); the topic is left out"
         remarks.append(remark("will mislead", "unreadable", text, rows=rows))
     for name in sorted(set(topics) - set(columns) - set(failed)):
         remarks.append(remark("note", "empty_topic", f"topic {name}: holds no messages"))
-    epoch = int(min((min(one.arrival) for one in columns.values()), default=0)) // 10**9 * 10**9
-    series = {name: one.series(epoch) for name, one in sorted(columns.items())}
-    return Recording(path, series, epoch, files, tuple(remarks), not_wanted)
+    found = {name: one.rows() for name, one in sorted(columns.items())}
+    return recording_of(path, found, files, remarks, not_wanted)
 
 
 @final
-class _Columns:
+class _Messages:
     """Messages of one topic as they come: times as whole ns, numbers row by row."""
 
-    def __init__(self, name: str, kind: str, wanted: Wanted, *, shared: bool) -> None:
-        self.name, self.kind, self._wanted, self._shared = name, kind, wanted, shared
-        self.arrival, self._stamp, self._sender = array("q"), array("q"), array("H")
+    def __init__(self, name: str, kind: str, first: Any, wanted: Wanted, *, shared: bool) -> None:
+        self._name, self._kind, self._shared = name, kind, shared
+        self._leaves = _Leaves(first, lambda path: wanted.field(name, path))
+        self.columns = Columns(self._leaves.names)
+        self._stamp, self._sender = array("q"), array("H")
         self._senders: dict[str, int] = {}
-        self._rows = array("d")
-        self._leaves: _Leaves | None = None
 
     def add(self, message: Any, arrival: int, connection: Connection) -> None:
         """Append one message."""
-        if self._leaves is None:
-            self._leaves = _Leaves(message, lambda path: self._wanted.field(self.name, path))
-        self._rows.extend(self._leaves.numbers(message))
-        header = getattr(message, "header", None)
+        numbers, header = self._leaves.numbers(message), getattr(message, "header", None)
         stamp = getattr(header, "stamp", None)
         self._stamp.append(0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
         sender = getattr(header, "frame_id", "")
         if self._shared:
             sender = getattr(connection.ext, "callerid", None) or f"connection {connection.id}"
         self._sender.append(self._senders.setdefault(sender, len(self._senders)))
-        self.arrival.append(arrival)
+        self.columns.add(arrival, numbers)
 
-    def series(self, epoch: int) -> Series:
-        """Return the topic, times in s from the epoch (ns)."""
-        names = [] if self._leaves is None else self._leaves.names
-        rows = np.frombuffer(self._rows, dtype=np.float64).reshape(len(self.arrival), len(names))
+    def rows(self) -> Rows:
+        """Return the topic."""
         stamps = np.frombuffer(self._stamp, dtype=np.int64)
         sender = None
         if len(self._senders) > 1 or next(iter(self._senders), ""):
@@ -156,14 +151,13 @@ class _Columns:
         empty = int((stamps == 0).sum())
         if 0 < empty < stamps.size:
             text = (
-                f"topic {self.name}: {empty} of {stamps.size} header stamps are zero; arrival times"
-                " are used"
+                f"topic {self._name}: {empty} of {stamps.size} header stamps are zero; arrival"
+                " times are used"
             )
             remarks = (remark("will mislead", "empty_stamps", text, rows=empty),)
-        stamp = None if empty else (stamps - epoch) * 1e-9
-        arrival = (np.frombuffer(self.arrival, dtype=np.int64) - epoch) * 1e-9
-        fields = {name: rows[:, i] for i, name in enumerate(names)}
-        return Series(self.name, self.kind, fields, stamp, arrival, sender, remarks)
+        stamp = None if empty else Stamps(stamps, True)
+        arrival = Stamps(self.columns.times, True)
+        return Rows(self._kind, self.columns.fields, stamp, arrival, sender, remarks)
 
 
 @final

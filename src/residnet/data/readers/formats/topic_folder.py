@@ -20,21 +20,22 @@ from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.joined import partners
 from residnet.data.readers.recording import (
     EVERYTHING,
+    Level,
     Recording,
     Remark,
-    Series,
+    Rows,
+    Stamps,
     Wanted,
     key_of,
+    recording_of,
     remark,
 )
 from residnet.data.readers.texts import as_utf8, encoding_of_head
 from residnet.data.readers.written import (
-    Stamps,
     parse_numbers,
     parse_texts,
     unit_of_steps,
     unix_unit,
-    whole_second,
 )
 
 if TYPE_CHECKING:
@@ -66,11 +67,9 @@ def is_topic_folder(path: Path) -> bool:
         names, *row = _cells(file)[:2]
         if names != [""]:
             heads[file] = names
-        clock = _clock_of(names, _ARRIVAL)
-        for name, cell in zip(names, *row, strict=False) if row else ():
-            if name == clock:
-                with contextlib.suppress(ValueError):
-                    begins[file] = float(cell)
+        cells = dict(zip(names, row[0], strict=False)) if row else {}
+        with contextlib.suppress(ValueError):
+            begins[file] = float(cells.get(_clock_of(names, _ARRIVAL) or "", ""))
     if any(_stamp_columns(head) is not None for head in heads.values()):
         return True
     trips = partners({file: tuple(head) for file, head in heads.items()})
@@ -131,7 +130,7 @@ class TopicFolderConfig(RecordingConfig):
         if not files:
             raise DataError(f"{path}: holds no csv file")
         size, done = total_size(files), 0
-        topics: dict[str, _Topic] = {}
+        topics: dict[str, Rows] = {}
         remarks: list[Remark] = []
         listed: list[str] = []
         # what is wrong with other topics too is worth a look where that costs little
@@ -150,7 +149,7 @@ class TopicFolderConfig(RecordingConfig):
                     continue
                 with as_utf8(file) as text:
                     found = self._topic(text, name, take, unit)
-                if isinstance(found, _Topic):
+                if isinstance(found, Rows):
                     topics[name] = found
                 else:
                     remarks.append(found)
@@ -160,11 +159,9 @@ class TopicFolderConfig(RecordingConfig):
             raise DataError(
                 f"{path}: none of {len(files)} csv files holds a topic ({remarks[0]['text']})"
             )
-        epoch = whole_second([stamps for topic in topics.values() for stamps in topic.stamps])
-        series = {name: topic.series(name, epoch) for name, topic in topics.items()}
-        return Recording(path, series, epoch, tuple(files), tuple(remarks), tuple(listed))
+        return recording_of(path, topics, tuple(files), remarks, listed)
 
-    def _topic(self, file: Path, name: str, wanted: Wanted, unit: str) -> _Topic | Remark:
+    def _topic(self, file: Path, name: str, wanted: Wanted, unit: str) -> Rows | Remark:
         """Return one topic; a remark where the file holds none."""
         import pandas as pd
 
@@ -206,7 +203,7 @@ class TopicFolderConfig(RecordingConfig):
             if table.empty:
                 raise pd.errors.EmptyDataError
             columns = {header[i]: table[i] for i in kept}
-            return _Topic(name, columns, (clock, unit), stamp)
+            return _rows(name, columns, clock, unit, stamp)
         except pd.errors.EmptyDataError:
             text = f"topic {name}: the file has a header and no rows"
             return remark("note", "empty_topic", text)
@@ -270,98 +267,72 @@ def _stamp_columns(header: list[str]) -> tuple[str, str] | None:
     return None
 
 
-@final
-class _Topic:
-    """One csv as read: times as whole ns, fields as float64."""
+def _rows(
+    name: str,
+    columns: dict[str, pd.Series],
+    clock: str | None,
+    unit: str,
+    stamp: tuple[str, str] | None,
+) -> Rows:
+    """Return one topic: times as whole ns, fields as float64, text left out but for senders."""
+    import pandas as pd
 
-    def __init__(
-        self,
-        name: str,
-        columns: dict[str, pd.Series],
-        time: tuple[str | None, str],
-        stamp: tuple[str, str] | None,
-    ) -> None:
-        self._remarks: list[Remark] = []
-        self._arrival: Stamps | None = None
-        self._sender: np.ndarray | None = None
-        clock, unit = time
-        if clock is not None:
-            try:
-                self._arrival = parse_texts(columns[clock], unit=unit)
-            except DataError:
-                if len(columns[clock]) < 2:
-                    raise
-                columns = {column: cells.iloc[:-1] for column, cells in columns.items()}
-                self._arrival = parse_texts(columns[clock], unit=unit)
-                text = f"topic {name}: the last row is cut short; left out"
-                self._remarks.append(remark("note", "cut_short", text, rows=1.0))
-        whole = {}
-        for column, cells in columns.items():
-            if column != clock and (values := self._numbers(name, column, cells)) is not None:
-                whole[column] = values
-        self._stamp = None if stamp is None else _header_stamps(whole, stamp)
-        self._fields = _told_apart(
-            {
-                column: values.astype(np.float64, copy=False)
-                for column, values in whole.items()
-                if column not in (stamp or ())
-            }
-        )
+    arrival = sender = stamped = None
+    remarks: list[Remark] = []
 
-    @property
-    def stamps(self) -> list[Stamps]:
-        """The arrival and header stamps that there are."""
-        return [stamps for stamps in (self._arrival, self._stamp) if stamps is not None]
+    def note(level: Level, code: str, text: str, **figures: float) -> None:
+        remarks.append(remark(level, code, f"topic {name}: {text}", **figures))
 
-    def series(self, name: str, epoch: int | None) -> Series:
-        """Return the topic with times in s from the epoch."""
-        stamp, arrival = (
-            None if stamps is None else stamps.since(epoch)
-            for stamps in (self._stamp, self._arrival)
-        )
-        said = [
-            {**noted, "text": f"topic {name}: {noted['text']}"}
-            for stamps in self.stamps
-            for noted in stamps.remarks
-        ]
-        remarks = (*self._remarks, *said)
-        return Series(name, "", self._fields, stamp, arrival, self._sender, remarks)
-
-    def _numbers(self, name: str, column: str, cells: pd.Series) -> np.ndarray | None:
-        """Return a column [T] as numbers; None where it is text, of which senders are kept."""
-        import pandas as pd
-
+    if clock is not None:
+        try:
+            arrival = parse_texts(columns[clock], unit=unit)
+        except DataError:
+            if len(columns[clock]) < 2:
+                raise
+            columns = {column: cells.iloc[:-1] for column, cells in columns.items()}
+            arrival = parse_texts(columns[clock], unit=unit)
+            note("note", "cut_short", "the last row is cut short; left out", rows=1.0)
+    whole: dict[str, np.ndarray] = {}
+    for column, cells in columns.items():
+        if column == clock:
+            continue
         if pd.api.types.is_numeric_dtype(cells.dtype):
             # whole stamps keep every bit
-            return cells.to_numpy(dtype=None if cells.dtype.kind in "iu" else np.float64)
+            whole[column] = cells.to_numpy(dtype=None if cells.dtype.kind in "iu" else np.float64)
+            continue
         if _names_sender(column):
-            # one object per name, not per row
-            names = cells.fillna("").astype(str).astype("category")
-            words = np.array(names.cat.categories, dtype=object)[names.cat.codes.to_numpy()]
-            self._sender = words if self._sender is None else self._sender
-            return None
+            if sender is None:
+                # one object per name, not per row
+                names = cells.fillna("").astype(str).astype("category")
+                sender = np.array(names.cat.categories, dtype=object)[names.cat.codes.to_numpy()]
+            continue
         texts = cells.astype("string")
         numbers = pd.to_numeric(texts, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
         filled = cells.notna().to_numpy()
         odd = filled & np.isnan(numbers)
         spoilt = int(odd.sum())
-        if 2 * spoilt < int(filled.sum()):
-            if spoilt:
-                text = (
-                    f"topic {name}: column '{column}' holds {spoilt} cells that are not numbers;"
-                    " they count as missing"
-                )
-                said = remark("will mislead", "not_numbers", text, cells=spoilt)
-                self._remarks.append(said)
-            return np.asarray(numbers)
-        sample = str(cells[odd].iloc[0])
-        kind = "structures" if sample.startswith(("{", "[", "(")) else "text"
-        text = (
-            f"topic {name}: column '{column}' holds {kind} ('{shown(sample, 40)}'), not numbers; it"
-            " is left out"
-        )
-        self._remarks.append(remark("note", "not_numbers", text, rows=float(len(cells))))
-        return None
+        if 2 * spoilt >= int(filled.sum()):
+            sample = str(cells[odd].iloc[0])
+            kind = "structures" if sample.startswith(("{", "[", "(")) else "text"
+            text = f"column '{column}' holds {kind} ('{shown(sample, 40)}'), not numbers; it is"
+            note("note", "not_numbers", f"{text} left out", rows=float(len(cells)))
+            continue
+        whole[column] = numbers
+        if spoilt:
+            text = f"column '{column}' holds {spoilt} cells that are not numbers; they count as"
+            note("will mislead", "not_numbers", f"{text} missing", cells=spoilt)
+    if stamp is not None and {*stamp} <= whole.keys():
+        seconds, rest = (whole[column] for column in stamp)
+        if np.isfinite(seconds).all() and np.isfinite(rest).all() and seconds.any():
+            ns = seconds.astype(np.int64) * 10**9 + rest.astype(np.int64)
+            stamped = Stamps(ns, parse_numbers(seconds.astype(np.float64)).absolute)
+    fields = {
+        n: v.astype(np.float64, copy=False) for n, v in whole.items() if n not in (stamp or ())
+    }
+    for stamps in (arrival, stamped):
+        for one in () if stamps is None else stamps.remarks:
+            remarks.append({**one, "text": f"topic {name}: {one['text']}"})
+    return Rows("", _told_apart(fields), stamped, arrival, sender, tuple(remarks))
 
 
 def _told_apart(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -382,14 +353,3 @@ def _told_apart(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
                 for one, at in last.items()
             }
     return fields
-
-
-def _header_stamps(numbers: dict[str, np.ndarray], columns: tuple[str, str]) -> Stamps | None:
-    """Return a header stamp from its two columns; None where it is empty."""
-    if any(column not in numbers for column in columns):
-        return None
-    seconds, rest = (numbers[column] for column in columns)
-    if not np.isfinite(seconds).all() or not np.isfinite(rest).all() or not seconds.any():
-        return None
-    ns = seconds.astype(np.int64) * 10**9 + rest.astype(np.int64)
-    return Stamps(ns, parse_numbers(seconds.astype(np.float64)).absolute)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, final
@@ -12,11 +13,20 @@ from pydantic import Field, field_validator
 from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import to_si
-from residnet.data.readers.base import missing_package, require_file
+from residnet.data.readers.base import package, readable, require_file
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.quantities import factor
-from residnet.data.readers.recording import EVERYTHING, Recording, Remark, Series, Wanted, remark
-from residnet.data.readers.written import Stamps, parse_numbers, parse_texts, whole_second
+from residnet.data.readers.recording import (
+    EVERYTHING,
+    Recording,
+    Remark,
+    Rows,
+    Stamps,
+    Wanted,
+    recording_of,
+    remark,
+)
+from residnet.data.readers.written import parse_numbers, parse_texts
 
 if TYPE_CHECKING:
     import h5py
@@ -107,47 +117,43 @@ class _TreeConfig(RecordingConfig):
         require_file(path)
         wanted = wanted if self.table is None else Wanted([(self.table, "")])
         if not is_hdf5(path) and isinstance(self, MatConfig):
-            return _tree_recording(path, _mat_leaves(path), self.time, wanted)
-        try:
+            from scipy.io import loadmat
+
+            # SciPy's parser fails in its own ways on damaged bytes
+            with readable(path, "a MATLAB file"):
+                content = dict(_below(loadmat(path, simplify_cells=True), ""))
+            return _tree_recording(path, content, self.time, wanted)
+        what = "an HDF5 file" if isinstance(self, Hdf5Config) else "a MATLAB 7.3 file"
+        with package("hdf5", "h5py", what):
             import h5py
-        except ImportError as error:
-            what = "an HDF5 file" if isinstance(self, Hdf5Config) else "a MATLAB 7.3 file"
-            raise missing_package("hdf5", "h5py", what) from error
-        try:
-            with h5py.File(path, "r") as file:
-                import h5py
+        with readable(path, what), h5py.File(path, "r") as file:
+            found: list[h5py.Dataset] = []
 
-                found: dict[str, h5py.Dataset] = {}
+            def visit(name: str, node: Any) -> None:
+                if isinstance(node, h5py.Dataset) and not name.startswith("#"):
+                    found.append(node)
 
-                def visit(name: str, node: Any) -> None:
-                    if isinstance(node, h5py.Dataset) and not name.startswith("#"):
-                        found[name] = node
-
-                file.visititems(visit)
-                leaves: dict[str, _Vector] = {}
-                for dataset in found.values():
-                    name, names = dataset.name.strip("/"), dataset.dtype.names
-                    claimed, held = dataset.size * dataset.dtype.itemsize, path.stat().st_size
-                    if claimed > max(_ALWAYS_HELD, _MOST_COMPRESSED * held):
-                        # a size is only a number in the file
-                        raise DataError(
-                            f"{path}: {dataset.name} claims {claimed / 1e9:.3g} GB in a file of"
-                            f" {held / 1e6:.3g} MB; the file is damaged, or was made and never"
-                            " filled"
-                        )
-                    if names and dataset.ndim == 1:
-                        for column in names:
-                            if not dataset.dtype[column].shape:
-                                leaves[f"{name}/{column}"] = _Column(dataset, column)
-                        continue
-                    text = dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
-                    if not names and dataset.ndim and dataset.size and not text:
-                        words = dataset.dtype.kind in "SO" and dataset.ndim == 1
-                        leaves[name] = _plain(dataset[()]) if words else dataset
-                return _tree_recording(path, leaves, self.time, wanted)
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise DataError(f"{path}: damaged or not an HDF5 file ({reason})") from error
+            file.visititems(visit)
+            leaves: dict[str, _Vector] = {}
+            for dataset in found:
+                name, names = dataset.name.strip("/"), dataset.dtype.names
+                claimed, held = dataset.size * dataset.dtype.itemsize, path.stat().st_size
+                if claimed > max(_ALWAYS_HELD, _MOST_COMPRESSED * held):
+                    # a size is only a number in the file
+                    raise DataError(
+                        f"{path}: {dataset.name} claims {claimed / 1e9:.3g} GB in a file of"
+                        f" {held / 1e6:.3g} MB; the file is damaged, or was made and never filled"
+                    )
+                if names and dataset.ndim == 1:
+                    for column in names:
+                        if not dataset.dtype[column].shape:
+                            leaves[f"{name}/{column}"] = _Column(dataset, column)
+                    continue
+                text = dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
+                if not names and dataset.ndim and dataset.size and not text:
+                    words = dataset.dtype.kind in "SO" and dataset.ndim == 1
+                    leaves[name] = _plain(dataset[()]) if words else dataset
+            return _tree_recording(path, leaves, self.time, wanted)
 
 
 @final
@@ -180,20 +186,6 @@ def is_hdf5(path: Path) -> bool:
     with path.open("rb") as stream:
         head = stream.read(520)
     return head.startswith(_HDF5) or head[512:520] == _HDF5
-
-
-def _mat_leaves(path: Path) -> dict[str, _Vector]:
-    from scipy.io import loadmat
-
-    try:
-        content = loadmat(path, simplify_cells=True)
-    # SciPy's parser fails in its own ways on damaged bytes
-    except Exception as error:
-        raise DataError(
-            f"{path}: damaged or not a MATLAB file ({type(error).__name__}:"
-            f" {' '.join(str(error).split())[:200]})"
-        ) from error
-    return dict(_below(content, ""))
 
 
 def _below(node: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
@@ -263,12 +255,8 @@ def _tree_recording(
             left.append(f"{name} {list(values.shape)}")
             continue
         clock, t = clocks[group]
-        shared, parts = 0, name.split("/")
-        for mine, other in zip(parts[:-1], group.split("/") if group else [], strict=False):
-            if mine != other:
-                break
-            shared += 1
-        inside = "/".join(parts[shared:])
+        above = os.path.commonpath([name.rpartition("/")[0], group])
+        inside = name.removeprefix(above).lstrip("/")
         if name != clock and wanted(group or "/") and wanted.field(group or "/", inside):
             fields[group] |= _columns(inside, values, len(t))
             if not name.startswith(f"{group}/" if group else ""):
@@ -285,26 +273,17 @@ def _tree_recording(
             shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
             text = f"{len(names)} arrays {what.format(shown)}"
             remarks.append(remark("note", code, text, arrays=len(names)))
-    parsed: dict[str, Stamps] = {}
+    topics: dict[str, Rows] = {}
     for group, (name, values) in clocks.items():
         if wanted(group or "/") and fields[group]:
             try:
-                parsed[group] = time.parse(values)
+                topics[group or "/"] = Rows("", fields[group], time.parse(values))
             except DataError as error:
                 raise DataError(f"{path}: {name}: {error}") from error
-    epoch = whole_second(list(parsed.values()))
-    series = {}
-    for group, stamps in parsed.items():
-        raw = clocks[group][1]
-        # seconds as they stand keep every bit
-        plain = not stamps.absolute and raw.dtype.kind == "f" and time.unit in (None, "s")
-        t = raw.astype(np.float64) if plain else stamps.since(epoch)
-        name = group or "/"
-        series[name] = Series(name, "", fields[group], t, remarks=stamps.remarks)
-    listed = tuple(group or "/" for group in clocks if group not in parsed)
-    if not series:
+    listed = [group or "/" for group in clocks if (group or "/") not in topics]
+    if not topics:
         raise UsageError(f"{path}: none of its groups is wanted (it holds {', '.join(listed)})")
-    return Recording(path, series, epoch, (path,), tuple(remarks), listed)
+    return recording_of(path, topics, (path,), remarks, listed)
 
 
 def _clocks(leaves: Mapping[str, _Vector], time: TreeTime) -> dict[str, tuple[str, np.ndarray]]:

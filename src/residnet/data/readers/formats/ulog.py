@@ -9,10 +9,19 @@ from typing import ClassVar, Literal, final
 
 import numpy as np
 
-from residnet.core.errors import DataError, UsageError
-from residnet.data.readers.base import missing_package, require_file
+from residnet.core.errors import UsageError
+from residnet.data.readers.base import package, readable, require_file
 from residnet.data.readers.compose import RecordingConfig
-from residnet.data.readers.recording import EVERYTHING, Recording, Remark, Series, Wanted, remark
+from residnet.data.readers.recording import (
+    EVERYTHING,
+    Recording,
+    Remark,
+    Rows,
+    Stamps,
+    Wanted,
+    recording_of,
+    remark,
+)
 
 
 @final
@@ -41,20 +50,11 @@ class UlogConfig(RecordingConfig):
             DataError: where it cannot be read.
         """
         require_file(path)
-        try:
+        with package("px4", "pyulog", "a PX4 flight log"):
             from pyulog import ULog
-        except ImportError as error:
-            raise missing_package("px4", "pyulog", "a PX4 flight log") from error
-        try:
-            # pyulog prints what it finds damaged, which the remarks say below
-            with contextlib.redirect_stdout(io.StringIO()):
-                log = ULog(str(path), None, disable_str_exceptions=True)
-        # pyulog fails in its own ways on damaged bytes
-        except Exception as error:
-            raise DataError(
-                f"{path}: damaged or not a ULog file ({type(error).__name__}:"
-                f" {' '.join(str(error).split())[:200]})"
-            ) from error
+        # pyulog prints what it finds damaged, which the remarks say below
+        with readable(path, "a ULog file"), contextlib.redirect_stdout(io.StringIO()):
+            log = ULog(str(path), None, disable_str_exceptions=True)
         data = {
             one.name + (f"_{one.multi_id}" if one.multi_id else ""): one for one in log.data_list
         }
@@ -69,14 +69,12 @@ class UlogConfig(RecordingConfig):
                 f" {', '.join(sorted(data)) or 'none'})"
             )
         boot = _boot_time([one.data for one in log.data_list])
-        start = min(int(fields["timestamp"][0]) for fields in chosen.values()) * 1000
-        epoch = None if boot is None else (boot + start) // 10**9 * 10**9
-        origin = 0 if boot is None or epoch is None else epoch - boot
-        series = {}
+        topics = {}
         for name, raw in chosen.items():
-            t = (raw["timestamp"].astype(np.int64) * 1000 - origin) * 1e-9
+            ns = raw["timestamp"].astype(np.int64) * 1000 + (boot or 0)
             fields = {p: v for p, v in _fields(raw).items() if wanted.field(name, p)}
-            series[name] = Series(name, f"px4/{data[name].name}", fields, t)
+            kind = f"px4/{data[name].name}"
+            topics[name] = Rows(kind, fields, Stamps(ns, boot is not None))
         remarks: list[Remark] = []
         if log.file_corruption:
             text = "the file is damaged in places; messages there are lost"
@@ -85,8 +83,7 @@ class UlogConfig(RecordingConfig):
             lost, count = sum(one.duration for one in log.dropouts) * 1e-3, len(log.dropouts)
             text = f"the logger dropped data {count} times, {lost:.3g} s in all; gaps stay gaps"
             remarks.append(remark("note", "dropouts", text, dropouts=count, seconds=lost))
-        listed = tuple(sorted(set(data) - set(series)))
-        return Recording(path, series, epoch, (path,), tuple(remarks), listed)
+        return recording_of(path, topics, (path,), remarks, sorted(data.keys() - topics))
 
 
 def _boot_time(messages: list[dict[str, np.ndarray]]) -> int | None:
