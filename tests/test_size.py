@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (884, 128),
     "control": (3240, 366),
     "core": (1610, 248),
-    "data": (9814, 857),
+    "data": (9649, 846),
     "documents": (2602, 239),
     "dynamics": (2233, 279),
     "export": (1509, 174),

@@ -22,13 +22,14 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.words import (
     axis_velocity,
     deep_channel,
-    si_of,
     thrown,
     unit_by_size,
+    unit_of,
     words_of,
     written_unit,
 )
 from residnet.data.motion import without_pauses
+from residnet.data.readers.base import unwrap
 from residnet.data.readers.quantities import (
     COSINE,
     QUATERNION,
@@ -121,11 +122,7 @@ class Motion(NamedTuple):
 def heading_of(raw: Raw, unit: str, frame: Frame) -> np.ndarray:
     """Return the heading [T] in rad, unwrapped over its known samples."""
     psi = raw.columns["psi"] * to_si(unit, "rad")
-    psi = np.pi / 2 - psi if frame.from_east else psi
-    out = np.full(psi.size, np.nan)
-    known = np.isfinite(psi)
-    out[known] = np.unwrap(psi[known])
-    return out
+    return unwrap(np.pi / 2 - psi if frame.from_east else psi)
 
 
 def motion_of(raw: Raw, unit: str, frame: Frame) -> Motion | None:
@@ -415,15 +412,16 @@ def drafted_channels(
     attitude = {name: column for name, column in names.items() if name in QUATERNION}
     frames = _frames(names, texts)
     rest = {name: column for name, column in names.items() if name not in QUATERNION}
-    angles = {}
+    angles, made = {}, dict[str, tuple[str, ...]]()
     for name in [one.removesuffix(COSINE) for one in names if one.endswith(COSINE)]:
+        made[name] = (name + COSINE, name + SINE)
         pair = (rest.pop(name + COSINE), rest.pop(name + SINE))
         rest[name] = f"angle of {' and '.join(pair)} [rad]"
         angles[rest[name]] = pair
-        logs = [_on_circle(raw, name) for raw in logs]
     if attitude:
+        made["psi"] = QUATERNION
         rest["psi"] = "heading of the quaternion [rad]"
-        logs = [_headed(raw) for raw in logs]
+    logs = [_with_angles(raw, made) for raw in logs]
     rest, logs, fixes = _from_fixes(rest, logs, marks)
     entries = Channels(rest, logs, marks, fixes, frames).drafted()
     if fixes:
@@ -454,21 +452,15 @@ def drafted_channels(
     return entries
 
 
-def _on_circle(raw: Raw, name: str) -> Raw:
-    """Return a log with an angle in rad from its cosine and sine."""
-    if not {name + COSINE, name + SINE} <= raw.columns.keys():
-        return raw
-    angle = np.arctan2(raw.columns[name + SINE], raw.columns[name + COSINE])
-    return Raw(raw.t, {**raw.columns, name: angle})
-
-
-def _headed(raw: Raw) -> Raw:
-    """Return a log with a heading in rad from its quaternion."""
-    if not set(QUATERNION) <= set(raw.columns):
-        return raw
-    yaw = yaw_of(*unit_quaternion(*(raw.columns[name] for name in QUATERNION)))
-    rest = {name: raw.columns[name] for name in raw.columns if name not in QUATERNION}
-    return Raw(raw.t, {**rest, "psi": yaw})
+def _with_angles(raw: Raw, made: Mapping[str, tuple[str, ...]]) -> Raw:
+    """Return a log with angles in rad that cosine and sine, or the parts of a quaternion, tell."""
+    columns = dict(raw.columns)
+    for name, parts in made.items():
+        if columns.keys() >= {*parts}:
+            own = [columns[part] for part in parts]
+            whole = len(own) == len(QUATERNION)
+            columns[name] = yaw_of(*unit_quaternion(*own)) if whole else np.arctan2(*own[::-1])
+    return Raw(raw.t, columns)
 
 
 def _from_fixes(
@@ -746,14 +738,10 @@ class Channels:
 
     def _unit(self, name: str, *, mark: bool = True) -> str:
         """Return the unit of a channel from its header or its size."""
-        column = self._names[name]
-        written = written_unit(column, si_of(name))
-        if written is not None:
-            return written
-        unit, reason = unit_by_size(name, self._values(name))
-        if mark:
-            self._marks.guess((*CHANNELS, name), reason)
-        return unit
+        found = unit_of(name, self._names[name], self._values(name))
+        if mark and found.reason:
+            self._marks.guess((*CHANNELS, name), found.reason)
+        return str(found.settings["unit"])
 
     def _entry(self, name: str) -> dict[str, Any]:
         column = self._names[name]
@@ -802,10 +790,18 @@ class Channels:
         Args:
             who: what that is, for a reader.
         """
-        key, column = (*CHANNELS, name), self._names[name]
-        si = CHANNEL_UNITS[name]
-        written = written_unit(column, si)
-        unit = self._measured_unit(name, written, fit, who)
+        key, column, si = (*CHANNELS, name), self._names[name], CHANNEL_UNITS[name]
+        written, found = written_unit(column, si), fit.unit(si) if fit.telling else None
+        unit = written or found or self._unit(name)
+        if written is None and found is not None:
+            text = f"the header has no unit; {who} say {found}"
+            self._marks.guess(key, f"{text} (correlation {fit.correlation:.2f})")
+        elif written and found and fit.correlation >= _SURE:
+            ratio = abs(fit.factor) / to_si(written, si)
+            if to_si(found) != to_si(written, si) and not 0.6 < ratio < 1.6:
+                text = f"the header says {written}, {who} say {found} (factor {ratio:.3g})"
+                asked = f"unit of '{column}'"
+                unit = self._marks.ask(key, asked, found, text, (found, written))
         entry: dict[str, Any] = {"unit": unit}
         if fit.telling and fit.factor < 0.0:
             entry["sign"] = -1
@@ -817,20 +813,3 @@ class Channels:
         if not fit.telling and written is None:
             self._marks.guess(key, f"{who} do not tell whether {unit} is right")
         return entry
-
-    def _measured_unit(self, name: str, written: str | None, fit: Fit, who: str) -> str:
-        key, si = (*CHANNELS, name), CHANNEL_UNITS[name]
-        found = fit.unit(si) if fit.telling else None
-        if written is None and found is not None:
-            text = f"the header has no unit; {who} say {found}"
-            self._marks.guess(key, f"{text} (correlation {fit.correlation:.2f})")
-            return found
-        if written is None:
-            return self._unit(name)
-        if found is None or to_si(found) == to_si(written, si) or fit.correlation < _SURE:
-            return written
-        ratio = abs(fit.factor) / to_si(written, si)
-        if 0.6 < ratio < 1.6:
-            return written
-        text = f"the header says {written}, {who} say {found} (factor {ratio:.3g})"
-        return self._marks.ask(key, f"unit of '{self._names[name]}'", found, text, (found, written))

@@ -80,9 +80,12 @@ class Marks:
         self.notes += other.notes
 
     def move(self, old: Key, new: Key) -> None:
-        """Move the marks of one key to another."""
-        self.guesses = [(new if key == old else key, text) for key, text in self.guesses]
-        self.notes = [(new if key == old else key, text) for key, text in self.notes]
+        """Move the marks of one key, and of those below it, to another."""
+        deep = len(old)
+        self.guesses, self.notes = (
+            [((*new, *key[deep:]) if key[:deep] == old else key, text) for key, text in marks]
+            for marks in (self.guesses, self.notes)
+        )
 
     def rename(self, below: Key, names: Mapping[str, str]) -> None:
         """Move what stands at keys below another one to new names; others there are forgotten."""

@@ -43,12 +43,10 @@ from residnet.data.drafting.words import (
     MOTION,
     PLANES,
     input_channel,
-    si_of,
     state_channel,
     thrown,
-    unit_by_size,
+    unit_of,
     words_of,
-    written_unit,
 )
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers import ReaderConfig
@@ -134,8 +132,7 @@ def draft_recordings(
     if not steps and log is not None:
         step = float(np.median(np.diff(log.t)))
     sources = _Sources({}, taken, step)
-    posed = [source.topic for source in (plan.position, plan.heading) if source is not None]
-    settled = any(in_ned(some[0][topic]) for topic in posed)
+    settled = any(in_ned(some[0][source.topic]) for source in poses)
     if by_name := _named_fields(some, marks):
         sources = by_name
     elif log is None or not whole or not _sound(log, marks):
@@ -159,11 +156,15 @@ def draft_recordings(
     standard = "standard_messages" not in content
     known = set(log.channels) if log is not None and standard else set()
     channels = dict(content.pop("channels", {}))
-    if standard:
-        channels |= _renamed(some, plan.channels, known, marks)
-    for name, (topic, field) in _inputs(some, sources.taken).items():
-        if name not in known and name not in channels:
-            channels[name] = _entry(name, topic, field, _values(some, topic, field), marks)
+    plain = _renamed(some[0], plan.channels) if standard else ()
+    for name, (topic, field) in (*plain, *_inputs(some, sources.taken)):
+        if name in known or name in channels:
+            continue
+        values = _values(some, topic, field)
+        told = thrown(name, field, values) or unit_of(name, field, values)
+        reason = f"taken by its name; {told.reason}" if told.reason else "taken by its name"
+        marks.guess((*CHANNELS, name), reason)
+        channels[name] = {"topic": topic, "field": field, **told.settings, "hold": True}
     return content | ({"channels": channels} if channels else {}), loaded
 
 
@@ -394,25 +395,21 @@ def _agreement(pose: Raw, motion: Motion, series: Series, first: str, second: st
 
 
 def _renamed(
-    recordings: Sequence[Recording], standard: Mapping[str, FieldMap], known: set[str], marks: Marks
-) -> dict[str, dict[str, Any]]:
-    """Return entries of plain numbers whose topic or joint is named as an actuator is.
+    recording: Recording, standard: Mapping[str, FieldMap]
+) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield channel, topic and field of plain numbers whose topic or joint names an actuator.
 
     A message that holds a bare number says neither what it measures nor its unit.
     """
-    out: dict[str, dict[str, Any]] = {}
     for name, entry in standard.items():
         topic, field = entry.topic or "", entry.field
-        if name in CHANNEL_UNITS or entry.unit not in ("-", "rad"):
+        if name in CHANNEL_UNITS or entry.unit not in ("-", "rad") or topic not in recording.series:
             continue
         # the last part of a topic says more than the folders that it lies in
         names = (topic.rsplit("/", 1)[-1], name) if field == "data" else (name,)
-        channels = [input_channel(words_of(one.removesuffix("_position"))) for one in names]
-        channel = next((one for one in channels if one), None)
-        if topic in recordings[0].series and channel and channel not in known | set(out):
-            values = _values(recordings, topic, field)
-            out[channel] = _entry(channel, topic, field, values, marks)
-    return out
+        channels = (input_channel(words_of(one.removesuffix("_position"))) for one in names)
+        if channel := next(filter(None, channels), None):
+            yield channel, (topic, field)
 
 
 def _values(recordings: Sequence[Recording], topic: str, field: str) -> np.ndarray:
@@ -423,8 +420,8 @@ def _values(recordings: Sequence[Recording], topic: str, field: str) -> np.ndarr
 
 def _inputs(
     recordings: Sequence[Recording], taken: set[tuple[str, str]]
-) -> dict[str, tuple[str, str]]:
-    """Return channel -> topic and field of those that are named as actuators are.
+) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield channel, topic and field of those that are named as actuators are.
 
     Several actuators of one topic are told apart by a number alone, `control[0]` and `control[1]`:
     each is taken. Of other fields that stand for one channel the first one is.
@@ -439,28 +436,11 @@ def _inputs(
             known = values[np.isfinite(values)]
             if known.size >= _FEW and float(np.ptp(known)) > 0.0:
                 found.setdefault(channel, []).append((topic, field))
-    out: dict[str, tuple[str, str]] = {}
     for channel, same in found.items():
-        first = same[0][0], re.sub(r"\d+", "#", same[0][1])
-        alike = [one for one in same if (one[0], re.sub(r"\d+", "#", one[1])) == first]
-        several = len(alike) > 1
-        out |= {f"{channel}_{i}" if several else channel: one for i, one in enumerate(alike, 1)}
-    return out
-
-
-def _entry(
-    channel: str, topic: str, field: str, values: np.ndarray, marks: Marks
-) -> dict[str, Any]:
-    entry: dict[str, Any] = {"topic": topic, "field": field}
-    if throw := thrown(channel, field, values):
-        marks.guess((*CHANNELS, channel), throw.reason)
-        return {**entry, **throw.settings, "hold": True}
-    if unit := written_unit(field, si_of(channel)):
-        marks.guess((*CHANNELS, channel), "taken by its name")
-        return {**entry, "unit": unit, "hold": True}
-    unit, reason = unit_by_size(channel, values)
-    marks.guess((*CHANNELS, channel), f"taken by its name; {reason}")
-    return {**entry, "unit": unit, "hold": True}
+        kinds = [(topic, re.sub(r"\d+", "#", field)) for topic, field in same]
+        alike = [one for one, kind in zip(same, kinds, strict=True) if kind == kinds[0]]
+        for number, one in enumerate(alike, 1):
+            yield f"{channel}_{number}" if len(alike) > 1 else channel, one
 
 
 INPUTS = ("signals", "inputs")
@@ -553,12 +533,8 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
             own = Marks()
             parts[word], lost = draft_tables(files, own, headed=True)
             left_out |= lost
-            place = (*READER, "parts", word)
-            for told, tell in ((own.guesses, marks.guess), (own.notes, marks.note)):
-                for key, text in told:
-                    tell(
-                        (*place, *key[len(READER) :]) if key[: len(READER)] == READER else key, text
-                    )
+            own.move(READER, (*READER, "parts", word))
+            marks.extend(own)
         order = sorted(parts, key=lambda word: -len(_of_motion(parts[word]["channels"])))
         text = (
             f"files whose names differ in {' and '.join(order)} alone are taken as one trip; where"

@@ -598,10 +598,11 @@ def clock_of(sheet: Sheet) -> Clock:
 
     def rises(name: str) -> bool:
         values = sheet.numbers[name]
+        known = values[np.isfinite(values)]
         # pandas writes the number of each row under no name, or the time
         return (
             values.size > 1
-            and bool((np.diff(_going_on(values[np.isfinite(values)])) > 0.0).all())
+            and bool((np.diff(steady_clock(known, [known], 1.0)[0]) > 0.0).all())
             and not (name.startswith("Unnamed: ") and bool((np.diff(values) == 1.0).all()))
         )
 
@@ -643,11 +644,6 @@ def _unsteady(values: np.ndarray) -> float:
     """Return the spread of steps, as a share of the usual one and without the last digit."""
     steps = np.diff(values[np.isfinite(values)])
     return round(float(np.std(steps) / np.median(steps)), 2)
-
-
-def _going_on(values: np.ndarray) -> np.ndarray:
-    """Return whole numbers as a counter of them went on that wrapped."""
-    return steady_clock(values, [values], 1.0)[0]
 
 
 def _steady(sheet: Sheet, t: np.ndarray, tick: float | None = None) -> np.ndarray:

@@ -86,19 +86,27 @@ def unit_by_size(channel: str, values: np.ndarray) -> tuple[str, str]:
     return unit, f"the header has no unit; values up to {largest:.3g} would be {unit}"
 
 
-class Throw(NamedTuple):
-    """How numbers that say how far an actuator is thrown become the values of its channel.
+class Scaling(NamedTuple):
+    """How the numbers of a column become the values of its channel.
 
     Attributes:
-        settings: unit, offset and scale of a channel map.
-        reason: why these are guessed.
+        settings: unit, and offset and scale where they are needed, of a channel map.
+        reason: why these are guessed; empty where the column's name says them.
     """
 
     settings: dict[str, Any]
     reason: str
 
 
-def thrown(channel: str, column: str, values: np.ndarray) -> Throw | None:
+def unit_of(channel: str, column: str, values: np.ndarray) -> Scaling:
+    """Return the unit of a column by its name, else by the size of its values [T]."""
+    unit, reason = written_unit(column, si_of(channel)), ""
+    if unit is None:
+        unit, reason = unit_by_size(channel, values)
+    return Scaling({"unit": unit}, reason)
+
+
+def thrown(channel: str, column: str, values: np.ndarray) -> Scaling | None:
     """Return how pulses, per cent or shares become a channel; None where its unit is a plain one.
 
     Args:
@@ -111,11 +119,11 @@ def thrown(channel: str, column: str, values: np.ndarray) -> Throw | None:
     if is_pulse(channel, values):
         settings = {"unit": unit, "offset": 1500, "scale": all_the_way / 500.0}
         reason = "pulses of a servo; 1500 us are taken as neutral, 500 us as all the way"
-        return Throw(settings, reason + told)
+        return Scaling(settings, reason + told)
     if not rudder or not (whole := _whole(column, values)):
         return None
     reason = f"{whole:g} is taken as all the way{told}"
-    return Throw({"unit": unit, "scale": all_the_way / whole}, reason)
+    return Scaling({"unit": unit, "scale": all_the_way / whole}, reason)
 
 
 def _whole(column: str, values: np.ndarray) -> float:
@@ -142,18 +150,13 @@ def is_pulse(channel: str, values: np.ndarray) -> bool:
 
 def si_of(channel: str) -> str | None:
     """Return the SI unit of a channel, by its name where residnet does not know it, or None."""
-    if channel in CHANNEL_UNITS:
-        return CHANNEL_UNITS[channel]
     first = channel.removeprefix("cmd_")
-    if re.match(r"n(_|$)", first):
-        return "1/s"
-    if first.startswith(("delta", "azimuth")):
-        return "rad"
-    if first.startswith(("tau_x", "tau_y", "thrust")):
-        return "N"
-    return "N m" if first.startswith("tau_n") else None
+    found = (si for start, si in _SI.items() if re.match(start, first))
+    return CHANNEL_UNITS.get(channel) or next(found, None)
 
 
+_SI = {r"n(_|$)": "1/s", "delta|azimuth": "rad", "tau_x|tau_y|thrust": "N", "tau_n": "N m"}
+"""How names of one's own begin -> SI unit."""
 # what a name may be about -> parts of words, and whole words behind a bar
 _ABOUT: dict[str, str] = {
     "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻 時間"
@@ -357,8 +360,83 @@ def _fits(thing: str, text: str, tokens: list[str]) -> bool:
     )
 
 
+class _Rule:
+    """A channel, and what a name is about that stands for it.
+
+    Args:
+        channel: its name; None where it is none.
+        about: things, of each of which one must be among them (`rate|speed`).
+        but: things that must not be.
+        text: pattern that the name must hold.
+    """
+
+    def __init__(self, channel: str | None, about: str, but: str = "", text: str = "") -> None:
+        self.channel, self._text = channel, re.compile(text)
+        self._about = [frozenset(things.split("|")) for things in about.split()]
+        self._but = frozenset(but.split())
+
+    def fits(self, w: Words) -> bool:
+        """Return whether a name stands for the channel."""
+        if not self._but.isdisjoint(w.about) or any(map(w.about.isdisjoint, self._about)):
+            return False
+        return self._text.search(w.text) is not None
+
+
+def _first(rules: tuple[_Rule, ...], words: Words) -> str | None:
+    return next((rule.channel for rule in rules if rule.fits(words)), None)
+
+
+_TWIST = (
+    r"\b(?:(?:twist|velocity) linear|linear velocity|v|vel|velo|velocity|speed|lin|linear)"
+    r" ?{}(?: (?:m s|mps|ms))?$"
+)
+_AXES = (_Rule("u", "", "", _TWIST.format("x")), _Rule("v", "", "", _TWIST.format("y")))
+# of what drives the vessel or is asked of it
+_DRIVEN = (
+    *("command", "acceleration", "rudder", "planes", "propeller", "current", "depth", "age"),
+    *("heave", "engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque"),
+)
+_ALONG = "north east angular voltage"
+_STATES = (
+    _Rule("latitude", "latitude"),
+    _Rule("longitude", "longitude", "surge speed"),
+    _Rule("p", "roll rate|angular"),
+    _Rule("phi", "roll"),
+    _Rule("r", "turn_rate"),
+    _Rule("r", "heading|turn rate"),
+    _Rule("r", "", "", "^r( mid)?$"),
+    _Rule("r", "angular", "", r" [zr](?: (?:dps|deg s|rad s))?$"),
+    # of an axis that is not told: what turns is the vessel
+    _Rule("r", "angular rate", "x y pitch"),
+    *_AXES,
+    _Rule("psi", "heading", "ground"),
+    _Rule("psi", "", "", "^(gyro|gyro ?compass|compass)$"),
+    # some write 0 for what is fixed to the earth
+    *(
+        _Rule(axis, about, "speed angle force", text)
+        for axis, way in (("x", "north"), ("y", "east"))
+        for about, text in ((way, ""), (f"{axis} position", ""), (axis, r"^[xy](?: ?0)?(?: m)?$"))
+    ),
+    _Rule("v", "sway", _ALONG),
+    _Rule("u", "surge|longitude", _ALONG),
+    _Rule("v", "speed port|starboard", _ALONG),
+    _Rule("speed", "speed", _ALONG),
+)
+"""In the order in which they are asked."""
+_DEEP = (
+    _Rule("q", "pitch rate|speed|angular", "propeller heave"),
+    _Rule("theta", "pitch", "propeller heave"),
+    _Rule("w", "heave|depth rate|speed|angular"),
+    _Rule("z", "depth", "heave"),
+)
+
+
+@lru_cache(maxsize=4096)
 def state_channel(words: Words) -> str | None:
-    """Return the channel of the motion or of the wind that a name stands for; None for none."""
+    """Return the channel of the motion or of the wind that a name stands for; None for none.
+
+    It is `speed` where only the size of a velocity is meant.
+    """
     w, name = words, words.text.replace(" ", "_")
     if name in MOTION:
         return name
@@ -373,95 +451,47 @@ def state_channel(words: Words) -> str | None:
         if w.has("speed") and "dir" not in w.text.split():
             return f"{felt}wind_speed"
         return (f"{felt}wind_angle" if felt else "wind_dir") if w.has("direction") else None
-    if not w.lacks(
-        *("command", "acceleration", "rudder", "planes", "propeller", "current", "depth", "age"),
-        "heave",
-    ):
-        return None
-    driven = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")
-    if not w.lacks(*driven) and not (w.has("position") and w.has("north")):
-        return None
-    if w.has("latitude"):
-        return "latitude"
-    if w.has("longitude") and w.lacks("surge", "speed"):
-        return "longitude"
-    if w.has("roll"):
-        return "p" if w.has("rate") or w.has("angular") else "phi"
-    if w.has("turn_rate") or (w.has("heading") and w.has("rate")) or w.text in ("r", "r mid"):
-        return "r"
-    if (w.has("turn") and w.has("rate")) or (w.has("angular") and _YAWING.search(w.text)):
-        return "r"
-    if w.has("angular", "rate") and w.lacks("x", "y", "pitch"):
-        # of an axis that is not told: what turns is the vessel
-        return "r"
-    if axis := axis_velocity(w):
-        return axis
-    return _place(w) or _velocity(w)
+    placed = w.has("position", "north") and w.lacks(*_DRIVEN[:9])
+    return _first(_STATES, w) if placed or w.lacks(*_DRIVEN) else None
 
 
 def deep_channel(words: Words) -> str | None:
     """Return w, q, z or theta of a vessel under water that a name stands for; None for others."""
-    w = words
-    if w.text in ("w", "q", "z", "theta"):
-        return w.text
-    moves = not w.lacks("rate", "speed", "angular")
-    if not w.lacks("command", "acceleration", "age", "index", "machinery", "thrust", "engine"):
-        return None
-    if w.has("pitch") and w.lacks("propeller", "heave"):
-        return "q" if moves else "theta"
-    if w.has("heave") or (w.has("depth") and moves):
-        return "w" if moves else None
-    return "z" if w.has("depth") else None
-
-
-_YAWING = re.compile(r" [zr](?: (?:dps|deg s|rad s))?$")
-_GROUND = re.compile(r"\bvel\w* (?:n|e|d|north|east|down)\b")
-"""A velocity along north, east or down: its N is no propeller."""
-_TWIST = re.compile(
-    r"\b(?:(?:twist|velocity) linear|linear velocity|v|vel|velo|velocity|speed|lin|linear)"
-    r" ?(?P<axis>[xy])(?: (?:m s|mps|ms))?$"
-)
+    if words.text in ("w", "q", "z", "theta"):
+        return words.text
+    none = ("command", "acceleration", "age", "index", "machinery", "thrust", "engine")
+    return _first(_DEEP, words) if words.lacks(*none) else None
 
 
 def axis_velocity(words: Words) -> str | None:
     """Return u or v of a velocity along an axis x or y, of whatever frame; None for others."""
-    twist = _TWIST.search(words.text)
-    return None if twist is None else "u" if twist["axis"] == "x" else "v"
+    return _first(_AXES, words)
 
 
-_AXIS = re.compile(r"[xy](?: ?0)?(?: m)?")
-_COMPASS = ("gyro", "compass", "gyro compass", "gyrocompass")
-
-
-def _place(w: Words) -> str | None:
-    if (w.has("heading") and w.lacks("ground")) or w.text in _COMPASS:
-        return "psi"
-    if w.lacks("speed", "angle", "force"):
-        # some write 0 for what is fixed to the earth
-        if w.has("north") or (w.has("x") and (w.has("position") or _AXIS.fullmatch(w.text))):
-            return "x"
-        if w.has("east") or (w.has("y") and (w.has("position") or _AXIS.fullmatch(w.text))):
-            return "y"
-    return None
-
-
-def _velocity(w: Words) -> str | None:
-    """Return u or v, or `speed` where only its size is meant."""
-    if w.has("north") or w.has("east") or w.has("angular") or w.has("voltage"):
-        return None
-    if w.has("sway"):
-        return "v"
-    if w.has("surge") or w.has("longitude"):
-        return "u"
-    if w.has("speed") and not w.lacks("port", "starboard"):
-        return "v"
-    return "speed" if w.has("speed") else None
-
-
+_GROUND = re.compile(r"\bvel\w* (?:n|e|d|north|east|down)\b")
+"""A velocity along north, east or down: its N is no propeller."""
 _LETTER = re.compile(r"(?<=\w) ([lr])(?= |$)")
 """The side behind the name of an actuator."""
 
 
+_INPUTS = (
+    _Rule(None, "torque"),
+    _Rule("azimuth{side}{_cmd}", "azimuth"),
+    _Rule("{cmd_}delta_s{side}", "planes"),
+    _Rule("{cmd_}delta_rate{side}", "rudder rate"),
+    _Rule("{cmd_}delta{side}", "rudder"),
+    _Rule("throttle{side}", "propeller throttle", "revolutions"),
+    _Rule("throttle{side}", "engine throttle", "revolutions angle"),
+    _Rule("{cmd_}n{side}", "revolutions|propeller", "thrust"),
+    _Rule("{cmd_}n{side}", "engine", "thrust angle"),
+    _Rule("thrust{side}{_cmd}", "thrust"),
+    _Rule("servo{side}", "servo"),
+    _Rule("throttle{side}", "throttle"),
+)
+"""In the order in which they are asked."""
+
+
+@lru_cache(maxsize=4096)
 def input_channel(words: Words) -> str | None:
     """Return the channel of an actuator that a name stands for; None where it names none."""
     w, name = words, words.text.replace(" ", "_")
@@ -478,32 +508,16 @@ def input_channel(words: Words) -> str | None:
     side = side or (f"_{w.number}" if w.number is not None else "")
     if w.has("force") and (forced := _force(w)):
         return forced
-    if w.has("torque"):
-        return None
-    if w.has("azimuth"):
-        return f"azimuth{side}{_ordered(w)}"
-    if w.has("planes"):
-        name = f"delta_s{side.removesuffix('_stern')}"
-        return f"cmd_{name}" if w.has("command") else name
-    if w.has("rudder"):
-        name = "delta" if w.lacks("rate") else "delta_rate"
-        return f"cmd_{name}{side}" if w.has("command") else f"{name}{side}"
-    turning = w.has("revolutions") or w.has("propeller") or (w.has("engine") and w.lacks("angle"))
-    if turning and w.has("throttle") and w.lacks("revolutions"):
-        return f"throttle{side}"
-    if turning and w.lacks("thrust"):
-        return f"cmd_n{side}" if w.has("command") else f"n{side}"
-    if w.has("thrust"):
-        return f"thrust{side}{_ordered(w)}"
-    if w.has("throttle") or w.has("servo"):
-        return f"{'servo' if w.has('servo') else 'throttle'}{side}"
-    if w.about and w.about <= {"port", "starboard", "command", "measured"}:
+    found = _first(_INPUTS, w)
+    if found is None and w.about and w.about <= _ACTUATED:
         return f"cmd{side}" if w.has("command") else f"n{side}"
-    return None
+    if w.has("planes"):
+        side = side.removesuffix("_stern")
+    before, behind = ("cmd_", "_cmd") if w.has("command") else ("", "")
+    return found and found.format(side=side, cmd_=before, _cmd=behind)
 
 
-def _ordered(w: Words) -> str:
-    return "_cmd" if w.has("command") else ""
+_ACTUATED = frozenset({"port", "starboard", "command", "measured"})
 
 
 def _force(w: Words) -> str | None:
