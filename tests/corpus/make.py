@@ -82,6 +82,7 @@ def csv(folder: Path, number: int, columns: dict[str, Any], word: str = "run") -
 
 POSE = {"x": "north [m]", "y": "east [m]", "heading": "heading [deg]"}
 SPEEDS = {"u": "surge [m/s]", "v": "sway [m/s]", "rate": "yaw rate [deg/s]"}
+ROLL = {"roll": "roll [deg]", "roll rate": "roll rate [deg/s]"}
 ACTS = {"rudder": "rudder [deg]", "rpm": "shaft [rpm]"}
 
 
@@ -90,8 +91,36 @@ def renamed(s: pd.DataFrame, *names: dict[str, str]) -> dict[str, object]:
     return {new: s[old] for part in names for old, new in part.items()}
 
 
-def plain(folder: Path, k: int, s: Any) -> None:
-    csv(folder, k, {"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)})
+TABLES: dict[str, Callable[[Any], dict[str, Any]]] = {
+    "plain": lambda s: {"time [s]": s.t, **renamed(s, POSE, SPEEDS, ACTS)},
+    "dead_gyro": lambda s: {"time [s]": s.t, **renamed(s.assign(rate=2e-5), POSE, SPEEDS, ACTS)},
+    "no_pose": lambda s: {"time [s]": s.t, **renamed(s, SPEEDS, ACTS)},
+    "surge_alone": lambda s: (
+        {"time [s]": s.t, "speed [m/s]": s.u, "motor [us]": (1100 + s.rpm / 2).round()}
+    ),
+    "yaw_alone": lambda s: (
+        {"time [s]": s.t, "heading [deg]": s.heading, "rudder [deg]": s.rudder}
+    ),
+    "speed_and_heading": lambda s: (
+        {"time [s]": s.t, "speed [m/s]": s.u, "heading [deg]": s.heading, **renamed(s, ACTS)}
+    ),
+    "with_roll": lambda s: {"time [s]": s.t, **renamed(s, POSE, SPEEDS, ROLL, ACTS)},
+    "whole_seconds": lambda s: {
+        "time": (START + pd.to_timedelta(np.floor(s.t), "s")).dt.strftime("%Y-%m-%d %H:%M:%S"),
+        **renamed(s, POSE, SPEEDS, ACTS),
+    },
+    "magnetic": lambda s: {
+        "time [s]": s.t,
+        **renamed(s, {**POSE, "heading": "compass heading [deg]"}, ACTS),
+    },
+    "newest_first": lambda s: {"time [s]": s.t[::-1], **renamed(s[::-1], POSE, ACTS)},
+}
+"""Layout -> columns of its tables, of those that are written as they stand."""
+
+
+def micros_wrap(folder: Path, k: int, s: Any) -> None:
+    micros = (2**32 - 40_000_000 * k + (1e6 * s.t).round().astype("int64")) % 2**32
+    csv(folder, k, {"micros": micros, **renamed(s, POSE, SPEEDS, ACTS)})
 
 
 def pandas_index(folder: Path, k: int, s: Any) -> None:
@@ -105,52 +134,10 @@ def heading_interpolated(folder: Path, k: int, s: Any) -> None:
     csv(folder, k, {"time [s]": s.t, **renamed(s.assign(heading=between), POSE, ACTS)})
 
 
-def dead_gyro(folder: Path, k: int, s: Any) -> None:
-    dead = s.assign(rate=2e-5)
-    csv(folder, k, {"time [s]": s.t, **renamed(dead, POSE, SPEEDS, ACTS)})
-
-
-def no_pose(folder: Path, k: int, s: Any) -> None:
-    csv(folder, k, {"time [s]": s.t, **renamed(s, SPEEDS, ACTS)})
-
-
-def surge_alone(folder: Path, k: int, s: Any) -> None:
-    csv(folder, k, {"time [s]": s.t, "speed [m/s]": s.u, "motor [us]": (1100 + s.rpm / 2).round()})
-
-
-def yaw_alone(folder: Path, k: int, s: Any) -> None:
-    csv(folder, k, {"time [s]": s.t, "heading [deg]": s.heading, "rudder [deg]": s.rudder})
-
-
-def speed_and_heading(folder: Path, k: int, s: Any) -> None:
-    columns = {"time [s]": s.t, "speed [m/s]": s.u, "heading [deg]": s.heading}
-    csv(folder, k, {**columns, **renamed(s, ACTS)})
-
-
-def with_roll(folder: Path, k: int, s: Any) -> None:
-    roll = {"roll": "roll [deg]", "roll rate": "roll rate [deg/s]"}
-    csv(folder, k, {"time [s]": s.t, **renamed(s, POSE, SPEEDS, roll, ACTS)})
-
-
-def micros_wrap(folder: Path, k: int, s: Any) -> None:
-    micros = (2**32 - 40_000_000 * k + (1e6 * s.t).round().astype("int64")) % 2**32
-    csv(folder, k, {"micros": micros, **renamed(s, POSE, SPEEDS, ACTS)})
-
-
-def whole_seconds(folder: Path, k: int, s: Any) -> None:
-    stamps = (START + pd.to_timedelta(np.floor(s.t), "s")).dt.strftime("%Y-%m-%d %H:%M:%S")
-    csv(folder, k, {"time": stamps, **renamed(s, POSE, SPEEDS, ACTS)})
-
-
 def summer_hour(folder: Path, k: int, s: Any) -> None:
     moments = pd.Timestamp("2024-10-27 00:59:20", tz="UTC") + pd.to_timedelta(s.t, "s")
     local = moments.dt.tz_convert("Europe/Berlin").dt.strftime("%d.%m.%Y %H:%M:%S.%f").str[:-4]
     csv(folder, k, {"Zeit": local, **renamed(s, POSE, SPEEDS, ACTS)})
-
-
-def magnetic(folder: Path, k: int, s: Any) -> None:
-    pose = {**POSE, "heading": "compass heading [deg]"}
-    csv(folder, k, {"time [s]": s.t, **renamed(s, pose, ACTS)})
 
 
 def bridge(folder: Path, k: int, s: Any) -> None:
@@ -497,10 +484,6 @@ def topic_echo(folder: Path, k: int, s: Any) -> None:
     (folder / f"pose{k}.txt").write_text("\n".join(lines) + "\n")
 
 
-def newest_first(folder: Path, k: int, s: Any) -> None:
-    csv(folder, k, {"time [s]": s.t[::-1], **renamed(s[::-1], POSE, ACTS)})
-
-
 def three_files(folder: Path, k: int, s: Any) -> None:
     """Three recorders with Unix time and rates of their own; the trip stands first in the names."""
     for word, every, columns in (
@@ -617,34 +600,27 @@ def json_document(folder: Path, k: int, s: Any) -> None:
     (folder / f"run{k}.json").write_text(json.dumps(document))
 
 
-LAYOUTS: dict[str, Callable[[Path, int, pd.DataFrame], None]] = {
+LAYOUTS: dict[str, Callable[[Path, int, Any], None]] = {
     layout.__name__: layout
     for layout in (
-        *(plain, pandas_index, heading_interpolated, dead_gyro, no_pose, surge_alone, with_roll),
-        *(micros_wrap, whole_seconds, summer_hour, magnetic, bridge, rostopic, moos_alog, cut),
-        *(two_files, several_rates, excel, json_lines, mat_arrays, rows_npy, bag_topics),
-        *(
-            course_alone,
-            nothing_known,
-            two_boats,
-            savetxt,
-            quotients,
-            marks_for_nothing,
-            begun_anew,
-        ),
-        *(plotjuggler, chart_plotter, voyage_recorder, labview, parquet_index, ulog_csv),
-        *(long_rows, file_a_channel, hdf5_trials),
-        *(yaw_alone, speed_and_heading),
-        *(portuguese, polish, chinese, russian, signal_k, topic_echo, newest_first, three_files),
-        *(lever, frames_in_names, to_port, parts_of_time, totals, minutes_apart),
-        *(on_change, packed_clock, side_by_side, korean, units_in_cells, json_document),
+        *(pandas_index, heading_interpolated, micros_wrap, summer_hour, bridge, rostopic),
+        *(moos_alog, cut, two_files, several_rates, excel, json_lines, mat_arrays, rows_npy),
+        *(bag_topics, course_alone, nothing_known, two_boats, savetxt, quotients),
+        *(marks_for_nothing, begun_anew, plotjuggler, chart_plotter, voyage_recorder, labview),
+        *(parquet_index, ulog_csv, long_rows, file_a_channel, hdf5_trials, portuguese, polish),
+        *(chinese, russian, signal_k, topic_echo, three_files, lever, frames_in_names, to_port),
+        *(parts_of_time, totals, minutes_apart, on_change, packed_clock, side_by_side, korean),
+        *(units_in_cells, json_document),
     )
 }
 
 if __name__ == "__main__":
     for number in COMMANDS:
         trip(number)[::5].round(6).to_csv(HERE / f"truth_{number}.csv", index=False)
-    for name in sys.argv[1:] or LAYOUTS:
+    for name in sys.argv[1:] or (*TABLES, *LAYOUTS):
         (HERE / name).mkdir(exist_ok=True)
         for number in COMMANDS:
-            LAYOUTS[name](HERE / name, number, seen(number))
+            if name in TABLES:
+                csv(HERE / name, number, TABLES[name](seen(number)))
+            else:
+                LAYOUTS[name](HERE / name, number, seen(number))

@@ -20,7 +20,6 @@ from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.reading import read_drafted
 from residnet.data.drafting.tables import draft_tables
-from residnet.data.drafting.words import state_channel, words_of
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers import ReaderConfig
 
@@ -253,13 +252,6 @@ def test_n_beside_e_is_north(names: tuple[str, str], log: Log, tmp_path: Path) -
         np.testing.assert_allclose(read[name], log[name], atol=1e-9)
     np.testing.assert_allclose(read["n"], log["cmd_n"], atol=1e-9)
     assert _guessed(marks, "x")
-
-
-@pytest.mark.parametrize(
-    ("column", "channel"), [("Nordwert [m]", "x"), ("Ostwert [m]", "y"), ("Ostkoordinate", "y")]
-)
-def test_german_compounds_of_north_and_east(column: str, channel: str) -> None:
-    assert state_channel(words_of(column)) == channel
 
 
 def test_records_beside_each_other_are_told_from_vessels(log: Log, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import written_logs
+import written_recorders
 from written_logs import COMMANDS, EPOCH, outcome, reader_for, recording_for, trial
 
 from residnet.core.config import validate
@@ -63,7 +64,7 @@ def test_tables(write: Writer, tmp_path: Path) -> None:
 def test_recordings_that_describe_themselves(write: Writer, tmp_path: Path) -> None:
     log = trial()
     path = write(log, tmp_path)
-    read = reader_for(path).read(path)
+    read = validate({"kind": "auto"}, ReaderConfig, "test").build().read(path)
     assert_same(read, log)
     assert len(read.meta["sha256"]) == 64
     assert all(finding["level"] == "note" for finding in read.meta["findings"]), read.meta[
@@ -112,14 +113,6 @@ def test_channel_maps_of_topics(write: Writer, tmp_path: Path) -> None:
         },
     }
     assert_same(validate(config, ReaderConfig, "test").build().read(path), log)
-
-
-@pytest.mark.parametrize("write", [*TREES, *BAGS])
-def test_one_config_reads_any_of_them(write: Writer, tmp_path: Path) -> None:
-    log = trial()
-    assert_same(
-        validate({"kind": "auto"}, ReaderConfig, "test").build().read(write(log, tmp_path)), log
-    )
 
 
 @pytest.mark.parametrize("write", BAGS)
@@ -177,9 +170,12 @@ def test_several_experiments_in_one_file(tmp_path: Path) -> None:
     assert "several_tables" in {finding["code"] for finding in both.meta["findings"]}
 
 
-@pytest.mark.parametrize("write", [*TREES, *BAGS])
+RECORDERS = [written_recorders.nmea, written_recorders.ulog, written_recorders.ardupilot]
+
+
+@pytest.mark.parametrize("write", [*TREES, *BAGS, *RECORDERS])
 def test_truncated_files_end_in_one_line(write: Writer, tmp_path: Path) -> None:
-    path = write(trial(), tmp_path)
+    path = write(trial(3.0), tmp_path)
     if path.is_dir():
         path = max(
             (file for file in path.iterdir() if file.suffix != ".yaml"),
@@ -188,7 +184,7 @@ def test_truncated_files_end_in_one_line(write: Writer, tmp_path: Path) -> None:
     if path.suffix == ".csv":
         return
     whole = path.read_bytes()
-    for share in (0.0, 0.1, 0.5, 0.99):
+    for share in (0.0, 0.02, 0.1, 0.3, 0.5, 0.9, 0.99):
         path.write_bytes(whole[: int(share * len(whole))])
         said = outcome(path)
         assert said is None or ("\n" not in said and path.name in said)
@@ -214,11 +210,19 @@ def test_a_missing_package_is_named_with_its_extra(
         reader_for(path).read(path)
 
 
-def test_formats_by_content(tmp_path: Path) -> None:
-    path = written_logs.bag1(trial(2.0), tmp_path).rename(tmp_path / "bag")
-    found = format_of(path)
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (written_logs.bag1, "ROS 1 bag"),
+        (written_recorders.nmea, "NMEA 0183"),
+        (written_recorders.ulog, "PX4 ULog"),
+        (written_recorders.ardupilot, "ArduPilot log"),
+    ],
+)
+def test_formats_by_content(write: Writer, name: str, tmp_path: Path) -> None:
+    found = format_of(write(trial(2.0), tmp_path).rename(tmp_path / "recording"))
     assert found is not None
-    assert found.name == "ROS 1 bag"
+    assert found.name == name
     (tmp_path / "table.csv").write_text("a,b\n1,2\n")
     assert format_of(tmp_path / "table.csv") is None
     with pytest.raises(UsageError, match="give a channel map"):

@@ -75,20 +75,6 @@ def test_one_map_from_every_door(files: list[Path], logs: list[Log]) -> None:
             np.testing.assert_allclose(log[name], truth[name], atol=1e-6 * size, err_msg=name)
 
 
-def test_every_door_keeps_roll(logs: list[Log], tmp_path: Path) -> None:
-    files = foreign_tables.write(logs, tmp_path / "logs", STYLES["English with units"])
-    for file in files:
-        table = pd.read_csv(file)
-        time = table.iloc[:, 0].to_numpy()
-        rolled = {"phi [deg]": 5.0 * np.sin(time), "p [deg/s]": 5.0 * np.cos(time)}
-        table.assign(**rolled).to_csv(file, index=False)
-    found = _doors(files)
-    for door, reader in found.items():
-        assert reader == found["new"], door
-        units = {name: reader["channels"][name]["unit"] for name in ("phi", "p")}
-        assert units == {"phi": "deg", "p": "deg/s"}, door
-
-
 def test_no_log_is_lost_for_a_roll_that_not_all_of_them_hold(tmp_path: Path) -> None:
     t = np.arange(0.0, 20.0, 0.1)
     for number in range(3):

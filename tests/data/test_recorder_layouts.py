@@ -17,7 +17,6 @@ from residnet.core.layout import SIX, Live
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
-from residnet.data.drafting.words import input_channel, state_channel, words_of
 from residnet.data.readers import ReaderConfig
 from residnet.data.split import stretch_of
 from residnet.tasks.drafting import driving
@@ -90,14 +89,6 @@ def test_an_empty_cell_at_the_end_of_lines(tmp_path: Path) -> None:
         path = tmp_path / "log.csv"
         path.write_text("\r\n".join(lines) + "\r\n", encoding="utf-8-sig")
         assert same(drafted(path)[0])
-
-
-def test_columns_between_blanks(tmp_path: Path) -> None:
-    path = tmp_path / "log.dat"
-    path.write_text("\n".join(line.replace(";", "   ") for line in text(COLUMNS, ";", UNITS)))
-    log, content, _ = drafted(path)
-    assert content["delimiter"] == " "
-    assert same(log)
 
 
 def test_a_line_is_called_by_its_number_in_the_file(tmp_path: Path) -> None:
@@ -187,34 +178,6 @@ def test_what_is_no_table_is_refused_in_one_line(content: bytes, said: str, tmp_
     with pytest.raises(DataError, match=said) as refused:
         draft_tables([path], Marks())
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("column", "channel"),
-    [
-        ("Battery_V", None),
-        ("Motordrehzahl [1/min]", "n"),
-        ("engine temperature [°C]", None),
-        ("engine load", None),
-        ("oil pressure main engine", None),
-        ("speed through water", "speed"),
-        ("pos_n", "x"),
-        ("Gyro [deg]", "psi"),
-        ("twist.linear.x", "u"),
-        ("pose.twist.linear.y", "v"),
-        ("twist.linear.z", None),
-        ("erpm", "n"),
-        ("Longitudine", "longitude"),
-        ("Long. speed", "u"),
-        ("Stävriktning", "psi"),
-        ("船首角", "psi"),
-        ("旋回角速度", "r"),
-        ("Gashendel", "throttle"),
-    ],
-)
-def test_what_recorders_call_columns(column: str, channel: str | None) -> None:
-    words = words_of(column)
-    assert (state_channel(words) or input_channel(words)) == channel
 
 
 def test_a_second_compass_is_no_input() -> None:

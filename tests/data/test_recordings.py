@@ -61,21 +61,6 @@ def test_commands_hold_measurements_are_interpolated_gaps_stay_gaps(tmp_path: Pa
     )
 
 
-def test_units(tmp_path: Path) -> None:
-    t = 0.1 * np.arange(20)
-    place = folder(tmp_path, a={"time": t, "data": np.full(20, 90.0)})
-    units = {
-        "u": ("kn", 90 * 1852 / 3600),
-        "psi_ref": ("deg", np.pi / 2),
-        "n": ("rpm", 1.5),
-        "n_port": ("rps", 90.0),
-        "throttle": ("%", 0.9),
-    }
-    log = read(place, channels={name: field("a", unit) for name, (unit, _) in units.items()})
-    for name, (_, value) in units.items():
-        np.testing.assert_allclose(log[name], value)
-
-
 def circle(t: np.ndarray) -> dict[str, np.ndarray]:
     """A vessel on a circle of 20 m, bow along the track: u = 2 m/s, v = 0, r = 0.1 rad/s; x, y of
     its centre.

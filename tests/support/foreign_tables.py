@@ -29,73 +29,21 @@ FACTORS = {
     "U/min": 60.0,
 }
 NAMES = {
-    "English": ("time", "north", "east", "heading", "surge", "sway", "yaw rate", "rudder", "n"),
-    "German": (
-        "Zeit",
-        "Nord",
-        "Ost",
-        "Kurs",
-        "Längsgeschwindigkeit",
-        "Quergeschwindigkeit",
-        "Drehrate",
-        "Ruderwinkel",
-        "Propellerdrehzahl",
-    ),
-    "French": (
-        "temps",
-        "position nord",
-        "position est",
-        "cap",
-        "vitesse d'avance",
-        "vitesse latérale",
-        "vitesse de lacet",
-        "angle de barre",
-        "régime hélice",
-    ),
-    "Spanish": (
-        "tiempo",
-        "norte",
-        "este",
-        "rumbo",
-        "velocidad de avance",
-        "velocidad lateral",
-        "velocidad de giro",
-        "ángulo de timón",
-        "revoluciones hélice",
-    ),
-    "Dutch": (
-        "tijd",
-        "noord",
-        "oost",
-        "koers",
-        "snelheid vooruit",
-        "snelheid dwars",
-        "draaisnelheid",
-        "roerhoek",
-        "toerental",
-    ),
-    "Norwegian": (
-        "tid",
-        "nord",
-        "øst",
-        "kurs",
-        "hastighet fremover",
-        "hastighet tverrskips",
-        "svinghastighet",
-        "rorvinkel",
-        "turtall",
-    ),
-    "Japanese": (
-        "時刻",
-        "北",
-        "東",
-        "船首方位",
-        "前後速度",
-        "左右速度",
-        "回頭角速度",
-        "舵角",
-        "プロペラ回転数",
-    ),
+    language: tuple(names.split("|"))
+    for language, names in {
+        "English": "time|north|east|heading|surge|sway|yaw rate|rudder|n",
+        "German": "Zeit|Nord|Ost|Kurs|Längsgeschwindigkeit|Quergeschwindigkeit|Drehrate"
+        "|Ruderwinkel|Propellerdrehzahl",
+        "French": "temps|position nord|position est|cap|vitesse d'avance|vitesse latérale"
+        "|vitesse de lacet|angle de barre|régime hélice",
+        "Spanish": "tiempo|norte|este|rumbo|velocidad de avance|velocidad lateral"
+        "|velocidad de giro|ángulo de timón|revoluciones hélice",
+        "Dutch": "tijd|noord|oost|koers|snelheid vooruit|snelheid dwars|draaisnelheid"
+        "|roerhoek|toerental",
+        "Norwegian": "tid|nord|øst|kurs|hastighet fremover|hastighet tverrskips|svinghastighet"
+        "|rorvinkel|turtall",
+        "Japanese": "時刻|北|東|船首方位|前後速度|左右速度|回頭角速度|舵角|プロペラ回転数",
+    }.items()
 }
 CHANNELS = ("x", "y", "psi", "u", "v", "r", "delta", "n")
 

@@ -46,13 +46,10 @@ def moos(log: Log, folder: Path) -> Path:
     return path
 
 
-def nmea(log: Log, folder: Path, *, prefix: bool = False) -> Path:
-    """RMC, HDT and ROT, in this order at every sample; `prefix` writes the logger's time in front
-    of each line.
-    """
+def nmea(log: Log, folder: Path) -> Path:
+    """RMC, HDT and ROT, in this order at every sample."""
     latitude, longitude = geodetic(log)
-    north = log["u"] * np.cos(log["psi"]) - log["v"] * np.sin(log["psi"])
-    east = log["u"] * np.sin(log["psi"]) + log["v"] * np.cos(log["psi"])
+    north, east = _over_ground(log)
     lines = []
     for i, t in enumerate(log.t.tolist()):
         clock = 9 * 3600 + 15 * 60 + 45 + t
@@ -67,10 +64,7 @@ def nmea(log: Log, folder: Path, *, prefix: bool = False) -> Path:
             f"HEHDT,{np.degrees(log['psi'][i]) % 360:.6f},T",
             f"HEROT,{np.degrees(log['r'][i]) * 60:.6f},A",
         ]
-        start = f"2025-04-11T09:15:{45 + t:09.6f}Z " if prefix and 45 + t < 60 else ""
-        lines += [
-            f"{start}${text}*{reduce(lambda a, b: a ^ b, text.encode()):02X}" for text in sentences
-        ]
+        lines += [f"${text}*{reduce(lambda a, b: a ^ b, text.encode()):02X}" for text in sentences]
     path = folder / "trial.nmea"
     path.write_text("\r\n".join(lines) + "\r\n")
     return path
@@ -95,14 +89,12 @@ def ulog(log: Log, folder: Path) -> Path:
     body += b"".join(
         _message("A", struct.pack("<BH", 0, i) + name.encode()) for i, name in enumerate(formats)
     )
+    north, east = _over_ground(log)
     for i, t in enumerate(log.t.tolist()):
         at, psi = BOOT + round(t * 1e6), log["psi"][i]
-        vx, vy = (
-            log["u"][i] * np.cos(psi) - log["v"][i] * np.sin(psi),
-            log["u"][i] * np.sin(psi) + log["v"][i] * np.cos(psi),
-        )
         sign = -1.0 if i % 7 == 0 else 1.0
-        rows = [struct.pack("<Qffffd", at, log["x"][i], log["y"][i], vx, vy, log["x"][i])]
+        motion = (log["x"][i], log["y"][i], north[i], east[i], log["x"][i])
+        rows = [struct.pack("<Qffffd", at, *motion)]
         rows.append(
             struct.pack("<Q4d", at, sign * np.cos(psi / 2), 0.0, 0.0, sign * np.sin(psi / 2))
         )
@@ -129,43 +121,22 @@ def ardupilot(log: Log, folder: Path) -> Path:
         (3, "IMU", "Qdd", "TimeUS,GyrX,GyrZ", 0),
         (4, "XKF1", "Qdddd", "TimeUS,PN,PE,VN,VE", 0),
     ]
-    size = {"Q": 8, "B": 1, "I": 4, "H": 2, "c": 2, "L": 4, "e": 4, "f": 4, "d": 8}
-    body = b""
-    for number, name, kinds, columns, length in formats:
-        whole = length or 3 + sum(size[kind] for kind in kinds)
-        body += b"\xa3\x95\x80" + struct.pack(
-            "<BB4s16s64s", number, whole, name.encode(), kinds.encode(), columns.encode()
-        )
+    body = _formats(formats)
+    north, east = _over_ground(log)
     # GPS time: weeks since 6 January 1980, 18 leap seconds ahead of UTC
     gps = EPOCH - 315_964_800 + 18
     for i, t in enumerate(log.t.tolist()):
         at, psi = BOOT + round(t * 1e6), log["psi"][i]
-        vn, ve = (
-            log["u"][i] * np.cos(psi) - log["v"][i] * np.sin(psi),
-            log["u"][i] * np.sin(psi) + log["v"][i] * np.cos(psi),
-        )
         if i % 2 == 0:
             ms = (gps % 604_800) * 1000 + round(t * 1e3)
-            body += b"\xa3\x95\x01" + struct.pack(
-                "<QBIHBhiiiffffB",
-                at,
-                3,
-                ms,
-                gps // 604_800,
-                12,
-                80,
-                634411000,
-                104198000,
-                0,
-                np.hypot(vn, ve),
-                0.0,
-                0.0,
-                0.0,
-                1,
-            )
+            speed = float(np.hypot(north[i], east[i]))
+            fix = (gps // 604_800, 12, 80, 634411000, 104198000, 0, speed, 0.0, 0.0, 0.0, 1)
+            body += b"\xa3\x95\x01" + struct.pack("<QBIHBhiiiffffB", at, 3, ms, *fix)
         body += b"\xa3\x95\x02" + struct.pack("<Qff", at, 0.0, np.degrees(psi) % 360)
         body += b"\xa3\x95\x03" + struct.pack("<Qdd", at, 0.0, log["r"][i])
-        body += b"\xa3\x95\x04" + struct.pack("<Qdddd", at, log["x"][i], log["y"][i], vn, ve)
+        body += b"\xa3\x95\x04" + struct.pack(
+            "<Qdddd", at, log["x"][i], log["y"][i], north[i], east[i]
+        )
     path = folder / "trial.bin"
     path.write_bytes(body)
     return path
@@ -185,11 +156,7 @@ def ardupilot_2014(log: Log, folder: Path) -> Path:
         (2, "ATT", "Iccf", "TimeMS,DesRoll,Roll,Yaw", 15),
         (3, "IMU", "Ifff", "TimeMS,GyrX,GyrY,GyrZ", 19),
     ]
-    body = b""
-    for number, name, kinds, columns, length in formats:
-        body += b"\xa3\x95\x80" + struct.pack(
-            "<BB4s16s64s", number, length, name.encode(), kinds.encode(), columns.encode()
-        )
+    body = _formats(formats)
     latitude, longitude = geodetic(log)
     gps = EPOCH - 315_964_800 + 18
     for i, t in enumerate(log.t.tolist()):
@@ -206,6 +173,29 @@ def ardupilot_2014(log: Log, folder: Path) -> Path:
     path = folder / "trial.bin"
     path.write_bytes(body)
     return path
+
+
+def _over_ground(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities along north and east."""
+    c, s = np.cos(log["psi"]), np.sin(log["psi"])
+    return log["u"] * c - log["v"] * s, log["u"] * s + log["v"] * c
+
+
+def _formats(formats: list[tuple[int, str, str, str, int]]) -> bytes:
+    """What tells of the messages of an ArduPilot log: number, name, types, columns and length."""
+    size = {"Q": 8, "B": 1, "I": 4, "H": 2, "c": 2, "L": 4, "e": 4, "f": 4, "d": 8}
+    return b"".join(
+        b"\xa3\x95\x80"
+        + struct.pack(
+            "<BB4s16s64s",
+            number,
+            length or 3 + sum(size[kind] for kind in kinds),
+            name.encode(),
+            kinds.encode(),
+            columns.encode(),
+        )
+        for number, name, kinds, columns, length in formats
+    )
 
 
 def _message(kind: str, content: bytes) -> bytes:
