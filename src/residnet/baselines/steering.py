@@ -284,7 +284,6 @@ class LinearSteadyConfig(SteeredConfig):
         return [replace(found, notes={"steady_states": states, "steady_constraints": phi})]
 
     def _dynamic(self, samples: Samples, kinds: tuple[str, ...]) -> Samples:
-        """Return the samples of some kinds of manoeuvre."""
         dynamic = samples.of_kinds(kinds)
         if len(dynamic) == 0:
             raise FitError(

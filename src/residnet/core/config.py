@@ -576,19 +576,16 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
                 else f"expected {context['expected']} {given(value)}"
             )
         case "value_error" | "assertion_error":
-            text = _own_text(str(context["error"]), value)
+            text = str(context["error"])
+            # a validator of a whole section has said which of its keys it means; the section
+            # itself would only fill the line
+            scalar = isinstance(value, (str, int, float)) and "(given " not in text
+            text = f"{text} {given(value)}" if scalar else text
         case _ if kind in _EXPECTED:
             text = f"expected {_EXPECTED[kind]} {given(value)}"
         case _:
             text = f"{details['msg'].replace('Input should', 'must')} {given(value)}"
     return _Fault(kind, path, text)
-
-
-def _own_text(text: str, value: Any) -> str:
-    # a validator of a whole section has said which of its keys it means; the section itself would
-    # only fill the line
-    scalar = isinstance(value, (str, int, float)) and "(given " not in text
-    return f"{text} {given(value)}" if scalar else text
 
 
 def given(value: Any) -> str:

@@ -10,7 +10,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,11 +42,12 @@ def whole(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         partial.replace(path)
-    except OSError as error:
-        _discard(partial)
-        raise not_written(path, error) from error
-    except BaseException:
-        _discard(partial)
+    except BaseException as error:
+        # where the folder itself cannot be written, the error under way says so
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise not_written(path, error) from error
         raise
 
 
@@ -171,14 +172,6 @@ def not_written(path: Path, error: OSError) -> UsageError:
     return UsageError(
         f"{path}: cannot be written ({reason}); make room or give a place that can be written"
     )
-
-
-def _discard(partial: Path) -> None:
-    try:
-        partial.unlink(missing_ok=True)
-    except OSError:
-        # the folder itself cannot be written; the error under way says so
-        return
 
 
 def config_folder() -> Path:

@@ -70,16 +70,6 @@ class StateLayout:
         """Columns of the velocities and of the angles behind them."""
         return slice(len(self.pose), len(self.names))
 
-    @property
-    def motion_columns(self) -> slice:
-        """Columns of pose, velocities and angles."""
-        return slice(0, len(self.names))
-
-    @property
-    def actuator_columns(self) -> slice:
-        """Columns of what follows: states of actuators and the like."""
-        return slice(len(self.names), None)
-
 
 PLANAR = StateLayout(names.POSE, names.VELOCITY)
 """Three degrees of freedom: x, y, psi, u, v, r."""
@@ -395,10 +385,10 @@ ALIVE = Live()
 
 POSE = PLANAR.pose_columns
 VELOCITIES = PLANAR.velocity_columns
-MOTION = PLANAR.motion_columns
+MOTION = slice(0, len(PLANAR.names))
 ACCELERATIONS = slice(MOTION.stop, MOTION.stop + PLANAR.dof)
 """Of a motion with accelerations, which stand behind pose and velocities."""
-ACTUATORS = PLANAR.actuator_columns
+ACTUATORS = slice(MOTION.stop, None)
 MOVING = slice(POSE.stop, None)
 """Of a free run: what moves."""
 BESIDE = slice(MOTION.stop, None)

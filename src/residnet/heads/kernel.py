@@ -151,13 +151,11 @@ class KernelHead(ClosedFormHead):
         return [self._named(solution) for solution in found]
 
     def _named(self, solution: Solution) -> Solution:
-        """Return the solution in the names of this head's state."""
-        out = solution.prefixed("kernel")
-        state = dict(out.state)
-        state["effective"] = state.pop("kernel.effective")
+        own = {"effective": "effective"}
+        state = {own.get(name, f"kernel.{name}"): value for name, value in solution.state.items()}
         make = solution.neighbours
         neighbours = None if make is None else lambda: [self._named(near) for near in make()]
-        return replace(out, state=state, neighbours=neighbours)
+        return replace(solution, state=state, neighbours=neighbours)
 
     def _recursion_errors(self, recursion: Recursion, paths: Sequence[Path]) -> Tensor:
         """Return mean square errors of velocities that run alone, [settings, penalties, n]."""

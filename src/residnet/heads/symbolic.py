@@ -321,7 +321,6 @@ class SymbolicHead(EquationHead):
         return Past(chosen, target, unbroken_stretches(group, t, step), step)
 
     def _fit(self, past: Past, gammas: Sequence[float] = ()) -> list[Solution]:
-        """Return the solutions of a sparse regression of all axes."""
         with torch.no_grad():
             terms = self.basis(torch.from_numpy(past.chosen)).numpy()
         rows = self.config.estimator.rows(Rows(terms, past.target, past.stretch), past.step)
@@ -375,7 +374,6 @@ class SymbolicHead(EquationHead):
         return tried[-1], {"delay": notes}
 
     def _complete(self, solution: Solution, steps: int, delay: dict[str, Any]) -> Solution:
-        """Return the solution with its delay, and with its equations in writing."""
         equations = {
             name: self._written(name, [c for c in solution.table if c.axis == name], steps) | about
             for name, about in solution.notes["equations"].items()
@@ -388,7 +386,6 @@ class SymbolicHead(EquationHead):
         )
 
     def _written(self, name: str, terms: Sequence[Coefficient], steps: int) -> dict[str, str]:
-        """Return one equation in writing."""
         channels = self.features.names
         weights = [entry.value for entry in terms]
         factors = [

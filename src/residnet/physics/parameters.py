@@ -43,8 +43,6 @@ def measured_in(unit: str) -> Callable[[Parameter], Parameter]:
     """Return a validator of a parameter whose unit must measure `unit`.
 
     The validator converts the value to `unit`.
-
-    The value is converted to it.
     """
 
     def convert(parameter: Parameter) -> Parameter:

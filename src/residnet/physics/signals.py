@@ -319,7 +319,4 @@ class VelocityBound(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz]."""
-        near = z[..., : self.dof]
-        low, high = self.low[: self.dof].to(z.dtype), self.high[: self.dof].to(z.dtype)
-        held = torch.where(near > high, high, torch.where(near < low, low, near))
-        return self.rate.to(z.dtype) * (held - near)
+        return self.back(self.held(z), z)

@@ -471,13 +471,8 @@ def _products(names: Sequence[str], degree: int, *, magnitudes: bool = False) ->
             if all(chosen.count((name, True)) <= 1 for name in names):
                 out.append(
                     " ".join(
-                        _power(name, bars, chosen.count((name, bars)))
+                        Factor(name, bars, chosen.count((name, bars))).text
                         for name, bars in dict.fromkeys(chosen)
                     )
                 )
     return out
-
-
-def _power(name: str, bars: bool, power: int) -> str:
-    symbol = f"|{name}|" if bars else name
-    return symbol if power == 1 else f"{symbol}^{power}"

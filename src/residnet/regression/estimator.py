@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, final
 
 import torch
@@ -105,15 +105,6 @@ class Solution:
     def predict(self, x: Tensor) -> Tensor:
         """Return the outputs [N, n] of a linear solution at inputs [N, J]."""
         return x @ self.coefficients + self.intercept
-
-    def prefixed(self, prefix: str) -> Solution:
-        """Return the solution for a module that holds the fitted one under the name `prefix`."""
-        make = self.neighbours
-        return replace(
-            self,
-            state={f"{prefix}.{name}": value for name, value in self.state.items()},
-            neighbours=None if make is None else lambda: [near.prefixed(prefix) for near in make()],
-        )
 
 
 @final

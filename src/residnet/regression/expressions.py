@@ -300,7 +300,7 @@ _VALUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 class Table(nn.Module):
     """A module whose buffers take the shapes of what is loaded.
 
-    How many terms an equation has is known only from the data.
+    How many terms an equation has, or samples a kernel, is known only from the data.
     """
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:

@@ -248,7 +248,6 @@ class Fitness:
         self._usable = torch.cat((self._usable, torch.from_numpy(good)))
 
     def _batch(self, group: Sequence[Terms]) -> None:
-        """Fit sets of as many terms each."""
         columns = self._values[torch.tensor([[self._rows[p] for p in terms] for terms in group])]
         x, x_validation = columns[..., : self.count], columns[..., self.count :]
         gram = x @ x.transpose(1, 2) / self.count
@@ -675,7 +674,6 @@ def validating(group: np.ndarray, every: int) -> np.ndarray:
 
 
 def _written(algebra: Algebra, name: str, bred: Bred) -> dict[str, Any]:
-    """Return one equation in writing, with the course of its search."""
     text = total([term(algebra, product) for product in bred.products], bred.values)
     value = symbolic_sum(algebra, list(zip(bred.products, bred.values, strict=True)))
     return {

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
-from math import factorial
+from math import factorial, prod
 from typing import Annotated, Any, Literal, NamedTuple, final
 
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.regression.estimator import Data, Estimator, Solution, fold_numbers, whole
+from residnet.regression.expressions import Table
 
 _RANK = 1e-12
 """Eigenvalues of the landmarks' kernel below this share of the largest are rounding."""
@@ -148,7 +150,7 @@ def _weights(factor: Tensor, outputs: int, penalties: Sequence[float]) -> tuple[
     return weights, torch.stack([(values * share).sum() for share in shrunk])
 
 
-class Kernel(nn.Module, ABC):
+class Kernel(Table, ABC):
     """A function f(x) [..., n] of inputs [..., F]: features of a kernel times coefficients."""
 
     @abstractmethod
@@ -259,16 +261,6 @@ class RbfKernel(Kernel):
             "coefficients": torch.zeros(0, self.outputs, dtype=torch.float64),
         }
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        # how many samples carry the function is known only from the data
-        for name in ("points", "coefficients"):
-            stored = state_dict.get(prefix + name)
-            if stored is not None:
-                present = getattr(self, name)
-                empty = torch.zeros(stored.shape, dtype=present.dtype, device=present.device)
-                setattr(self, name, empty)
-        super()._load_from_state_dict(state_dict, prefix, *rest)
-
 
 @final
 class PolynomialKernel(Kernel):
@@ -282,12 +274,13 @@ class PolynomialKernel(Kernel):
         super().__init__()
         self.degree = config.degree
         chosen = list(combinations_with_replacement(range(count + 1), config.degree))
+        # multinomial coefficients
+        repeats = [prod(map(factorial, Counter(numbers).values())) for numbers in chosen]
+        weights = [factorial(config.degree) // count for count in repeats]
         self.index = nn.Buffer(
             torch.tensor(chosen, dtype=torch.long).T.contiguous(), persistent=False
         )
-        self.weight = nn.Buffer(
-            torch.tensor([_weight(c) for c in chosen], dtype=torch.float64).sqrt(), persistent=False
-        )
+        self.weight = nn.Buffer(torch.tensor(weights, dtype=torch.float64).sqrt(), persistent=False)
         self.coefficients = nn.Buffer(torch.zeros(len(chosen), outputs, dtype=torch.float64))
         self.slope, self.constant = config.slope**0.5, config.constant**0.5
 
@@ -392,14 +385,6 @@ def spread_out(x: Tensor, count: int, seed: int) -> Tensor:
         found.append(min(int(torch.searchsorted(total, draw, right=True)), len(x) - 1))
         nearest = torch.minimum(nearest, (x - x[found[-1]]).square().sum(-1))
     return torch.tensor(found)
-
-
-def _weight(chosen: tuple[int, ...]) -> float:
-    """Return the multinomial coefficient of a product of factors given by number."""
-    out = factorial(len(chosen))
-    for number in set(chosen):
-        out //= factorial(chosen.count(number))
-    return float(out)
 
 
 class Recursion:
@@ -536,7 +521,6 @@ class KernelRidge(Estimator):
         return [*(self._solution(paths, pick, notes) for pick in picks), nothing]
 
     def _solution(self, paths: Sequence[Path], pick: _Pick, notes: dict[str, Any]) -> Solution:
-        """Return the solution of one setting and penalty for each output."""
         parts = list(enumerate(zip(pick.settings, pick.penalties, strict=True)))
         columns = [paths[i].coefficients[j, :, output] for output, (i, j) in parts]
         effective = torch.stack([paths[i].effective[j] for _, (i, j) in parts])

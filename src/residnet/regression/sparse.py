@@ -569,7 +569,6 @@ class SparseRegression(Estimator):
         names: Sequence[str],
         outputs: Sequence[str],
     ) -> Solution:
-        """Return the solution of one search."""
         found = [find(part, output, search) for output, part in enumerate(reduced)]
         coefficients = torch.zeros(len(names), len(outputs), dtype=torch.float64)
         table: list[Coefficient] = []

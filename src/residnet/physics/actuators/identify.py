@@ -97,29 +97,19 @@ def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
     slope = top / reach
     flat = np.abs(n) > 0.97 * top
     saturated = flat.sum() >= _SATURATION_POINTS and np.ptp(np.abs(throttle[flat])) > 0.05 * reach
+    start, scale = [slope, 0.0], [slope, 0.1 * top]
     if saturated:
         free = ~flat
-        slope = (
-            float(np.polyfit(throttle[free], n[free], 1)[0])
-            if np.unique(throttle[free]).size >= 2
-            else slope
-        )
+        if np.unique(throttle[free]).size >= 2:
+            start[0] = scale[0] = float(np.polyfit(throttle[free], n[free], 1)[0])
+        start, scale = [*start, float(np.median(np.abs(n[flat])))], [*scale, top]
 
-        def residual(p: np.ndarray) -> np.ndarray:
-            return np.asarray(np.clip(p[0] * throttle + p[1], -p[2], p[2]) - n)
+    def residual(p: np.ndarray) -> np.ndarray:
+        most = p[2] if saturated else np.inf
+        return np.asarray(np.clip(p[0] * throttle + p[1], -most, most) - n)
 
-        value, error = _least_squares(
-            residual,
-            [slope, 0.0, float(np.median(np.abs(n[flat])))],
-            [slope, 0.1 * top, top],
-            n.size,
-        )
-    else:
-
-        def residual(p: np.ndarray) -> np.ndarray:
-            return np.asarray(p[0] * throttle + p[1] - n)
-
-        value, error = _least_squares(residual, [slope, 0.0], [slope, 0.1 * top], n.size)
+    value, error = _least_squares(residual, start, scale, n.size)
+    if not saturated:
         value, error = [*value, top], [*error, 0.0]
     slope_, offset, n_max = (
         Estimate(v, v - e, v + e, "1/s") for v, e in zip(value, error, strict=True)
