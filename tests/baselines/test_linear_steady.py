@@ -157,4 +157,3 @@ def test_what_is_missing_is_named() -> None:
         config.fit(config.build(NAMES), without(samples, ("acceleration_deceleration",)))
     with pytest.raises(FitError, match="zigzag"):
         config.fit(config.build(NAMES), without(samples, ("zigzag", "three_two_one_one")))
-

@@ -3,12 +3,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from made_samples import sampled
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from residnet.baselines.mmg import PARAMETERS, MMGBaseline, MMGConfig, usual_priors
 from residnet.core.errors import ConfigError
-from residnet.core.samples import Samples
 
 NAMES = ("u", "v", "r", "n", "delta")
 TANKER = {
@@ -134,9 +134,7 @@ def test_accelerations_of_a_known_ship_move_the_beliefs_to_it() -> None:
     z = channels(4000, 3)
     with torch.no_grad():
         target = truth(z) + 1e-5 * torch.from_numpy(np.random.default_rng(4).normal(size=(4000, 3)))
-    samples = Samples(
-        z, target, torch.zeros(4000, dtype=torch.long), torch.arange(4000) * 0.1, ("zigzag",), NAMES
-    )
+    samples = sampled(z, target, NAMES)
     baseline = config.build(NAMES)
     table = {c.term: c for c in config.fit(baseline, samples)}
     fresh = channels(200, 5)
@@ -160,4 +158,3 @@ def test_config_names_what_is_wrong() -> None:
         built(Y_w=(0.0, 1.0))
     with pytest.raises(ConfigError, match="'delta'"):
         MMGConfig.model_validate(TANKER).build(("u", "v", "r", "n"))
-

@@ -10,6 +10,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from made_samples import sampled
 
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.baselines.steering import NomotoConfig, NomotoSideslipConfig
@@ -38,15 +39,7 @@ def made(noise: float = 0.0, count: int = 600, groups: int = 12, seed: int = 0) 
         axis=1,
     )
     target += noise * rng.normal(size=target.shape) * [0.05, 0.02, 0.02]
-    group = torch.arange(count) * groups // count
-    return Samples(
-        torch.from_numpy(z),
-        torch.from_numpy(target),
-        group,
-        torch.zeros(count),
-        ("zigzag",) * groups,
-        NAMES,
-    )
+    return sampled(z, target, NAMES, groups=groups)
 
 
 def test_parameters_of_known_lags_are_exact() -> None:

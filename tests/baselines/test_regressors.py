@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from made_samples import sampled
 
 from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
@@ -36,11 +37,8 @@ def made(noise: float = 0.0, count: int = 400, groups: int = 8) -> Samples:
     rng = np.random.default_rng(0)
     z = rng.normal(size=(count, 5)) * [1, 0.3, 0.3, 300, 200]
     target = accelerations(z) + noise * rng.normal(size=(count, 3))
-    group = torch.arange(count) * groups // count
-    kinds = tuple("zigzag" if g % 2 else "constant" for g in range(groups))
-    return Samples(
-        torch.from_numpy(z), torch.from_numpy(target), group, torch.zeros(count), kinds, NAMES
-    )
+    kinds = ["zigzag" if g % 2 else "constant" for g in range(groups)]
+    return sampled(z, target, NAMES, groups=groups, kinds=kinds)
 
 
 def test_exact_coefficients_from_noise_free_samples() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from made_samples import sampled
 from sklearn.linear_model import Ridge
 from sklearn.preprocessing import PolynomialFeatures
 
@@ -14,7 +15,6 @@ from residnet.baselines.regressors import RegressorsConfig
 from residnet.baselines.sets import merged
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.samples import Samples
 from residnet.physics.terms import TermLibrary
 
 TANKER = ("u", "v", "r", "n", "delta", "wind_u", "wind_v", "wind_mag")
@@ -84,14 +84,7 @@ def test_a_ridge_polynomial_is_scikit_learn_s() -> None:
     names = ("u", "v", "r", "n", "delta")
     rng = np.random.default_rng(1)
     z, y = rng.normal(size=(300, 5)) + 0.5, rng.normal(size=(300, 3))
-    samples = Samples(
-        torch.from_numpy(z),
-        torch.from_numpy(y),
-        torch.arange(300) // 30,
-        torch.zeros(300),
-        ("made",) * 10,
-        names,
-    )
+    samples = sampled(z, y, names, groups=10)
     config = RegressorsConfig(sets=("polynomial_2",), ridge=0.05)
     baseline = config.build(names)
     config.fit(baseline, samples)
@@ -187,14 +180,7 @@ def test_each_of_several_penalties_is_the_fit_with_it() -> None:
     names = ("u", "v", "r", "n", "delta")
     rng = np.random.default_rng(2)
     z, y = rng.normal(size=(200, 5)), rng.normal(size=(200, 3))
-    samples = Samples(
-        torch.from_numpy(z),
-        torch.from_numpy(y),
-        torch.arange(200) // 20,
-        torch.zeros(200),
-        ("made",) * 10,
-        names,
-    )
+    samples = sampled(z, y, names, groups=10)
     several = RegressorsConfig(sets=("linear",), ridge=(0.0, 1e-2, 1.0))
     baseline = several.build(names)
     found = several.solutions(baseline, samples)
@@ -216,14 +202,7 @@ def test_a_penalty_decides_between_regressors_that_the_data_cannot_tell_apart() 
     rng = np.random.default_rng(3)
     z = rng.normal(size=(200, 5))
     z[:, 3] = 5 + abs(z[:, 3])
-    samples = Samples(
-        torch.from_numpy(z),
-        torch.from_numpy(z[:, :3]),
-        torch.arange(200) // 20,
-        torch.zeros(200),
-        ("made",) * 10,
-        names,
-    )
+    samples = sampled(z, z[:, :3], names, groups=10)
     plain, ridge = (
         RegressorsConfig(sets=("fossen", "astern")),
         RegressorsConfig(sets=("fossen", "astern"), ridge=1e-6),

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from made_samples import sampled
 
 from residnet.baselines.given import BelievedConfig
 from residnet.baselines.regressors import RegressorsConfig
@@ -69,10 +70,7 @@ def samples(mass_sign: float = 1.0, count: int = 3000, groups: int = 10) -> Samp
     )
     with torch.no_grad():
         tau = hull("milliampere_half").required(mass_sign * nu_dot, nu)
-    group = torch.arange(count) * groups // count
-    return Samples(
-        torch.cat((nu, tau), dim=-1), nu_dot, group, torch.zeros(count), ("zigzag",) * groups, NAMES
-    )
+    return sampled(torch.cat((nu, tau), dim=-1), nu_dot, NAMES, groups=groups)
 
 
 def spec(head: Any, name: str = "force") -> ModelSpec:

@@ -12,7 +12,7 @@ import sympy
 import torch
 from made_equations import CHANNELS, draw_ship
 from made_odin import FORCE_TRUTH, MSD_TRUTH, force_logs, msd_log
-from made_samples import NAMES, made
+from made_samples import NAMES, made, sampled
 
 from residnet.baselines.given import StillConfig
 from residnet.core.config import validate
@@ -45,16 +45,8 @@ def _deap() -> None:
 
 
 def samples(log: dict[str, np.ndarray]) -> Samples:
-    z = torch.from_numpy(np.stack([log[name] for name in FORCES], axis=1))
-    target = torch.from_numpy(np.stack([log[name] for name in ACCELERATION], axis=1))
-    return Samples(
-        z,
-        target,
-        torch.zeros(len(z), dtype=torch.long),
-        torch.from_numpy(log["t"]),
-        ("made",),
-        FORCES,
-    )
+    z, target = (np.stack([log[n] for n in names], axis=1) for names in (FORCES, ACCELERATION))
+    return sampled(z, target, FORCES, t=log["t"])
 
 
 def test_force_equations_of_odin() -> None:

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from made_samples import NAMES, channels, made
+from made_samples import NAMES, channels, made, sampled
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.metrics.pairwise import rbf_kernel
 
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.samples import Samples
 from residnet.heads.kernel import KernelConfig, KernelHead
 from residnet.regression.kernel import Polynomial, Rbf, spread_out
 
@@ -247,16 +246,8 @@ def test_recursion_is_a_free_run_of_one_velocity() -> None:
             -z[k, 2] + 0.4 * z[k, 1],
         ] + 0.05 * random.normal(size=3)
         z[k + 1, :3] = z[k, :3] + step * rates[k]
-    group = np.repeat([0, 1], 30)
     t = step * np.concatenate((np.arange(30), np.arange(30)))
-    made_here = Samples(
-        torch.from_numpy(z),
-        torch.from_numpy(rates),
-        torch.from_numpy(group),
-        torch.from_numpy(t),
-        ("a", "b"),
-        names,
-    )
+    made_here = sampled(z, rates, names, groups=2, t=t)
     penalties = (1e-3, 1.0)
     head = KernelConfig(
         kernel=Rbf(sigma=(2.0, 20.0)),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from made_samples import NAMES, made
+from made_samples import NAMES, made, sampled
 from sklearn.cross_decomposition import PLSRegression
 from sklearn.linear_model import Ridge
 
@@ -200,8 +201,7 @@ def test_columns_that_say_nothing_get_nothing(kind: Any) -> None:
     z = torch.randn(400, 5, generator=random, dtype=torch.float64)
     z[:, 3] = 0.1
     target = z[:, :3] @ torch.randn(3, 3, generator=random, dtype=torch.float64)
-    group = torch.arange(400) // 40
-    of = Samples(z, target, group, torch.zeros(400), ("a",) * 10, NAMES)
+    of = sampled(z, target, NAMES, groups=10)
 
     def solved(terms: tuple[str, ...], samples: Samples = of) -> tuple[BasisHead, np.ndarray]:
         head = calibrated(kind(terms=terms, choose="one_step"), samples)
@@ -218,8 +218,8 @@ def test_columns_that_say_nothing_get_nothing(kind: Any) -> None:
     spoiled = z.clone()
     spoiled[7, 0] = torch.nan
     with pytest.raises(FitError, match="channel 'u' is not finite at sample 7"):
-        solved(("v", "u"), Samples(spoiled, target, group, of.t, of.kinds, NAMES))
+        solved(("v", "u"), replace(of, z=spoiled))
     with pytest.raises(FitError, match="samples do not determine"):
         solved((), of.where(torch.arange(400) % 40 == 0))
     with pytest.raises(FitError, match="one run or segment only"):
-        solved(("u",), Samples(z, target, torch.zeros_like(group), of.t, ("a",), NAMES))
+        solved(("u",), sampled(z, target, NAMES))

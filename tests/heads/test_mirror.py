@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from made_samples import sampled
 from torch import Tensor
 
 from residnet.core.errors import ConfigError
@@ -52,14 +53,7 @@ def samples(names: tuple[str, ...], count: int = 300) -> Samples:
     random = np.random.default_rng(2)
     z = torch.from_numpy(random.normal(size=(count, len(names))) + 0.7)
     target = torch.from_numpy(random.normal(size=(count, 3)) * [0.1, 0.05, 0.2])
-    return Samples(
-        z,
-        target,
-        torch.zeros(count, dtype=torch.long),
-        torch.arange(count) * 0.1,
-        ("turning",),
-        names,
-    )
+    return sampled(z, target, names, t=torch.arange(count) * 0.1)
 
 
 def built(kind: str, names: tuple[str, ...], **change: Any) -> ResidualHead:

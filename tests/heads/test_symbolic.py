@@ -16,6 +16,7 @@ import sympy
 import torch
 from made_equations import SPACE, draw, draw_ship
 from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, msd_log, step_log
+from made_samples import sampled
 
 from residnet.core.errors import FitError
 from residnet.core.names import ACCELERATION
@@ -41,13 +42,9 @@ Log = dict[str, np.ndarray]
 
 def samples(log: Log, names: tuple[str, ...], target: np.ndarray | None = None) -> Samples:
     """Samples of one log, with its exact accelerations unless others are given."""
-    z = torch.from_numpy(np.stack([log[name] for name in names], axis=1))
-    y = torch.from_numpy(
-        np.stack([log[name] for name in ACCELERATION], axis=1) if target is None else target
-    )
-    return Samples(
-        z, y, torch.zeros(len(z), dtype=torch.long), torch.from_numpy(log["t"]), ("made",), names
-    )
+    z = np.stack([log[name] for name in names], axis=1)
+    y = np.stack([log[name] for name in ACCELERATION], axis=1) if target is None else target
+    return sampled(z, y, names, t=log["t"])
 
 
 def fitted(config: dict[str, Any], data: Samples) -> tuple[SymbolicHead, dict[str, Any]]:
@@ -155,17 +152,6 @@ def test_a_channel_that_never_moves_is_said_to_be_unknown() -> None:
     assert notes["equations"]["v_dot"]["text"] == "v_dot = 0"
 
 
-def test_structure_in_noisy_accelerations() -> None:
-    """Noise of 0.3 standard deviations on accelerations, 600 s at 20 Hz."""
-    right = 0
-    for number, log in enumerate(force_logs(4, 600.0, 0.05, (20.0, 150.0))):
-        y = np.stack([log[name] for name in ACCELERATION], axis=1)
-        y = y + 0.3 * y.std(axis=0) * np.random.default_rng(number).normal(size=y.shape)
-        _, notes = fitted(FORCE, samples(log, FORCES, y))
-        right += all(set(found(notes, axis)) == set(terms) for axis, terms in FORCE_TRUTH.items())
-    assert right >= 3
-
-
 def measured(log: Log, noise: float, window: float, step: float, jump: float = 300.0) -> Samples:
     """Velocities with noise, differentiated; samples at both sides of an input's jump left out."""
     random = np.random.default_rng(0)
@@ -181,15 +167,7 @@ def measured(log: Log, noise: float, window: float, step: float, jump: float = 3
     pieces = np.where(bad, -1, np.cumsum(np.append(0, np.diff(bad.astype(int)) != 0)))
     smooth, rate, good = SavitzkyGolay(window=window, order=2).derive(nu, step, pieces)
     z = np.concatenate((smooth, np.stack([log[n] for n in FORCES[3:]], axis=1)), axis=1)[good]
-    group = torch.zeros(int(good.sum()), dtype=torch.long)
-    return Samples(
-        torch.from_numpy(z),
-        torch.from_numpy(rate[good]),
-        group,
-        torch.from_numpy(log["t"][good]),
-        ("made",),
-        FORCES,
-    )
+    return sampled(z, rate[good], FORCES, t=log["t"][good])
 
 
 def test_velocities_alone_by_the_weak_form() -> None:
@@ -352,10 +330,7 @@ def written() -> tuple[SymbolicHead, dict[str, Any], torch.Tensor]:
         * np.random.default_rng(2).choice([-1, 1], (len(WRITTEN), 3))
     )
     y = blank.library(z) @ (weights / blank.library(z).std(0).clamp(min=1e-3)[:, None])
-    head, notes = fitted(
-        {"terms": list(WRITTEN)},
-        Samples(z, y, torch.zeros(400), torch.zeros(400), ("made",), names),
-    )
+    head, notes = fitted({"terms": list(WRITTEN)}, sampled(z, y, names))
     assert notes["kept"] == [len(WRITTEN)] * 3
     return head, notes, z
 

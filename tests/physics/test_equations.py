@@ -69,34 +69,6 @@ def test_matrices_of_a_hull_written_out() -> None:
         assert np.abs(residual).max() < 1e-10 * np.abs(force).max()
 
 
-def test_matrices_of_the_ferry_written_out() -> None:
-    """Document 002 (2.3)-(2.6), (4.1), (4.2) with Table A.1; the half ferry is half of it."""
-    mass = np.array([[2389.657, 0, 0], [0, 2533.911, 62.386], [0, 28.141, 5068.910]])
-    nu, tau = scattered([2.0, 1.5, 0.5]), scattered([300.0] * 3, seed=1)
-    for name, share in (("milliampere", 1.0), ("milliampere_half", 0.5)):
-        hull = plant_of(name).hull
-        got = hull(nu, tau)
-        for (u, v, r), force, out in zip(nu.numpy(), tau.numpy(), got.numpy(), strict=True):
-            c13, c23 = -2533.911 * v - 62.386 * r, 2389.657 * u
-            coriolis = np.array([[0, 0, c13], [0, 0, c23], [-c13, -c23, 0]])
-            damping = np.array([
-                [27.632 + 110.064 * abs(u) + 13.965 * u**2, 0, 0],
-                [
-                    0,
-                    52.947 + 116.486 * abs(v) + 1540.383 * abs(r) + 24.313 * v**2,
-                    -24.732 - 572.141 * abs(v) + 115.457 * abs(r),
-                ],
-                [
-                    0,
-                    -3.524 + 0.832 * abs(v) - 336.827 * abs(r),
-                    122.860 + 121.957 * abs(v) + 874.428 * abs(r),
-                ],
-            ])  # fmt: skip
-            wanted = share * (mass @ out + coriolis @ [u, v, r] + damping @ [u, v, r])
-            np.testing.assert_allclose(wanted, force, atol=1e-10 * np.abs(force).max())
-        torch.testing.assert_close(hull.required(got, nu), tau, rtol=1e-10, atol=1e-8)
-
-
 @pytest.mark.parametrize(
     ("name", "speed", "pole", "allowed"),
     [
@@ -216,19 +188,6 @@ def test_jets_saturate_and_turn_to_the_side_that_is_asked_for() -> None:
     torch.testing.assert_close(tau[:, 2], -3.82 * tau[:, 1])
 
 
-def test_slew_rates_where_they_are_switched_on() -> None:
-    plant = plant_of(
-        "odin_jets", "actuators.motor.n_rate=2000 rpm/s", "actuators.nozzle.rate=1.3464"
-    )
-    assert plant.state[6:] == ("n", "nozzle")
-    x = torch.zeros(1, 8, dtype=torch.float64)
-    w = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
-    w[0, :2] = torch.tensor([2000 / 60, 0.3], dtype=torch.float64)
-    for _ in range(10):
-        x = PlantDynamics(plant, 0.01).step(x, w, x[:, :0])[0]
-    torch.testing.assert_close(x[0, 6:], torch.tensor([200 / 60, 0.13464], dtype=torch.float64))
-
-
 def test_froude_phases() -> None:
     """Appendix D with the length of correction H17: 0.4 at 4.06 m/s, 1.0 at 10.1 m/s."""
     vessel = load_vessel("odin_forces")
@@ -243,19 +202,6 @@ def test_froude_phases() -> None:
     assert phase_of(torch.tensor([0.4, 1.0, 1.1])).tolist() == [1, 2, 2]
     with pytest.raises(ValueError, match="length"):
         froude_number(u, v, 0.0)
-
-
-def test_forces_follow_by_the_thruster_dynamics() -> None:
-    """(4.3): step response of 4 / (s^2 + 3.2 s + 4) by its closed form, and the limits."""
-    plant = plant_of("milliampere")
-    x0 = plant.approach(1)
-    w = torch.zeros(1, 300, len(plant.inputs), dtype=torch.float64)
-    w[..., 0], w[..., 1], w[..., 2] = 100.0, -5000.0, 30.0
-    with torch.no_grad():
-        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.01))(x0, w, x0[:, :0])
-    t = 0.01 * np.arange(301)
-    step = 1 - np.exp(-1.6 * t) * (np.cos(1.2 * t) + 1.6 / 1.2 * np.sin(1.2 * t))
-    np.testing.assert_allclose(states[0, :, 6:9], step[:, None] * [100.0, -995.0, 30.0], atol=1e-5)
 
 
 def azimuth(*overrides: str) -> AzimuthThrusters:
@@ -660,14 +606,3 @@ def test_an_unstable_ship_has_both_signs_negative() -> None:
     ).build()
     states = flown(NomotoDynamics(plant, 0.1), np.full(100, 0.1))
     assert states[-1, 5] == pytest.approx(0.1 * (np.exp(10.0 / 20) - 1), rel=1e-12)
-
-
-def test_a_rudder_that_lags_follows_its_time_constant() -> None:
-    plant = load_config(
-        vessel_files()["nomoto_oceanos"],
-        ["rudder.response={kind: first_order, time: 1 s}"],
-        VesselConfig,
-    ).build()
-    assert flown(PlantDynamics(plant, 0.1), np.full(30, 0.1))[-1, -1] == pytest.approx(
-        0.1 * (1 - np.exp(-3.0)), rel=1e-5
-    )

@@ -6,6 +6,7 @@ What an estimator is given it either answers rightly or refuses in one line.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,63 +56,32 @@ def drawn(samples: int, j: int, n: int, seed: int = 0) -> tuple[np.ndarray, np.n
     )
 
 
-def case(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Data that ask for trouble."""
-    x, y = drawn(60, 4, 2)
-    if name == "rank deficient":
-        x[:, 3] = 2.0 * x[:, 0] - x[:, 1]
-    elif name == "one sample":
-        x, y = x[:1], y[:1]
-    elif name == "no sample":
-        x, y = x[:0], y[:0]
-    elif name == "no column":
-        x = x[:, :0]
-    elif name == "constant column":
-        x[:, 2] = 7.3
-    elif name == "zero column":
-        x[:, 2] = 0.0
-    elif name == "fewer samples than columns":
-        x, y = drawn(8, 12, 2)
-    elif name == "one output":
-        y = y[:, :1]
-    elif name == "one column":
-        x = x[:, :1]
-    elif name == "constant output":
-        y[:, 1] = 5.1
-    elif name == "zero output":
-        y[:, 1] = 0.0
-    elif name == "not finite":
-        x[7, 2] = np.nan
-    elif name == "not finite output":
-        y[7, 1] = np.inf
-    elif name == "repeated sample":
-        x, y = np.repeat(x[:1], 60, axis=0), np.repeat(y[:1], 60, axis=0)
-    elif name == "far from zero":
-        x += 1e6 * x.std(0)
-    elif name == "huge":
-        x, y = 1e150 * x, 1e150 * y
-    return x, y
+def put(values: np.ndarray, where: Any, value: Any) -> np.ndarray:
+    changed = values.copy()
+    changed[where] = value
+    return changed
 
 
-CASES = [
-    "plain",
-    "rank deficient",
-    "one sample",
-    "no sample",
-    "no column",
-    "constant column",
-    "zero column",
-    "fewer samples than columns",
-    "one output",
-    "one column",
-    "constant output",
-    "zero output",
-    "not finite",
-    "not finite output",
-    "repeated sample",
-    "far from zero",
-    "huge",
-]
+# data that ask for trouble, from 60 samples of 4 columns and 2 outputs
+CASES: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
+    "plain": lambda x, y: (x, y),
+    "rank deficient": lambda x, y: (put(x, np.s_[:, 3], 2.0 * x[:, 0] - x[:, 1]), y),
+    "one sample": lambda x, y: (x[:1], y[:1]),
+    "no sample": lambda x, y: (x[:0], y[:0]),
+    "no column": lambda x, y: (x[:, :0], y),
+    "constant column": lambda x, y: (put(x, np.s_[:, 2], 7.3), y),
+    "zero column": lambda x, y: (put(x, np.s_[:, 2], 0.0), y),
+    "fewer samples than columns": lambda x, y: drawn(8, 12, 2),
+    "one output": lambda x, y: (x, y[:, :1]),
+    "one column": lambda x, y: (x[:, :1], y),
+    "constant output": lambda x, y: (x, put(y, np.s_[:, 1], 5.1)),
+    "zero output": lambda x, y: (x, put(y, np.s_[:, 1], 0.0)),
+    "not finite": lambda x, y: (put(x, (7, 2), np.nan), y),
+    "not finite output": lambda x, y: (x, put(y, (7, 1), np.inf)),
+    "repeated sample": lambda x, y: (np.repeat(x[:1], 60, 0), np.repeat(y[:1], 60, 0)),
+    "far from zero": lambda x, y: (x + 1e6 * x.std(0), y),
+    "huge": lambda x, y: (1e150 * x, 1e150 * y),
+}
 ANSWERED_BY_ALL = {"plain", "one output"}
 REFUSED_BY_ALL = {"no sample", "no column", "not finite", "not finite output"}
 
@@ -120,7 +90,7 @@ REFUSED_BY_ALL = {"no sample", "no column", "not finite", "not finite output"}
 @pytest.mark.parametrize("kind", ALL)
 def test_the_answer_is_right_or_refused_in_one_line(kind: str, trouble: str) -> None:
     """Right: coefficients are finite, and no prediction is far beyond the outputs."""
-    x, y = (torch.from_numpy(part) for part in case(trouble))
+    x, y = (torch.from_numpy(part) for part in CASES[trouble](*drawn(60, 4, 2)))
     groups = torch.arange(len(x)) * 4 // max(len(x), 1)
     refused = ""
     solutions: list[Solution] = []

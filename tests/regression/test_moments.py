@@ -22,4 +22,3 @@ def test_too_few_groups_are_refused() -> None:
     for one in (torch.zeros(4), None):
         with pytest.raises(FitError, match="one run or segment only"):
             fold_numbers(one, None)
-

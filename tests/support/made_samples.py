@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -25,6 +28,27 @@ def residual(z: np.ndarray) -> np.ndarray:
             -0.3 * r * np.abs(r) + 1e-4 * tau_n * u,
         ),
         axis=-1,
+    )
+
+
+def sampled(
+    z: Any,
+    target: Any,
+    names: Sequence[str],
+    *,
+    groups: int = 1,
+    t: Any = None,
+    kinds: Sequence[str] = (),
+) -> Samples:
+    """Samples of channels [N, nz] and targets [N, n], dealt out to groups of one size."""
+    count = len(z)
+    return Samples(
+        torch.as_tensor(z),
+        torch.as_tensor(target),
+        torch.arange(count) * groups // count,
+        torch.zeros(count) if t is None else torch.as_tensor(t),
+        tuple(kinds) or ("made",) * groups,
+        tuple(names),
     )
 
 
