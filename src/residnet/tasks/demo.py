@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -69,7 +69,7 @@ _EPOCH = 1_717_000_000
 
 
 def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
-    """Write the logs in several layouts, with rosbags as MCAP too; returns what to say.
+    """Write the logs in several layouts; returns what to say.
 
     Args:
         folder: that a folder for each layout is made in.
@@ -77,7 +77,7 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
     Raises:
         UsageError: where they exist already, or cannot be written.
     """
-    for name in (*LAYOUTS, "mcap"):
+    for name in LAYOUTS:
         if (folder / name).exists() and not overwrite:
             raise UsageError(f"{folder / name}: exists; give --overwrite, or another folder")
         shutil.rmtree(folder / name, ignore_errors=True)
@@ -95,12 +95,12 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written ({error.strerror})") from error
     seconds = sum(float(log.t[-1] - log.t[0]) for log in logs)
-    lines = [
+    return [
         f"{len(logs)} logs of a simulated boat in wind, {seconds / 60.0:.0f} minutes, as",
         *(f"{folder}/{name}: {about}" for name, (about, _) in LAYOUTS.items()),
         "their faults: positions 0.3 s late, a rudder that stands 2 degrees off, gaps, noise",
+        f"next: residnet new {folder}/two_files",
     ]
-    return [*lines, *_mcap_lines(logs, folder / "mcap"), f"next: residnet new {folder}/two_files"]
 
 
 def _with_gap(log: Log, number: int) -> Log:
@@ -168,56 +168,3 @@ LAYOUTS: dict[str, tuple[str, Callable[[pd.DataFrame], dict[str, pd.DataFrame]]]
     "surge": ("speed and propeller alone", lambda table: {"": table[["time [s]", *_SURGE]]}),
 }
 """Folder -> what it holds, and the tables of a log by the word that its file's name begins with."""
-
-
-def _mcap_lines(logs: Sequence[Log], folder: Path) -> list[str]:
-    """Write the logs as MCAP; returns what to say."""
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        return ["MCAP is left out: it needs rosbags (pip install 'residnet[ros]')"]
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    folder.mkdir(parents=True)
-    for number, log in enumerate(logs):
-        report("writing MCAP", number, len(logs))
-        whole = folder / f"{log.name}_bag"
-        with Writer(whole, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            _messages(log, writer, store)
-        next(whole.glob("*.mcap")).rename(folder / f"{log.name}.mcap")
-        shutil.rmtree(whole)
-    report("writing MCAP", len(logs), len(logs))
-    return [f"the same as MCAP: {folder}"]
-
-
-def _messages(log: Log, writer: Any, store: Any) -> None:
-    """Write odometry by REP-103, and each other channel as a number of its own topic."""
-    odometry, number = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
-    types = store.types
-    pose = writer.add_connection("/odometry", odometry, typestore=store)
-    others = [name for name in log.channels if name not in ("x", "y", "psi", "u", "v", "r")]
-    topics = {name: writer.add_connection(f"/{name}", number, typestore=store) for name in others}
-    yaw = np.remainder(np.pi / 2 - log["psi"] + np.pi, 2 * np.pi) - np.pi
-    vector, none = types["geometry_msgs/msg/Vector3"], np.zeros(36)
-    for i, t in enumerate(log.t.tolist()):
-        at = _EPOCH * 10**9 + round(t * 1e9)
-        stamp = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
-        turned = types["geometry_msgs/msg/Quaternion"](
-            x=0.0, y=0.0, z=float(np.sin(yaw[i] / 2)), w=float(np.cos(yaw[i] / 2))
-        )
-        point = types["geometry_msgs/msg/Point"](x=log["y"][i], y=log["x"][i], z=0.0)
-        twist = types["geometry_msgs/msg/Twist"](
-            linear=vector(log["u"][i], -log["v"][i], 0.0), angular=vector(0.0, 0.0, -log["r"][i])
-        )
-        message = types[odometry](
-            header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="odom"),
-            child_frame_id="base_link",
-            pose=types["geometry_msgs/msg/PoseWithCovariance"](
-                types["geometry_msgs/msg/Pose"](point, turned), none
-            ),
-            twist=types["geometry_msgs/msg/TwistWithCovariance"](twist, none),
-        )
-        writer.write(pose, at, store.serialize_cdr(message, odometry))
-        for name, topic in topics.items():
-            value = types[number](data=float(log[name][i]))
-            writer.write(topic, at, store.serialize_cdr(value, number))
