@@ -295,20 +295,6 @@ def _at(row: Any, keys: str) -> Any:
     return row
 
 
-def nested(keys: Iterable[str], columns: Sequence[Column]) -> list[Column]:
-    """Return the columns of what stands below each of some keys of a row."""
-
-    def inside(key: str, column: Column) -> Column:
-        title, what, *rest = column
-
-        def of(row: Any) -> Any:
-            return what(row[key]) if callable(what) else _at(row[key], what)
-
-        return title, of, *rest
-
-    return [inside(key, column) for key in keys for column in columns]
-
-
 def bad_where(text: object, bad: object) -> Cell:
     """Return a cell that is set off where something is wrong."""
     return Cell(str(text), mark="bad" if bad else "")

@@ -12,7 +12,7 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.format import plural, signed
 from residnet.judge.metrics import blocks, intervals
-from residnet.report.blocks import Cell, Column, Section, Table, Text, nested, table_of
+from residnet.report.blocks import Cell, Column, Section, Table, Text, table_of
 from residnet.report.figure import BLUE, Case, Figure, Look, Panel, joined, names_of, whiskers
 from residnet.report.figure_files import write_figures
 from residnet.report.run_reader import Content, RunFiles
@@ -220,7 +220,7 @@ def variants_table(rows: Sequence[Content], reference: str) -> Table:
 
     heads: list[Column] = [
         ("NRMSE", error),
-        ("sd of seeds", "nrmse_sd", 4),
+        ("sd of seeds", lambda row: row["nrmse_sd"], 4),
         ("difference", difference, str),
         ("95 % interval", interval),
     ]
@@ -228,7 +228,11 @@ def variants_table(rows: Sequence[Content], reference: str) -> Table:
         by_variant.values(),
         [
             ("variant", lambda row: row[protocols[0]]["variant"]),
-            *nested(protocols, heads),
+            *(
+                (title, lambda row, name=name, of=of: of(row[name]), *how)
+                for name in protocols
+                for title, of, *how in heads
+            ),
             ("run [s]", f"{protocols[0]}.seconds", 0),
             ("what changes", lambda row: ", ".join(row[protocols[0]]["overrides"])),
         ],
