@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from typing import Any, ClassVar, Literal, Protocol, TypeAlias
 
-from residnet.core.format import fixed
+from residnet.core.format import DASH, fixed, signed
 
 EXPORTS = "exports.json"
 """File of a run folder that says what came of each export."""
@@ -293,6 +293,14 @@ def _at(row: Any, keys: str) -> Any:
     for key in keys.split("."):
         row = row.get(key) if isinstance(row, Mapping) else None
     return row
+
+
+def paired_interval(bounds: Sequence[float] | None, absent: str = DASH) -> Cell:
+    """Return the interval of a difference, set off where it excludes zero."""
+    if not bounds:
+        return Cell(absent)
+    text = " to ".join(map(signed, bounds))
+    return Cell(text, mark="best" if bounds[0] > 0 or bounds[1] < 0 else "")
 
 
 def bad_where(text: object, bad: object) -> Cell:

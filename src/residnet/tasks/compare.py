@@ -10,9 +10,9 @@ from typing import Any
 import pandas as pd
 
 from residnet.core.errors import UsageError
-from residnet.core.format import number
+from residnet.core.format import number, signed
 from residnet.judge.metrics import blocks, difference
-from residnet.report.blocks import Block, Cell, Section, Table, table_of
+from residnet.report.blocks import Block, Cell, Section, Table, paired_interval, table_of
 from residnet.report.figure import GLANCE, Case, Figure, Panel, family
 from residnet.report.figure_files import write_figure
 from residnet.report.page import write_page
@@ -182,13 +182,12 @@ def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, An
         for protocol, entries in pairs.items()
     }
 
-    def apart(row: Mapping[str, Any]) -> Cell:
-        return Cell("" if row["run"] == first else f"{row['nrmse_mean']:+.3f}")
+    def apart(row: Mapping[str, Any]) -> str:
+        return "" if row["run"] == first else signed(row["nrmse_mean"])
 
     def interval(row: Mapping[str, Any]) -> Cell:
-        ends = row["ci95"]
-        text = f"{ends[0]:+.3f} to {ends[1]:+.3f}" if ends else "too few logs"
-        return Cell("" if row["run"] == first else text)
+        own = row["run"] == first
+        return Cell("") if own else paired_interval(row["ci95"], "too few logs")
 
     return table_of(
         rows,
@@ -198,7 +197,7 @@ def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, An
             ("protocol", "protocol"),
             ("windows", "windows", str),
             ("NRMSE [-]", "mean", number),
-            ("difference", apart),
+            ("difference", apart, str),
             ("95 % interval", interval),
         ],
         caption="Selected models over the windows that all runs were judged on, by the scales of"

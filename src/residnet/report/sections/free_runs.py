@@ -27,6 +27,7 @@ from residnet.report.blocks import (
     Table,
     Text,
     bad_where,
+    paired_interval,
     table_of,
 )
 from residnet.report.figure import Figure
@@ -248,11 +249,6 @@ def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table:
         text = DASH if value is None else percent(100 * (value - 1))
         return bad_where(text, line["apart"].get("worse"))
 
-    def span(line: Content) -> Cell:
-        bounds = line["apart"].get("ci95")
-        text = " to ".join(map(signed, bounds)) if bounds else DASH
-        return Cell(text, mark="best" if line["apart"].get("excludes_zero") else "")
-
     def less(line: Content) -> float:
         return float(line["value"] - line["apart"].get("nrmse_mean", math.nan))
 
@@ -266,7 +262,7 @@ def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table:
             (f"NRMSE of {reference}", less, number),
             ("change", ratio),
             ("difference", "apart.nrmse_mean", lambda by: DASH if by is None else signed(by)),
-            ("paired 95 % interval", span),
+            ("paired 95 % interval", lambda line: paired_interval(line["apart"].get("ci95"))),
         ]
     return table_of(lines, columns, rule=lambda line: line["by"])
 

@@ -12,7 +12,7 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.format import plural, signed
 from residnet.judge.metrics import blocks, intervals
-from residnet.report.blocks import Cell, Column, Section, Table, Text, table_of
+from residnet.report.blocks import Cell, Column, Section, Table, Text, paired_interval, table_of
 from residnet.report.figure import BLUE, Case, Figure, Look, Panel, joined, names_of, whiskers
 from residnet.report.figure_files import write_figures
 from residnet.report.run_reader import Content, RunFiles
@@ -211,18 +211,11 @@ def variants_table(rows: Sequence[Content], reference: str) -> Table:
     def difference(row: Content) -> str:
         return signed(row["difference"]) if row["difference_ci95"] else ""
 
-    def interval(row: Content) -> Cell:
-        bounds = row["difference_ci95"]
-        if not bounds:
-            return Cell("")
-        excludes_zero = bounds[0] > 0 or bounds[1] < 0
-        return Cell(" to ".join(map(signed, bounds)), mark="best" if excludes_zero else "")
-
     heads: list[Column] = [
         ("NRMSE", error),
         ("sd of seeds", lambda row: row["nrmse_sd"], 4),
         ("difference", difference, str),
-        ("95 % interval", interval),
+        ("95 % interval", lambda row: paired_interval(row["difference_ci95"], "")),
     ]
     return table_of(
         by_variant.values(),
