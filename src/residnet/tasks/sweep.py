@@ -188,10 +188,7 @@ class FreeRunObjective(Config):
     kind: Literal["free_run"] = "free_run"
     model: str = "selected"
 
-    @property
-    def minimized(self) -> bool:
-        """That a lesser error is better."""
-        return True
+    minimized: ClassVar[bool] = True
 
     @property
     def watched(self) -> str | None:
@@ -247,14 +244,13 @@ class FigureObjective(Config):
     name: str
     direction: Literal["minimize", "maximize"] = "minimize"
 
+    # no training shows the figure before a run ends
+    watched: ClassVar[None] = None
+
     @property
     def minimized(self) -> bool:
         """Whether a lesser figure is better."""
         return self.direction == "minimize"
-
-    @property
-    def watched(self) -> None:
-        """None: no training shows the figure before a run ends."""
 
     @property
     def words(self) -> str:

@@ -208,13 +208,14 @@ def variants_table(rows: Sequence[Content], reference: str) -> Table:
         least = row["nrmse_mean"] == min(other["nrmse_mean"] for other in same)
         return Cell(f"{row['nrmse_mean']:.4f}", note, "bad" if lost else "best" if least else "")
 
-    def difference(row: Content) -> str:
-        return signed(row["difference"]) if row["difference_ci95"] else ""
-
     heads: list[Column] = [
         ("NRMSE", error),
         ("sd of seeds", lambda row: row["nrmse_sd"], 4),
-        ("difference", difference, str),
+        (
+            "difference",
+            lambda row: signed(row["difference"]) if row["difference_ci95"] else "",
+            str,
+        ),
         ("95 % interval", lambda row: paired_interval(row["difference_ci95"], "")),
     ]
     return table_of(
