@@ -315,17 +315,12 @@ class HeadingChanges:
         def more(values: Tensor) -> Tensor:
             return values.repeat(times, *[1] * (values.dim() - 1))
 
-        return HeadingChanges(
-            heading=more(self.heading),
-            start=more(self.start),
-            variation=more(self.variation),
-            delay=more(self.delay),
-            push=more(self.push),
-            noise=more(self.noise),
-            weather={name: more(values) for name, values in self.weather.items()},
-            dt=self.dt,
-            count=self.count,
-        )
+        given = vars(self)
+        tensors: dict[str, Any] = {
+            name: more(part) for name, part in given.items() if isinstance(part, Tensor)
+        }
+        weather = {name: more(values) for name, values in self.weather.items()}
+        return replace(self, **tensors, weather=weather)
 
 
 QUANTITIES = {"cost": "s", "time_outside": "s", "overshoot": "rad", "travel": "rad", "iae": "rad s"}

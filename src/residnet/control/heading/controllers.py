@@ -143,7 +143,7 @@ class TunableConfig(ControllerConfig, ABC):
         return {name: one.of(turning) for name, one in self.ranges.items()}
 
     @abstractmethod
-    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> Policy:
+    def rows(self, parameters: Mapping[str, Tensor], steering: Steering) -> Policy:
         """Return a controller whose parameters [B] differ from row to row."""
 
     def tuned(self, found: Mapping[str, float]) -> Self:
@@ -184,7 +184,7 @@ class TunedConfig(TunableConfig, ABC):
 
     @abstractmethod
     def gains(
-        self, parameters: dict[str, Tensor], turning: Turning
+        self, parameters: Mapping[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return kp, kd, ki of parameters, any shape."""
 
@@ -199,7 +199,7 @@ class TunedConfig(TunableConfig, ABC):
         found = {name: torch.tensor([value]).double() for name, value in self.complete().items()}
         return self.rows(found, steering)
 
-    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> LinearLaw:
+    def rows(self, parameters: Mapping[str, Tensor], steering: Steering) -> LinearLaw:
         """Return the law with gains of its own for every row."""
         gains = self.gains(parameters, steering.turning)
         return LinearLaw(steering, [*gains, parameters["filter_time"]])
@@ -223,7 +223,7 @@ class PdConfig(TunedConfig):
     damping_time: Seconds | None = Field(default=None, gt=0)
 
     def gains(
-        self, parameters: dict[str, Tensor], turning: Turning
+        self, parameters: Mapping[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
         return (
             parameters["kp"],
@@ -254,7 +254,7 @@ class PidConfig(TunedConfig):
     integral_time: Seconds | None = Field(default=None, gt=0)
 
     def gains(
-        self, parameters: dict[str, Tensor], turning: Turning
+        self, parameters: Mapping[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
         kp = parameters["kp"]
         return kp, kp * parameters["damping_time"], kp / parameters["integral_time"]
@@ -283,7 +283,7 @@ class LqrConfig(TunedConfig):
     rate_weight: float | None = Field(default=None, ge=0)
 
     def gains(
-        self, parameters: dict[str, Tensor], turning: Turning
+        self, parameters: Mapping[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
         gain, time = torch.tensor(turning.gain), torch.tensor(turning.time)
         kp, kd = regulator_gains(
@@ -357,21 +357,17 @@ class ObservedConfig(TunableConfig, ABC):
     def law(self, limit: float, rate: float | None) -> HeadingLaw:
         """Return the law for a rudder with a limit in rad and a rate in rad/s, None for none."""
 
-    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> ObservedPolicy:
-        """Return the law with constants of its own for every row."""
-        return self.policy(parameters, steering)
-
     def build(self, steering: Steering) -> ObservedPolicy:
-        return self.policy(self.complete(), steering)
+        return self.rows(self.complete(), steering)
 
-    def policy(self, constants: Mapping[str, float | Tensor], steering: Steering) -> ObservedPolicy:
-        """Return the policy without a network; each constant is one number or [B]."""
+    def rows(self, parameters: Mapping[str, float | Tensor], steering: Steering) -> ObservedPolicy:
+        """Return the law without a network; each constant is one number or [B]."""
         vessel = steering.vessel
         return ObservedPolicy(
             vessel.state,
             turning=steering.turning,
             law=self.law(steering.limit, vessel.rate),
-            constants=constants,
+            constants=parameters,
             limit=steering.limit,
             dt=steering.dt,
             rate=vessel.rate,
@@ -474,7 +470,7 @@ class DepthConfig(TunableConfig):
         law = {name: value for name, value in found.items() if name not in own}
         return self.model_copy(update={**own, "pitch": self.pitch.tuned(law)})
 
-    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> DepthPolicy:
+    def rows(self, parameters: Mapping[str, Tensor], steering: Steering) -> DepthPolicy:
         """Return the policy with constants of its own for every row."""
         return self.over(self.pitch.rows(parameters, steering), parameters, steering)
 

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.signal import lfilter
-from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.dynamics.base import Dynamics
 
 Array = NDArray[np.float64]
 _TIMES, _DELAYS, _RATES = 20, 8, 10
@@ -130,53 +126,25 @@ def fit_response(
     refined = {
         rate: _refined(records, *found[rate][1], rate, longest_delay) for rate in (best, math.inf)
     }
-    gain, time, delay, bias, rate = refined[best].values
-    values = np.concatenate([record.rate[record.usable] for record in records])
-    explained = 1.0 - refined[best].square / max(
-        float(((values - values.mean()) ** 2).sum()), 1e-30
-    )
-    if gain <= 0 or explained < _EXPLAINED:
+    likely, square, independent = refined[best]
+    if likely.gain <= 0 or likely.explained < _EXPLAINED:
         raise FitError(
-            f"steering: the best response found has K {gain:.3g} 1/s and explains"
-            f" {100 * explained:.0f} % of the yaw rate; check the rudder's sign and unit, and that"
-            " the vessel answers its rudder"
+            f"steering: the best response found has K {likely.gain:.3g} 1/s and explains"
+            f" {100 * likely.explained:.0f} % of the yaw rate; check the rudder's sign and"
+            " unit, and that the vessel answers its rudder"
         )
     # the rate must explain more than chance does
-    gained = refined[math.inf].square / refined[best].square - 1.0
-    chosen = refined[best if gained * refined[best].independent >= _SURE else math.inf]
-    gain, time, delay, bias, rate = chosen.values
-    return SteeringResponse(
-        gain,
-        time,
-        delay,
-        bias,
-        float(np.sqrt(chosen.square / len(values))),
-        explained,
-        rate if math.isfinite(rate) else None,
-        chosen.spread,
-    )
-
-
-class _Refined(NamedTuple):
-    """K, T, delay, bias and rate of least error, and how sure they are.
-
-    Attributes:
-        values: SI.
-        square: sum of squared errors.
-        independent: number of errors that do not hang together over time.
-        spread: standard deviations of K, T and delay.
-    """
-
-    values: tuple[float, float, float, float, float]
-    square: float
-    independent: float
-    spread: tuple[float, float, float]
+    gained = refined[math.inf][1] / square - 1.0
+    return refined[best if gained * independent >= _SURE else math.inf][0]
 
 
 def _refined(
     records: Sequence[Record], time: float, delay: float, rate: float, longest_delay: float
-) -> _Refined:
-    """Return the response of least error near one of the grid; an infinite rate is kept."""
+) -> tuple[SteeringResponse, float, float]:
+    """Return the response of least error near one of the grid; an infinite rate is kept.
+
+    The sum of its squared errors follows, and how many of them do not hang together over time.
+    """
     from scipy.optimize import least_squares
 
     def moved(rate: float) -> list[Record]:
@@ -204,12 +172,21 @@ def _refined(
     slopes = np.asarray(found.jac)
     covariance = np.linalg.pinv(slopes.T @ slopes) * (square / independent)
     deviation = np.sqrt(np.diag(covariance).clip(min=0.0))
-    time = math.exp(values[1])
-    return _Refined(
-        (values[0], time, max(values[2], 0.0), values[3], math.exp(values[4])),
+    time, rate = math.exp(values[1]), math.exp(values[4])
+    rates = np.concatenate([record.rate[record.usable] for record in records])
+    return (
+        SteeringResponse(
+            values[0],
+            time,
+            max(values[2], 0.0),
+            values[3],
+            math.sqrt(square / len(rates)),
+            1.0 - square / max(float(((rates - rates.mean()) ** 2).sum()), 1e-30),
+            rate if math.isfinite(rate) else None,
+            (float(deviation[0]), time * float(deviation[1]), float(deviation[2])),
+        ),
         square,
         independent,
-        (float(deviation[0]), time * float(deviation[1]), float(deviation[2])),
     )
 
 
@@ -242,22 +219,6 @@ def _fit(records: Sequence[Record], time: float, delay: float) -> tuple[float, f
     return max(square - float(found @ right), 0.0), float(found[0]), float(found[1])
 
 
-_STEPS = 400
-"""Steps of one length before the next are twice as long."""
-_STEADY = 0.1
-"""Share of the yaw rate by which it may still change over the last half of the time."""
-_OVERSHOOT = 0.02
-"""Share of the steady yaw rate that a vessel of the first order may overshoot by."""
-_PATIENCE = 8
-"""Times the duration given that a turn is waited for."""
-_SWITCHES = 6
-"""Changes of rudder that a zigzag ends after."""
-_FINE = 25
-"""Steps until a zigzag's first change of rudder."""
-_LONGEST = 12000
-"""Steps after which a zigzag is given up."""
-
-
 @dataclass(frozen=True)
 class Turning:
     """T r_dot + r = K (delta - c psi) at a speed: K [1/s], T [s], u [m/s] and c [-].
@@ -269,157 +230,3 @@ class Turning:
     time: float
     speed: float
     righting: float = 0.0
-
-
-@dataclass(frozen=True)
-class Steered:
-    """What K and T are measured on.
-
-    Attributes:
-        build: returns the model of the vessel with steps of a length in s.
-        x: straight ahead at its speed, [1, nx].
-        w: inputs [1, m] of that motion; the first is the rudder command.
-        s: memory [1, n_state] of the model.
-        columns: of u, r and psi in the state.
-        steps: the first length of a step and the largest, in s.
-        rate: of the rudder in rad/s; infinite where it stands at its command, or K and T are to
-            hold what moves it.
-        side: sign of yaw rate and heading under a positive command.
-        rights: whether the angle that is turned comes to rest under a held command, as a pitch
-            that weight and buoyancy right.
-    """
-
-    build: Callable[[float], Dynamics]
-    x: Tensor
-    w: Tensor
-    s: Tensor
-    columns: tuple[int, int, int]
-    steps: tuple[float, float]
-    rate: float = math.inf
-    side: float = 1.0
-    rights: bool = False
-
-
-def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
-    """Return K and T of the answer to a rudder angle.
-
-    The angle is held first: T is the area above the yaw rate's answer over its end, less that above
-    the rudder's own way to the angle. The yaw rate of
-    a vessel that hardly holds its course overshoots in hard turns, or is not steady for long. Then
-    K and T are those that simulate its yaw rate best in a zigzag, with a delay beside them. An
-    angle that comes to rest under the held rudder tells c, and the zigzag K and T.
-
-    Args:
-        angle: of the rudder in rad.
-        duration: until the turn is steady, in s.
-
-    Raises:
-        FitError: where the vessel does not answer its rudder so that it can be steered.
-    """
-    speed = float(steered.x[0, steered.columns[0]])
-    times, rates, headings = _held(steered, angle, duration)
-    if steered.rights:
-        half = np.array_split(headings, 2)[1]
-        # an angle that is righted nears its end; one that is not goes round and round
-        if not np.ptp(half) <= abs(half.mean()):
-            raise FitError(
-                f"at {angle:.3g} rad of planes the vessel is at {headings[-1]:.3g} rad after"
-                f" {times[-1]:.3g} s and does not come to rest: nothing rights it. The planes hold"
-                " an angle against what rights the vessel: check that its weight lies below its"
-                " buoyancy (rigid_body.z_G, buoyancy.z_B) and its speed, or give turning_time more"
-            )
-        return _measure_righted(steered, angle, float(headings[-1]))
-    while times[-1] < _PATIENCE * duration and not _settled(times, rates):
-        times, rates, headings = _held(steered, angle, 2.0 * float(times[-1]))
-    if not np.isfinite(rates).all():
-        raise FitError(f"the vessel's motion does not stay finite at {angle:.3g} rad of rudder")
-    steady = float(rates[-1])
-    straight = steady * angle > 0 and _settled(times, rates)
-    if straight and (rates / steady).max() <= 1.0 + _OVERSHOOT:
-        time = float(np.trapezoid(steady - rates, times)) / steady
-        time -= 0.5 * abs(angle) / steered.rate
-        if time > 0:
-            return Turning(gain=steady / angle, time=time, speed=speed)
-    turned = np.flatnonzero(headings * np.sign(angle) >= abs(angle))
-    if len(turned) == 0:
-        raise FitError(
-            f"at {angle:.3g} rad of rudder the vessel does not turn by as much to that side within"
-            f" {times[-1]:.3g} s; it cannot be steered (check the sign of its rudder and the limit)"
-        )
-    first = float(times[turned[0]])
-    found = fit_response([_zigzag(steered, angle, angle, first)[0]], 0.5 * first)
-    return Turning(gain=found.gain, time=found.time, speed=speed)
-
-
-def _measure_righted(steered: Steered, angle: float, end: float) -> Turning:
-    """Return K, T and c of a vessel that has come to rest at an angle `end` under a held one."""
-    if not (math.isfinite(end) and end * angle > 0):
-        raise FitError(
-            f"at {angle:.3g} rad of rudder the vessel comes to rest at an angle of {end:.3g} rad;"
-            " it cannot be steered (check the sign of the command that steers)"
-        )
-    righting, first = angle / end, 2.0 * steered.steps[1]
-    record, headings = _zigzag(steered, angle, min(abs(angle), 0.5 * abs(end)), first)
-    known = replace(record, rudder=record.rudder - righting * headings)
-    found = fit_response([known], _FINE * first)
-    return Turning(float(found.gain), found.time, float(steered.x[0, steered.columns[0]]), righting)
-
-
-def _settled(times: np.ndarray, rates: np.ndarray) -> bool:
-    """Return whether a yaw rate is steady over the last half of the time."""
-    half, steady = rates[np.searchsorted(times, 0.5 * times[-1]) :], rates[-1]
-    overshoots = np.abs(rates).max() > (1.0 + _STEADY) * abs(steady)
-    return bool(overshoots or np.abs(half - steady).max() <= _STEADY * abs(steady))
-
-
-def _held(
-    steered: Steered, angle: float, duration: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times, yaw rates and headings [N] under a held rudder, in steps that grow."""
-    _, r, psi = steered.columns
-    x, w, s = steered.x, steered.w.clone(), steered.s
-    w[:, 0] = angle
-    times, rates, headings = [0.0], [0.0], [0.0]
-    dt = steered.steps[0]
-    with torch.no_grad():
-        while times[-1] < duration - 0.5 * dt:
-            model = steered.build(dt)
-            for _ in range(min(_STEPS, round((duration - times[-1]) / dt))):
-                x, s = model.step(x, w, s)
-                times.append(times[-1] + dt)
-                rates.append(steered.side * float(x[0, r]))
-                headings.append(steered.side * float(x[0, psi] - steered.x[0, psi]))
-            dt = min(2.0 * dt, steered.steps[1])
-    return np.array(times), np.array(rates), np.array(headings)
-
-
-def _zigzag(steered: Steered, angle: float, turned: float, first: float) -> tuple[Record, Array]:
-    """Return a zigzag in which the heading goes to an angle `turned` on each side, and headings.
-
-    `first` is the time in s until its first change of rudder.
-    """
-    _, r, psi = steered.columns
-    low, high = steered.steps
-    dt = low if high <= low else min(max(first / _FINE, low), high)
-    model, x, w, s = steered.build(dt), steered.x, steered.w.clone(), steered.s
-    side, switches = float(np.sign(angle)), 0
-    rates: list[float] = []
-    rudder: list[float] = []
-    headings: list[float] = []
-    with torch.no_grad():
-        while switches < _SWITCHES:
-            if len(rates) > _LONGEST:
-                raise FitError(
-                    f"a zigzag with {abs(angle):.3g} rad of rudder does not turn the vessel back"
-                    f" within {dt * _LONGEST:.3g} s; it cannot be steered with so little rudder"
-                )
-            headings.append(steered.side * float(x[0, psi] - steered.x[0, psi]))
-            if side * headings[-1] > abs(turned):
-                side, switches = -side, switches + 1
-            w[:, 0] = side * abs(angle)
-            rates.append(steered.side * float(x[0, r]))
-            rudder.append(side * abs(angle))
-            x, s = model.step(x, w, s)
-    rate = np.array(rates)
-    angle_taken = slewed(np.array([0.0, *rudder]), steered.rate, dt)[1:]
-    return Record(dt, angle_taken, rate, np.isfinite(rate)), np.array(headings)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from residnet.control.base import Followed, Policy
-from residnet.control.heading.turning import Steered, Turning, measure_turning
-from residnet.core.errors import ConfigError
+from residnet.control.heading.turning import Array, Record, Turning, fit_response, slewed
+from residnet.core.errors import ConfigError, FitError
 from residnet.core.frames import wrap
 from residnet.core.names import nearest
 from residnet.dynamics.actuated import commanded
@@ -27,6 +28,20 @@ from residnet.physics.symmetry import live_of
 
 _LONG_STEP = 0.4
 """Longest step in s by which a vessel's answer to its rudder is measured."""
+_STEPS = 400
+"""Steps of one length before the next are twice as long."""
+_STEADY = 0.1
+"""Share of the yaw rate by which it may still change over the last half of the time."""
+_OVERSHOOT = 0.02
+"""Share of the steady yaw rate that a vessel of the first order may overshoot by."""
+_PATIENCE = 8
+"""Times the duration given that a turn is waited for."""
+_SWITCHES = 6
+"""Changes of rudder that a zigzag ends after."""
+_FINE = 25
+"""Steps until a zigzag's first change of rudder."""
+_LONGEST = 12000
+"""Steps after which a zigzag is given up."""
 _LEVEL = ("x", "y", "z", "theta", "psi", "v", "w", "p", "q", "r")
 """States that a straight course begins with at zero."""
 _RUN_UP = (0.1, 6000)
@@ -78,20 +93,139 @@ class SteeredVessel(ABC):
     def turning(self, angle: float, duration: float, dt: float = 0.02) -> Turning:
         """Return K and T at the service speed, from answers to a rudder angle.
 
+        The angle is held first: T is the area above the yaw rate's answer over its end, less that
+        above the rudder's own way to the angle. The yaw rate of a vessel that hardly holds its
+        course overshoots in hard turns, or is not steady for long. Then K and T are those that
+        simulate its yaw rate best in a zigzag, with a delay beside them. An angle that comes to
+        rest under the held rudder tells c, and the zigzag K and T.
+
         Args:
             angle: of the rudder in rad.
             duration: until the turn is steady, in s.
             dt: step in s; later steps are longer.
+
+        Raises:
+            FitError: where the vessel does not answer its rudder so that it can be steered.
         """
+        speed = float(self._straight_on()[0][0, self.column("u")])
+        times, rates, headings = self._held(angle, duration, dt)
+        if self.axis.value != self.axis.angle:
+            half = np.array_split(headings, 2)[1]
+            # an angle that is righted nears its end; one that is not goes round and round
+            if not np.ptp(half) <= abs(half.mean()):
+                raise FitError(
+                    f"at {angle:.3g} rad of planes the vessel is at {headings[-1]:.3g} rad after"
+                    f" {times[-1]:.3g} s and does not come to rest: nothing rights it. The planes"
+                    " hold an angle against what rights the vessel: check that its weight lies"
+                    " below its buoyancy (rigid_body.z_G, buoyancy.z_B) and its speed, or give"
+                    " turning_time more"
+                )
+            return self._righted(angle, float(headings[-1]), speed, dt)
+        while times[-1] < _PATIENCE * duration and not _settled(times, rates):
+            times, rates, headings = self._held(angle, 2.0 * float(times[-1]), dt)
+        if not np.isfinite(rates).all():
+            raise FitError(f"the vessel's motion does not stay finite at {angle:.3g} rad of rudder")
+        steady = float(rates[-1])
+        straight = steady * angle > 0 and _settled(times, rates)
+        if straight and (rates / steady).max() <= 1.0 + _OVERSHOOT:
+            time = float(np.trapezoid(steady - rates, times)) / steady
+            time -= 0.0 if self.rate is None else 0.5 * abs(angle) / self.rate
+            if time > 0:
+                return Turning(gain=steady / angle, time=time, speed=speed)
+        turned = np.flatnonzero(headings * np.sign(angle) >= abs(angle))
+        if len(turned) == 0:
+            raise FitError(
+                f"at {angle:.3g} rad of rudder the vessel does not turn by as much to that side"
+                f" within {times[-1]:.3g} s; it cannot be steered (check the sign of its rudder and"
+                " the limit)"
+            )
+        first = float(times[turned[0]])
+        found = fit_response([self._zigzag(angle, angle, first, dt)[0]], 0.5 * first)
+        return Turning(gain=found.gain, time=found.time, speed=speed)
+
+    def _righted(self, angle: float, end: float, speed: float, dt: float) -> Turning:
+        """Return K, T and c of a vessel that has come to rest at an angle `end` under a held one.
+
+        `speed` is that of K and T in m/s.
+        """
+        if not (math.isfinite(end) and end * angle > 0):
+            raise FitError(
+                f"at {angle:.3g} rad of rudder the vessel comes to rest at an angle of {end:.3g}"
+                " rad; it cannot be steered (check the sign of the command that steers)"
+            )
+        righting, first = angle / end, 2.0 * self._longest(dt)
+        record, headings = self._zigzag(angle, min(abs(angle), 0.5 * abs(end)), first, dt)
+        known = replace(record, rudder=record.rudder - righting * headings)
+        found = fit_response([known], _FINE * first)
+        return Turning(float(found.gain), found.time, speed, righting)
+
+    def _longest(self, dt: float) -> float:
+        """Return the longest step in s of answers that begin with steps of dt seconds."""
+        return max(dt, _LONG_STEP) if self.any_step else dt
+
+    def _straight_on(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return state, inputs and memory of a straight course at the service speed, [1, ...]."""
         x, w = self.start(torch.ones(1, dtype=torch.float64))
-        variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
-        axis = self.axis
-        columns = (self.column("u"), self.column(axis.rate), self.column(axis.angle))
-        steps = (dt, max(dt, _LONG_STEP) if self.any_step else dt)
-        rate = math.inf if self.rate is None else self.rate
-        memory, rights = self.memory(variation), axis.value != axis.angle
-        steered = Steered(self.model, x, w, memory, columns, steps, rate, axis.side, rights)
-        return measure_turning(steered, angle, duration)
+        return x, w, self.memory(torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64))
+
+    def _held(self, angle: float, duration: float, dt: float) -> tuple[Array, Array, Array]:
+        """Return times, yaw rates and headings [N] under a held rudder, in steps that grow."""
+        r, psi, side = self.column(self.axis.rate), self.column(self.axis.angle), self.axis.side
+        x, w, s = self._straight_on()
+        begun = float(x[0, psi])
+        w[:, 0] = angle
+        times, rates, headings = [0.0], [0.0], [0.0]
+        longest = self._longest(dt)
+        with torch.no_grad():
+            while times[-1] < duration - 0.5 * dt:
+                model = self.model(dt)
+                for _ in range(min(_STEPS, round((duration - times[-1]) / dt))):
+                    x, s = model.step(x, w, s)
+                    times.append(times[-1] + dt)
+                    rates.append(side * float(x[0, r]))
+                    headings.append(side * (float(x[0, psi]) - begun))
+                dt = min(2.0 * dt, longest)
+        return np.array(times), np.array(rates), np.array(headings)
+
+    def _zigzag(self, angle: float, turned: float, first: float, dt: float) -> tuple[Record, Array]:
+        """Return a zigzag with its headings, which go to an angle `turned` on each side.
+
+        `first` is the time in s until its first change of rudder.
+        """
+        r, psi = self.column(self.axis.rate), self.column(self.axis.angle)
+        longest = self._longest(dt)
+        dt = dt if longest <= dt else min(max(first / _FINE, dt), longest)
+        model, (x, w, s) = self.model(dt), self._straight_on()
+        begun, side, switches = float(x[0, psi]), float(np.sign(angle)), 0
+        rates: list[float] = []
+        rudder: list[float] = []
+        headings: list[float] = []
+        with torch.no_grad():
+            while switches < _SWITCHES:
+                if len(rates) > _LONGEST:
+                    raise FitError(
+                        f"a zigzag with {abs(angle):.3g} rad of rudder does not turn the vessel"
+                        f" back within {dt * _LONGEST:.3g} s; it cannot be steered with so little"
+                        " rudder"
+                    )
+                headings.append(self.axis.side * (float(x[0, psi]) - begun))
+                if side * headings[-1] > abs(turned):
+                    side, switches = -side, switches + 1
+                w[:, 0] = side * abs(angle)
+                rates.append(self.axis.side * float(x[0, r]))
+                rudder.append(side * abs(angle))
+                x, s = model.step(x, w, s)
+        rate = np.array(rates)
+        gear = math.inf if self.rate is None else self.rate
+        angle_taken = slewed(np.array([0.0, *rudder]), gear, dt)[1:]
+        return Record(dt, angle_taken, rate, np.isfinite(rate)), np.array(headings)
+
+
+def _settled(times: Array, rates: Array) -> bool:
+    """Return whether a yaw rate is steady over the last half of the time."""
+    half, steady = rates[np.searchsorted(times, 0.5 * times[-1]) :], rates[-1]
+    overshoots = np.abs(rates).max() > (1.0 + _STEADY) * abs(steady)
+    return bool(overshoots or np.abs(half - steady).max() <= _STEADY * abs(steady))
 
 
 @final
