@@ -18,7 +18,7 @@ ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
     "api": (723, 84),
     "baselines": (884, 128),
-    "control": (3240, 366),
+    "control": (3217, 366),
     "core": (1602, 244),
     "data": (9649, 846),
     "documents": (2602, 239),
