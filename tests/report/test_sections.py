@@ -209,7 +209,7 @@ def test_indices_stand_flight_by_flight_or_by_kind(
     assert few.tables[0][2] == ["zigzag_01", "ship", "first overshoot", "9.000 deg"]
     assert few.tables[1] == [
         ["index", "unit", "ship", "model", "difference", "ship [L]", "model [L]", "IMO limit"],
-        ["first overshoot", "deg", "9.000", "11.00", "2.000", "–", "–", "10.00|exceeded"],
+        ["first overshoot", "deg", "9.000", "11.00", "2.000", "", "", "10.00|exceeded"],
         ["initial turning distance", "m", "8.000", "8.000", "0", "2.00", "2.00", ""],
     ]
     run = RunFiles(made_simulate(tmp_path / "many", logs=13))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from residnet.core.format import DASH, DEG, interval, number, plural, shown_unit
+from residnet.core.format import DASH, DEG, fixed, interval, number, plural, shown_unit
 from residnet.core.log import Log
 from residnet.data.simulated import Flight
 from residnet.manoeuvres.closed_loop import Spiral, Zigzag
@@ -206,16 +207,16 @@ def _by_index(content: Content, crafts: Mapping[str, Mapping[str, Content]]) -> 
     """
     every = [entry for of in crafts.values() for entry in of.values()]
 
-    def shown(craft: str, key: str = "value") -> Any:
-        return lambda name: _shown(content, name, crafts[craft].get(name, {}), key)[0]
+    def shown(craft: str, key: str, name: str) -> str:
+        return _shown(content, name, crafts[craft].get(name, {}), key)[0]
 
-    def lengths(craft: str) -> Any:
-        return lambda name: (crafts[craft].get(name) or {}).get("lengths")
+    def lengths(craft: str, name: str) -> str:
+        found = crafts[craft].get(name, {}).get("lengths")
+        return "" if found is None else fixed(found, 2)
 
     def apart(name: str) -> str:
         values: list[Any] = [of.get(name, {}).get("value") for of in crafts.values()]
-        difference = None if None in values else values[1] - values[0]
-        return _shown(content, name, {"value": difference})[0]
+        return _shown(content, name, {} if None in values else {"value": values[1] - values[0]})[0]
 
     def limit(name: str) -> Cell:
         found = [of[name] for of in crafts.values() if "limit" in of.get(name, {})]
@@ -233,15 +234,15 @@ def _by_index(content: Content, crafts: Mapping[str, Mapping[str, Content]]) -> 
     columns: list[Column] = [
         ("index", index_title),
         ("unit", lambda name: _shown(content, name, {})[1], str),
-        *((craft, shown(craft), str) for craft in crafts),
+        *((craft, partial(shown, craft, "value"), str) for craft in crafts),
+        *([("difference", apart, str)] if len(crafts) == 2 else []),
     ]
-    columns += [("difference", apart, str)] * (len(crafts) == 2)
     if any("interval" in entry for entry in every):
         columns.append((f"{100 * content['level']:.0f} % interval", within, str))
     if any(entry.get("lengths") is not None for entry in every):
-        columns += [(f"{craft} [L]", lengths(craft), 2) for craft in crafts]
+        columns += [(f"{craft} [L]", partial(lengths, craft), str) for craft in crafts]
     if float(content.get("scale", 1)) != 1:
-        columns += [("ship", shown(craft, "ship"), str) for craft in crafts]
+        columns += [("ship", partial(shown, craft, "ship"), str) for craft in crafts]
     if any("limit" in entry for entry in every):
         columns.append(("IMO limit", limit))
     return table_of(dict.fromkeys(name for of in crafts.values() for name in of), columns)
