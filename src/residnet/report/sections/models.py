@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from residnet.core.errors import ConfigError
-from residnet.core.format import DASH, fixed, interval, number
+from residnet.core.format import DASH, fixed, interval, number, powers
 from residnet.core.format import whole as whole_number
 from residnet.core.names import CHANNEL_UNITS
 from residnet.judge.verdict import diverged_note
@@ -120,7 +119,7 @@ def term_unit(axis: str, term: str) -> str:
         factors = parse_term(term, [name for name in units if name != "t"], functions=False)
     except ConfigError:
         return ""
-    powers: dict[str, int] = {}
+    found: dict[str, int] = {}
     for unit, sign in [
         (units.get(axis, "-"), 1),
         *((units[factor.name], -factor.power) for factor in factors),
@@ -130,10 +129,9 @@ def term_unit(axis: str, term: str) -> str:
                 name, _, exponent = piece.partition("^")
                 if name not in ("1", "-"):
                     power = (sign if place == 0 else -sign) * int(exponent or 1)
-                    powers[name] = powers.get(name, 0) + power
-    raised = {1: "", 2: "²", 3: "³", 4: "⁴"}
+                    found[name] = found.get(name, 0) + power
     up, down = (
-        "·".join(n + raised.get(s * p, f"^{s * p}") for n, p in powers.items() if s * p > 0)
+        "·".join(powers(f"{n}^{s * p}".removesuffix("^1")) for n, p in found.items() if s * p > 0)
         for s in (1, -1)
     )
     if not down:
@@ -303,9 +301,7 @@ def terms(run: RunFiles) -> Iterator[Figure]:
             "smaller terms": Look("sum of smaller terms", "#7F7F7F", "dotted", 1.0),
             "sum": Look("sum", width=0.8, order=4),
         }
-        for name, look in looks.items():
-            label = re.sub(r"\^([234])", lambda found: "²³⁴"[int(found[1]) - 2], look.label)
-            looks[name] = replace(look, label=label)
+        looks = {name: replace(look, label=powers(look.label)) for name, look in looks.items()}
         yield Figure(
             f"terms_{model}",
             f"Equation of {model}, term by term",
