@@ -30,7 +30,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "manoeuvres": (963, 143),
     "physics": (2124, 263),
     "regression": (1739, 192),
-    "report": (2716, 296),
+    "report": (2712, 296),
     "runs": (384, 50),
     "simulators": (355, 42),
     "tasks": (3059, 252),
