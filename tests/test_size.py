@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (884, 128),
     "control": (3217, 366),
     "core": (1602, 244),
-    "data": (9649, 846),
+    "data": (9642, 846),
     "documents": (2602, 239),
     "dynamics": (2233, 279),
     "export": (1509, 174),

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from drafted_logs import drafted
 
 import residnet
 from residnet.core.config import validate
@@ -35,9 +36,8 @@ def log() -> Log:
 def _drafted(frame: pd.DataFrame, file: Path, **to_csv: Any) -> tuple[Log, Marks]:
     """Return the log that a table's draft reads, and what was marked."""
     frame.to_csv(file, index=False, **to_csv)
-    marks = Marks()
-    content = draft_tables([file], marks)[0]
-    return validate(content, ReaderConfig, "test").build().read(file), marks
+    log, _, marks = drafted(file)
+    return log, marks
 
 
 def _guessed(marks: Marks, name: str) -> bool:
@@ -115,9 +115,8 @@ def test_a_workbook_that_begins_with_words(log: Log, tmp_path: Path) -> None:
             book, sheet_name="Info"
         )
         frame.to_excel(book, sheet_name="Daten", index=False)
-    content = draft_tables([file], Marks())[0]
+    read, content, _ = drafted(file)
     assert content["sheet"] == "Daten"
-    read = validate(content, ReaderConfig, "test").build().read(file)
     np.testing.assert_allclose(read["x"], log["x"], atol=1e-9)
 
 
@@ -226,9 +225,7 @@ def test_json_lines(log: Log, tmp_path: Path) -> None:
     file = tmp_path / "log.jsonl"
     whole = "\n".join(map(json.dumps, lines))
     file.write_text(whole + '\n\n{"stamp": 9')
-    marks = Marks()
-    content = draft_tables([file], marks)[0]
-    read = validate(content, ReaderConfig, "test").build().read(file)
+    read, content, marks = drafted(file)
     assert content["kind"] == "json_lines"
     assert any(finding["code"] == "cut_line" for finding in read.meta["findings"])
     for name in ("x", "y", "psi"):
@@ -312,8 +309,7 @@ def test_a_document_of_geojson_holds_fixes(log: Log, tmp_path: Path) -> None:
     ]
     file = tmp_path / "trip.json"
     file.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    marks = Marks()
-    read = validate(draft_tables([file], marks)[0], ReaderConfig, "test").build().read(file)
+    read, _, _ = drafted(file)
     _at(read, log)
     np.testing.assert_allclose(read["delta"], log["delta"], atol=1e-4)
 
@@ -385,8 +381,7 @@ def test_a_model_basin_names_its_columns_by_groups_and_its_time_not_at_all(
     frame = pd.DataFrame(columns, index=log.t)
     file = tmp_path / "22605.csv"
     frame.to_csv(file)
-    content = draft_tables([file], Marks())[0]
-    read = validate(content, ReaderConfig, "test").build().read(file)
+    read, _, _ = drafted(file)
     np.testing.assert_allclose(read.t, log.t, atol=1e-6)
     for name in ("x", "y", "psi", "delta"):
         np.testing.assert_allclose(read[name], log[name], atol=1e-6)

@@ -6,13 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drafted_logs import drafted
 
-from residnet.core.config import validate
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.drafting.questions import Marks
-from residnet.data.drafting.tables import draft_tables
-from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import AutoConfig, format_of
 from residnet.data.readers.formats.topic_folder import TopicFolderConfig
 from residnet.data.readers.recording import EVERYTHING
@@ -31,8 +28,7 @@ JAPANESE = "\n".join(
 
 def read(path: Path, **settings: object) -> Log:
     """Return the log in a table by the map that residnet drafts."""
-    content = {**draft_tables([path], Marks())[0], **settings}
-    return validate(content, ReaderConfig, "here").build().read(path)
+    return drafted(path, **settings)[0]
 
 
 @pytest.mark.parametrize(

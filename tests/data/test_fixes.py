@@ -10,17 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from drafted_logs import drafted
 from tiny_tasks import boat
 
-from residnet.core.config import validate
 from residnet.core.errors import DataError
-from residnet.core.log import Log
-from residnet.data.drafting.questions import Marks
-from residnet.data.drafting.tables import draft_tables
-from residnet.data.readers import ReaderConfig
 from residnet.data.readers.tables import CsvConfig
 from residnet.data.readers.written import degrees_of
-from residnet.tasks.drafting import drafted
+from residnet.tasks import drafting
 
 pytest.importorskip("pyproj")
 CHANNELS = {
@@ -82,7 +78,7 @@ def test_a_plotters_table_is_drafted_without_a_word(tmp_path: Path) -> None:
     files = [tmp_path / f"trial{k}.csv" for k in range(3)]
     for k, file in enumerate(files):
         table(100 + k).to_csv(file, index=False)
-    content = yaml.safe_load(drafted(files, tmp_path, "boat").text)
+    content = yaml.safe_load(drafting.drafted(files, tmp_path, "boat").text)
     channels = content["data"]["reader"]["channels"]
     assert channels["latitude"] == {"column": "Lat", "unit": "deg"}
     assert channels["longitude"] == {"column": "Lon", "unit": "deg"}
@@ -158,7 +154,7 @@ def test_written_positions_are_drafted_and_read(
         Lon=[write(value, "W") for value in made["Lon"]],
     )
     written.to_csv(file, index=False)
-    read = [_read(path)[0] for path in (file, tmp_path / "plain.csv")]
+    read = [drafted(path)[0] for path in (file, tmp_path / "plain.csv")]
     for name in ("x", "y"):
         np.testing.assert_allclose(read[0][name], read[1][name], atol=2e-3)
 
@@ -170,13 +166,7 @@ def test_numbers_with_minutes_and_letters_beside_them(tmp_path: Path) -> None:
         name: [100 * int(value) + value % 1 * 60 for value in made[name]] for name in ("Lat", "Lon")
     }
     made.assign(**numbers, NS="N", EW="E").to_csv(file, index=False)
-    log, marks = _read(file)
+    log, _, marks = drafted(file)
     for name in ("x", "y"):
-        np.testing.assert_allclose(log[name], _read(tmp_path / "plain.csv")[0][name], atol=2e-3)
+        np.testing.assert_allclose(log[name], drafted(tmp_path / "plain.csv")[0][name], atol=2e-3)
     assert any("degrees and minutes in one" in text for _, text in marks.guesses)
-
-
-def _read(file: Path) -> tuple[Log, Marks]:
-    marks = Marks()
-    content = draft_tables([file], marks)[0]
-    return validate(content, ReaderConfig, "here").build().read(file), marks

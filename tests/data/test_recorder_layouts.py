@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from drafted_logs import drafted
 from scipy.spatial.transform import Rotation
 
 import residnet
@@ -42,13 +43,6 @@ def text(columns: dict[str, Any], delimiter: str = ";", units: tuple[str, ...] =
     lines += [delimiter.join(units)] if units else []
     rows = zip(*columns.values(), strict=True)
     return lines + [delimiter.join(f"{cell:.6f}" for cell in row) for row in rows]
-
-
-def drafted(path: Path) -> tuple[Log, dict[str, Any], Marks]:
-    """What the drafted reader reads, its settings, and what is marked."""
-    marks = Marks()
-    content = draft_tables([path], marks)[0]
-    return validate(content, ReaderConfig, "here").build().read(path), content, marks
 
 
 def same(log: Log) -> bool:
@@ -201,9 +195,8 @@ def test_times_of_unix_keep_their_digits(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     lines = text({"No.": np.arange(T.size), **COLUMNS, "Zeit": np.floor(T)}, ";")
     path.write_text("\n".join(lines) + "\n")
-    content = draft_tables([path], Marks())[0]
+    read, content, _ = drafted(path)
     assert content["time"]["column"] == "Zeit", "a counter is no time"
-    read = validate(content, ReaderConfig, "here").build().read(path)
     np.testing.assert_allclose(read.t - read.t[0], T, atol=1e-9)
     assert "coarse_stamps" in [found["code"] for found in read.meta["findings"]]
 

@@ -140,12 +140,11 @@ def draft_tables(
     for name in [one for one in rolls if any(names[one] not in s.numbers for s in sheets)]:
         marks.note(CHANNELS, f"empty in some files, left out: {names.pop(name)}")
     names |= submerged(numeric, names)
-    sheet = first
-    found = [name for name in sheet.texts if state_channel(words_of(name)) in _LARGEST]
+    found = [name for name in first.texts if state_channel(words_of(name)) in _LARGEST]
     if found and "x" not in names and not set(_LARGEST) <= set(names):
-        cell = sheet.texts[found[0]].dropna().iloc[0]
+        cell = first.texts[found[0]].dropna().iloc[0]
         raise DataError(
-            f"{sheet.path}: column '{found[0]}' holds '{shown(str(cell))}', which is no latitude or"
+            f"{first.path}: column '{found[0]}' holds '{shown(str(cell))}', which is no latitude or"
             " longitude beside its other column; forms that are read are 59.90535, 59°54.321'N,"
             " 59 54 19.3 N and 5954.321"
         )

@@ -15,7 +15,7 @@ import numpy as np
 
 from residnet.core.errors import UsageError
 from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS
-from residnet.core.units import known_unit
+from residnet.core.units import is_unit, known_unit, si_unit
 
 _IN_BRACKETS = re.compile(r"[\[({]([^\])}]*)[\])}]")
 _FULL = 35.0
@@ -49,17 +49,12 @@ def written_unit(column: str, expected: str | None) -> str | None:
 
 def other_dimension(column: str, expected: str) -> str | None:
     """Return the unit in the brackets of a name where it measures something else; None for none."""
-    for text in _IN_BRACKETS.findall(column):
-        if expected == "rad" and text in ("T", "M"):
-            # a true or a magnetic heading
-            continue
-        try:
-            known_unit(text.strip(), expected)
-        except UsageError:
-            try:
-                return known_unit(text.strip())
-            except UsageError:
-                continue
+    for text in map(str.strip, _IN_BRACKETS.findall(column)):
+        # (T) and (M) tell a true and a magnetic heading
+        if is_unit(text) and not (expected == "rad" and text in ("T", "M")):
+            unit = known_unit(text)
+            if si_unit(unit) != expected:
+                return unit
     return None
 
 
@@ -391,11 +386,13 @@ _TWIST = (
     r" ?{}(?: (?:m s|mps|ms))?$"
 )
 _AXES = (_Rule("u", "", "", _TWIST.format("x")), _Rule("v", "", "", _TWIST.format("y")))
-# of what drives the vessel or is asked of it
-_DRIVEN = (
+# what no channel of the motion is about, and what none is but a position along north, whose N
+# may be one of revolutions
+_NO_MOTION = (
     *("command", "acceleration", "rudder", "planes", "propeller", "current", "depth", "age"),
-    *("heave", "engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque"),
+    "heave",
 )
+_POWERED = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")
 _ALONG = "north east angular voltage"
 _STATES = (
     _Rule("latitude", "latitude"),
@@ -451,8 +448,8 @@ def state_channel(words: Words) -> str | None:
         if w.has("speed") and "dir" not in w.text.split():
             return f"{felt}wind_speed"
         return (f"{felt}wind_angle" if felt else "wind_dir") if w.has("direction") else None
-    placed = w.has("position", "north") and w.lacks(*_DRIVEN[:9])
-    return _first(_STATES, w) if placed or w.lacks(*_DRIVEN) else None
+    moves = w.lacks(*_NO_MOTION) and (w.lacks(*_POWERED) or w.has("position", "north"))
+    return _first(_STATES, w) if moves else None
 
 
 def deep_channel(words: Words) -> str | None:

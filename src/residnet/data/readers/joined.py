@@ -217,14 +217,12 @@ class JoinedReader(LogReader):
 
 def _by_dates(log: Log, other: Log) -> float | None:
     """Return what brings another clock to that of a log by dates or Unix time that overlap."""
-    begins = []
-    for one in (log, other):
-        epoch = one.meta.get("epoch")
-        epoch = float(one.t[0]) if epoch is None and unix_unit(one.t) == "s" else epoch
-        if epoch is None:
-            return None
-        begins.append(float(epoch))
-    apart = begins[1] - begins[0]
+    first, second = (
+        one.meta.get("epoch", one.t[0] if unix_unit(one.t) == "s" else None) for one in (log, other)
+    )
+    if first is None or second is None:
+        return None
+    apart = float(second) - float(first)
     if not other.t[0] - other.t[-1] < apart < log.t[-1] - log.t[0]:
         return None
     return apart + float(log.t[0] - other.t[0])
