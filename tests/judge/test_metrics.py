@@ -179,13 +179,16 @@ def test_find_wants_exactly_one() -> None:
         find(table, split="test")
 
 
-def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest() -> None:
-    random, held, logs, windows = np.random.default_rng(3), [], 4, 3
+@pytest.mark.parametrize("logs", [3, 4, 6])
+def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest(logs: int) -> None:
+    random, held, windows = np.random.default_rng(3), [], 3
     numbers = np.repeat(np.arange(logs), windows)
     for _ in range(400):
         # a log has its size in common, half of it for all columns
         sizes = 0.4 * random.normal(size=(2, logs, 1)) + 0.4 * random.normal(size=(2, logs, 6))
-        seen, new = np.exp(sizes.repeat(windows, axis=1) + 0.1 * random.normal(size=(2, 12, 6)))
+        seen, new = np.exp(
+            sizes.repeat(windows, axis=1) + 0.1 * random.normal(size=(2, 3 * logs, 6))
+        )
         spans = np.array(new_trials(seen, numbers))
         own = np.log(seen.reshape(logs, windows, 6).mean(1)).std(0)
         surest = int(own.argmin())
@@ -394,34 +397,6 @@ def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[Pr
     for window, prediction in pairs:
         prediction.states[20, 2] -= 0.5 * (window.log + 1)
     assert entries[0]["models"]["mlp"]["intervals"]["heading"][1] == pytest.approx(np.pi)
-
-
-@pytest.mark.parametrize("count", [3, 4, 6])
-def test_intervals_hold_the_mean_over_as_many_new_logs(logs: list[Prepared], count: int) -> None:
-    """Forty sets of logs are judged, and forty others fall into the intervals as often as told."""
-    logs = logs[:count]
-    random, hits = np.random.default_rng(0), 0
-    protocol = Windows(length=20.0, first=0.0, history=0.0)
-    windows = [w for i, prepared in enumerate(logs) for w in protocol.windows(prepared, i, STEP)]
-
-    def drawn() -> FreeRun:
-        out = FreeRun("T20", "test", windows)
-        by_log = random.gamma(2.0, 1.0, len(logs))
-        out.predictions["mlp"] = []
-        for window in windows:
-            states = logs[window.log].y[window.start : window.stop].copy()
-            states[:, 0] += by_log[window.log] * random.gamma(4.0, 0.25)
-            out.predictions["mlp"].append(Prediction(states, False))
-        return out
-
-    trials = 40
-    for _ in range(trials):
-        seen, new = (
-            Judged(drawn(), [CANDIDATES[2]], logs, SCALES).horizons(STEP) for _ in range(2)
-        )
-        low, high = seen[-1]["models"]["mlp"]["intervals"]["position"]
-        hits += low <= new[-1]["models"]["mlp"]["position"] <= high
-    assert hits >= 0.85 * trials
 
 
 def test_every_model_is_compared_with_zero_and_the_first_baseline(

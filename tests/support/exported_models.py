@@ -138,7 +138,7 @@ class AsTensors:
         ).float()
 
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        states, flags, x = [self.guard.accept_state(x0)], [], x0
+        states, flags, x = [self.guard.of_state.replaced(x0)], [], x0
         for k in range(w.shape[1]):
             x, s, outside = self.step(x, w[:, k], s)
             states.append(x)

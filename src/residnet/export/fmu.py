@@ -85,7 +85,7 @@ class FmuExporter(Exporter):
             for part, text in sources.items():
                 (folder / part).write_text(text)
             library = compile_shared(
-                _compiled(folder, sources), folder / f"{NAME}{_library_suffix()}"
+                _compiled(folder, sources), folder / f"{NAME}{_SUFFIX.get(sys.platform, '.so')}"
             )
             loaded = CompiledModel(library, exported, torch.float64)
             out = {}
@@ -139,6 +139,8 @@ class FmuExporter(Exporter):
         """Return this machine as the standard names it."""
 
 
+_SUFFIX = {"win32": ".dll", "darwin": ".dylib"}
+"""Of libraries, by the system; `.so` elsewhere."""
 _CROSS = (
     ("x86_64-w64-mingw32-gcc", {"3.0": "x86_64-windows", "2.0": "win64"}, ".dll"),
     # version 2.0 has no name for it
@@ -153,10 +155,6 @@ def _compiled(folder: Path, sources: Mapping[str, str]) -> list[Path]:
 
 def _packaged(name: str) -> str:
     return resources.files("residnet.export").joinpath(name).read_text()
-
-
-def _library_suffix() -> str:
-    return {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 
 
 def _machine() -> str:

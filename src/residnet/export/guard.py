@@ -151,10 +151,6 @@ class GuardedDynamics(Dynamics):
             s = torch.where(remembers.unsqueeze(-1), s, torch.zeros_like(s))
         return motion(used, self.dof), actuators(used, self.dof), s, ~inside
 
-    def accept_state(self, x: Tensor) -> Tensor:
-        """Return a state [B, 3 + n] as it is used."""
-        return self.of_state.replaced(x)
-
     def remembers(self, s: Tensor) -> Tensor:
         """Return which rows [B] of a memory [B, n_state] the head can have come to."""
         return ((s >= self.memory_low) & (s <= self.memory_high)).all(dim=-1)

@@ -83,6 +83,17 @@ class _Controller(nn.Module):
         self.travel = min(policy.rate * policy.dt, 2.0 * policy.limit)
         self.limit, self.dt, self.speed = policy.limit, policy.dt, policy.speed
 
+    @torch.jit.export
+    def initial_state(self, y: Tensor) -> Tensor:
+        """Return the memory s [B, n] at the first measurement y [B, k], rudder amidships."""
+        require_shape("measured", y, [size(y, 2, 0), self.low.numel()])
+        y = y.to(self.low.dtype)
+        return self.begun(torch.where(self.good(y), y, torch.zeros_like(y)))
+
+    def begun(self, y: Tensor) -> Tensor:
+        """Return the memory [B, n] at an accepted measurement [B, k]."""
+        raise NotImplementedError
+
     def good(self, y: Tensor) -> Tensor:
         """Return which measurements are in range, [B, 1]; what is no number is not."""
         return ((y >= self.low) & (y <= self.high)).all(dim=-1, keepdim=True)
@@ -127,13 +138,6 @@ class ExportedPolicy(_Controller):
         memory = policy.memory_ranges(limits[-1][1], policy.limit).values()
         super().__init__(limits, list(memory), policy, safe, dtype)
         self.policy = policy
-
-    @torch.jit.export
-    def initial_state(self, y: Tensor) -> Tensor:
-        """Return the memory s [B, n] at the first measurement y [B, 3], rudder amidships."""
-        require_shape("measured", y, [size(y, 2, 0), self.low.numel()])
-        y = y.to(self.low.dtype)
-        return self.begun(torch.where(self.good(y), y, torch.zeros_like(y)))
 
     def begun(self, y: Tensor) -> Tensor:
         return torch.cat((self.policy.initial_state(y), torch.zeros_like(y[:, :1])), dim=-1)
@@ -209,17 +213,7 @@ class ExportedCourse(_Controller):
         self.travel = self.follower.travel
         self.guidance = guidance
 
-    @torch.jit.export
-    def initial_state(self, y: Tensor) -> Tensor:
-        """Return the memory [B, n] at the first measurement y [B, 6].
-
-        It stands at the beginning of the course, rudder amidships.
-        """
-        require_shape("measured", y, [size(y, 2, 0), self.low.numel()])
-        return self.begun(y.to(torch.float64))
-
     def begun(self, y: Tensor) -> Tensor:
-        y = torch.where(self.good(y), y, torch.zeros_like(y))
         parts = (self.guidance.initial_state(y), self.follower.initial_state(y))
         return torch.cat((*parts, torch.zeros_like(y[:, :1])), dim=-1)
 

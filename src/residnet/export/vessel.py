@@ -142,7 +142,7 @@ class ExportedModel(nn.Module):
         require_shape("w", w, [rows, steps, self.inputs])
         require_shape("s", s, [rows, self.n_state])
         x0 = x0.float()
-        start = torch.cat((self.guarded.accept_state(x0), torch.zeros_like(x0[:, :1])), dim=-1)
+        start = torch.cat((self.guarded.of_state.replaced(x0), torch.zeros_like(x0[:, :1])), dim=-1)
         # the first step sees x0 as it was given, for its flag
         states, _, s = self.simulate(
             torch.cat((x0, torch.zeros_like(x0[:, :1])), dim=-1), w.float(), s.float()

@@ -172,16 +172,13 @@ def calibrate_bands(
             runs.add({name: entry.model for name, entry in identified.items()}, validation, True)
         for name, band in runs.bands().items():
             out.setdefault(name, {})[protocol] = band
-    return {name: _banded(entry, out.get(name, {})) for name, entry in identified.items()}
-
-
-def _banded(entry: FittedModel, bands: Mapping[str, Band]) -> FittedModel:
-    """Return a model with its bands; its description takes the one that reaches furthest."""
-    if not bands:
-        return entry
-    furthest = max(bands.values(), key=lambda band: band.horizon)
-    spec = entry.spec.model_copy(update={"band": furthest.table()})
-    return replace(entry, spec=spec, bands=bands)
+    found = dict(identified)
+    for name, bands in out.items():
+        # the description of a model takes the band that reaches furthest
+        furthest = max(bands.values(), key=lambda band: band.horizon)
+        spec = found[name].spec.model_copy(update={"band": furthest.table()})
+        found[name] = replace(found[name], spec=spec, bands=bands)
+    return found
 
 
 class _Calibration:

@@ -146,11 +146,6 @@ class Errors:
         return np.asarray(np.cumsum(self.counts) - self.counts)
 
     @property
-    def place(self) -> np.ndarray:
-        """Number of each sample in its window [N]."""
-        return np.asarray(np.arange(len(self.error)) - np.repeat(self.begins, self.counts))
-
-    @property
     def scored(self) -> np.ndarray:
         """Whether each of what moves counts at each sample [N, n]."""
         turning = [np.ones_like(self.usable)] * (self.live.size - 2)

@@ -117,7 +117,16 @@ def find_pairs(
                 if len(starts) == 0:
                     continue
                 miss = mismatch(given, coarse[other])[: len(starts)]
-                fits = (miss < _COMMAND) & _same_start(window, logs[other], starts, length, scales)
+                there = logs[other]
+                apart = np.abs(there.smooth[starts, there.live.columns] - window.nu)
+                fits = (
+                    (miss < _COMMAND)
+                    # an unbroken, usable stretch with nearly the initial velocities of the window
+                    & (there.piece[starts] >= 0)
+                    & (there.piece[starts] == there.piece[starts + length - 1])
+                    & there.usable[starts]
+                    & (apart < _START * scales).all(1)
+                )
                 if other == number:
                     fits &= starts >= window.stop
                 if fits.any():
@@ -144,21 +153,6 @@ def mismatch(given: np.ndarray, series: np.ndarray) -> np.ndarray:
         )
         out.append(np.sqrt(np.maximum(square, 0.0) / length))
     return np.asarray(np.max(out, axis=0))
-
-
-def _same_start(
-    window: Window, log: Prepared, starts: np.ndarray, length: int, scales: np.ndarray
-) -> np.ndarray:
-    """[S] bool: starts in an unbroken, usable stretch with nearly the initial velocities of the
-    window.
-    """
-    whole = (
-        (log.piece[starts] >= 0)
-        & (log.piece[starts] == log.piece[starts + length - 1])
-        & log.usable[starts]
-    )
-    near = (np.abs(log.smooth[starts, log.live.columns] - window.nu) < _START * scales).all(1)
-    return np.asarray(whole & near)
 
 
 def _apart(pair: Pair, logs: Sequence[Prepared]) -> list[float]:

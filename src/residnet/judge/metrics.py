@@ -396,7 +396,10 @@ class Judged:
         for quantity, values in quantities.items():
             if not np.isfinite(values).all():
                 continue
-            thirds = [part for part in _equal_parts(values, _BANDS) if part.sum() >= _LEAST]
+            # equal values stay together
+            edges = np.quantile(values, np.arange(1, _BANDS) / _BANDS)
+            place = np.searchsorted(edges, values, side="left")
+            thirds = [place == k for k in range(_BANDS) if (place == k).sum() >= _LEAST]
             out += [
                 {
                     "by": quantity,
@@ -492,13 +495,6 @@ def _sizes(
         }
         out[model] = {name: mean for name, (mean, _) in found.items()} | {"intervals": intervals}
     return out
-
-
-def _equal_parts(values: np.ndarray, count: int) -> list[np.ndarray]:
-    """[W] bool of each of so many equal parts, lowest first; equal values stay together."""
-    edges = np.quantile(values, np.arange(1, count) / count)
-    place = np.searchsorted(edges, values, side="left")
-    return [place == part for part in range(count)]
 
 
 def find(table: Sequence[Mapping[str, Any]], **wanted: str) -> Mapping[str, Any]:
