@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from typing import final
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +44,6 @@ _WIDER = (1.0, 5.0)
 """Multiples of that change that are tried until what is asked is held."""
 _HELD = 1e-3
 """Turning radii that may be missed."""
-_COMPARED = 2
-"""Rounds after which several courses are compared."""
 _UNCHANGED = 1e-3
 """Largest change of z with which turns made anew fit each other."""
 _MOST = 3
@@ -60,8 +57,6 @@ def joined(
 ) -> Iterator[tuple[Fit, Fitted]]:
     """Yield courses with turns that follow each other as the vessel makes them, quickest first.
 
-    What turns leave to those behind them changes which course is quickest.
-
     Args:
         turns: that the courses were found with, each from straight ahead.
         found: the courses, quickest first.
@@ -73,59 +68,34 @@ def joined(
     for one in found:
         if one[1].time < _SLOWER * found[0][1].time:
             distinct.setdefault(one[0].route.sides, one)
-    begun = [_Joining(turns, make, *one) for one in list(distinct.values())[:_MOST]]
-    for course in begun:
-        course.advance(0, _COMPARED)
-    for course in sorted(begun, key=lambda course: course.fitted.time):
-        course.advance(_COMPARED, len(_ROUNDS))
-        yield course.fit, course.fitted
+    for fit, fitted in list(distinct.values())[:_MOST]:
+        yield _joined(turns, fit, fitted, make)
 
 
-@final
-@dataclass
-class _Joining:
-    """A course whose turns are made anew, round for round."""
-
-    turns: Turns
-    make: TurnMaker
-    fit: Fit
-    fitted: Fitted
-    begin: list[Array] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        route = self.fit.route
-        rudder = [self.turns.tables[number].rudder for number in route.numbers]
-        self.rudder = np.array(route.sides) * rudder
-        self.begin = [self.make.straight] * len(rudder)
-
-    def advance(self, first: int, last: int) -> None:
-        """Make the turns anew, and fit the course to them, in some of the rounds."""
-        for width, reach in _ROUNDS[first:last]:
-            if len(self.rudder) == 0:
-                return
-            before = self.fitted.z
-            self._round(width, reach)
-            if reach > 0.0 and np.abs(self.fitted.z - before).max() < _UNCHANGED:
-                return
-
-    def _round(self, width: float, reach: float) -> None:
-        route, z = self.fit.route, self.fitted.z
-        values = z * route.units
-        spacing = width / (self.make.turning.gain * np.abs(self.rudder))
-        middle = np.maximum(values[2::2], 2.0 * spacing + 0.1 * self.make.dt)
+def _joined(turns: Turns, fit: Fit, fitted: Fitted, make: TurnMaker) -> tuple[Fit, Fitted]:
+    """Return a course whose turns are made anew, and that is fitted to them, round for round."""
+    route = fit.route
+    rudder = np.array([turns.tables[number].rudder for number in route.numbers]) * route.sides
+    begin = [make.straight] * len(rudder)
+    for width, reach in _ROUNDS if len(rudder) else ():
+        before, values = fitted.z, fitted.z * route.units
+        spacing = width / (make.turning.gain * np.abs(rudder))
+        middle = np.maximum(values[2::2], 2.0 * spacing + 0.1 * make.dt)
         holds = middle[:, None] + spacing[:, None] * np.arange(-2, 3)
-        turns, made = following_turns(self.make, holds, self.rudder, self.begin, route.turns.radius)
-        self.begin = [self.make.straight]
-        for turn, leg in zip(made[:-1], values[3:-1:2], strict=True):
-            self.begin.append(state_behind(turn, float(leg)))
-        if reach > 0.0:
-            follows = Route(route.start, route.sides, tuple(range(len(holds))), turns)
-            self.fit = self.fit.on(follows)
-            for wider in _WIDER:
-                fitted = self.fit.solve(np.clip(z, *self.fit.bounds()), wider * reach)
-                self.fitted = fitted
-                if fitted.missed <= _HELD * turns.radius:
-                    break
+        made, middles = following_turns(make, holds, rudder, begin, turns.radius)
+        begin = [make.straight]
+        for turn, leg in zip(middles[:-1], values[3:-1:2], strict=True):
+            begin.append(state_behind(turn, float(leg)))
+        if reach == 0.0:
+            continue
+        fit = fit.on(Route(route.start, route.sides, tuple(range(len(holds))), made))
+        for wider in _WIDER:
+            fitted = fit.solve(np.clip(before, *fit.bounds()), wider * reach)
+            if fitted.missed <= _HELD * turns.radius:
+                break
+        if np.abs(fitted.z - before).max() < _UNCHANGED:
+            break
+    return fit, fitted
 
 
 _TRIES = ((1.0, 1.0, 1), (0.5, 1.0, 1), (0.0, 1.0, 1))

@@ -1,7 +1,6 @@
 """The lengths of a route's legs and turns that make it quickest and keep it right.
 
-What is asked of it has exact derivatives; linear programs find the lengths, quadratic ones mend
-them.
+What is asked of it has exact derivatives; sequential linear programs find the lengths.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.optimize import linprog, minimize
+from scipy.optimize import linprog
 
 from residnet.control.courses.course_check import left_behind
 from residnet.control.courses.outline import Circle
@@ -29,9 +28,6 @@ _REACH = (5e-4, 0.3, 1.0)
 """Least, first and largest reach of a step."""
 _HELD = (0.05, 0.3, 0.7)
 """Shares of the promised gain: from which a step is made, shortened below, lengthened above."""
-
-_BENT = (0.5, 25)
-"""Largest reach of all steps of quadratic programs, and how many there are at most."""
 _DEAR = 40.0
 """Turning radii that a course may be longer by to miss what is asked by one less."""
 _PRICE = 4.0
@@ -46,8 +42,6 @@ kept an eye on.
 """
 _SHARES = 4
 """Pieces of a turn that keep to circles each for itself."""
-_CLOSE = 0.02
-"""Turning radii that a route may miss by to be improved further."""
 FARTHEST = 0.3
 """How much farther off than its circle a buoy may be passed, in turning radii."""
 
@@ -310,14 +304,6 @@ class Fit:
         z, reach = self.near
         return np.maximum(least, z - reach), np.minimum(most, z + reach)
 
-    def within(self, z: Array, reach: float) -> tuple[Array, Array]:
-        """Return the bounds of z that is changed by no more than a reach."""
-        least, most = self.bounds()
-        low, high = np.maximum(least, z - reach), np.minimum(most, z + reach)
-        if not self.free:
-            low[0] = high[0] = z[0]
-        return low, high
-
     def look(self, z: Array) -> None:
         """Look anew which parts of the course come near which buoys."""
         self.seen = None
@@ -339,8 +325,6 @@ class Fit:
         """Return the route that is found from a start, not farther from it than a reach of z."""
         self.near = None if reach is None else (z, reach)
         z = self._descended(np.clip(z, *self.bounds()))
-        if self.missed(z)[0] <= _CLOSE * self.unit:
-            z = self._polished(z)
         missed, worst = self.missed(z)
         return Fitted(z, self.linear(z).cost * self.unit / self.route.turns.speed, missed, worst)
 
@@ -364,7 +348,9 @@ class Fit:
             if number % _LOOKED == 0:
                 self.look(z)
                 here = self.linear(z)
-            low, high = (bound - z for bound in self.within(z, reach))
+            low, high = np.maximum(least - z, -reach), np.minimum(most - z, reach)
+            if not self.free:
+                low[0] = high[0] = 0.0
             step, promised = here.step(low, high)
             if promised < _SETTLED:
                 break
@@ -385,32 +371,3 @@ class Fit:
                 break
         self.look(z)
         return z
-
-    def _polished(self, z: Array) -> Array:
-        """Return the z of least cost near an end of `_descended`, or that end where none is found.
-
-        Linear programs creep where less is asked than z has parts, because the cost bends there.
-        Quadratic ones (SLSQP) see the bend. What is far from being missed is left out.
-        """
-        first = self.linear(z)
-        low, high = self.within(z, _BENT[0])
-        kept = first.values < np.abs(first.rows).max(axis=1, initial=0.0) * _BENT[0]
-        # its types know no conditions with derivatives
-        solve: Any = minimize
-        found = solve(
-            lambda x: (self.linear(x).cost, self.linear(x).slope),
-            z,
-            jac=True,
-            method="SLSQP",
-            bounds=np.stack((low, high), axis=-1),
-            constraints={
-                "type": "ineq",
-                "fun": lambda x: self.linear(x).values[kept],
-                "jac": lambda x: self.linear(x).rows[kept],
-            },
-            options={"maxiter": _BENT[1], "ftol": 1e-4},
-        )
-        after = np.clip(found.x, low, high)
-        better = self.linear(after).merit() < first.merit()
-        self.look(after if better else z)
-        return after if better else z
