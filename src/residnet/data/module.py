@@ -10,7 +10,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from residnet.data.windows import WindowStage, WindowStore
+from residnet.data.windows import COLUMNS, WindowStage, WindowStore
 
 
 class EpochDataModule(L.LightningDataModule, ABC):
@@ -87,6 +87,7 @@ class Windows(NamedTuple):
         past_y: measured states before the window [B, H, 3 + n].
         past_w: inputs before it [B, H, m].
         depth: samples since the stretch began [B]; 0 where the window begins it.
+        told: what a training adds of each sample [B, L, k].
     """
 
     y: Tensor
@@ -99,6 +100,7 @@ class Windows(NamedTuple):
     past_y: Tensor
     past_w: Tensor
     depth: Tensor
+    told: Tensor
 
 
 @final
@@ -158,15 +160,18 @@ class WindowsDataModule(EpochDataModule):
         drawn = [source.epoch(self.seed, epoch)[:, rank::world] for source in self._drawn[number]]
         for rows in zip(*drawn, strict=True):
             yield tuple(
-                self.windows(starts, stage.length, history)
+                self.windows(starts, stage.length, history, stage.columns)
                 for starts, history in zip(rows, histories, strict=False)
             )
 
-    def windows(self, starts: Tensor, length: int, history: int) -> Windows:
+    def windows(
+        self, starts: Tensor, length: int, history: int, columns: Sequence[str] = COLUMNS
+    ) -> Windows:
         """Return the windows of `length` samples from rows [B] of the store on."""
         store = self.store
-        names = ("y", "smooth", "nu_dot", "w", "recorded", "usable", "good")
-        taken = {name: store.take(getattr(store, name), starts, length) for name in names}
+        taken = dict.fromkeys((*COLUMNS, "told"), store.y[:0]) | {
+            name: store.take(getattr(store, name), starts, length) for name in columns
+        }
         past_y, past_w = store.history(starts, history)
         return Windows(**taken, past_y=past_y, past_w=past_w, depth=store.depth[starts])
 
@@ -200,8 +205,7 @@ class RowsDataModule(EpochDataModule):
     def batches(self, epoch: int) -> Iterator[tuple[Tensor, ...]]:
         rank, world = self.share
         generator = torch.Generator().manual_seed(epoch_seed(self.seed, epoch))
-        order = torch.randperm(self.tensors[0].shape[0], generator=generator)
-        for rows in order.split(self.batch):
+        for rows in torch.randperm(len(self.tensors[0]), generator=generator).split(self.batch):
             yield tuple(values[rows[rank::world]] for values in self.tensors)
 
 

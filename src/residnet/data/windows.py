@@ -32,6 +32,7 @@ class WindowStore:
             none.
         depth: samples since the stretch began, [N].
         log: number of the log, in the order gathered, [N].
+        told: what a training adds of each sample [N, k]; None where it adds nothing.
     """
 
     y: Tensor
@@ -44,6 +45,7 @@ class WindowStore:
     reach: Tensor
     depth: Tensor
     log: Tensor
+    told: Tensor | None = None
 
     @classmethod
     def gather(cls, logs: Sequence[Prepared], dtype: torch.dtype = torch.float32) -> WindowStore:
@@ -114,7 +116,11 @@ class WindowStore:
                 apart[:, column] -= torch.pi
             return (blocks[..., 0] + apart.mean(-1))[order]
 
-        rest = {part.name: getattr(self, part.name)[order] for part in fields(self)}
+        rest = {
+            part.name: getattr(self, part.name)[order]
+            for part in fields(self)
+            if part.name != "told"
+        }
         return replace(
             self,
             **rest
@@ -124,12 +130,6 @@ class WindowStore:
                 "reach": (self.reach[order] + steps - 1) // steps,
                 "depth": self.depth[order] // steps,
             },
-        )
-
-    def to(self, device: torch.device) -> WindowStore:
-        """Return the same store on a device."""
-        return WindowStore(
-            **{part.name: getattr(self, part.name).to(device) for part in fields(self)}
         )
 
     def starts(self, length: int, share: float = 0.5) -> Tensor:
@@ -209,6 +209,10 @@ class WindowBatches:
         return self.starts[order].reshape(self.steps, self.batch)
 
 
+COLUMNS = ("y", "smooth", "nu_dot", "w", "recorded", "usable", "good")
+"""What the windows of a log hold of each sample."""
+
+
 @dataclass(frozen=True)
 class WindowStage:
     """The windows of one stage of a training.
@@ -220,6 +224,7 @@ class WindowStage:
             is repeated.
         begun: how many of the batch begin near the start of a stretch, as a free run does.
         lead: how many samples after it these begin; their history is as long, and at least one.
+        columns: of the store that its windows hold, the others are left empty.
     """
 
     length: int
@@ -227,6 +232,7 @@ class WindowStage:
     history: int = 1
     begun: int = 0
     lead: int = 0
+    columns: Sequence[str] = COLUMNS
 
     def sources(self, store: WindowStore, steps: int) -> list[WindowBatches]:
         """Return where the windows of `steps` batches come from: anywhere, then beginnings.

@@ -288,11 +288,13 @@ class HybridDynamics(Dynamics):
 
         The head's memory is empty at first.
         """
-        known = self.baseline(z)
+        return self.taught(z, self.known(z))
+
+    def taught(self, z: Tensor, known: Tensor) -> Tensor:
+        """Return what `one_step` does where the baseline's share [B, T, n] is known."""
         if self.missed is not None:
             return self._observed(z, known)
-        rho = self.head.sequence(z)
-        return self.found(known, rho, z[..., : self.dof])
+        return self.found(known, self.head.sequence(z), z[..., : self.dof])
 
     def _observed(self, z: Tensor, known: Tensor) -> Tensor:
         """Return nu_dot [B, T, n] where the head is shown what was predicted wrong.

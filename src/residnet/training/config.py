@@ -262,7 +262,9 @@ class TrainingConfig(MachineConfig):
         one, lead = self.one_step, 0
         if self.beginnings is not None:
             lead = max(round(self.beginnings.initial / dt), 1)
-        first = WindowStage(round(one.window / dt), one.batch, 0, begun(one.batch))
+        first = WindowStage(
+            round(one.window / dt), one.batch, 0, begun(one.batch), columns=("told", "good")
+        )
         return [first if one.epochs else None] + [
             WindowStage(
                 round(stage.horizon / dt) + 1,
@@ -270,6 +272,7 @@ class TrainingConfig(MachineConfig):
                 round(self.history / dt),
                 begun(stage.batch),
                 lead,
+                ("y", "smooth", "w", "usable"),
             )
             for stage in self.multi_step
         ]

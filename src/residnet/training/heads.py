@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.given import GivenBaseline
+from residnet.core.arrays import paged
 from residnet.core.columns import pose, velocities, velocities_on
 from residnet.core.samples import Samples
 from residnet.data.module import Windows, WindowsDataModule
@@ -37,8 +38,8 @@ def alone(value: Tensor) -> Tensor:
 
 def one_step_loss(
     model: HybridDynamics,
-    y: Tensor,
-    w: Tensor,
+    z: Tensor,
+    known: Tensor,
     nu_dot: Tensor,
     good: Tensor,
     spread: Tensor,
@@ -50,14 +51,14 @@ def one_step_loss(
 
     Args:
         model: the hybrid model.
-        y: smoothed states [B, T, 3 + n].
-        w: inputs at the same samples [B, T, m].
+        z: channels of smoothed states and the inputs at the same samples [B, T, nz].
+        known: what its baseline says there [B, T, n].
         nu_dot: accelerations [B, T, n].
         good: samples that count: acceleration known, memory filled [B, T].
         spread: of the residual, [n].
         shared: over the processes of a training, whose mean loss is that of all windows.
     """
-    error = (nu_dot - model.one_step(model.channels(y, w))) / spread
+    error = (nu_dot - model.taught(z, known)) / spread
     weight = good.to(error.dtype).unsqueeze(-1)
     count = float(error.shape[-1])
     return (error.square() * weight).sum() / shared(count * weight.sum()).clamp(min=1.0)
@@ -193,10 +194,26 @@ class HeadTraining(EpochTraining):
         Raises:
             DataError: where no log is long enough for a stage.
         """
+        if self.stages[0] is not None:
+            store = replace(store, told=self._told(store))
         # methods, which other processes can be given
         return WindowsDataModule(
             store, self.stages, self.settings.steps, self.seed, self.stage_of, self.present_epoch
         )
+
+    def _told(self, store: WindowStore) -> Tensor:
+        """Return channels, what the baseline says and accelerations of all samples [N, nz + 2 n].
+
+        Epochs go through each of them many times, and neither channels nor baseline change.
+        """
+        width, n = len(self.model.signals.names), self.model.dof
+        told = paged.rows(len(store.y), width + 2 * n, dtype=store.y.dtype)
+        with torch.no_grad():
+            for rows in paged.row_pieces(len(told)):
+                z = self.model.channels(store.smooth[rows], store.recorded[rows])
+                told[rows] = torch.cat((z, self.model.known(z), store.nu_dot[rows]), dim=-1)
+                paged.forget()
+        return told
 
     def stage_of(self, epoch: int) -> int:
         """Return the number of the stage that an epoch belongs to."""
@@ -245,17 +262,19 @@ class HeadTraining(EpochTraining):
         return total / self.world
 
     def _one_step(self, windows: Sequence[Windows]) -> Tensor:
-        y, w, nu_dot, good, depth = (
+        told, good, depth = (
             torch.cat([getattr(part, name) for part in windows])
-            for name in ("smooth", "recorded", "nu_dot", "good", "depth")
+            for name in ("told", "good", "depth")
         )
+        n = self.model.dof
+        z, known, nu_dot = told.split([told.shape[-1] - 2 * n, n, n], dim=-1)
         washout = torch.full_like(depth, round(self.settings.one_step.washout / self.model.dt))
         if self.settings.beginnings is not None:
             washout[depth == 0] = 0
-        samples = torch.arange(y.shape[1], device=y.device)
+        samples = torch.arange(z.shape[1], device=z.device)
         counted = good & (samples >= washout[:, None])
-        spread = self.model.head.residual_std().to(y.dtype)
-        return one_step_loss(self.model, y, w, nu_dot, counted, spread, self.shared)
+        spread = self.model.head.residual_std().to(z.dtype)
+        return one_step_loss(self.model, z, known, nu_dot, counted, spread, self.shared)
 
     def _multi_step(self, windows: Sequence[Windows], stage: int) -> Tensor:
         begins, memories = [], []
@@ -351,11 +370,10 @@ def train(
     if isinstance(model.head, RecurrentHead):
         return _train_coarse(name, model, store, config, scales, validate, seed, folder)
     dtype = torch.float64 if config.double else torch.float32
-    scale = scales.to(dtype)
     # losses and scores are those of velocities
     model.positions = False
     try:
-        module = HeadTraining(model.to(dtype), config, scale, validate, seed)
+        module = HeadTraining(model.to(dtype), config, scales.to(dtype), validate, seed)
         return run_epochs(name, module, module.data(store), model, model.head, folder, config)
     finally:
         model.to(torch.float32)
