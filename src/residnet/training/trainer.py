@@ -59,6 +59,13 @@ class Epochs(Protocol):
         """Number of the stage that may stop early."""
 
 
+_KEPT = (
+    "best_score", "best_diverged", "best_state", "start_score", "without_gain", "history",
+    "stopped",
+)  # fmt: skip
+"""What a checkpoint keeps of a training, beside Lightning's part and random numbers."""
+
+
 class EpochTraining(L.LightningModule, ABC):
     """A Lightning module that `run_epochs` trains.
 
@@ -165,14 +172,7 @@ class EpochTraining(L.LightningModule, ABC):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep the best weights, the curve, random state and thread count in the checkpoint."""
-        checkpoint["residnet"] = {
-            "best_score": self.best_score,
-            "best_diverged": self.best_diverged,
-            "best_state": self.best_state,
-            "start_score": self.start_score,
-            "without_gain": self.without_gain,
-            "history": self.history,
-            "stopped": self.stopped,
+        checkpoint["residnet"] = {name: getattr(self, name) for name in _KEPT} | {
             "stage": self.settings.stage(self.epoch)[0],
             "random": torch.get_rng_state(),
             "threads": torch.get_num_threads(),
@@ -185,14 +185,8 @@ class EpochTraining(L.LightningModule, ABC):
 
     def restore(self, kept: dict[str, Any]) -> None:
         """Put back what a checkpoint kept of this module."""
-        self.best_score, self.best_state, self.without_gain = (
-            kept["best_score"],
-            kept["best_state"],
-            kept["without_gain"],
-        )
-        self.best_diverged = kept.get("best_diverged", 0)
-        self.start_score = kept.get("start_score")
-        self.history, self.stopped = kept["history"], kept["stopped"]
+        for name in _KEPT:
+            setattr(self, name, kept.get(name, getattr(self, name)))
         torch.set_rng_state(kept["random"])
         torch.set_num_threads(kept["threads"])
 
@@ -201,44 +195,31 @@ def _copied(model: nn.Module) -> dict[str, Tensor]:
     return {name: value.detach().to("cpu", copy=True) for name, value in model.state_dict().items()}
 
 
-class FinishEpoch(L.Callback):
-    """A callback that lets the module finish its epoch before the checkpoint is written.
+class EpochEnd(L.Callback):
+    """What happens at the end of an epoch: validation, then `last.ckpt`, then a report.
 
-    Lightning runs callbacks before the module's own hook.
+    Lightning runs callbacks before the module's own hook, and the checkpoint must hold what the
+    module finished.
+
+    Args:
+        name: of what is trained, for the report; every tenth of the epochs has a line.
+        epochs: in all.
+        checkpoint: file, written whole or not at all; None for none.
     """
 
+    def __init__(self, name: str, epochs: int, checkpoint: Path | None) -> None:
+        self.name, self.epochs, self.checkpoint = name, epochs, checkpoint
+
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Run the module's own end of the epoch."""
+        """Finish the epoch, keep it, and report loss and the best validation."""
         assert isinstance(pl_module, EpochTraining)
         pl_module.finish_epoch()
-
-
-class KeepCheckpoint(L.Callback):
-    """Writes `last.ckpt` after every epoch, whole or not at all."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Write beside the old one, then put it in place; the first process alone writes."""
-        if not trainer.is_global_zero:
-            # the processes wait for each other there
-            trainer.save_checkpoint(self.path)
-            return
-        with whole(self.path) as file:
-            trainer.save_checkpoint(file)
-
-
-class ReportProgress(L.Callback):
-    """A callback that reports every epoch, and every tenth of the epochs with a line."""
-
-    def __init__(self, name: str, epochs: int) -> None:
-        self.name = name
-        self.epochs = epochs
-
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Report the epoch, and now and then loss and the best validation."""
-        assert isinstance(pl_module, EpochTraining)
+        if self.checkpoint is not None and trainer.is_global_zero:
+            with whole(self.checkpoint) as file:
+                trainer.save_checkpoint(file)
+        elif self.checkpoint is not None:
+            # the processes wait for each other there; the first alone writes
+            trainer.save_checkpoint(self.checkpoint)
         done, last = trainer.current_epoch + 1, pl_module.history[-1]
         score = pl_module.best_score if math.isfinite(pl_module.best_score) else None
         line = (
@@ -288,16 +269,26 @@ def run_epochs(
             return run_epochs(name, module, data, model, trained, Path(temporary), machine)
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     settings: Epochs = module.settings
-    callbacks: list[L.Callback] = [FinishEpoch(), ReportProgress(name, settings.epochs)]
     logger, last = None, None
     if folder is not None:
         last = folder / "checkpoints" / name / "last.ckpt"
         last.parent.mkdir(parents=True, exist_ok=True)
-        callbacks.insert(1, KeepCheckpoint(last))
         logger = TensorBoardLogger(folder / "tensorboard", name=name, version="")
     # a checkpoint that is there is taken up
     checkpoint = last if last is not None and last.is_file() else None
-    trainer = _trainer(settings, callbacks, logger, machine)
+    trainer = L.Trainer(
+        **machine.for_lightning(),
+        max_epochs=settings.epochs,
+        gradient_clip_val=settings.gradient_clip,
+        logger=logger if logger is not None else False,
+        callbacks=[EpochEnd(name, settings.epochs, last)],
+        # what it would print and keep is printed and kept here
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        log_every_n_steps=10**9,
+    )
     if checkpoint is not None:
         module.restore(_kept(checkpoint, module.made_of))
     # killed between the last epoch and the model's file: there is nothing left to train
@@ -371,27 +362,6 @@ def _fit(
                 raise
     if trainer.interrupted:
         raise KeyboardInterrupt
-
-
-def _trainer(
-    settings: Epochs,
-    callbacks: list[L.Callback],
-    logger: TensorBoardLogger | None,
-    machine: MachineConfig,
-) -> L.Trainer:
-    """Return a trainer that prints nothing and keeps no checkpoints of its own."""
-    return L.Trainer(
-        **machine.for_lightning(),
-        max_epochs=settings.epochs,
-        gradient_clip_val=settings.gradient_clip,
-        logger=logger if logger is not None else False,
-        callbacks=callbacks,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        log_every_n_steps=10**9,
-    )
 
 
 def _conclude(logger: TensorBoardLogger, module: EpochTraining) -> None:
