@@ -13,7 +13,7 @@ import ctypes
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import accumulate, pairwise
+from itertools import accumulate, chain, groupby, pairwise
 from typing import Any, final
 
 import casadi as ca
@@ -152,18 +152,34 @@ def _sums(count: int, entry: str) -> str:
     each = range(count)
     cells = "".join(f" V c{q} = {{0}};" for q in each)
     added = "".join(f" c{q} += v * {entry.format(q)};" for q in each)
-    stored = "".join(f" *(U *)(to + (j + {q}) * to_room) = c{q};" for q in each)
+    stored = "".join(f" *(U *)(to + (j + {q}) * LANES) = c{q};" for q in each)
     return (
         f"    for (; j + {count} <= to_count; j += {count}) {{\n       {cells}\n"
         f"        for (long i = 0; i < count; i++) {{\n"
-        f"            V v = *(const U *)(from + i * room);{added}\n        }}\n"
+        f"            V v = *(const U *)(from + i * LANES);{added}\n        }}\n"
         f"       {stored}\n    }}\n"
     )
 
 
+_CURVES = {
+    "tanh": ("v_tanh(v)", "ONE - v * v"),
+    "sigmoid": ("ONE / (ONE + v_exp(-v))", "v * (ONE - v)"),
+}
+"""Curves, and their slopes by the values of the curves."""
+_BEND = "".join(
+    f"static void times_{name}(const REAL *from, REAL *to, long count) {{\n"
+    "    for (long i = 0; i < count * LANES; i += LANES) {\n"
+    f"        V v = *(const U *)(from + i);\n        *(U *)(to + i) = {value};\n    }}\n}}\n"
+    f"static void back_times_{name}(const REAL *value, const REAL *from, REAL *to, long count) {{\n"
+    "    for (long i = 0; i < count * LANES; i += LANES) {\n"
+    "        V v = *(const U *)(value + i);\n"
+    f"        *(U *)(to + i) = *(const U *)(from + i) * ({slope});\n    }}\n}}\n"
+    for name, (value, slope) in _CURVES.items()
+)
+"""Curves of many numbers of a row, and the slopes of these numbers."""
 _PRODUCT = "".join(
     f"static __attribute__((noinline)) void {name}(const REAL *restrict table, long count,"
-    " long to_count, const REAL *restrict from, long room, REAL *restrict to, long to_room) {\n"
+    " long to_count, const REAL *restrict from, REAL *restrict to) {\n"
     "    long j = 0;\n" + _sums(_SIDE_BY_SIDE, entry) + _sums(1, entry) + "}\n"
     for name, entry in (
         ("times", "table[i * to_count + j + {0}]"),
@@ -172,11 +188,11 @@ _PRODUCT = "".join(
 )
 """Numbers [count] of a row times a matrix [count, to_count], and times the transposed of one."""
 _OUTER = """static __attribute__((noinline)) void outer(const REAL *restrict from, long count,
-    const REAL *restrict slope, long to_count, long room, REAL *restrict sum) {
+    const REAL *restrict slope, long to_count, REAL *restrict sum) {
     for (long i = 0; i < count; i++) {
-        V v = *(const U *)(from + i * room);
+        V v = *(const U *)(from + i * LANES);
         for (long j = 0; j < to_count; j++)
-            *(U *)(sum + (i * to_count + j) * LANES) += v * *(const U *)(slope + j * room);
+            *(U *)(sum + (i * to_count + j) * LANES) += v * *(const U *)(slope + j * LANES);
     }
 }
 """
@@ -193,10 +209,10 @@ def _prelude(dtype: torch.dtype) -> str:
     }
     defined = [f"#define {name} {text}\n" for name, text in words.items()]
     functions = _ONE_BY_ONE | _AT_ONCE[dtype]
-    return "".join((*defined, _PRELUDE, *functions.values(), _PRODUCT))
+    return "".join((*defined, _PRELUDE, *functions.values(), _PRODUCT, _BEND))
 
 
-Calls = Mapping[str, tuple[str, str]]
+Calls = Mapping[str, Sequence[tuple[str, str]]]
 
 
 class _Lanes(Body):
@@ -208,8 +224,8 @@ class _Lanes(Body):
     Args:
         function: to be written.
         strides: of arguments and results, by name; `LANES` where not given.
-        calls: which argument is made from a result once this is complete, and by which statement;
-            by the result's name.
+        calls: which arguments are made from a result once this is complete, and by which
+            statements; by the result's name.
     """
 
     REAL, FLAG = "V", "I"
@@ -238,8 +254,9 @@ class _Lanes(Body):
         name, cells = self.given[result], self.results[result]
         if name in self.calls and len(cells) == self.function.numel_out(result):
             stored = [f"*{self.place(name, i)} = {cell};" for i, cell in enumerate(cells)]
-            made, text = self.calls[name]
-            self.lines.append((made, " ".join((*stored, text))))
+            for made, text in self.calls[name]:
+                self.lines.append((made, " ".join((*stored, text))))
+                stored = []
 
     def real(self, cell: str, flag: bool) -> str:
         return f"pick({cell}, ALL(ONE), ALL(ZERO))" if flag else cell
@@ -272,7 +289,7 @@ def _function(
         added: results that are added to what stands there.
     """
     body = _Lanes(function, strides, calls)
-    ends = [f"(void){made};" for made, _ in calls.values()]
+    ends = [f"(void){made};" for made, _ in chain(*calls.values())]
     for result, cells in zip(function.name_out(), body.results, strict=True):
         if result not in calls:
             sign = "+=" if result in added else "="
@@ -283,7 +300,7 @@ def _function(
             ]
     given = [f"const REAL *restrict {one}" for one in body.names if one not in begun]
     taken = [f"REAL *restrict {one}" for one in function.name_out() if one not in begun]
-    apart = "const REAL *tables, REAL *held, REAL *pulled, const long stride, const long room"
+    apart = "const REAL *tables, REAL *held, REAL *pulled, const long stride"
     head = f"static void {name}({', '.join((*given, *taken, apart))})"
     return head + " {\n" + "\n".join((*begun.values(), *body.read(ends))) + "\n}\n"
 
@@ -295,8 +312,10 @@ def _source(
     dtype: torch.dtype,
     *,
     apart: bool,
-) -> str:
+) -> tuple[str, dict[str, slice], dict[str, slice]]:
     """Return the source file with the functions `fly` and, where there is a gradient, `back`.
+
+    With it come the places of what a step keeps for its gradient, and of slopes of products.
 
     Args:
         parts: of a step.
@@ -308,80 +327,115 @@ def _source(
     step = in_numbers(parts.function)
     if not step.is_a("SXFunction") or step.n_instructions() > _LONGEST:
         raise ExportError("a step too long, or with tables too long, to be written for many rows")
-    products = parts.products
-    taken, given = ([one.rows * getattr(one, way) for one in products] for way in _WAYS)
-    tables = [0, *accumulate(one.taken * one.given for one in products)]
-    held = [0, *accumulate((*given, *taken))]
-    numbers = dict(enumerate(products))
-
-    def calls(way: str, start: str, end: str, rooms: tuple[str, str]) -> dict[str, tuple[str, str]]:
-        found = {}
-        for k, one in numbers.items():
-            here, there = (one.taken, one.given) if way == "times" else (one.given, one.taken)
-            found[start.format(k)] = (
-                end.format(k),
-                " ".join(
-                    f"{way}(tables + {tables[k]}, {here}, {there},"
-                    f" {start.format(k)} + {r * here} * {rooms[0]}, {rooms[0]},"
-                    f" {end.format(k)} + {r * there} * {rooms[1]}, {rooms[1]});"
-                    for r in range(one.rows)
-                ),
-            )
-        return found
-
-    at = {f"product_{k}": f"REAL *product_{k} = held + {held[k]} * room;" for k in numbers}
-    forward = at | {
-        f"factor_{k}": f"REAL *factor_{k} = held + {held[k + len(products)]} * room;"
-        for k in numbers
+    numbers = dict(enumerate(parts.products))
+    matrices = [k for k, one in numbers.items() if not one.curve]
+    tables = [0, *accumulate(one.numbers for one in parts.products)]
+    size = {
+        f"{name}_{k}{end}": one.rows * count
+        for k, one in numbers.items()
+        for name, count in (("product", one.given), ("factor", one.taken))
+        for end in ("", "_slope")
     }
-    kept = dict.fromkeys(forward, "room")
-    rows = dict.fromkeys(
+    strides = dict.fromkeys(
         ("x", "w", "s", "q", "own", "x_after", "s_after", "q_after", "a"), "stride"
     )
-    functions = [
-        _function(
-            "step",
-            _flowing(step, len(products)),
-            rows | kept,
-            calls("times", "factor_{}", "product_{}", ("room", "room")),
-            forward,
+
+    def laid(array: str, names: Sequence[str]) -> tuple[dict[str, slice], dict[str, str]]:
+        """Return places in an array of what is kept, and statements that say where it stands."""
+        ends = [0, *accumulate(size[name] for name in names)]
+        return (
+            {name: slice(*pair) for name, pair in zip(names, pairwise(ends), strict=True)},
+            {
+                name: f"REAL *{name} = {array} + {begin} * LANES;"
+                for name, begin in zip(names, ends, strict=False)
+            },
         )
-    ]
+
+    def slope_of(k: int) -> str:
+        return first.get(name := f"product_{k}_slope", name)
+
+    def local(name: str) -> str:
+        return f"REAL {name}[{size[name]} * LANES] __attribute__((aligned(BYTES)));"
+
+    def calls(way: str, start: str, end: str) -> Calls:
+        found: dict[str, list[tuple[str, str]]] = {}
+        for k, one in numbers.items():
+            a, b = start.format(k), end.format(k)
+            a = first.get(a, a)
+            here, there = size[a] // one.rows, size[b] // one.rows
+            text = "".join(
+                f"{way}(tables + {tables[k]}, {here}, {there}, {a} + {r * here} * LANES,"
+                f" {b} + {r * there} * LANES);"
+                for r in range(one.rows)
+            )
+            if one.curve:
+                value = "" if way == "times" else f"product_{k}, "
+                text = f"{way}_{one.curve}({value}{a}, {b}, {here});"
+            found.setdefault(a, []).append((b, text))
+        return found
+
+    held, pulled = dict[str, slice](), dict[str, slice]()
+    kept, first, back = dict[str, str](), dict[str, str](), list[str]()
     if trained is not None:
-        slopes = {
-            f"product_{k}_slope": f"REAL *product_{k}_slope = pulled + {held[k]} * room;"
-            for k in numbers
+        alone = [k for k in matrices if numbers[k].rows == 1]
+        slope, first = _slope(step, sizes, len(numbers), trained, alone)
+        given = _symbols(slope)
+        whole = ca.veccat(*slope.call(given))
+        # products that slopes do not hang on, as those of an affine layer, are not kept
+        values = {f"product_{k}": bool(one.curve) for k, one in numbers.items()}
+        values |= {
+            name: values[name] or ca.depends_on(whole, one)
+            for name, one in zip(slope.name_in(), given, strict=True)
+            if name in values
         }
-        own = {f"factor_{k}_slope": f"REAL factor_{k}_slope[{taken[k]} * LANES];" for k in numbers}
-        outside = dict.fromkeys(("x_slope", "a_slope", "x_before"), "stride")
-        functions.append(
+        held, kept = laid(
+            "held",
+            [name for name, wanted in values.items() if wanted]
+            + [f"factor_{k}" for k in sorted(matrices, key=slope_of)],
+        )
+        pulled, begun = laid("pulled", [*dict.fromkeys(map(slope_of, matrices))])
+        pulled |= {f"product_{k}_slope": pulled[slope_of(k)] for k in matrices}
+        begun |= {name: kept.get(name, "") for name in values}
+        begun |= {n: local(n) for n in size if n.endswith("_slope") and n not in begun}
+        back = [
             _function(
                 "slope",
-                _slope(step, sizes, len(products), trained),
-                rows | kept | outside | dict.fromkeys(slopes, "room"),
-                calls("back_times", "product_{}_slope", "factor_{}_slope", ("room", "LANES")),
-                at | slopes | own,
+                slope,
+                strides | dict.fromkeys(("x_slope", "a_slope", "x_before"), "stride"),
+                calls("back_times", "product_{}_slope", "factor_{}_slope"),
+                begun,
                 ("x_before", "total"),
             )
-        )
+        ]
+    forward = kept | {n: local(n) for n in size if n not in kept and not n.endswith("_slope")}
+    fly = _function(
+        "step",
+        _flowing(step, len(numbers)),
+        strides,
+        calls("times", "factor_{}", "product_{}"),
+        forward,
+    )
     plain = len(trained or ())
     outer = "".join(
-        f"outer(AT(held, N_HELD, k) + {held[len(products) + k] + r * one.taken} * width,"
-        f" {one.taken}, AT(pulled, N_PULLED, k) + {held[k] + r * one.given} * width, {one.given},"
-        f" width, total + at * N_TOTAL + {plain + tables[k]} * LANES);\n"
+        f"outer(KEPT(held, N_HELD, k) + {held[f'factor_{k}'].start + r * one.taken} * LANES,"
+        f" {one.taken}, KEPT(pulled, N_PULLED, k)"
+        f" + {pulled[f'product_{k}_slope'].start + r * one.given} * LANES, {one.given},"
+        f" total + at * N_TOTAL + {plain + tables[k]} * LANES);\n"
         for k, one in numbers.items()
         for r in range(one.rows)
-        if apart
+        if apart and not one.curve
     )
     counts = dict(sizes) | {
-        "held": held[-1], "pulled": held[len(products)], "total": plain + apart * tables[-1]
-    }  # fmt: skip
+        "held": _end(held),
+        "pulled": _end(pulled),
+        "total": plain + apart * tables[-1],
+    }
     text = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in counts.items())
-    back = "" if trained is None else _OUTER + BACK.replace("OUTER\n", outer)
-    return "".join((_prelude(dtype), text, _AT, *functions, FLY, back))
+    if trained is not None:
+        back.append(_OUTER + BACK.replace("OUTER\n", outer))
+    return "".join((_prelude(dtype), text, _AT, fly, *back[:1], FLY, *back[1:])), held, pulled
 
 
-_WAYS = ("taken", "given")
 _GIVEN = ("x", "w", "s", "q", "own", "theta")
 
 
@@ -408,11 +462,17 @@ def _flowing(step: ca.Function, products: int) -> ca.Function:
 
 
 def _slope(
-    step: ca.Function, sizes: Mapping[str, int], products: int, trained: Sequence[int]
-) -> ca.Function:
+    step: ca.Function,
+    sizes: Mapping[str, int],
+    products: int,
+    trained: Sequence[int],
+    alone: Sequence[int],
+) -> tuple[ca.Function, dict[str, str]]:
     """Return the product of a step's Jacobian with the slopes of what it gives.
 
     The slopes of a product need those of the factors of later ones alone, and stand in that order.
+    Products that are added up have their slopes in common: of those in `alone`, slopes that are the
+    same are told once, and the second of what is returned says by the name of which product.
     """
     given = _symbols(step)
     inside = len(_GIVEN) + products
@@ -431,21 +491,29 @@ def _slope(
     order = [*range(products)[::-1], *range(products, len(parts))]
     names = [f"product_{k}_slope" for k in range(products)]
     names += [*(f"{name}_before" for name in _HANDED_ON), "total"]
-    return ca.Function(
+    whole = dict(zip((names[k] for k in order), ca.cse([parts[k] for k in order]), strict=True))
+    first, seen = dict[str, str](), dict[tuple[int, ...], str]()
+    for name in (names[k] for k in order if k in alone):
+        cells = tuple(cell.element_hash() for cell in whole[name].elements())
+        first[name] = seen.setdefault(cells, name)
+    told = [name for name in whole if first.get(name, name) == name]
+    function = ca.Function(
         "slope",
         [*given[:inside], *slopes, *inner],
-        ca.cse([parts[k] for k in order]),
+        [whole[name] for name in told],
         [
             *step.name_in()[:inside],
             *(f"{name}_slope" for name in (*_HANDED_ON, "a")),
             *(f"factor_{k}_slope" for k in range(products)),
         ],
-        [names[k] for k in order],
+        told,
     )
+    return function, first
 
 
 _AT = """
 #define AT(array, n, k) (array + (n) * (k) * width + at)
+#define KEPT(array, n, k) (array + (at * steps + (k) * LANES) * (n))
 #define ROOM(n) (((n) ? (n) : 1) * LANES)
 #define BLOCKS for (long at = first * LANES; at < last * LANES; at += LANES)
 """
@@ -461,7 +529,7 @@ void fly(const REAL *theta, const REAL *tables, const REAL *own, REAL *x, const 
             step(AT(x, N_X, k), AT(w, N_W, k), AT(s, N_S, from), AT(q, N_Q, from),
                  AT(own, N_OWN, 0), theta,
                  AT(x, N_X, k + 1), AT(s, N_S, to), AT(q, N_Q, to), AT(a, N_A, k),
-                 tables, keep ? AT(held, N_HELD, k) : here, 0, width, keep ? width : LANES);
+                 tables, keep ? KEPT(held, N_HELD, k) : here, 0, width);
         }
     }
 }
@@ -479,7 +547,7 @@ void back(const REAL *theta, const REAL *tables, const REAL *own, const REAL *x,
             slope(AT(x, N_X, k), AT(w, N_W, k), AT(s, N_S, k), AT(q, N_Q, k), AT(own, N_OWN, 0),
                   theta, AT(gx, N_X, k + 1), slope_s[k & 1], slope_q[k & 1], AT(ga, N_A, k),
                   AT(gx, N_X, k), slope_s[~k & 1], slope_q[~k & 1], total + at * N_TOTAL,
-                  tables, AT(held, N_HELD, k), AT(pulled, N_PULLED, k), width, width);
+                  tables, KEPT(held, N_HELD, k), KEPT(pulled, N_PULLED, k), width);
 OUTER
         }
         for (long i = 0; i < N_S; i++) EACH
@@ -584,7 +652,9 @@ class CompiledRollout:
         self.most = most
 
     def _made(self, dtype: torch.dtype, *, quick: bool = False) -> None:
-        source = _source(self.parts, self.sizes, self.trained, dtype, apart=self.apart)
+        source, self.held, self.pulled = _source(
+            self.parts, self.sizes, self.trained, dtype, apart=self.apart
+        )
         self.dtype, self.library = dtype, compiled_library(source, quick=quick)
         self.lanes = ctypes.c_long.in_dll(self.library, "lanes").value
 
@@ -606,6 +676,7 @@ class CompiledRollout:
             [
                 found[one.place].reshape(-1, one.taken, one.given)[one.member]
                 for one in self.parts.products
+                if not one.curve
             ]
         ).to(self.dtype)
 
@@ -642,7 +713,7 @@ class CompiledRollout:
         """Return states, inputs and the last memory of runs, and all that is known of each step.
 
         The latter stand with the rows last, padded to whole blocks: `theta`, tables, own numbers,
-        states, inputs, both memories, and what goes into products and comes from them.
+        states, inputs and both memories; and, block by block, what a step keeps for its gradient.
         """
         count, steps = w.shape[:2]
         blocks = -(-count // self.lanes)
@@ -663,8 +734,7 @@ class CompiledRollout:
             whole[0] = filled(start).T
         inputs = filled(w).permute(1, 2, 0).contiguous()
         acting = room(steps, self.sizes["a"])
-        inside = sum(one.rows * (one.taken + one.given) for one in self.parts.products)
-        held = room(steps if keep else 0, inside)
+        held = self.kept(blocks, steps if keep else 0, self.held)
         rows = filled(own).T.contiguous()
         known = [theta.detach(), tables.detach(), rows, states, inputs, *memories]
         self.run("fly", blocks, *known, acting, held, int(keep), steps, width)
@@ -675,6 +745,10 @@ class CompiledRollout:
             last.T[:count],
         )
         return found, [*known, held]
+
+    def kept(self, blocks: int, steps: int, places: Mapping[str, slice]) -> Tensor:
+        """Return room for what stands at these places, block by block and step by step."""
+        return torch.empty(blocks * steps, _end(places), self.lanes, dtype=self.dtype)
 
     def run(self, name: str, blocks: int, *arguments: Tensor | int) -> None:
         """Call a function of the library for all blocks of rows, spread over free cores."""
@@ -812,18 +886,17 @@ class _Flight(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradient of theta, tables, x and s."""
         known, loop, count = ctx.saved_tensors, ctx.loop, ctx.rows
-        products = loop.parts.products
         steps, _, width = known[4].shape
         given = []
         for grad in (grads[0], grads[1], grads[2][:, None]):
             whole = torch.zeros(*grad.shape[1:], width, dtype=loop.dtype)
             whole[:, :, :count] = grad.permute(1, 2, 0)
             given.append(whole)
-        sizes = [one.rows * one.given for one in products]
-        pulled = torch.empty(steps, sum(sizes), width, dtype=loop.dtype)
         # each row adds up for itself, so that the sum does not depend on the number of threads
         blocks, plain = width // loop.lanes, len(loop.trained)
-        shared = sum(one.taken * one.given for one in products) if loop.apart else 0
+        pulled = loop.kept(blocks, steps, loop.pulled)
+        products = [(k, one) for k, one in enumerate(loop.parts.products) if not one.curve]
+        shared = sum(one.numbers for _, one in products) if loop.apart else 0
         total = torch.zeros(blocks, plain + shared, loop.lanes, dtype=loop.dtype)
         loop.run("back", blocks, *known, *given, pulled, total, steps, width)
         rows = total.transpose(1, 2).reshape(width, -1)[:count]
@@ -832,22 +905,29 @@ class _Flight(torch.autograd.Function):
             rows = _held(rows, torch.as_tensor(asked).sqrt(), loop.most)
         found, tables = rows.sum(0).split([plain, shared])
         if not loop.apart:
-            held = known[-1].split([*sizes, *(one.rows * one.taken for one in products)], dim=1)
-            pairs = [
-                (factor.unflatten(1, (one.rows, -1)), slope.unflatten(1, (one.rows, -1)))
-                for one, factor, slope in zip(
-                    products, held[len(products) :], pulled.split(sizes, dim=1), strict=True
-                )
-            ]
-            by_table = [
-                a.permute(2, 0, 1, 3).flatten(1) @ b.permute(2, 0, 1, 3).flatten(1).T
-                for a, b in pairs
-            ]
-            tables = _flat(by_table)
+            by_table: dict[int, Tensor] = {}
+            places = loop.pulled
+            in_order = sorted(products, key=lambda p: loop.held[f"factor_{p[0]}"].start)
+            for _, group in groupby(in_order, lambda p: places[f"product_{p[0]}_slope"].start):
+                alike = [*group]
+                (k, one), last = alike[0], loop.held[f"factor_{alike[-1][0]}"]
+                ends = slice(loop.held[f"factor_{k}"].start, last.stop)
+                factor = known[-1][:, ends].unflatten(1, (one.rows, -1))
+                slope = pulled[:, places[f"product_{k}_slope"]].unflatten(1, (one.rows, -1))
+                table = torch.zeros(factor.shape[2], one.given, dtype=loop.dtype)
+                for a, b in zip(factor.unbind(1), slope.unbind(1), strict=True):
+                    table.addbmm_(a, b.transpose(1, 2))
+                split = table.split([each.taken for _, each in alike])
+                by_table |= {k: part for (k, _), part in zip(alike, split, strict=True)}
+            tables = _flat([by_table[k] for k, _ in products])
         theta = torch.zeros(len(known[0]), dtype=loop.dtype)
         theta[loop.trained] = found
         x, s = given[0][0].T[:count], given[2][0].T[:count]
         return theta, tables, x, s, *[None] * 4
+
+
+def _end(places: Mapping[str, slice]) -> int:
+    return max((place.stop for place in places.values()), default=0)
 
 
 def _held(gradients: Tensor, asked: Tensor, most: float) -> Tensor:

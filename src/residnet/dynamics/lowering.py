@@ -157,20 +157,27 @@ def _columns(
 
 @dataclass(frozen=True)
 class Product:
-    """A product of numbers of each row with a matrix that all rows share.
+    """A product of numbers of each row with a matrix that all rows share, or a curve of each.
 
     Attributes:
         rows: times that each row is multiplied with the matrix, with other numbers each time.
         taken, given: numbers of a row, and of the result; the matrix is [taken, given].
         place: number of what holds the matrix among the results of `Parts.prepare`.
         member: number of the matrix in there, where several lie side by side.
+        curve: the operation that takes the place of a product, with no matrix.
     """
 
     rows: int
     taken: int
     given: int
-    place: int
+    place: int = -1
     member: int = 0
+    curve: str = ""
+
+    @property
+    def numbers(self) -> int:
+        """Numbers of the matrix."""
+        return 0 if self.curve else self.taken * self.given
 
 
 @dataclass(frozen=True)
@@ -195,6 +202,10 @@ class Parts:
 
 _LEAST: Final = 64
 """Least numbers of a matrix whose products are loops; smaller ones are written out."""
+CURVES: Final = ("tanh", "sigmoid")
+"""Operations that are loops over a layer's units, and whose slopes follow from their values."""
+_UNITS: Final = 8
+"""Least units of a layer whose curves are loops."""
 
 
 def in_parts(
@@ -286,19 +297,36 @@ def in_parts(
                 products.append(made)
             found = _Value(example, ca.vertcat(*symbols[first:]))
             return found if bias is None else _each("add", example + bias.example, found, bias)
+        curve = _name(node.target)
+        if curve in CURVES and not args[0].constant and args[0].column.numel() >= _UNITS:
+            count = args[0].column.numel()
+            symbols.append(ca.MX.sym(f"product_{len(products)}", count))
+            factors.append(args[0].column)
+            products.append(Product(1, count, count, curve=curve))
+            return _Value(getattr(torch, curve)(args[0].example), symbols[-1])
         if node.target is torch.ops.aten.detach.default and not args[0].constant:
             symbol = ca.MX.sym(f"detached_{len(apart)}", args[0].column.numel())
             apart.append((symbol, args[0].column))
             return _Value(args[0].example, symbol)
         return None
 
-    found = _columns(graph, values, what, instead)
+    told = _columns(graph, values, what, instead)
+    found = [*factors, *told, *(column for _, column in apart)]
+    for k, one in [(k, one) for k, one in enumerate(products) if one.curve]:
+        used = np.flatnonzero(ca.which_depends(ca.veccat(*found), symbols[k])).tolist()
+        if len(used) < one.taken:
+            # a curve of more than what is looked at, as of all gates of a network at once
+            wanted, whole = ca.MX.sym(symbols[k].name(), len(used)), ca.MX.zeros(one.taken)
+            whole[used] = wanted
+            found = ca.substitute(found, [symbols[k]], [whole])
+            found[k] = found[k][used]
+            symbols[k], products[k] = wanted, Product(1, len(used), len(used), curve=one.curve)
     names = [f"detached_{k}" for k in range(len(apart))]
     return Parts(
         ca.Function(
             "step",
             [*columns, theta, *symbols, *(symbol for symbol, _ in apart)],
-            [*factors, *found, *(column for _, column in apart)],
+            found,
             [
                 *(name for name, _ in rows),
                 "theta",
