@@ -22,7 +22,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "core": (1602, 244),
     "data": (9642, 846),
     "documents": (2602, 239),
-    "dynamics": (2233, 279),
+    "dynamics": (2292, 284),
     "export": (1504, 172),
     "heads": (1233, 178),
     "identification": (2084, 206),
@@ -35,7 +35,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "simulators": (355, 42),
     "tasks": (3059, 252),
     "testing": (480, 30),
-    "training": (1362, 156),
+    "training": (1362, 153),
     "": (458, 52),
 }
 

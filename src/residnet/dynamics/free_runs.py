@@ -43,7 +43,7 @@ class _Structure(pickle.Pickler):
             return None
         if obj.is_floating_point():
             self.apart |= id(obj) not in self.known
-            return str(obj.dtype), tuple(obj.shape), obj.requires_grad
+            return str(obj.dtype), tuple(obj.shape), obj.requires_grad and torch.is_grad_enabled()
         return str(obj.dtype), obj.tolist()
 
 
@@ -94,6 +94,7 @@ def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> F
         once = not (torch.is_grad_enabled() or structure.apart)
         return _scripted_once(key, rollout, steps) if once else scripted(rollout, steps)
     if key not in _KNOWN:
+        from residnet.dynamics.c_code import CompilerError
         from residnet.dynamics.compiled import CompiledRollout
 
         try:
@@ -103,7 +104,8 @@ def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> F
         except Exception as error:
             # no compiler, or a step that C does not hold
             _KNOWN[key] = False
-            _tell(error)
+            if isinstance(error, CompilerError):
+                _tell(str(error))
     known = _KNOWN[key]
     return known.of(rollout) if known else scripted(rollout, steps)
 
@@ -124,13 +126,6 @@ def _scripted_once(key: bytes, rollout: Rollout, steps: int) -> FreeRun:
 
 
 @cache
-def _tell_once(reason: str) -> None:
+def _tell(reason: str) -> None:
+    """Say once why free runs are not compiled."""
     say(f"  free runs are not compiled, and take longer: {reason}")
-
-
-def _tell(error: Exception) -> None:
-    """Say once why free runs are not compiled, where that can be mended."""
-    from residnet.dynamics.c_code import CompilerError
-
-    if isinstance(error, CompilerError):
-        _tell_once(str(error))
