@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import math
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from residnet.core.log import Log
 from residnet.core.stretches import stretches
@@ -25,7 +27,7 @@ _GLANCE = 3.0
 _BEYOND = 0.9
 _FEWEST = 20
 """Samples below which a channel has no usual change; chosen by hand."""
-_CACHED = 8_192
+CACHED = 8_192
 """Samples whose neighbours are compared at a time: they stay in a core's cache."""
 _FEW, _SPREAD = 40_000, 40
 """Samples of a long channel that tell how far samples usually lie from their neighbours, and in how
@@ -42,7 +44,7 @@ def noise_of(values: np.ndarray) -> float:
     known = values[np.isfinite(values)]
     if known.size < 8:
         return 0.0
-    return float(SIGMA_OF_MAD * np.median(np.abs(np.diff(known, 3))) / np.sqrt(20.0))
+    return SIGMA_OF_MAD * median(np.abs(np.diff(known, 3))) / 20.0**0.5
 
 
 def quantiles(values: np.ndarray, *shares: float) -> list[float]:
@@ -53,10 +55,24 @@ def quantiles(values: np.ndarray, *shares: float) -> list[float]:
     known = values[~np.isnan(values)]
     if not known.size:
         return [np.nan] * len(shares)
-    at = np.multiply(shares, known.size - 1)
-    low, high = np.floor(at).astype(int), np.ceil(at).astype(int)
-    known = np.partition(known, np.concatenate((low, high)))
-    return [float(x) for x in known[low] + (at - low) * (known[high] - known[low])]
+    places = [share * (known.size - 1) for share in shares]
+    between = [(math.floor(at), math.ceil(at), at % 1.0) for at in places]
+    known.partition([at for low, high, _ in between for at in (low, high)])
+    return [float(known[low] + part * (known[high] - known[low])) for low, high, part in between]
+
+
+def median(values: np.ndarray) -> float:
+    """Return the median of the numbers in values [T], NaN where there are none."""
+    return quantiles(values, 0.5)[0]
+
+
+def deviation(values: np.ndarray) -> float:
+    """Return the standard deviation of the finite values, NaN where there are none."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return np.nan
+    off = known - known.sum() / known.size
+    return math.sqrt(float(off @ off) / known.size)
 
 
 def _medians(members: Callable[[slice], list[np.ndarray]], count: int) -> np.ndarray:
@@ -66,8 +82,8 @@ def _medians(members: Callable[[slice], list[np.ndarray]], count: int) -> np.nda
     the middle. Both go, and the next comes, until the middle is left.
     """
     out = np.empty(count)
-    for start in range(0, count, _CACHED):
-        part = slice(start, min(start + _CACHED, count))
+    for start in range(0, count, CACHED):
+        part = slice(start, min(start + CACHED, count))
         rest = members(part)
         some, rest = rest[: len(rest) // 2 + 2], rest[len(rest) // 2 + 2 :]
         while len(some) > 2:
@@ -90,49 +106,63 @@ def _medians(members: Callable[[slice], list[np.ndarray]], count: int) -> np.nda
 
 def spikes(values: np.ndarray) -> np.ndarray:
     """Return [T] bool: samples that the mask `hampel` with its defaults leaves out."""
-    return far_from_median(values, 6.0, 11)
+    return far_from_medians([values])[0]
 
 
-def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarray:
-    """Return [T] bool: known values [T] that stand out of their neighbours by `Hampel`'s rule.
+def far_from_medians(
+    columns: Sequence[np.ndarray], sigmas: float = 6.0, samples: int = 11
+) -> list[np.ndarray]:
+    """Return for each column [T], [T] bool: known values that stand out of their neighbours.
 
-    `samples`, made odd, is the number of neighbours.
+    The rule is that of the mask `Hampel`; `samples`, made odd, is the number of neighbours. Columns
+    are compared side by side: several short ones take hardly longer than one.
     """
-    out = np.zeros(values.size, dtype=bool)
-    at, half = np.flatnonzero(np.isfinite(values)), samples // 2
-    reach = 2 * half
-    if at.size <= 2 * reach:
+    half = samples // 2
+    reach, count = 2 * half, 2 * half + 1
+    out = [np.zeros(values.size, dtype=bool) for values in columns]
+    places = [np.flatnonzero(np.isfinite(values)) for values in columns]
+    told = [i for i, at in enumerate(places) if at.size > 2 * reach]
+    known = [columns[i][places[i]] for i in told]
+    if not known:
         return out
-    known = values[at]
-    padded = np.pad(known, reach, mode="reflect", reflect_type="odd")
 
     def neighbours(values: np.ndarray, i: int, k: slice) -> np.ndarray:
         return values[k.start + i : k.stop + i]
 
+    def each(values: np.ndarray, margin: int) -> list[np.ndarray]:
+        """Return the part of each column of those that stand one behind the other."""
+        starts = np.cumsum([0, *(one.size + 2 * margin for one in known[:-1])])
+        return [values[at : at + one.size] for at, one in zip(starts, known, strict=True)]
+
     # how far samples lie from the straight lines between their neighbours, and how usual that is
+    padded = np.concatenate([np.pad(k, reach, mode="reflect", reflect_type="odd") for k in known])
     lines = _medians(
         lambda k: [
             0.5 * (neighbours(padded, i, k) + neighbours(padded, 2 * reach - i, k))
             for i in range(reach)
         ],
-        known.size,
+        padded.size - 2 * reach,
     )
-    bent = np.pad(known - lines, half, mode="reflect")
-    count = 2 * half + 1
-    median = _medians(lambda k: [neighbours(bent, i, k) for i in range(count)], known.size)
-    distance = np.abs(bent[half:-half] - median)
-    some = distance[spread_rows(known.size, _FEW, _SPREAD)]
-    # a coarse channel flickers by single steps of its resolution, a spread at the level of rounding
-    # is none
-    resolution = 2.0 * quantiles(some[some > 0.0], 0.1)[0] if some.any() else 0.0
-    floor = max(
-        SIGMA_OF_MAD * float(np.median(some)), resolution, 1e-9 * float(np.abs(known).max())
+    off = [one - line for one, line in zip(known, each(lines, reach), strict=True)]
+    padded = np.concatenate([np.pad(one, half, mode="reflect") for one in off])
+    medians = _medians(
+        lambda k: [neighbours(padded, i, k) for i in range(count)], padded.size - 2 * half
     )
-    # what a smooth channel bends by anyhow is no outlier where it stops bending
-    far = np.flatnonzero(distance > sigmas * np.maximum(floor, np.abs(median)))
-    windows = bent[far[:, None] + np.arange(count)]
-    spread = SIGMA_OF_MAD * np.median(np.abs(windows - median[far, None]), axis=1)
-    out[at[far]] = distance[far] > sigmas * spread
+    windows = sliding_window_view(padded, count)
+    for i, one, bent, middle, around in zip(
+        told, known, off, each(medians, half), each(windows, half), strict=True
+    ):
+        distance = np.abs(bent - middle)
+        some = distance[spread_rows(one.size, _FEW, _SPREAD)]
+        # a coarse channel flickers by single steps of its resolution, a spread at the level of
+        # rounding is none
+        resolution = 2.0 * quantiles(some[some > 0.0], 0.1)[0] if some.any() else 0.0
+        floor = max(SIGMA_OF_MAD * median(some), resolution, 1e-9 * float(np.abs(one).max()))
+        # what a smooth channel bends by anyhow is no outlier where it stops bending
+        far = np.flatnonzero(distance > sigmas * np.maximum(floor, np.abs(middle)))
+        if far.size:
+            usual = np.median(np.abs(around[far] - middle[far, None]), axis=1)
+            out[i][places[i][far]] = distance[far] > sigmas * SIGMA_OF_MAD * usual
     return out
 
 

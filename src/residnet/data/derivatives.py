@@ -7,6 +7,7 @@ the smoothing that goes with it is stated.
 from __future__ import annotations
 
 from abc import ABC
+from functools import cache
 from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
@@ -118,17 +119,24 @@ def local_polynomials(
     are per s for a step in s.
     """
     half = size // 2
-    powers = np.vander(np.linspace(-1.0, 1.0, size), order + 1, increasing=True)
-    fit, slopes = np.linalg.pinv(powers), np.zeros_like(powers)
-    slopes[:, 1:] = powers[:, :-1] * np.arange(1, order + 1) / (half * step)
+    powers, fit, slopes = _fitting(size, order)
     first, last = fit @ values[:size], fit @ values[-size:]
     out = []
-    for rows in (powers, slopes):
+    for rows in (powers, slopes / (half * step)):
         weights = rows[half] @ fit
         inner = [np.correlate(column, weights, "valid") for column in values.T]
         ends = rows[:half] @ first, rows[half + 1 :] @ last
         out.append(np.concatenate((ends[0], np.stack(inner, axis=1), ends[1])))
     return out[0], out[1]
+
+
+@cache
+def _fitting(size: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return powers [size, order + 1] of places from -1 to 1, their inverse and their slopes."""
+    powers = np.vander(np.linspace(-1.0, 1.0, size), order + 1, increasing=True)
+    slopes = np.zeros_like(powers)
+    slopes[:, 1:] = powers[:, :-1] * np.arange(1, order + 1)
+    return powers, np.linalg.pinv(powers), slopes
 
 
 @final

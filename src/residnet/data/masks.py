@@ -22,7 +22,7 @@ from residnet.core.log import Log
 from residnet.core.stretches import stretch_numbers, stretches
 from residnet.data.channels import (
     SIGMA_OF_MAD,
-    far_from_median,
+    far_from_medians,
     spike_cells,
     steps_above,
     usual_interval,
@@ -218,7 +218,9 @@ class Hampel(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         return _each(
-            log, self.channels, lambda values: far_from_median(values, self.sigmas, self.samples)
+            log,
+            self.channels,
+            lambda values: far_from_medians([values], self.sigmas, self.samples)[0],
         )
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from residnet.core.stretches import stretches
-from residnet.data.channels import SIGMA_OF_MAD, quantiles
+from residnet.data.channels import SIGMA_OF_MAD, deviation, quantiles
 from residnet.data.doctor.findings import Check, Finding, check, correction
 from residnet.data.doctor.statistics import (
     AT_ONCE,
@@ -119,7 +119,7 @@ def _reversed(log: Record, names: Sequence[str]) -> dict[str, float]:
     All choices of signs are compared by how well the sum of thrusts explains the surge: effects of
     single propellers cannot be told apart where one runs ahead while the other runs astern.
     """
-    blocks, u = blocks_of(log, "u"), log["u"]
+    blocks, u = log.of(blocks_of, "u"), log["u"]
     drift = [log["v"] * log["r"], log["r"] ** 2] if "v" in log and "r" in log else []
     thrusts = np.stack([log[name] * np.abs(log[name]) for name in names], axis=-1)
     table = np.column_stack((np.ones(len(log)), u, u * np.abs(u), *drift, thrusts))
@@ -141,7 +141,7 @@ def _reversed(log: Record, names: Sequence[str]) -> dict[str, float]:
     signs, sure = trials[best], fits[best].sure
     total = thrusts @ signs
     # of a thrust that hardly varies the effect cannot be told
-    varied = float(np.nanstd(total)) / max(high(total, 1.0), 1e-12)
+    varied = deviation(total) / max(high(total, 1.0), 1e-12)
     if abs(sure) < _SURE or varied < 0.2:
         return {}
     return {
@@ -178,7 +178,7 @@ def _yaw_fit(log: Record, *further: np.ndarray) -> Fit | None:
     """
     if any(name not in log for name in ("delta", "u", "r")):
         return None
-    blocks, u, r = blocks_of(log, "r"), log["u"], log["r"]
+    blocks, u, r = log.of(blocks_of, "r"), log["u"], log["r"]
     v = log["v"] if "v" in log else np.zeros(len(log))
     speed = u * np.abs(u)
     if "n" in log:
@@ -191,7 +191,7 @@ def _yaw_fit(log: Record, *further: np.ndarray) -> Fit | None:
         side = log["wind_dir"] - (log["psi"] if "psi" in log else np.zeros(len(log)))
         columns += [log["wind_speed"] ** 2 * np.sin(k * side) for k in (1.0, 2.0)]
     found = fit(blocks.integrals(np.stack(columns, axis=-1))(0), blocks.change(r))
-    varies = float(np.nanstd(log["delta"])) >= math.radians(1.0)
+    varies = log.std("delta") >= math.radians(1.0)
     return found if found.rest.size >= 60 and varies else None
 
 
@@ -263,7 +263,7 @@ def _unexplained(log: Record, at_end: np.ndarray) -> float:
     The fit is one to all that lies off the limit, so it must hold rests at smaller angles; 0 where
     it does not, or explains what happens at the limit.
     """
-    blocks, u, r, values = blocks_of(log, "r"), log["u"], log["r"], log["delta"]
+    blocks, u, r, values = log.of(blocks_of, "r"), log["u"], log["r"], log["delta"]
     v = log["v"] if "v" in log else np.zeros(len(log))
     flows = [log[name] * np.abs(log[name]) for name in ("u", "n") if name in log]
     columns = [*flows, *(flow * values for flow in flows)]
@@ -331,12 +331,12 @@ def rudder_sign(log: Record, found: Check) -> Iterator[Finding]:
 def _steering(log: Record) -> tuple[str, np.ndarray]:
     """Return what steers and its values [T], positive to starboard; no name where none is known."""
     for name in STEERING[:4]:
-        if name in log and float(np.nanstd(log[name])) > 1e-9:
+        if name in log and log.std(name) > 1e-9:
             return name, log[name]
     for port, starboard in (("n_port", "n_stbd"), ("cmd_port", "cmd_stbd")):
         if port in log and starboard in log:
             steer = log[port] * np.abs(log[port]) - log[starboard] * np.abs(log[starboard])
-            if float(np.nanstd(steer)) > 1e-9:
+            if deviation(steer) > 1e-9:
                 return f"{port} over {starboard}", steer
     return "", np.zeros(0)
 
@@ -438,7 +438,7 @@ def delays(log: Record) -> dict[tuple[str, str], tuple[tuple[str, ...], Delay]]:
     pairs += [(turning, "u" if len(turning) == 1 else "r")] if turning else []
     found = {}
     for names, answer in pairs:
-        varied = all(float(np.nanstd(log[n])) > 0.02 * np.nanmax(np.abs(log[n])) for n in names)
+        varied = all(log.std(n) > 0.02 * np.nanmax(np.abs(log[n])) for n in names)
         delay = delay_of(log, names, answer) if answer in log and varied else None
         if delay is not None:
             found[", ".join(names), answer] = names, delay
@@ -447,7 +447,7 @@ def delays(log: Record) -> dict[tuple[str, str], tuple[tuple[str, ...], Delay]]:
 
 def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     """Return how late a velocity answers inputs; None where the log does not tell."""
-    step, blocks = log.step, blocks_of(log, answer)
+    step, blocks = log.step, log.of(blocks_of, answer)
     reach = max(2 * blocks.size, round(3.0 / step))
     if len(log) < max(20 * blocks.size, 6 * reach):
         return None
@@ -461,11 +461,8 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
     # the flow over a rudder falls as the vessel turns: without their product in the fit the answer
     # seems to come early
     moving = {name: log[name][:, None] for name in log.moving}
-    driving = [name for name in (*other, *names) if float(np.nanstd(log[name])) > 0.0]
+    driving = [name for name in (*other, *names) if log.std(name) > 0.0]
     linear = len(driving) > 4
-
-    def integrals(columns: Sequence[np.ndarray]) -> np.ndarray:
-        return np.stack([blocks.integrals(one)(0) for one in columns], axis=-1)
 
     def given(part: Sequence[str], shifts: Sequence[int] | np.ndarray) -> list[np.ndarray]:
         """Return terms [T, S] of inputs that are shifted by so many samples each."""
@@ -473,8 +470,10 @@ def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
         inputs = [np.take(log[name], at, mode="wrap") for name in driving if name in part]
         return of_inputs(inputs, moving.get("u"), linear=linear)
 
-    ones = np.ones((len(log), 1))
-    fixed = integrals([ones, *of_motion(moving), *given(other, [0])])
+    def integrals(columns: Sequence[np.ndarray]) -> np.ndarray:
+        return np.stack([blocks.integrals(one)(0) for one in columns], axis=-1)
+
+    fixed = integrals([np.ones((len(log), 1)), *of_motion(moving), *given(other, [0])])
 
     def look(shifts: Iterable[int]) -> None:
         new = [k for k in dict.fromkeys(shifts) if k not in sums and abs(k) <= reach]

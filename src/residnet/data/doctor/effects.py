@@ -185,7 +185,7 @@ class Effects:
             # one-step predictions may stay as good while the coefficients they give are wrong
             for name in self._log.moving:
                 apart = float(np.sqrt(np.nanmean((after[name] - self._log[name]) ** 2)))
-                moved = max(moved, apart / max(float(np.nanstd(self._log[name])), 1e-12))
+                moved = max(moved, apart / max(self._log.std(name), 1e-12))
             moved = moved if moved >= _LEAST_MOVED else 0.0
         if fitted is None or rows.table.shape[1] != fitted.shape[0] or not len(rows):
             return None if place < LEAST_EFFECT else max(place, moved)

@@ -98,7 +98,7 @@ def condition(log: Record, found: Check) -> Iterator[Finding]:
     names = [
         name
         for name in (*log.moving, *log.inputs)
-        if np.nanstd(log[name]) > 1e-6 * np.nanmax(np.abs(log[name]))
+        if log.std(name) > 1e-6 * np.nanmax(np.abs(log[name]))
     ]
     columns = log.log.stack(names)
     columns = columns[np.isfinite(columns).all(axis=1)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -157,15 +157,16 @@ def check(
     return register
 
 
-def run(stage: str, subject: Any) -> Iterator[Finding]:
+def run(stage: str, subject: Any) -> list[Finding]:
     """Return what the checks of a stage find in a log, or between several."""
-    for one in CHECKS:
-        if one.stage == stage and all(name in subject for name in one.needs):
-            # a stretch without a number is no news to who measured it
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)
-                found = list(one.body(subject.few if one.few else subject, one))
-            yield from found
+    found: list[Finding] = []
+    # a stretch without a number is no news to who measured it
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        for one in CHECKS:
+            if one.stage == stage and all(name in subject for name in one.needs):
+                found += one.body(subject.few if one.few else subject, one)
+    return found
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.names import POSE, VELOCITY
-from residnet.data.channels import SIGMA_OF_MAD, STILL, quantiles
+from residnet.data.channels import SIGMA_OF_MAD, STILL, deviation, median, quantiles
 from residnet.data.doctor.findings import (
     Check,
     Finding,
@@ -74,7 +74,7 @@ class Rates:
 def rates(log: Record) -> Rates:
     """Return the rates over windows in which the pose moves by several times its noise."""
     known = [name for name in log.moving if np.isfinite(log[name]).any()]
-    turning = float(np.nanstd(log["r"])) if "r" in known else 0.0
+    turning = log.std("r") if "r" in known else 0.0
 
     def half(noise: float, rate: float) -> int:
         longest = float(log.t[-1] - log.t[0]) / 15.0
@@ -228,7 +228,7 @@ def position_jumps(log: Record, found: Check) -> Iterator[Finding]:
     excess = np.abs(np.nan_to_num(np.diff(log["x"] + 1j * log["y"]) - explained))
     known = np.abs(explained[np.isfinite(explained)])
     fast = 0.5 * quantiles(known, 0.95)[0] if known.size else 0.0
-    limit = max(15.0 * float(np.median(excess)), fast)
+    limit = max(15.0 * median(excess), fast)
     what = (
         f"position jumps {{}} times by more than {limit:.2g} m beyond u, v, at most by {{:.2g}} m"
     )
@@ -325,7 +325,7 @@ def _follow(
     slow channels correlate at any lag.
     """
     motion = log.of(rates)
-    own, turned = (float(np.nanstd(one)) for one in (motion.measured[name], reference))
+    own, turned = (deviation(one) for one in (motion.measured[name], reference))
     if name == "r" and turned > 5.0 * motion.noise and own < STILL * turned:
         return {
             "text": f"{name} does not move, while {what} does; the gyro is dead or another column",
@@ -405,7 +405,7 @@ def heading_jumps(log: Record, found: Check) -> Iterator[Finding]:
     """Report steps of the heading that the yaw rate does not explain."""
     psi, r = log["psi"], log["r"]
     change = np.diff(psi) - 0.5 * _bridged_steps(log) * (r[1:] + r[:-1])
-    scatter = float(np.nanmedian(np.abs(change))) if np.isfinite(change).any() else 0.0
+    scatter = median(np.abs(change)) if np.isfinite(change).any() else 0.0
     noise = max(log.noise("psi") * math.sqrt(2.0), SIGMA_OF_MAD * scatter)
     limit = max(10.0 * noise, math.radians(2.0))
     what = "psi jumps {} times beyond what r explains, at most by {:+.1f} deg"
@@ -421,7 +421,7 @@ def yaw_drift(log: Record, found: Check) -> Iterator[Finding]:
     psi, r = bridged(log.t, log["psi"]), bridged(log.t, log["r"])
     drift = psi - psi[0] - np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (r[1:] + r[:-1])))
     end, most, span = float(drift[-1]), float(np.abs(drift).max()), float(log.t[-1] - log.t[0])
-    spread, bias = max(float(np.nanstd(log["r"])), 1e-12), end / span
+    spread, bias = max(log.std("r"), 1e-12), end / span
     causes = log.few.of(yaw_causes)
     known = causes.get("bias") or causes.get("ramp")
     # a bias misleads from 1.8 deg a minute and 5 % of the yaw rate on, or by what it adds up to

@@ -13,14 +13,14 @@ filters leave errors that are not white.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from residnet.core.log import Log
-from residnet.data.channels import SIGMA_OF_MAD
+from residnet.data.channels import SIGMA_OF_MAD, deviation, median
 from residnet.data.derivatives import local_polynomials
 from residnet.data.doctor.findings import Check, Finding, Level, correction, with_channels
 from residnet.data.doctor.statistics import FEWEST, SECTIONS, WINDOW, Record, bridged, fit
@@ -33,6 +33,12 @@ _MOST_CAUSES = 4
 # standard errors from nothing
 _WORTH, _SURE = 60.0, 3.5
 _REACH = WINDOW // 2
+_APART = np.abs(np.arange(-_REACH, _REACH + 1)) > 1
+_BESIDE = np.zeros(WINDOW)
+"""Weights of the samples about one in the parabola that leaves it and its neighbours out."""
+_BESIDE[_APART] = np.linalg.pinv(np.vander(np.arange(-_REACH, _REACH + 1)[_APART], 3))[-1]
+_DEPENDENT = 1e-9
+"""Square of what others leave of a column of length 1, below which it is a sum of theirs."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ def yaw_causes(log: Record) -> dict[str, Cause]:
     time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
     columns = {"bias": [-dt], "ramp": [-dt, -dt * time]}
     # where the heading does not move, a bias of r would be all gain
-    turned = float(np.nanstd(log.of(_around, "psi")))
+    turned = deviation(log.of(_around, "psi"))
     if _stands_out(log, "r") and turned > _TURNED * log.noise("psi"):
         columns = {"gain": [-_area(dt, smooth)], "lag": [np.diff(smooth)], **columns}
     rate = np.full(dt.size, log.noise("r"))
@@ -153,11 +159,8 @@ def _around(log: Record, name: str) -> np.ndarray:
     if known.sum() < WINDOW:
         return values
     filled = bridged(np.arange(values.size), values)
-    offsets = np.arange(-_REACH, _REACH + 1)
-    weights, others = np.zeros(WINDOW), np.abs(offsets) > 1
-    weights[others] = np.linalg.pinv(np.vander(offsets[others], 3))[-1]
     smooth = local_polynomials(filled[:, None], WINDOW, 2, 1.0)[0][:, 0]
-    smooth[_REACH:-_REACH] = np.convolve(filled, weights, "valid")
+    smooth[_REACH:-_REACH] = np.convolve(filled, _BESIDE, "valid")
     return np.where(known & ~log.torn(_REACH), smooth, np.nan)
 
 
@@ -195,13 +198,13 @@ def _explained(
     excess, seconds, variance = np.diff(pose[at]) - between(known), between(dt), (dt * rate) ** 2
     table = between(np.stack([part for parts in columns.values() for part in parts], axis=-1))
     usable = np.isfinite(excess) & np.isfinite(table).all(axis=1) & np.isfinite(between(rate))
-    keep = np.flatnonzero(usable & (seconds <= 3.0 * float(np.median(seconds))))
+    keep = np.flatnonzero(usable & (seconds <= 3.0 * median(seconds)))
     if keep.size < FEWEST:
         return {}
     total = between(variance)[keep]
     shared = variance[np.minimum(at[keep], variance.size - 1)]
     shared = np.where(np.isfinite(shared), np.minimum(shared, total), total)
-    floor = 1e-3 * float(np.median(np.abs(excess[keep]))) + 1e-12
+    floor = 1e-3 * median(np.abs(excess[keep])) + 1e-12
     # the trapezoid shares half a sample with its neighbour, which noise of the pose hides at least
     # in part: increments are never taken as more alike than independent ones, or the whitening
     # would look at the highest frequencies alone
@@ -218,8 +221,9 @@ def _explained(
     y, table = rows[:, 0], rows[:, 1:]
     # rows that stand far out and that no cause explains are jumps
     scale = np.maximum(np.abs(table).max(axis=0), 1e-300)
-    rest = np.abs(y - (table / scale) @ np.linalg.lstsq(table / scale, y, rcond=1e-9)[0])
-    trust = rest <= 8.0 * SIGMA_OF_MAD * max(float(np.median(rest)), 1e-300)
+    unit = table / scale
+    rest = np.abs(y - unit @ np.linalg.lstsq(unit.T @ unit, unit.T @ y, rcond=1e-12)[0])
+    trust = rest <= 8.0 * SIGMA_OF_MAD * max(median(rest), 1e-300)
     names = np.array([name for name, parts in columns.items() for _ in parts])
     return _pursuit(np.where(trust, y, 0.0), np.where(trust[:, None], table, 0.0), names)
 
@@ -228,30 +232,44 @@ def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray) -> dict[str, Cause
     """Select groups of columns one at a time, then drop those that others made superfluous."""
     scale = np.linalg.norm(x, axis=0)
     x, names = x[:, scale > 0.0] / scale[scale > 0.0], names[scale > 0.0]
-    scale, told = scale[scale > 0.0], names.tolist()
+    scale = scale[scale > 0.0]
     gram, product, energy = x.T @ x, x.T @ y, float(y @ y)
+    groups = {name: np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())}
 
-    def left(chosen: list[str]) -> float:
+    def left(chosen: Iterable[str]) -> float:
         """Return the sum of squares that some causes leave."""
-        part = [i for i, name in enumerate(told) if name in chosen]
+        part = np.concatenate([groups[name] for name in chosen])
         values = np.linalg.lstsq(gram[part][:, part], product[part], rcond=1e-9)[0]
-        return energy - float(product[part] @ values) if chosen else energy
+        return energy - float(product[part] @ values)
 
-    every = list(dict.fromkeys(told))
-    variance = max(left(every) / y.size, 1e-12 * energy / y.size)
-    price = {name: _WORTH * variance * (1.0 + 0.2 * told.count(name)) for name in every}
+    if not groups:
+        return {}
+    variance = max(left(groups) / y.size, 1e-12 * energy / y.size)
+    price = {n: _WORTH * variance * (1.0 + 0.2 * part.size) for n, part in groups.items()}
     chosen: list[str] = []
+    # what the causes chosen so far leave of columns and of what they have to explain
+    rest, unexplained = gram, product
+    first, last = np.array([part[[0, -1]] for part in groups.values()]).T
     while len(chosen) < _MOST_CAUSES:
-        others = [name for name in every if name not in chosen]
+        # one column of a group after the other, the second by what the first leaves of it
+        size, shared = rest[first, first], rest[first, last] * (last > first)
+        shared = np.where(size > _DEPENDENT, shared / np.maximum(size, _DEPENDENT), 0.0)
+        sizes = np.stack((size, rest[last, last] - shared * rest[first, last]))
+        told = np.stack((unexplained[first], unexplained[last] - shared * unexplained[first]))
+        gain = np.where(sizes > _DEPENDENT, told**2 / np.maximum(sizes, _DEPENDENT), 0.0)
+        gain[1] *= last > first
         # of causes that explain the same, as lags of all channels but one and of that one do, the
         # first counts
-        before = left(chosen)
-        gain = {n: before - left([*chosen, n]) - price[n] for n in others}
-        gain = {n: round(value / max(energy, 1e-300), 9) for n, value in gain.items()}
-        best = max(others, key=lambda name: gain[name], default="")
-        if not best or gain[best] <= 0.0:
+        more = np.round((gain.sum(axis=0) - [*price.values()]) / max(energy, 1e-300), 9)
+        best = int(np.argmax(more))
+        if more[best] <= 0.0 or [*groups][best] in chosen:
             break
-        chosen.append(best)
+        chosen.append([*groups][best])
+        for i in groups[chosen[-1]]:
+            if rest[i, i] > _DEPENDENT:
+                share = rest[i] / rest[i, i]
+                unexplained = unexplained - share * unexplained[i]
+                rest = rest - np.outer(rest[:, i], share)
     for name in list(chosen[:-1]):
         fewer = [cause for cause in chosen if cause != name]
         chosen = fewer if left(fewer) - left(chosen) < price[name] else chosen

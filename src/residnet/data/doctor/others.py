@@ -214,7 +214,7 @@ class Model:
 
     def unsure(self, rows: Rows) -> np.ndarray:
         """Return how much the coefficients' uncertainty adds to the variance [K], as a share."""
-        return np.asarray(np.einsum("ij,jk,ik->i", rows.x, self.inverse, rows.x))
+        return np.asarray(((rows.x @ self.inverse) * rows.x).sum(1))
 
     def rest(self, rows: Rows) -> np.ndarray:
         """Return what the model leaves of y [K, n], in standard deviations of what is usual."""

@@ -16,7 +16,15 @@ from numpy.typing import ArrayLike
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.stretches import stretches as runs_of
-from residnet.data.channels import noise_of, quantiles, spikes, spread_rows
+from residnet.data.channels import (
+    CACHED,
+    deviation,
+    far_from_medians,
+    median,
+    noise_of,
+    quantiles,
+    spread_rows,
+)
 from residnet.data.derivatives import local_polynomials
 
 MEASURED = (
@@ -80,11 +88,12 @@ class Record:
         self._bad = bad
         self.noise = cache(lambda name: noise_of(self.few[name]))
         """Standard deviation of a channel's white noise."""
-        self.spikes = cache(lambda name: spikes(log[name]))
-        """[T] bool: samples of a channel that stand far out of their neighbours."""
+        self.std = cache(lambda name: deviation(self[name]))
+        """Standard deviation of a channel."""
         self.smooth = cache(lambda name: smoothed(self.t, log[name]))
         """A channel [T] smoothed by a parabola over 15 samples, NaN bridged."""
         self._shared: dict[Hashable, Any] = {}
+        self._spikes: dict[str, np.ndarray] = {}
 
     def __contains__(self, name: object) -> bool:
         return name in self.log.channels
@@ -101,10 +110,20 @@ class Record:
     def __len__(self) -> int:
         return len(self.log)
 
+    def spikes(self, name: str) -> np.ndarray:
+        """Return [T] bool: samples of a channel that stand far out of their neighbours."""
+        if name not in self._spikes:
+            # as many channels of a short log at once as stay in a core's cache
+            some = [n for n in self.measured if n not in self._spikes and n != name]
+            some = [name, *some[: CACHED // len(self) - 1]] if len(self) < CACHED else [name]
+            found = far_from_medians([self.log[n] for n in some])
+            self._spikes.update(zip(some, found, strict=True))
+        return self._spikes[name]
+
     @cached_property
     def step(self) -> float:
         """Usual time between samples in s."""
-        return float(np.median(np.diff(self.t)[:: max(len(self) // _LONG, 1)]))
+        return median(np.diff(self.t)[:: max(len(self) // _LONG, 1)])
 
     @cached_property
     def measured(self) -> list[str]:
@@ -293,9 +312,17 @@ def fit(x: np.ndarray, y: np.ndarray) -> Fit:
     inverse = np.linalg.pinv(x.T @ x, rcond=1e-10)
     values = inverse @ (x.T @ y)
     rest = y - x @ values
-    scores = np.stack([part.sum(axis=0) for part in np.array_split(x * rest[:, None], SECTIONS)])
-    spread = inverse @ (scores.T @ scores) @ inverse
-    return Fit(values / size, spread / np.outer(size, size), rest)
+    total = np.concatenate((np.zeros((1, values.size)), np.cumsum(x * rest[:, None], axis=0)))
+    scores = np.diff(total[_bounds(rest.size)], axis=0)
+    covariance = inverse @ (scores.T @ scores) @ inverse
+    return Fit(values / size, covariance / np.outer(size, size), rest)
+
+
+def _bounds(count: int) -> np.ndarray:
+    """Return the rows [SECTIONS + 1] at which sections meet; the first ones may hold a row more."""
+    size, longer = divmod(count, SECTIONS)
+    at = np.arange(SECTIONS + 1)
+    return at * size + np.minimum(at, longer)
 
 
 # a block covers so many samples and so many seconds at least
@@ -369,7 +396,7 @@ def blocks_of(log: Record, *moving: str) -> Blocks:
         within = ~log.torn(longer)[longer:]
         changes = {n: (log[n][longer:] - log[n][:-longer])[within] for n in moving}
         over = [
-            float(np.nanstd(change)) / max(log.noise(name), 1e-12)
+            deviation(change) / max(log.noise(name), 1e-12)
             for name, change in changes.items()
             if np.isfinite(change).any()
         ]
@@ -384,7 +411,7 @@ def regressors(
     velocity: Mapping[str, np.ndarray], inputs: Mapping[str, np.ndarray], count: int
 ) -> np.ndarray:
     """Return a polynomial [T, k] of second degree in velocities and inputs that knows no vessel."""
-    driving = [values for values in inputs.values() if np.nanstd(values) > 0.0]
+    driving = [values for values in inputs.values() if deviation(values) > 0.0]
     columns = [np.ones(count), *of_motion(velocity)]
     # beyond four inputs each enters linearly only
     columns += of_inputs(driving, velocity.get("u"), linear=len(driving) > 4)

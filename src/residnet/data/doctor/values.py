@@ -15,7 +15,9 @@ from residnet.core.names import POSE, STATE
 from residnet.core.stretches import stretches
 from residnet.data.channels import (
     beyond_belief,
+    deviation,
     fills,
+    median,
     noise_of,
     quantiles,
     spike_cells,
@@ -277,7 +279,7 @@ def _held(log: Record, names: tuple[str, ...]) -> np.ndarray:
 
 def _noisy(log: Record, name: str) -> bool:
     """Return whether noise is a good part of what a channel does from sample to sample."""
-    return log.noise(name) > 0.05 * float(np.nanstd(np.diff(log[name])))
+    return log.noise(name) > 0.05 * deviation(np.diff(log[name]))
 
 
 def _moves(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
@@ -374,14 +376,14 @@ def _straight(log: Record, name: str) -> np.ndarray:
     known = known[np.isfinite(known)]
     if known.size < 100:
         return out
-    usual = float(np.median(known))
+    usual = median(known)
     rounding = 1e-9 * float(np.nanmax(np.abs(values))) / log.step
     resolution = resolution_of(values) / log.step
     # between few steps of its resolution a channel runs straight by itself, a smooth channel bends
     # little anyhow: only noise bends at every sample
     coarse = resolution > 0.0 and 8.0 * resolution >= usual
     noise = log.noise(name) * np.sqrt(6.0)
-    noisy = noise > 0.5 * float(np.nanmedian(np.abs(np.diff(values, 2))))
+    noisy = noise > 0.5 * median(np.abs(np.diff(values, 2)))
     if coarse or usual <= 10.0 * rounding or not noisy:
         return out
     slope = np.diff(log[name]) / np.diff(log.t)

@@ -509,8 +509,7 @@ def peek(path: Path, rows: int = 20_000) -> Sheet:
     numbers: dict[str, np.ndarray] = {}
     texts: dict[str, pd.Series] = {}
     empty = []
-    for i, name in enumerate(table.columns):
-        column = table.iloc[:, i]
+    for name, column in table.items():
         unknown = column.isna().to_numpy()
         if unknown.all():
             empty.append(name)

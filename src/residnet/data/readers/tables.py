@@ -307,7 +307,7 @@ class TableReader(LogReader):
         about, table.attrs = table.attrs, {}
         above, cut = about.get("above", 0), bool(about.get("cut"))
         rows = len(table) + cut
-        cells = {name: table.iloc[:, i] for i, name in enumerate([*columns, *sides])}
+        cells = dict(zip([*columns, *sides], (cells for _, cells in table.items()), strict=True))
         self._require_units(path, about.get("units", ()))
         t, start, findings = self._times(path, cells, above)
         raw = {name: self._values(path, name, cells, above) for name in maps}

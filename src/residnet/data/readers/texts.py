@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TextIO
 
 import numpy as np
 
@@ -163,10 +163,11 @@ def read_csv(
                 f"{path}: not a regular table, its header has {wide} columns ({reason}); check"
                 " `delimiter` and `decimal`"
             ) from error
-    whole = {
-        place: _plain(pd.concat(pieces.pop(place) or [pd.Series([])], ignore_index=True), decimal)
-        for place in [*pieces]
-    }
+    whole = {}
+    for place in [*pieces]:
+        parts = pieces.pop(place) or [pd.Series([])]
+        column = parts[0] if len(parts) == 1 else pd.concat(parts, ignore_index=True)
+        whole[place] = _plain(column, decimal)
     table = pd.DataFrame({i: whole[place][0] for i, place in enumerate(where)}, copy=False)
     table.columns = pd.Index(where)
     table = table.iloc[: -1 if cut else None]
@@ -204,7 +205,7 @@ def plain(table: pd.DataFrame, decimal: str = ".") -> pd.DataFrame:
     """
     import pandas as pd
 
-    found = [_plain(table.iloc[:, i], decimal) for i in range(table.shape[1])]
+    found = [_plain(cells, decimal) for _, cells in table.items()]
     out = pd.DataFrame({i: cells for i, (cells, _) in enumerate(found)}, table.index)
     out.columns = table.columns
     out.attrs = {**table.attrs, "units": [unit for _, unit in found]}
@@ -301,7 +302,7 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
         names = numbered(cells[at])
         comments, held = [], 0
         for line, block, _ in _blocks(file):
-            said = [i for i in _passed(block, delimiter, cells[at]) if line + i >= above]
+            said = _passed(block, delimiter, cells[at], above - line)
             comments += [line + i for i in said]
             held += sum(bool(one.strip()) for one in _lines(block)) - len(said)
             if held >= above + rows:
@@ -381,41 +382,49 @@ def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str])
         DataError: where the first line is blank or no line of cells.
     """
     wanted = set(columns)
-    rows: list[tuple[int, list[str]]] = []
 
-    def holding() -> list[int]:
-        own = (i for i, (_, row) in enumerate(rows) if wanted <= {*row, *numbered(row)})
-        return [*islice(own, 1)]
+    def lines(stream: TextIO) -> Iterator[tuple[int, list[str]]]:
+        if delimiter == BLANKS:
+            yield from enumerate((line.split() for line in stream), start=1)
+            return
+        reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
+        for row in reader:
+            yield reader.line_num, [cell.strip() for cell in row]
 
+    first: tuple[list[str], int] | None = None
+    names: list[str] | None = None
+    # numbers of the names' line and of those below it, and the cells of the latter
+    numbers, below = list[int](), list[list[str]]()
     with file.open(newline="", encoding="utf-8-sig") as stream:
         try:
-            if delimiter == BLANKS:
-                rows += enumerate((line.split() for line in islice(stream, _SEARCHED)), start=1)
-            else:
-                reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
-                for row in islice(reader, _SEARCHED):
-                    rows.append((reader.line_num, [cell.strip() for cell in row]))
-            # names may stand in a line of comment
-            said = [(i, _COMMENTED.sub("", delimiter.join(row), count=1)) for i, row in rows]
-            rows = [*((i, line.split(delimiter)) for i, line in said), *rows]
+            for number, row in islice(lines(stream), _SEARCHED):
+                # names may stand in a line of comment
+                said = _COMMENTED.sub("", delimiter.join(row), count=1).split(delimiter)
+                first = first or (said, number)
+                if names is None:
+                    held = (one for one in (said, row) if wanted <= {*one, *numbered(one)})
+                    names = next(held, None)
+                elif len(below) < _BELOW:
+                    below.append(row)
+                else:
+                    break
+                numbers += [number] if names is not None else []
         except csv.Error as error:
-            if not holding():
+            if names is None:
                 raise DataError(
                     f"{path}: line 1 is no header with column names ({error}); a quotation mark may"
                     " be open, or lines are missing at the beginning"
                 ) from error
-    found = holding()
-    if not found and (not rows or not any(rows[0][1])):
-        raise DataError(
-            f"{path}: the file is empty or its first line is blank; a header line with column"
-            " names was expected"
-        )
-    at = found[0] if found else 0
-    names = rows[at][1]
+    if names is None:
+        if first is None or not any(first[0]):
+            raise DataError(
+                f"{path}: the file is empty or its first line is blank; a header line with column"
+                " names was expected"
+            )
+        return Header(tuple(first[0]), first[1])
     called = numbered(names)
     where = [called.index(column) for column in columns if column in called]
-    below = _without_values([cells for _, cells in rows[at + 1 :]], where) if found else 0
-    return Header(tuple(names), rows[at + below][0])
+    return Header(tuple(names), numbers[_without_values(below, where)])
 
 
 def _without_values(rows: Sequence[Sequence[str]], where: Iterable[int]) -> int:
@@ -497,7 +506,7 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
         cells = _counted(block, delimiter, wide)
         odd = (cells != wide) & (cells != 0)
         odd[: max(above - line, 0)] = False
-        said = [i for i in _passed(block, delimiter, header.names) if line + i >= above]
+        said = _passed(block, delimiter, header.names, above - line)
         comments += [line + i for i in said]
         odd[[i for i in said if i < odd.size]] = False
         if odd.any():
@@ -551,14 +560,18 @@ def _lines(block: bytes) -> list[bytes]:
     return lines if lines[-1] else lines[:-1]
 
 
-def _passed(block: bytes, delimiter: str, names: Sequence[str]) -> list[int]:
-    """Return which lines are comments, or the names again, as a recorder begins anew."""
+def _passed(block: bytes, delimiter: str, names: Sequence[str], above: int) -> list[int]:
+    """Return which lines below those `above` are comments, or the names again."""
     again, telling = list(names), max(names, key=len, default="").encode() or _COMMENT[0]
+    begin = 0
+    for _ in range(above):
+        begin = block.find(b"\n", begin) + 1 or len(block)
+    block = block[begin:]
     if not any(sign in block for sign in (*_COMMENT, telling)):
         return []
     return [
         i
-        for i, line in enumerate(_lines(block))
+        for i, line in enumerate(_lines(block), max(above, 0))
         if line.lstrip().startswith(_COMMENT)
         or (telling in line and _cells(line.decode("utf-8", "replace"), delimiter) == again)
     ]
