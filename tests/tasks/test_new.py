@@ -20,6 +20,8 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Question
 from residnet.data.readers import ReaderConfig
+from residnet.data.sources import read_logs
+from residnet.identification.prepared import prepare_logs
 from residnet.identification.recipe import judging, window_length
 from residnet.tasks.drafting import new_config
 from residnet.tasks.registry import load_task
@@ -51,19 +53,34 @@ def lasting(seconds: float) -> Log:
 
 
 def test_free_runs_are_no_longer_than_most_logs() -> None:
-    assert window_length([lasting(180.0)], 20.0) == 100.0
-    assert window_length([lasting(95.0), lasting(95.0), lasting(200.0)], 20.0) == 60.0
-    assert window_length([lasting(30.0)], 20.0) == 20.0
+    assert window_length([180.0], 20.0) == 100.0
+    assert window_length([95.0, 95.0, 200.0], 20.0) == 60.0
+    assert window_length([30.0], 20.0) == 20.0
     assert window_length([], 20.0) == 0.5
 
 
 def test_the_length_of_the_test_logs_enters_no_choice() -> None:
-    splits = {"train": [lasting(180.0)] * 3, "validation": [lasting(180.0)]}
-    long, short = (judging({**splits, "test": [lasting(s)]}, 20.0) for s in (180.0, 15.0))
+    lengths = {"train": [180.0] * 3, "validation": [180.0]}
+    splits = {name: [lasting(s) for s in each] for name, each in {**lengths, "test": []}.items()}
+    long, short = (judging(splits, {**lengths, "test": [s]}, 20.0) for s in (180.0, 15.0))
     assert long["selection"] == short["selection"] == "T100"
     assert long["scales"] == short["scales"]
     assert list(long["protocols"]) == list(short["protocols"])[:2] == ["T100", "T40"]
     assert min(float(one["length"].split()[0]) for one in short["protocols"].values()) < 13.0
+
+
+def test_free_runs_are_as_short_as_gaps_ask_for(tmp_path: Path, logs: list[Log]) -> None:
+    random, (log, *_) = np.random.default_rng(1), logs
+    holes = {
+        name: np.where(random.random(len(log)) < 0.5, np.nan, values)
+        for name, values in log.channels.items()
+    }
+    log.replace(channels=holes).save(tmp_path / "holes.parquet")
+    out = tmp_path / "holes.yaml"
+    new_config([tmp_path / "holes.parquet"], out, None, overwrite=False)
+    task = load_task(out)
+    # refuses a log that holds no window
+    assert all(prepare_logs(read_logs(task.data), task).values())
 
 
 def test_a_config_from_logs_alone(folder: Path) -> None:

@@ -29,7 +29,7 @@ from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.data.sources import read_logs as read_splits
 from residnet.data.split import SPLITS, check_leaks, divided, log_names
 from residnet.identification.recipe import Preparation, judging
-from residnet.judge.protocol import EvaluationConfig
+from residnet.judge.protocol import EvaluationConfig, longest_stretch
 from residnet.physics.signals import SignalsConfig
 from residnet.tasks.drafting import Draft, drafted, driving
 
@@ -340,7 +340,7 @@ def prepare(
         if live.text:
             say(f"velocities: {live.text}")
         say(f"recipe: {chosen.reason}")
-        judged = judging(whole, chosen.memory, live)
+        judged: dict[str, Any] = {}
         content = chosen.content()
         grid = {"step": step, "held": held}
         content["grid"] |= {key: value for key, value in grid.items() if value is not None}
@@ -364,8 +364,16 @@ def prepare(
             home = next((c for kind, c in homes if key in kind.model_fields), content)
             if value is not None:
                 home[key] = value
-        built: list[Any] = [validate(plain(part), kind, "prepare") for kind, part in homes]
-        return Data(_prepared(splits, built[0], built[2]), built[0], built[2], built[1], source)
+        model = validate(plain(signals), SignalsConfig, "prepare")
+        preparation = validate(plain(content), PrepareConfig, "prepare")
+        prepared, step = _prepared(splits, model, preparation), preparation.grid.step
+        lasting = {
+            split: [longest_stretch(log) * step for log in members]
+            for split, members in prepared.items()
+        }
+        judged = judging(whole, lasting, chosen.memory, live) | judged
+        evaluation = validate(plain(judged), EvaluationConfig, "prepare")
+        return Data(prepared, model, preparation, evaluation, source)
 
 
 def _named_live(given: Any) -> Live:

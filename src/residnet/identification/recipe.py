@@ -16,10 +16,10 @@ from residnet.core.log import Log
 from residnet.core.names import BOW_WIND, CHANNEL_UNITS, WIND_INPUTS
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
-from residnet.data.motion import BRIDGED, without_pauses
-from residnet.data.prepare import Prepared
+from residnet.data.motion import without_pauses
+from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.base import Integrator
-from residnet.judge.protocol import EvaluationConfig, Windows
+from residnet.judge.protocol import EvaluationConfig, Windows, longest_stretch
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
 from residnet.physics.symmetry import live_of, mirrored_channels, wrong_parity
 
@@ -384,6 +384,10 @@ def _regressors(ridge: float, terms: list[str] | dict[str, list[str]]) -> dict[s
 
 
 _WINDOWS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
+_ROOMY = 1.15
+"""Times of a free run that a log lasts so that it starts somewhere in it."""
+_PART = 40_000
+"""First samples of a long log that mostly tell how long its stretches are."""
 
 
 @dataclass(frozen=True)
@@ -478,8 +482,34 @@ def integrator(live: Live) -> Integrator:
     return "rk4" if live.spatial else "semi_implicit_euler"
 
 
+def longest_time(log: Log, columns: Sequence[str], config: PrepareConfig, live: Live) -> float:
+    """Return the longest time in s without a gap that preparing leaves of a log.
+
+    It is 0 where nothing is left to learn from. Of a long log its first part tells, unless that
+    holds no free run of the longest kind.
+
+    Args:
+        log: as its reader gives it.
+        columns: inputs of the model.
+
+    Raises:
+        DataError: where no sample is usable.
+    """
+    longest = 0.0
+    for part in (log.rows(slice(_PART)), log)[: 1 + (len(log) > _PART)]:
+        prepared = prepare(part, "train", columns, config, live)
+        if prepared.good.any():
+            longest = longest_stretch(prepared) * config.grid.step
+        if longest >= _ROOMY * _WINDOWS[0]:
+            break
+    return longest
+
+
 def judging(
-    splits: Mapping[str, Sequence[Log]], memory: float, live: Live = ALIVE
+    splits: Mapping[str, Sequence[Log]],
+    lasting: Mapping[str, Sequence[float]],
+    memory: float,
+    live: Live = ALIVE,
 ) -> dict[str, Any]:
     """Return protocols, selection and scales of a config, for logs by split.
 
@@ -488,13 +518,14 @@ def judging(
 
     Args:
         splits: `train`, `validation` and `test`.
+        lasting: the longest time in s without a gap that preparing leaves of each of their logs.
         memory: how long the vessel remembers, s.
     """
-    length = window_length(splits["validation"] or splits["train"], memory)
+    length = window_length(lasting["validation"] or lasting["train"], memory)
     laid = protocols(length)
     both = [*splits["train"], *splits["validation"]]
     out = {"selection": next(iter(laid)), "scales": scales(both, live)}
-    if splits["test"] and (shorter := window_length(splits["test"], memory)) < length:
+    if lasting["test"] and (shorter := window_length(lasting["test"], memory)) < length:
         laid |= {name: one for name, one in protocols(shorter).items() if name not in laid}
     return {"protocols": laid, **out}
 
@@ -518,25 +549,18 @@ def _memory(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float:
     return float(below[0] * step) if below.size else float("nan")
 
 
-def window_length(logs: Sequence[Log], memory: float) -> float:
+def window_length(lasting: Sequence[float], memory: float) -> float:
     """Return the length in s of free runs that most of the logs hold.
 
     Args:
-        logs: to be judged on; none ask for half a second.
+        lasting: the longest time in s without a gap of each log to be judged on; none ask for half
+            a second.
         memory: how long the vessel remembers, s.
     """
-    lengths = sorted(_longest(log.t) for log in logs) or [1.0]
+    lengths = sorted(lasting) or [1.0]
     usual = lengths[int(0.25 * (len(lengths) - 1))]
-    room = [length for length in _WINDOWS if 1.15 * length <= usual] or [0.5 * usual]
+    room = [length for length in _WINDOWS if _ROOMY * length <= usual] or [0.5 * usual]
     return next((length for length in room if length <= 15.0 * memory), room[-1])
-
-
-def _longest(t: np.ndarray) -> float:
-    """Return the longest time in s without a pause of the recorder; no free run goes across one."""
-    step = np.diff(t)
-    pauses = np.flatnonzero(step > BRIDGED * np.median(step) * (1.0 + 1e-6))
-    first, last = np.append(0, pauses + 1), np.append(pauses, t.size - 1)
-    return float((t[last] - t[first]).max())
 
 
 def protocols(length: float) -> dict[str, Any]:

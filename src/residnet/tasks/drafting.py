@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,13 +27,11 @@ from residnet.data.drafting.reading import INPUTS, log_files, read_drafted
 from residnet.data.drafting.words import PLANES, input_channel, state_channel, words_of
 from residnet.data.motion import MotionConfig, complete_motion
 from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
-from residnet.data.split import SPLITS, called_splits, divided, without_copies
+from residnet.data.split import SPLITS, called_splits, divided, stretch_of, without_copies
 
 _UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
 _INSPECTED = 12
 """Logs that the data doctor looks at."""
-_PART = 40_000
-"""First samples of a long log that mostly tell whether it can be prepared."""
 _SHOWN = 12
 """Guesses that the terminal shows."""
 
@@ -155,11 +153,15 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
         where = {"channels": list(live.channels)} if live.dead else {}
         preparation |= {"masks": [{"kind": "frozen", **where}]}
     usable = read.usable((*inputs, *chosen.exogenous), preparation)
-    split, splits = _split(usable, folder, marks)
+    root, parts = _split(read, usable, folder, marks)
     if not called_splits(list(usable.values())):
         # a split that the folders tell stays as it is
-        _judge_long_ones(split, splits, chosen.memory, marks)
-    judged = judging(splits, chosen.memory, live)
+        _judge_long_ones(parts, chosen.memory, marks)
+    split, splits, lasting = (
+        {name: [part[place] for part in members] for name, members in parts.items()}
+        for place in range(3)
+    )
+    judged = judging(splits, lasting, chosen.memory, live)
     marks.note(("prepare", "grid"), chosen.reason)
     marks.note(
         ("evaluation", "protocols"),
@@ -171,7 +173,7 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
         "task": "fit",
         "name": name,
         "description": f"Drafted by residnet new from {len(usable)} logs",
-        "data": {"kind": "measured", "reader": read.reader, "split": split},
+        "data": {"kind": "measured", "reader": read.reader, "split": {"root": root, **split}},
         "prepare": preparation,
         "signals": signals,
         "integrator": integrator(live),
@@ -215,9 +217,14 @@ class _Read:
         logs: path -> log, in SI, as the reader gives it.
         whole: path -> the same with the motion at every sample.
         left_out: path -> why it is not used.
+        lasting: path -> the longest time in s without a gap that preparing leaves of it.
+        longest: returns that of any part of a log, in SI as the reader gives it.
     """
 
+    longest: Callable[[Log], float]
+
     def __init__(self, paths: Sequence[Path], marks: Marks) -> None:
+        self.lasting: dict[Path, float] = {}
         read = read_drafted(paths, marks)
         self.reader = read.reader
         self.left_out = {path: str(error) for path, error in read.left_out.items()}
@@ -279,17 +286,16 @@ class _Read:
 
     def usable(self, columns: Sequence[str], preparation: Mapping[str, Any]) -> dict[Path, Log]:
         """Return the logs that can be prepared; the others are left out with the reason."""
-        from residnet.data.prepare import PrepareConfig, prepare
+        from residnet.data.prepare import PrepareConfig
+        from residnet.identification.recipe import longest_time
 
         config = validate(dict(preparation), PrepareConfig, "draft")
+        self.longest = lambda log: longest_time(log, columns, config, self.live)
         out: dict[Path, Log] = {}
         for path, log in self.logs.items():
             try:
-                # of a long log a part tells, but for one with nothing that is usable
-                parts = [log.rows(slice(_PART)), log] if len(log) > _PART else [log]
-                if any(
-                    prepare(part, "train", columns, config, self.live).good.any() for part in parts
-                ):
+                self.lasting[path] = self.longest(log)
+                if self.lasting[path]:
                     out[path] = self.whole[path]
                 else:
                     self.left_out[path] = "no stretch is as long as the window of the derivative"
@@ -324,56 +330,75 @@ class _Read:
         return lines
 
 
+_Part = tuple[Any, Log, float]
+"""Entry of a split in a config, its log with the whole motion, and the longest time in s without a
+gap that preparing leaves of it."""
+
+
 def _split(
-    usable: Mapping[Path, Log], folder: Path, marks: Marks
-) -> tuple[dict[str, Any], dict[str, list[Log]]]:
-    """Return the split as a config has it, and its logs with their whole motion."""
-    splits = divided(list(usable.values()))
+    read: _Read, usable: Mapping[Path, Log], folder: Path, marks: Marks
+) -> tuple[str, dict[str, list[_Part]]]:
+    """Return the folder of the logs and their split.
+
+    Raises:
+        DataError: where nothing that can be prepared is left of the logs for a split.
+    """
     paths = {log.name: path for path, log in usable.items()}
     common = Path(os.path.commonpath([path.resolve().parent for path in usable]))
     near = os.path.relpath(common, folder.resolve())
     # absolute where it lies far from the config
     root = common.as_posix() if near.count("..") > 2 else Path(near).as_posix()
-    entries: dict[str, list[Any]] = {split: [] for split in splits}
     why = (
         "of each five logs, in the order of their manoeuvres, one is for validation and one for the"
         " test"
     )
     if called_splits(list(usable.values())):
         why = "folders or files are called after the splits"
-    for split, logs in splits.items():
+    parts: dict[str, list[_Part]] = {split: [] for split in SPLITS}
+    for split, logs in divided(list(usable.values())).items():
         for log in logs:
             ends = log.meta.get("stretch")
             # the name of a stretch begins with that of its log, and may with a shorter one
             own = [n for n in paths if n == log.name or (ends and log.name.startswith(n))]
             path = paths[max(own, key=len)]
             entry: Any = path.resolve().relative_to(common).as_posix()
+            time = read.lasting[path]
             if ends:
                 why, source = "few logs: each is cut in time", usable[path]
                 entry = {"log": entry}
                 entry |= {"from": f"{ends[0]:.13g} s"} if ends[0] > source.t[0] else {}
                 entry |= {"to": f"{ends[1]:.13g} s"} if ends[1] < source.t[-1] else {}
-            entries[split].append(entry)
+                try:
+                    time = read.longest(stretch_of(read.logs[path], *ends))
+                except DataError:
+                    time = 0.0
+            if time:
+                parts[split].append((entry, log, time))
+            else:
+                text = f"{log.name} is left out: its gaps leave no stretch to learn from"
+                marks.note(("data", "split"), text)
+        if logs and not parts[split]:
+            raise DataError(
+                f"the logs hold nothing for {split}: in {', '.join(log.name for log in logs)[:120]}"
+                " no stretch without a gap is as long as the window of the derivative; fill gaps"
+                " that may be interpolated, or give longer logs"
+            )
     marks.guess(("data", "split"), f"{why}; logs of one day may be alike, so check the choice")
-    return {"root": root, **entries}, splits
+    return root, parts
 
 
-def _judge_long_ones(
-    split: dict[str, Any], splits: dict[str, list[Log]], memory: float, marks: Marks
-) -> None:
+def _judge_long_ones(parts: dict[str, list[_Part]], memory: float, marks: Marks) -> None:
     """Learn from the logs that are too short to be judged on, but for the last one of a split."""
     from residnet.identification.recipe import protocols, window_length
 
     for name in SPLITS[1:]:
-        laid = protocols(window_length(splits[name], memory)).values()
+        laid = protocols(window_length([time for *_, time in parts[name]], memory)).values()
         shortest = 1.2 * min(float(entry["length"].split()[0]) for entry in laid)
-        for entry, log in list(zip(split[name], splits[name], strict=True)):
-            if log.t[-1] - log.t[0] < shortest and len(split[name]) > 1:
-                split[name].remove(entry)
-                splits[name] = [other for other in splits[name] if other is not log]
-                split["train"].append(entry)
-                splits["train"].append(log)
-                marks.note(("data", "split"), f"{log.name} is too short to be judged on")
+        for part in list(parts[name]):
+            if part[2] < shortest and len(parts[name]) > 1:
+                parts[name].remove(part)
+                parts["train"].append(part)
+                marks.note(("data", "split"), f"{part[1].name} is too short to be judged on")
 
 
 _PASSIVE = (
