@@ -410,12 +410,15 @@ class Fleet:
         free = ~np.logical_or.reduce(groups) if groups else np.ones(plain.shape[1], dtype=bool)
         return [free, *groups]
 
-    def _by_parts(self, i: int, model: Model, axis: int) -> np.ndarray:
-        """Return what each part of a model contributes to the change of a velocity [K, parts]."""
+    def by_parts(self, i: int, model: Model) -> np.ndarray:
+        """Return what each part of a model contributes to the changes of velocities [n, K, parts].
+
+        It is 0 of a part that contributes next to nothing.
+        """
         rows = self.rows[i]
-        parts = [rows.x[:, group] @ model.theta[group, axis] for group in self._groups]
-        table = np.stack(parts, axis=1)
-        return table[:, np.abs(table).max(0) > 1e-9]
+        parts = [rows.x[:, group] @ model.theta[group] for group in self._groups]
+        table = np.stack(parts, axis=-1).transpose(1, 0, 2)
+        return np.asarray(table * (np.abs(table).max(axis=1, keepdims=True) > 1e-9))
 
     def _parts(self, i: int, model: Model, beyond: np.ndarray) -> tuple[float, float]:
         """Return by how many standard errors parts of the others' model differ in a log.
@@ -424,18 +427,19 @@ class Fleet:
         for the worst velocity; and the share of what there is to predict that such factors change.
         `beyond` is the mean square [n] that is usually left.
         """
-        rows = self.rows[i]
-        rest, most, moved = rows.y - rows.x @ model.theta, 0.0, 0.0
-        for axis in range(len(self.moving)):
-            table = self._by_parts(i, model, axis)
-            score, seen = table.T @ rest[:, axis], table.T @ rows.x
-            spread = table.T @ table + seen @ model.inverse @ seen.T
-            spread = _OVERLAP * max(float(beyond[axis]), 1e-12) * spread
-            inverse = np.linalg.pinv(spread, rcond=1e-9, hermitian=True)
-            most = max(most, math.sqrt(max(score @ inverse @ score, 0.0) / max(len(score), 1)))
-            factors = np.linalg.pinv(table.T @ table, rcond=1e-6, hermitian=True) @ score
-            moved = max(moved, float(np.sqrt(np.mean((table @ factors) ** 2))))
-        return most, moved
+        rows, table = self.rows[i], self.by_parts(i, model)
+        turned = table.transpose(0, 2, 1)
+        score = turned @ (rows.y - rows.x @ model.theta).T[..., None]
+        own, seen = turned @ table, turned @ rows.x
+        spread = own + seen @ model.inverse @ seen.transpose(0, 2, 1)
+        spread = _OVERLAP * np.maximum(beyond, 1e-12)[:, None, None] * spread
+        inverse = np.linalg.pinv(spread, rcond=1e-9, hermitian=True)
+        size = (score.transpose(0, 2, 1) @ inverse @ score)[:, 0, 0]
+        count = table.any(axis=1).sum(axis=1)
+        factors = np.linalg.pinv(own, rcond=1e-6, hermitian=True) @ score
+        moved = np.sqrt(np.mean((table @ factors) ** 2, axis=1))
+        most = np.sqrt(np.maximum(size, 0.0) / np.maximum(count, 1))
+        return float(most.max()), float(moved.max())
 
     def _separate(self) -> None:
         """Take the logs apart that contradict the others, one after the other, the worst first."""
@@ -589,9 +593,8 @@ _STILL = 1e-3
 
 def resting(fleet: Fleet, i: int, name: str) -> bool:
     """Return whether an input rests in a log though it moves in others."""
-    own = fleet.logs[i][name]
-    among = [float(np.nanstd(fleet.logs[j][name])) for j in range(len(fleet.logs)) if j != i]
-    return float(np.nanstd(own)) <= _STILL * max(float(np.median(among)), 1e-12)
+    among = [log.std(name) for j, log in enumerate(fleet.logs) if j != i]
+    return fleet.logs[i].std(name) <= _STILL * max(float(np.median(among)), 1e-12)
 
 
 def _with_change(kind: str, values: np.ndarray, t: np.ndarray, size: float) -> np.ndarray:
@@ -620,7 +623,7 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
     out: list[Cause] = []
     for name in (*fleet.driving, *fleet.moving):
         drives = name in fleet.driving
-        spread = float(np.nanmedian([np.nanstd(fleet.logs[j][name]) for j in fleet.core])) or 1.0
+        spread = float(np.nanmedian([fleet.logs[j].std(name) for j in fleet.core])) or 1.0
         if drives and resting(fleet, i, name):
             surprise = _freed(fleet, model, i, name, 0.01 * spread) + unsure
             text = f"the record of {name} is dead: it rests while the vessel answers to it"
@@ -694,12 +697,12 @@ def _current(fleet: Fleet, model: Model, log: Record) -> list[Cause]:
 
 def _vessel(fleet: Fleet, model: Model, i: int, unsure: float) -> Cause:
     """Return what is left of a log if every part of the model had a size of its own in it."""
-    rest, rows, left = model.rest(fleet.rows[i]), fleet.rows[i], 0.0
+    rows, left = fleet.rows[i], 0.0
     spread = np.sqrt((model.usual + rows.noise) * (1.0 + model.unsure(rows))[:, None])
-    for axis in range(len(fleet.moving)):
-        table = fleet._by_parts(i, model, axis) / spread[:, [axis]]
-        sizes = np.linalg.lstsq(table, rest[:, axis], rcond=1e-6)[0]
-        left += float(np.mean((rest[:, axis] - table @ sizes) ** 2))
+    tables = fleet.by_parts(i, model) / spread.T[..., None]
+    for table, rest in zip(tables, model.rest(rows).T, strict=True):
+        sizes = np.linalg.lstsq(table, rest, rcond=1e-6)[0]
+        left += float(np.mean((rest - table @ sizes) ** 2))
     text = "it is another vessel or another loading: no single change of a channel explains it"
     return Cause("vessel", "", 0.0, _OF_MANY * left + unsure, text)
 
@@ -760,7 +763,7 @@ def nothing_steers(fleet: Fleet) -> tuple[list[str], float]:
         name
         for name in steering
         if all(
-            float(np.nanstd(log[name])) <= _STILL * max(float(np.nanmax(np.abs(log[name]))), 1e-12)
+            log.std(name) <= _STILL * max(float(np.nanmax(np.abs(log[name]))), 1e-12)
             for log in fleet.logs
         )
     ]
