@@ -12,7 +12,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, lru_cache
 
 from residnet.core.errors import UsageError
 
@@ -160,6 +160,7 @@ def to_si(unit: str, expected: str | None = None) -> float:
     return _UNITS[known_unit(unit, expected)][1]
 
 
+@lru_cache(maxsize=4096)
 def known_unit(unit: str, expected: str | None = None) -> str:
     """Return residnet's own name of a unit, whatever its spelling.
 

@@ -284,6 +284,7 @@ _SYMBOLS = {"ψ̇": "r", "ψ": "psi", "δ": "delta", "φ": "phi", "ϕ": "phi", "
 """Greek letters that stand alone."""
 
 
+@lru_cache(maxsize=4096)
 def plain(name: str) -> str:
     """Return a name in lower case and plain letters, its words apart, its units left out."""
     text = _IN_BRACKETS.sub(" ", name)
