@@ -391,40 +391,37 @@ def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str])
         for row in reader:
             yield reader.line_num, [cell.strip() for cell in row]
 
-    first: tuple[list[str], int] | None = None
     names: list[str] | None = None
-    # numbers of the names' line and of those below it, and the cells of the latter
-    numbers, below = list[int](), list[list[str]]()
+    # number of a line, its cells, and those without the sign of a comment
+    rows: list[tuple[int, list[str], list[str]]] = []
     with file.open(newline="", encoding="utf-8-sig") as stream:
         try:
             for number, row in islice(lines(stream), _SEARCHED):
-                # names may stand in a line of comment
                 said = _COMMENTED.sub("", delimiter.join(row), count=1).split(delimiter)
-                first = first or (said, number)
+                rows.append((number, row, said))
                 if names is None:
                     held = (one for one in (said, row) if wanted <= {*one, *numbered(one)})
                     names = next(held, None)
-                elif len(below) < _BELOW:
-                    below.append(row)
-                else:
+                    rows = rows if names is None else rows[-1:]
+                elif len(rows) > _BELOW:
                     break
-                numbers += [number] if names is not None else []
         except csv.Error as error:
             if names is None:
                 raise DataError(
                     f"{path}: line 1 is no header with column names ({error}); a quotation mark may"
                     " be open, or lines are missing at the beginning"
                 ) from error
+    if names is None and (not rows or not any(rows[0][2])):
+        raise DataError(
+            f"{path}: the file is empty or its first line is blank; a header line with column"
+            " names was expected"
+        )
     if names is None:
-        if first is None or not any(first[0]):
-            raise DataError(
-                f"{path}: the file is empty or its first line is blank; a header line with column"
-                " names was expected"
-            )
-        return Header(tuple(first[0]), first[1])
+        return Header(tuple(rows[0][2]), rows[0][0])
     called = numbered(names)
     where = [called.index(column) for column in columns if column in called]
-    return Header(tuple(names), numbers[_without_values(below, where)])
+    below = _without_values([row for _, row, _ in rows[1:]], where)
+    return Header(tuple(names), rows[below][0])
 
 
 def _without_values(rows: Sequence[Sequence[str]], where: Iterable[int]) -> int:
