@@ -398,7 +398,7 @@ def usual_interval(values: np.ndarray) -> float:
     every = np.diff(np.flatnonzero(moved if moved.ndim == 1 else moved.any(axis=1)))
     if every.size < _FEWEST_INTERVALS:
         return 1.0
-    usual = float(np.median(every))
+    usual = median(every)
     regular = float((np.abs(every - usual) <= ALIKE * usual).mean()) >= REGULAR
     return usual if usual >= 2.0 and regular else 1.0
 

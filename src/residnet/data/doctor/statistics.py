@@ -219,9 +219,9 @@ class Record:
 def bridged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return values [T] with straight lines where some are missing, 0 where all are."""
     known = np.isfinite(values)
-    if known.all() or not known.any():
-        return np.asarray(np.nan_to_num(values))
-    return np.asarray(np.interp(t, t[known], values[known]))
+    if known.all():
+        return values
+    return np.interp(t, t[known], values[known]) if known.any() else np.zeros(values.size)
 
 
 def smoothed(t: np.ndarray, values: np.ndarray) -> np.ndarray:
