@@ -44,7 +44,7 @@ def noise_of(values: np.ndarray) -> float:
     known = values[np.isfinite(values)]
     if known.size < 8:
         return 0.0
-    return SIGMA_OF_MAD * median(np.abs(np.diff(known, 3))) / 20.0**0.5
+    return SIGMA_OF_MAD * median(np.abs(np.diff(known, 3))) / math.sqrt(20.0)
 
 
 def quantiles(values: np.ndarray, *shares: float) -> list[float]:

@@ -157,10 +157,9 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
     if not called_splits(list(usable.values())):
         # a split that the folders tell stays as it is
         _judge_long_ones(parts, chosen.memory, marks)
-    split, splits, lasting = (
-        {name: [part[place] for part in members] for name, members in parts.items()}
-        for place in range(3)
-    )
+    split = {name: [entry for entry, *_ in members] for name, members in parts.items()}
+    splits = {name: [log for _, log, _ in members] for name, members in parts.items()}
+    lasting = {name: [time for *_, time in members] for name, members in parts.items()}
     judged = judging(splits, lasting, chosen.memory, live)
     marks.note(("prepare", "grid"), chosen.reason)
     marks.note(

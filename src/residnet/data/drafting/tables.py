@@ -509,7 +509,7 @@ def peek(path: Path, rows: int = 20_000) -> Sheet:
     numbers: dict[str, np.ndarray] = {}
     texts: dict[str, pd.Series] = {}
     empty = []
-    for name, column in table.items():
+    for name, (_, column) in zip(columns, table.items(), strict=True):
         unknown = column.isna().to_numpy()
         if unknown.all():
             empty.append(name)
