@@ -13,7 +13,7 @@ from residnet.core.arrays.paged import LARGE
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.stretches import stretches
-from residnet.data.channels import noise_of
+from residnet.data.channels import deviation, median, noise_of
 from residnet.data.doctor.clock import EPOCH
 from residnet.data.doctor.excitation import conditioning, in_brackets
 from residnet.data.doctor.findings import (
@@ -159,7 +159,7 @@ def continued(logs: Together, found: Check) -> Iterator[Finding]:
 
     first, last = each(lambda x: float(x[:3].mean())), each(lambda x: float(x[-3:].mean()))
     noise, fast = each(noise_of), each(lambda x: float(high(x, 0.9)))
-    usual = each(lambda x: float(np.nanmedian(np.abs(np.diff(x)))))
+    usual = each(lambda x: median(np.abs(np.diff(x))))
     for i, a in enumerate(logs.logs):
         apart = np.abs(first - last[i]) / np.maximum(usual[i] + noise[i] + noise, 1e-12)
         most = np.nan_to_num(np.max(np.where(np.isnan(apart), 0.0, apart), axis=1))
@@ -214,7 +214,9 @@ def _perhaps_same(logs: Sequence[Record], names: Sequence[str]) -> Iterator[tupl
         for n, name in enumerate(names):
             for k in np.flatnonzero(starts <= len(log)):
                 part = log[name][: starts[k]]
-                told[:, i, n, k] = np.nanmean(part), np.nanmean(np.abs(part)), np.nanstd(part)
+                part = part[np.isfinite(part)]
+                if part.size:
+                    told[:, i, n, k] = part.mean(), np.abs(part).mean(), part.std()
     mean, size, spread = told
     for i, log in enumerate(logs if names else ()):
         k = np.searchsorted(starts, np.minimum(lengths[i], lengths[i + 1 :]), "right") - 1
@@ -238,7 +240,7 @@ def same_commands(logs: Together, found: Check) -> Iterator[Finding]:
     names = [name for name in logs.inputs if not name.startswith(("wind", "current"))]
     for a, b in _perhaps_same(logs.logs, names):
         size = min(len(a), len(b))
-        moving = [name for name in names if float(np.nanstd(a[name][:size])) > 1e-9]
+        moving = [name for name in names if deviation(a[name][:size]) > 1e-9]
         if size < 50 or not moving:
             continue
 
