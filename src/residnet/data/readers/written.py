@@ -531,7 +531,7 @@ def steady_clock(
         t, remarks = packed, [remark("note", "clock_packed", text)]
         step = np.diff(t)
     lengths = {"an hour, as in autumn": 3600.0} if tick is None else {}
-    if tick is not None:
+    if tick is not None and (step < 0.0).any():
         lengths = {f"2^{bits} of its ticks": 2.0**bits * tick for bits in _BITS}
     added = np.zeros_like(t)
     for what, length in lengths.items():
