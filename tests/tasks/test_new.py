@@ -24,6 +24,7 @@ from residnet.data.sources import read_logs
 from residnet.identification.prepared import prepare_logs
 from residnet.identification.recipe import judging, window_length
 from residnet.tasks.drafting import new_config
+from residnet.tasks.fit import FitConfig
 from residnet.tasks.registry import load_task
 
 
@@ -79,6 +80,7 @@ def test_free_runs_are_as_short_as_gaps_ask_for(tmp_path: Path, logs: list[Log])
     out = tmp_path / "holes.yaml"
     new_config([tmp_path / "holes.parquet"], out, None, overwrite=False)
     task = load_task(out)
+    assert isinstance(task, FitConfig)
     # refuses a log that holds no window
     assert all(prepare_logs(read_logs(task.data), task).values())
 
