@@ -7,7 +7,7 @@ residual models are identified from the course, and the course is flown again wi
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, final
@@ -20,7 +20,7 @@ from torch import Tensor
 from residnet.baselines.given import BelievedConfig, HullEquations
 from residnet.control.guidance import CrossingConfig
 from residnet.control.motion import ReferenceFilterConfig
-from residnet.core.config import Config, Seconds
+from residnet.core.config import Config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
 from residnet.core.files import read_json
 from residnet.core.format import DEG, number
@@ -57,7 +57,6 @@ from residnet.dynamics.rollout import Rollout
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.heads.base import ZeroHead
 from residnet.judge.autopilots import mse
-from residnet.manoeuvres import FamilyConfig
 from residnet.manoeuvres.closed_loop import ZigzagFamily
 from residnet.physics.force_model import Correction, ForceModel
 from residnet.physics.signals import FORCE_CHANNELS, SignalsConfig
@@ -67,53 +66,14 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, ExportRequest, Exports, MainFigure, PartName
 
 
-class StillFitsConfig(Config):
-    """Settings of the check: on some axis the residual has grown by `factor` and is no trifle.
-
-    Attributes:
-        factor: of the mean square residual of the stretch it is compared with.
-        share: of the variance of the force, below which a residual does not matter.
-        segments: share of the segments of an axis that must show both, so that one gust or one wake
-            is no reason.
-    """
-
-    factor: float = Field(default=4.0, gt=1)
-    share: float = Field(default=0.02, gt=0, lt=1)
-    segments: float = Field(default=0.5, gt=0, le=1)
+_WORSE, _MATTERS, _MOST = 4.0, 0.02, 0.5
+"""A model no longer fits an axis where the mean square residual of a share of the segments, so that
+one gust or one wake is no reason, and of the whole log is so many times what it was, and more than
+a trifle of the force's variance. Chosen by hand.
+"""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What was found, by axis.
-
-    Attributes:
-        fits: whether the model may stay.
-        growth: mean square residual now over then [3].
-        share: mean square residual now over the force's variance [3].
-        segments: share of segments that show a worse fit [3].
-    """
-
-    fits: bool
-    growth: list[float]
-    share: list[float]
-    segments: list[float]
-
-    def text(self) -> str:
-        """Return one line about it."""
-        growth, share = (
-            "/".join(f"{value:.3g}" for value in part)
-            for part in (self.growth, [100 * value for value in self.share])
-        )
-        sentence = "still fits" if self.fits else "no longer fits: identify it again from this log"
-        return (
-            f"{sentence} (residual {growth} times what it was, {share} % of the force's variance;"
-            " surge/sway/yaw)"
-        )
-
-
-def still_fits(
-    config: StillFitsConfig, then: Tensor, now: Tensor, force: Tensor, fold: Tensor
-) -> Verdict:
+def still_fits(then: Tensor, now: Tensor, force: Tensor, fold: Tensor) -> dict[str, Any]:
     """Return whether a model still fits, by comparing residuals.
 
     Args:
@@ -121,6 +81,10 @@ def still_fits(
         now: residual on new data [M, 3].
         force: of the new data [M, 3].
         fold: segment of each new sample [M].
+
+    Returns:
+        Whether the model `fits`; by axis `growth` (mean square residual now over then), `share` of
+        the force's variance, and `segments`, the share of those that show a worse fit.
 
     Raises:
         DataError: where the new data are empty or not finite, or their force does not vary.
@@ -133,24 +97,31 @@ def still_fits(
     variance, before = force.var(0), then.square().mean(0)
     if bool((variance <= 0).any()):
         raise DataError(
-            "the force of the new log does not vary on some axis: nothing can be sentence about the"
+            "the force of the new log does not vary on some axis: nothing can be said about the"
             " model; give a log with manoeuvres"
         )
-    by_segment = torch.stack([now[fold == f].square().mean(0) for f in torch.unique(fold)])
-    worse = (
-        ((by_segment > config.factor * before) & (by_segment > config.share * variance))
-        .to(torch.float64)
-        .mean(0)
+    segments = [now[fold == one].square().mean(0) for one in torch.unique(fold)]
+    # the segments, and the whole log as the last row
+    squares = torch.stack([*segments, now.square().mean(0)])
+    worse = ((squares > _WORSE * before) & (squares > _MATTERS * variance)).to(torch.float64)
+    share = worse[:-1].mean(0)
+    return {
+        "fits": not bool((worse[-1].bool() & (share >= _MOST)).any()),
+        "growth": (squares[-1] / before.clamp(min=1e-300)).tolist(),
+        "share": (squares[-1] / variance).tolist(),
+        "segments": share.tolist(),
+    }
+
+
+def _verdict_text(found: Results) -> str:
+    growth, share = (
+        "/".join(f"{value:.3g}" for value in part)
+        for part in (found["growth"], [100 * value for value in found["share"]])
     )
-    mean = now.square().mean(0)
-    grown = (
-        (mean > config.factor * before)
-        & (mean > config.share * variance)
-        & (worse >= config.segments)
-    )
-    growth = mean / before.clamp(min=1e-300)
-    return Verdict(
-        not bool(grown.any()), growth.tolist(), (mean / variance).tolist(), worse.tolist()
+    sentence = "still fits" if found["fits"] else "no longer fits: identify it again from this log"
+    return (
+        f"{sentence} (residual {growth} times what it was, {share} % of the force's variance;"
+        " surge/sway/yaw)"
     )
 
 
@@ -198,25 +169,17 @@ class Published(Config):
     coefficients: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
 
 
-class ForwardRunsConfig(Config):
-    """What the models are run forward in time beside.
-
-    Attributes:
-        trials: families of manoeuvres of the true ferry.
-        duration: of each manoeuvre.
-        step: of the free runs.
-        seed: of everything random in them.
-    """
-
-    trials: tuple[FamilyConfig, ...] = Field(
-        default=(
-            ZigzagFamily(count=6, drive=(0.03, 0.07), steer=(0.01, 0.03), heading=(0.17, 0.35)),
-        ),
-        min_length=1,
-    )
-    duration: Seconds = Field(default=60.0, gt=0)
-    step: Seconds = Field(default=0.1, gt=0)
-    seed: int = Field(default=0, ge=0)
+_FORWARD: Mapping[str, Any] = {
+    "trials": (
+        ZigzagFamily(count=6, drive=(0.03, 0.07), steer=(0.01, 0.03), heading=(0.17, 0.35)),
+    ),
+    "duration": 60.0,
+    "step": 0.1,
+    "seed": 0,
+    "identification": {},
+    "validation": {},
+}
+"""Manoeuvres of the true ferry beside which the models run forward in time."""
 
 
 class FerryModelConfig(ResidualModelConfig):
@@ -252,13 +215,10 @@ class FerryStudyConfig(Study, ComputingTask):
         noise: noise on what is measured; null for none.
         disturbance: force that is constant in earth axes.
         feed_forward_alone: fly the course without feedback too (Table 4.8).
-        forward: manoeuvres of the true ferry beside which the models run forward in time; one that
-            diverges there is refused, and its equations are not written.
         models: residual models by name; a model stands after the one that it builds on.
         published: figures that the document prints for the believed model.
         later: vessel that the true one has become later, by name or file; the models that fly are
             judged on its log and identified again where they no longer fit. Null for none.
-        check_fit: when a model counts as no longer fitting.
         seed: seed of the noise.
     """
 
@@ -273,11 +233,9 @@ class FerryStudyConfig(Study, ComputingTask):
     noise: MotionNoise | None = None
     disturbance: Disturbance = Disturbance()
     feed_forward_alone: bool = False
-    forward: ForwardRunsConfig = ForwardRunsConfig()
     models: dict[PartName, FerryModelConfig] = Field(min_length=1)
     published: Published = Published()
     later: str | None = None
-    check_fit: StillFitsConfig = StillFitsConfig()
     seed: int = Field(default=0, ge=0)
 
     verbs: ClassVar[tuple[str, ...]] = ("report", "export")
@@ -517,16 +475,14 @@ def study(config: FerryStudyConfig) -> Flown:
         for name, flight in flown(changed, config.course, flying).items():
             log = record_of(flight, config.course.interval, config.noise)
             before, now = (flying[name].remaining(of) for of in (record, log))
-            verdict = still_fits(
-                config.check_fit, before[~record.train], now, log.command, log.fold
-            )
+            verdict = still_fits(before[~record.train], now, log.command, log.fold)
             after = flight
-            if not verdict.fits:
+            if not verdict["fits"]:
                 again = identify(config.models[name], log, believed)
                 after = changed.fly(config.course, [(again.force, again.lag)])[0]
             later[name] = {
-                "verdict": asdict(verdict),
-                "text": verdict.text(),
+                "verdict": verdict,
+                "text": _verdict_text(verdict),
                 "before": flight.tracking.row(),
                 "after": after.tracking.row(),
             }
@@ -556,11 +512,7 @@ def forward_runs(
         By model, `believed` first: `rmse` of u, v, r in m/s, m/s, rad/s over the runs that did not
         diverge (None without any), `runs`, and `diverged`, how many of them did.
     """
-    forward = config.forward
-    given = forward.model_dump(include={"duration", "step", "seed"})
-    trials = SimulatedTrials(
-        vessel=config.true, trials=forward.trials, identification={}, validation={}, **given
-    )
+    trials = SimulatedTrials(vessel=config.true, **_FORWARD)
     logs = [flight.motion for flight in fly_trials(trials.draw(), trials)]
     # one that ended early shows no free run
     logs = [log for log in logs if len(log) == max(map(len, logs))]
@@ -577,7 +529,7 @@ def forward_runs(
     signals, out = SignalsConfig(inputs=FORCE_CHANNELS).build(), {}
     for name, equations in {_BELIEVED: known, **models}.items():
         baseline = BelievedConfig(vessel=equations).build(signals.names)
-        model = HybridDynamics(signals, baseline, ZeroHead(), forward.step).double()
+        model = HybridDynamics(signals, baseline, ZeroHead(), trials.step).double()
         with torch.no_grad():
             ran = Rollout(model)(x[:, 0], w, x[:, 0, :0])[0]
         beyond = (ran[..., VELOCITIES].abs() > limit).any(dim=-1)

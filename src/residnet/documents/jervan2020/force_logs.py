@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -178,9 +178,8 @@ def read_measured(
     channels: ForceChannels,
     preparation: PrepareConfig,
     validation: FoldsConfig,
-    acceleration_of: Literal["velocity", "measured"],
 ) -> Measured:
-    """Read, mask, smooth and differentiate all logs; accelerations as asked for.
+    """Read, mask, smooth and differentiate all logs.
 
     Raises:
         ResidnetError: where a log cannot be read or holds no usable samples.
@@ -223,13 +222,9 @@ def read_measured(
     accelerations: dict[str, Tensor] = {}
     acceleration: dict[str, Any] = {}
     if channels.acceleration is not None:
-        derived, sensed = nu_dot, measured[:, ACCELERATIONS]
-        accelerations = {"measured acceleration": sensed, "derivative of velocity": derived}
-        acceleration = compare_accelerations(derived[good], sensed[good], fold[good])
-        if acceleration_of == "measured":
-            # less their mean offset, log by log
-            by_log = zip(*(part.split(lengths) for part in (sensed, derived, good)), strict=True)
-            nu_dot = torch.cat([s - (s - d)[kept].mean(0) for s, d, kept in by_log])
+        sensed = measured[:, ACCELERATIONS]
+        accelerations = {"measured acceleration": sensed, "derivative of velocity": nu_dot}
+        acceleration = compare_accelerations(nu_dot[good], sensed[good], fold[good])
     command = torch.cat(commands)
     record = Record(
         step * torch.arange(len(fold), dtype=torch.float64),

@@ -7,7 +7,7 @@ alone.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, final
 
@@ -33,7 +33,6 @@ from residnet.documents.jervan2020.residual import (
     AXES,
     Fit,
     ResidualModelConfig,
-    SurfaceRegression,
     fit_as_json,
     fit_model,
     forward_equations,
@@ -101,7 +100,7 @@ class MeasuredModelConfig(ResidualModelConfig):
             raise ValueError(
                 "lag: forces lag behind commands; set force to 'commanded', or leave lag out"
             )
-        if isinstance(self.fit, SurfaceRegression) and self.fit.choose == "test":
+        if self.fit.choose == "test":
             raise ValueError(
                 "fit.choose: 'test' lets the samples that judge a model choose it; take simplest or"
                 " least"
@@ -119,9 +118,6 @@ class ForceResidualConfig(Study, ComputingTask):
         data: the measured logs.
         prepare: time grid, masks, and how velocities are smoothed and differentiated.
         channels: names of the channels of force and acceleration.
-        acceleration: acceleration of the regressors: `velocity` for the derivative of the measured
-            velocities, `measured` for the log's own acceleration less its mean difference from that
-            derivative.
         validation: how the models are cross-validated.
         models: regressions by name.
     """
@@ -133,7 +129,6 @@ class ForceResidualConfig(Study, ComputingTask):
     data: ForceLogs
     prepare: PrepareConfig
     channels: ForceChannels
-    acceleration: Literal["velocity", "measured"] = "velocity"
     validation: FoldsConfig = FoldsConfig()
     models: dict[PartName, MeasuredModelConfig] = Field(min_length=1)
 
@@ -141,8 +136,6 @@ class ForceResidualConfig(Study, ComputingTask):
     def _combination(self) -> ForceResidualConfig:
         if taken := sorted(set(_NULLS) & set(self.models)):
             raise ValueError(f"'{taken[0]}' cannot name a model: it stands beside all of them")
-        if self.acceleration == "measured" and self.channels.acceleration is None:
-            raise ValueError("acceleration: 'measured' needs channels.acceleration")
         if self.prepare.hold != "start":
             raise ValueError("prepare.hold: nothing runs forward here, leave it out")
         if (
@@ -183,12 +176,10 @@ class ForceResidualConfig(Study, ComputingTask):
 
     def measured(self) -> Measured:
         """Return what the logs hold."""
-        return read_measured(
-            self.data, self.channels, self.prepare, self.validation, self.acceleration
-        )
+        return read_measured(self.data, self.channels, self.prepare, self.validation)
 
     def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        return written(self, force_study(self))
+        return force_study(self)
 
     def main_figures(self, results: Results) -> dict[str, MainFigure]:
         figures: dict[str, MainFigure] = {}
@@ -242,7 +233,7 @@ class ForceResidualConfig(Study, ComputingTask):
             _forces(results, run),
         ]
         if results["acceleration"]:
-            out.append(_accelerations(self, results, run))
+            out.append(_accelerations(results, run))
         for force, rows in _groups(results).items():
             out.append(Section(f"Residual of the {force} force", [_models(self, results, rows)]))
         out.append(Section("Errors and residuals", pictures(run, "scores", "residual_")))
@@ -270,29 +261,8 @@ class Model(NamedTuple):
     not_forward: str
 
 
-@dataclass(frozen=True)
-class Found:
-    """Everything that was found.
-
-    Attributes:
-        measured: the logs.
-        models: models by name.
-        failed: models that the logs do not determine, with the reason.
-        rows: rows of the tables; `zero` and `believed` are the first of each force.
-        forces: comparison of commanded and actual force.
-        unmodelled: residual [N, 3] of the believed model, by force.
-    """
-
-    measured: Measured
-    models: dict[str, Model]
-    failed: dict[str, str]
-    rows: list[dict[str, Any]]
-    forces: dict[str, Any]
-    unmodelled: dict[str, Tensor]
-
-
-def force_study(config: ForceResidualConfig) -> Found:
-    """Read the logs, and fit and judge every model.
+def force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[Figure]]:
+    """Read the logs, fit and judge every model; return what force_residual.json holds, and figures.
 
     A model that the logs do not determine is set aside with the reason.
 
@@ -308,13 +278,70 @@ def force_study(config: ForceResidualConfig) -> Found:
             failed[name] = f"model {name}: {error}"
     if not models:
         raise FitError(next(iter(failed.values())))
-    record = measured.record
+    record, parts = measured.record, measured.blocks()
     motion = record.nu_dot, record.nu, record.pose[:, HEADING]
     unmodelled = {
         which: believed.residual(force, *motion) for which, force in measured.forces.items()
     }
     rows = _rows(config, measured, models, unmodelled)
-    return Found(measured, models, failed, rows, compare_forces(measured), unmodelled)
+    content = {
+        "schema": "residnet.force_residual/1",
+        "run": config.name,
+        "logs": [
+            {"name": name, "samples": count, "seconds": count * record.dt}
+            for name, count in zip(measured.names, record.runs, strict=True)
+        ],
+        "samples": len(measured.good),
+        "used": int(measured.good.sum()),
+        "masked": measured.masked,
+        "folds": {"of": measured.parts, "count": int(measured.part.max()) + 1},
+        "intervals": None if parts is None else parts.row(),
+        "forces": compare_forces(measured),
+        "acceleration": measured.acceleration,
+        "rows": rows,
+        "failed": failed,
+        "models": {
+            name: {
+                "folds": model.folds,
+                "all": model.fit.notes,
+                "runs_forward": not model.not_forward,
+                "not_forward": model.not_forward,
+                **fit_as_json(config.models[name].terms, model.fit),
+            }
+            for name, model in models.items()
+        },
+    }
+    signals = [
+        ("forces", "Commanded and actual force", measured.forces, _FORCE_UNITS),
+        (
+            "accelerations",
+            "Measured acceleration and derivative of velocity",
+            measured.accelerations,
+            _ACCELERATION_UNITS,
+        ),
+    ]
+    # of the models of the actual force, the one with the least cross-validated error
+    of_actual = {
+        row["model"]: row["minus_believed"]["mean"][3]
+        for row in rows
+        if row["force"] == "actual" and row["model"] in models
+    }
+    if of_actual:
+        best, residual = min(of_actual, key=of_actual.__getitem__), unmodelled["actual"]
+        both = {"residual of the believed model": residual}
+        both[f"predicted by {best}"] = residual - models[best].error
+        title = f"Residual of the believed model and what {best} predicts on left-out folds"
+        signals.append(("residual", title, both, _FORCE_UNITS))
+    figures, start = [_scores(rows)], 0
+    for name, length in zip(measured.names, record.runs, strict=True):
+        inside = slice(start, start + length)
+        figures += [_pair(measured, name, inside, *pair) for pair in signals if pair[2]]
+        start += length
+    before = {row["force"]: row["mse"] for row in rows if row["model"] == "believed"}
+    for name, model in models.items():
+        of_model = config.models[name]
+        figures += model_figures(name, of_model, model.fit, before[of_model.judged_on])
+    return content, figures
 
 
 def _judged(
@@ -411,83 +438,26 @@ def better(row: Mapping[str, Any], than: str) -> list[bool]:
     return [interval is not None and interval[1] < 0 for interval in row[f"minus_{than}"]["ci95"]]
 
 
-def written(config: ForceResidualConfig, found: Found) -> tuple[dict[str, Any], list[Figure]]:
-    """Return the contents of force_residual.json and all figures."""
-    measured, record, parts = found.measured, found.measured.record, found.measured.blocks()
-    content = {
-        "schema": "residnet.force_residual/1",
-        "run": config.name,
-        "logs": [
-            {"name": name, "samples": count, "seconds": count * record.dt}
-            for name, count in zip(measured.names, record.runs, strict=True)
-        ],
-        "samples": len(measured.good),
-        "used": int(measured.good.sum()),
-        "masked": measured.masked,
-        "folds": {"of": measured.parts, "count": int(measured.part.max()) + 1},
-        "intervals": None if parts is None else parts.row(),
-        "forces": found.forces,
-        "acceleration": measured.acceleration,
-        "rows": found.rows,
-        "failed": found.failed,
-        "models": {
-            name: {
-                "folds": model.folds,
-                "all": model.fit.notes,
-                "runs_forward": not model.not_forward,
-                "not_forward": model.not_forward,
-                **fit_as_json(config.models[name].terms, model.fit),
-            }
-            for name, model in found.models.items()
-        },
-    }
-    figures, start = [_scores(found.rows)], 0
-    for name, length in zip(measured.names, record.runs, strict=True):
-        figures += _log_figures(found, name, slice(start, start + length))
-        start += length
-    believed = {row["force"]: row["mse"] for row in found.rows if row["model"] == "believed"}
-    for name, model in found.models.items():
-        of_model = config.models[name]
-        figures += model_figures(name, of_model, model.fit, believed[of_model.judged_on])
-    return content, figures
-
-
-def _log_figures(found: Found, name: str, inside: slice) -> list[Figure]:
-    measured = found.measured
+def _pair(
+    measured: Measured,
+    log: str,
+    inside: slice,
+    kind: str,
+    title: str,
+    signals: Mapping[str, Tensor],
+    units: Sequence[tuple[str, float]],
+) -> Figure:
+    """Return two signals along one log, masked stretches in grey."""
     t = (measured.record.t[inside] - measured.record.t[inside.start]).numpy()
     starts, stops = stretches(~measured.good[inside].numpy())
-    masked = (t[starts], t[stops - 1])
-
-    def pair(
-        kind: str, title: str, signals: Mapping[str, Tensor], units: Sequence[tuple[str, float]]
-    ) -> Figure:
-        first, second = signals
-        looks = {"masked": MASKED, first: DASHED, second: SOLID}
-        for label in signals:
-            looks[label] = replace(looks[label], label=label, width=1.1)
-        title = f"{title}, log {name}"
-        caption = f"{title}; {first} (dashed) and {second} (solid)."
-        paths = {label: signal[inside].numpy() for label, signal in signals.items()}
-        shared = {"masked": masked}
-        return histories(f"{kind}_{name}", (title, caption), looks, t, paths, units, shared=shared)
-
-    out = [pair("forces", "Commanded and actual force", measured.forces, _FORCE_UNITS)]
-    if measured.accelerations:
-        title = "Measured acceleration and derivative of velocity"
-        out.append(pair("accelerations", title, measured.accelerations, _ACCELERATION_UNITS))
-    # of the models of the actual force, the one with the least cross-validated error
-    of_actual = {
-        row["model"]: row["minus_believed"]["mean"][3]
-        for row in found.rows
-        if row["force"] == "actual" and row["model"] in found.models
-    }
-    if of_actual:
-        best, residual = min(of_actual, key=of_actual.__getitem__), found.unmodelled["actual"]
-        title = f"Residual of the believed model and what {best} predicts on left-out folds"
-        both = {"residual of the believed model": residual}
-        both[f"predicted by {best}"] = residual - found.models[best].error
-        out.append(pair("residual", title, both, _FORCE_UNITS))
-    return out
+    first, second = signals
+    looks = {"masked": MASKED, first: DASHED, second: SOLID}
+    for label in signals:
+        looks[label] = replace(looks[label], label=label, width=1.1)
+    words = (f"{title}, log {log}", f"{title}, log {log}; {first} (dashed) and {second} (solid).")
+    paths = {label: signal[inside].numpy() for label, signal in signals.items()}
+    masked = {"masked": (t[starts], t[stops - 1])}
+    return histories(f"{kind}_{log}", words, looks, t, paths, units, shared=masked)
 
 
 def _scores(rows: Sequence[Results]) -> Figure:
@@ -651,12 +621,7 @@ def _forces(results: Results, run: Path) -> Section:
     return Section("Commanded and actual force", [Text(text), table, *pictures(run, "forces_")])
 
 
-def _accelerations(config: ForceResidualConfig, results: Results, run: Path) -> Section:
-    used = (
-        "the derivative of the velocity"
-        if config.acceleration == "velocity"
-        else "the measured acceleration less its offset"
-    )
+def _accelerations(results: Results, run: Path) -> Section:
     table = table_of(
         [{"axis": axis, **results["acceleration"][axis]} for axis in AXES],
         [
@@ -667,7 +632,7 @@ def _accelerations(config: ForceResidualConfig, results: Results, run: Path) -> 
             ("rms of the derivative", "rms", number),
             ("correlation", "correlation", 4),
         ],
-        caption=f"In m/s^2, m/s^2 and rad/s^2; the models use {used}.",
+        caption="In m/s^2, m/s^2 and rad/s^2; the models use the derivative of the velocity.",
     )
     title = "Measured accelerations and derivatives of velocity"
     return Section(title, [table, *pictures(run, "accelerations_")])

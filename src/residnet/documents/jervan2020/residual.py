@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import itertools
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, final
+from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.baselines.given import BelievedConfig, HullEquations
@@ -140,72 +139,86 @@ class Fit:
         return x @ self.coefficients + self.intercept
 
 
-class RegressionKind(Config, ABC):
-    """A way to find coefficients."""
+_ESTIMATORS: Mapping[str, Estimator] = {
+    "ols": CentredLeastSquares(),
+    "ridge": Ridge(_PENALTIES, folds=None, scale=False, shared=True),
+    "lasso": ElasticNet(),
+    "elastic_net": ElasticNet(0.5),
+}
+"""Estimators without settings, by kind; what they choose they choose over left-out folds."""
 
-    @abstractmethod
+
+@final
+class RegressionConfig(Config):
+    """A way to find the coefficients of a residual force.
+
+    Attributes:
+        kind: `plsr`, of the three axes together; `surface`, PLSR of each axis by itself, chosen by
+            surface analysis (document 002 section 4.5.1); `ols`, ordinary least squares; `ridge`,
+            `lasso` or `elastic_net`, with the penalty of the least error over left-out folds.
+        order: number of latent variables of `plsr`; null takes the least error over left-out folds.
+        choose: how `surface` chooses. `test`, the document's own: the least error on the test half,
+            which then also judges it; `simplest`: cross-validation over the folds of the first half
+            and the one-standard-error rule; `least`: cross-validation and its bare minimum.
+    """
+
+    kind: Literal["plsr", "surface", "ols", "ridge", "lasso", "elastic_net"]
+    order: int | None = Field(default=None, ge=1)
+    choose: Literal["test", "simplest", "least"] = "simplest"
+
+    @model_validator(mode="after")
+    def _own(self) -> RegressionConfig:
+        for key, kind in (("order", "plsr"), ("choose", "surface")):
+            if self.kind != kind and getattr(self, key) != type(self).model_fields[key].default:
+                raise ValueError(f"{key}: belongs to kind {kind}; leave it out of {self.kind}")
+        return self
+
+    @property
+    def searches(self) -> bool:
+        """Whether it searches its order."""
+        return self.kind == "plsr" and self.order is None
+
     def fit(self, data: Regression) -> Fit:
         """Return the coefficients that fit the regression's samples.
+
+        A PLSR tells its errors over all orders, too (Figures 4.4, 4.22, 4.42, 5.7).
 
         Raises:
             FitError: where the data do not determine them.
         """
-
-
-class _ScaledRegression(RegressionKind, ABC):
-    """An estimator that runs on scaled columns and outputs."""
-
-    @abstractmethod
-    def estimator(self) -> tuple[Estimator, bool]:
-        """Return the estimator, and whether it leaves folds out to choose something."""
-
-    def fit(self, data: Regression) -> Fit:
+        if self.kind == "surface":
+            return _by_surface(data, self.choose)
+        chooses = self.kind != "ols" and self.order is None
+        estimator = _ESTIMATORS.get(self.kind) or PLSR(
+            self.order, max_order=None, folds=None, scale=False
+        )
         e, f, mean_x, mean_y, std_y = data.standardised
-        estimator, chooses = self.estimator()
         groups = data.fold if chooses else None
         first = estimator.fit(e, f, groups, names=data.terms, outputs=_FORCES)[0]
         # Theta_post = diag(scale)^-1 Theta_pre diag(std y) (3.12), correction J15
         post = first.coefficients / data.scale[:, None] * std_y
         notes = first.choice or first.notes
-        return Fit(post, mean_y - mean_x @ post, first.coefficients, notes)
-
-
-@final
-class PlsrRegression(_ScaledRegression):
-    """PLSR of the three axes together.
-
-    Attributes:
-        order: number of latent variables; null takes the least error over left-out folds.
-    """
-
-    kind: Literal["plsr"]
-    order: int | None = Field(default=None, ge=1)
-
-    def estimator(self) -> tuple[Estimator, bool]:
-        return PLSR(self.order, max_order=None, folds=None, scale=False), self.order is None
-
-    def fit(self, data: Regression) -> Fit:
-        """Return the coefficients, and the errors over all orders (Figures 4.4, 4.22, 4.42, 5.7).
-
-        See `RegressionKind.fit`.
-        """
-        found = super().fit(data)
-        if found.notes["order"] == 0:
+        if self.kind == "ridge":
+            notes = {"penalty": notes["penalty"][0]}
+        if notes.get("order") == 0:
             raise FitError("PLSR: nothing in the residual varies with the basis functions")
-        e, f, mean_x, mean_y, std_y = data.standardised
-        folds, count = data.fold.unique(), e.shape[1]
-        left_out = torch.full_like(f, torch.nan).repeat(count, 1, 1)
-        for fold in folds if len(folds) > 1 else ():
-            out = data.fold == fold
-            left_out[:, out] = _error_by_order(e[~out], f[~out], e[out], f[out])
-        test = torch.full((count, 1, 3), torch.nan, dtype=f.dtype)
-        if data.test is not None and len(data.test[0]):
-            x, y = data.test
-            test = _error_by_order(e, f, (x - mean_x) / data.scale, (y - mean_y) / std_y)
-        errors = {"left-out segments": left_out, "test half": test}
-        square = std_y.square()
-        orders = {what: error.square().mean(1) * square for what, error in errors.items()}
-        return replace(found, orders=orders)
+        orders = _errors_by_order(data) if self.kind == "plsr" else {}
+        return Fit(post, mean_y - mean_x @ post, first.coefficients, notes, orders=orders)
+
+
+def _errors_by_order(data: Regression) -> dict[str, Tensor]:
+    """Return the mean square errors [A, 3] of a PLSR over its order, on folds left out and test."""
+    e, f, mean_x, mean_y, std_y = data.standardised
+    folds, nothing = data.fold.unique(), torch.full_like(f, torch.nan).repeat(e.shape[1], 1, 1)
+    left_out, test = nothing.clone(), nothing[:, :1]
+    for fold in folds if len(folds) > 1 else ():
+        out = data.fold == fold
+        left_out[:, out] = _error_by_order(e[~out], f[~out], e[out], f[out])
+    if data.test is not None and len(data.test[0]):
+        x, y = data.test
+        test = _error_by_order(e, f, (x - mean_x) / data.scale, (y - mean_y) / std_y)
+    errors = {"left-out segments": left_out, "test half": test}
+    return {what: error.square().mean(1) * std_y.square() for what, error in errors.items()}
 
 
 def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor) -> Tensor:
@@ -220,89 +233,19 @@ def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return y - mean_f - (x - mean_e) @ path
 
 
-@final
-class SurfaceRegression(RegressionKind):
-    """PLSR of each axis by itself, chosen by surface analysis (document 002 section 4.5.1).
-
-    Attributes:
-        choose: `test`, the document's own: the least error on the test half, which then also judges
-            it; `simplest`: cross-validation over the folds of the first half and the
-            one-standard-error rule; `least`: cross-validation and its bare minimum.
-    """
-
-    kind: Literal["surface"]
-    choose: Literal["test", "simplest", "least"] = "simplest"
-
-    def fit(self, data: Regression) -> Fit:
-        x, y, groups = data.x, data.y, data.fold
-        estimator = SurfacePLSR("simplest" if self.choose == "simplest" else "least")
-        if self.choose == "test":
-            if data.test is None:
-                raise FitError("surface: choose 'test' needs the test half")
-            x, y = torch.cat((x, data.test[0])), torch.cat((y, data.test[1]))
-            groups = (torch.arange(len(x)) >= len(data.x)).long()
-            estimator = SurfacePLSR("least", test=[1])
-        found = estimator.surface(x, y, groups)
-        best = estimator.chosen(found, x, y, groups)
-        pre = best.coefficients * data.x.std(0)[:, None] / data.y.std(0)
-        return Fit(best.coefficients, best.intercept, pre, best.choice, found)
-
-
-@final
-class LeastSquaresRegression(_ScaledRegression):
-    """Ordinary least squares of the residual force on the basis functions."""
-
-    kind: Literal["ols"]
-
-    def estimator(self) -> tuple[Estimator, bool]:
-        return CentredLeastSquares(), False
-
-
-@final
-class RidgeRegression(_ScaledRegression):
-    """Ridge regression of the residual force on the basis functions.
-
-    Attributes:
-        penalty: in units of a scaled column's energy: alpha = penalty * samples in scikit-learn's
-            terms; null takes that of the least error over left-out folds.
-    """
-
-    kind: Literal["ridge"]
-    penalty: float | None = Field(default=None, gt=0)
-
-    def estimator(self) -> tuple[Estimator, bool]:
-        penalties = _PENALTIES if self.penalty is None else (self.penalty,)
-        return Ridge(penalties, folds=None, scale=False, shared=True), self.penalty is None
-
-    def fit(self, data: Regression) -> Fit:
-        found = super().fit(data)
-        return replace(found, notes={"penalty": found.notes["penalty"][0]})
-
-
-@final
-class ShrinkRegression(_ScaledRegression):
-    """LASSO or elastic net, cross-validated over the folds; each axis by itself.
-
-    Attributes:
-        kind: `lasso`, or `elastic_net`, whose penalty is partly quadratic.
-        l1_ratio: share of the absolute penalty in that of the elastic net.
-    """
-
-    kind: Literal["lasso", "elastic_net"]
-    l1_ratio: float = Field(default=0.5, gt=0, lt=1)
-
-    def estimator(self) -> tuple[Estimator, bool]:
-        return ElasticNet(1.0 if self.kind == "lasso" else self.l1_ratio), True
-
-
-RegressionConfig = Annotated[
-    PlsrRegression
-    | SurfaceRegression
-    | LeastSquaresRegression
-    | RidgeRegression
-    | ShrinkRegression,
-    Field(discriminator="kind"),
-]
+def _by_surface(data: Regression, choose: str) -> Fit:
+    x, y, groups = data.x, data.y, data.fold
+    estimator = SurfacePLSR("simplest" if choose == "simplest" else "least")
+    if choose == "test":
+        if data.test is None:
+            raise FitError("surface: choose 'test' needs the test half")
+        x, y = torch.cat((x, data.test[0])), torch.cat((y, data.test[1]))
+        groups = (torch.arange(len(x)) >= len(data.x)).long()
+        estimator = SurfacePLSR("least", test=[1])
+    found = estimator.surface(x, y, groups)
+    best = estimator.chosen(found, x, y, groups)
+    pre = best.coefficients * data.x.std(0)[:, None] / data.y.std(0)
+    return Fit(best.coefficients, best.intercept, pre, best.choice, found)
 
 
 class ResidualModelConfig(Config):
@@ -330,7 +273,7 @@ class ResidualModelConfig(Config):
     @property
     def searched(self) -> bool:
         """Whether lag, mirror and no residual at all are candidates beside the orders."""
-        return self.lag is None and isinstance(self.fit, PlsrRegression) and self.fit.order is None
+        return self.lag is None and self.fit.searches
 
     def model_post_init(self, context: Any) -> None:
         """Parse the terms, so that a wrong one is found when the config is read."""
