@@ -27,7 +27,11 @@ REFUSED = (
     ("jervan2020/measured", ("models.ols.fit.order=3",), "belongs to kind plsr"),
     ("jervan2020/measured", ("validation.gap=0",), "at least one step"),
     ("jervan2020/measured", ("prepare.hold=mean",), "leave it out"),
-    ("halvorsen2019/table_5_2", ("rows.key=head.evolution.populaton",), "no key 'head.evol"),
+    (
+        "halvorsen2019/table_5_2",
+        ("rows.key=head.evolution.populaton",),
+        "did you mean 'population'",
+    ),
     (
         "halvorsen2019/table_5_2",
         (

@@ -15,7 +15,7 @@ import residnet
 from residnet.baselines.given import BelievedConfig
 from residnet.control.motion import Derivatives, Lag, course, needed_force
 from residnet.core.config import load_config
-from residnet.core.errors import FitError
+from residnet.core.errors import DataError, FitError
 from residnet.documents.jervan2020.ferry import (
     FerryModelConfig,
     FerryStudyConfig,
@@ -23,6 +23,7 @@ from residnet.documents.jervan2020.ferry import (
     identify,
     objections,
     record_of,
+    still_fits,
     study,
     written,
 )
@@ -334,6 +335,27 @@ def test_one_segment_nan_and_too_few_samples_are_clear_errors(short: Flown) -> N
     few = torch.arange(len(record.t)) % 100 == 7
     with pytest.raises(FitError, match="samples do not determine 30"):
         identify(wanted, type(record)(**{**record.__dict__, "train": few}), base)
+
+
+def test_a_model_is_identified_again_where_its_residual_has_grown_for_long() -> None:
+    def noise(scale: float, seed: int = 0) -> torch.Tensor:
+        random = torch.Generator().manual_seed(seed)
+        return scale * torch.randn(600, 3, generator=random, dtype=torch.float64)
+
+    then, now, force, fold = noise(20.0), noise(20.0, 1), noise(100.0, 9), torch.arange(600) // 100
+    same = still_fits(then, now, force, fold)
+    assert same["fits"]
+    assert same["growth"] == pytest.approx([1.0] * 3, rel=0.3)
+    # one percent of the force is a trifle, and one gust no reason
+    assert still_fits(noise(0.1), noise(1.0, 1), force, fold)["fits"]
+    gust = torch.cat((6.0 * now[:100], now[100:]))
+    assert still_fits(then, gust, force, fold)["fits"]
+    grown = still_fits(then, now * torch.tensor([1.0, 3.0, 1.0]).double(), force, fold)
+    assert (grown["fits"], grown["segments"]) == (False, [0.0, 1.0, 0.0])
+    with pytest.raises(DataError, match="does not vary"):
+        still_fits(then, now, 0.0 * force, fold)
+    with pytest.raises(DataError, match="not finite"):
+        still_fits(then, now * torch.nan, force, fold)
 
 
 def test_constant_force_needs_a_vessel_that_turns() -> None:

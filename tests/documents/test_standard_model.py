@@ -22,9 +22,10 @@ from residnet.documents.halvorsen2019.sea_trial import (
     prepared,
 )
 from residnet.documents.halvorsen2019.standard_model import (
-    LIMITS,
+    HIGH,
+    LOW,
     NAMES,
-    PARAMETERS,
+    SCALE,
     StandardFitConfig,
     accelerations,
     fit,
@@ -65,21 +66,16 @@ def matrices(p: dict[str, float], nu: np.ndarray, tau: np.ndarray) -> np.ndarray
     return np.array(out)
 
 
-def some(seed: int = 1) -> dict[str, float]:
-    random = np.random.default_rng(seed)
-    values = {
-        name: START[name] + entry.scale * random.uniform(-0.5, 0.5)
-        for name, entry in PARAMETERS.items()
-    }
-    return {
-        name: float(np.clip(value, *limit))
-        for (name, value), limit in zip(values.items(), LIMITS, strict=True)
-    }
+def some(**given: float) -> dict[str, float]:
+    """Return parameters near the start, but for the given ones."""
+    near = np.array([START[name] for name in NAMES])
+    near = near + SCALE * np.random.default_rng(1).uniform(-0.5, 0.5, len(NAMES))
+    return dict(zip(NAMES, np.clip(near, LOW, HIGH).tolist(), strict=True)) | given
 
 
 def test_accelerations_equal_the_matrices() -> None:
     nu, tau = states(30)
-    p = some() | {"X_udot": -400.0, "Y_vdot": -900.0, "N_rdot": -3e3}
+    p = some(X_udot=-400.0, Y_vdot=-900.0, N_rdot=-3e3)
     np.testing.assert_allclose(
         accelerations(np.array([p[n] for n in NAMES]), MASS, nu, tau),
         matrices(p, nu, tau),
@@ -99,43 +95,28 @@ def test_truth_is_the_vessel() -> None:
 
 def test_a_fit_recovers_what_is_determined_and_names_what_is_not() -> None:
     nu, tau = states(3000)
-    p = some() | {
-        "X_udot": -400.0,
-        "Y_vdot": -900.0,
-        "N_rdot": -3e3,
-        "Y_r": 700.0,
-        "N_v": 500.0,
-        "N_vdot": -800.0,
-    }
+    p = some(X_udot=-400.0, Y_vdot=-900.0, N_rdot=-3e3, Y_r=700.0, N_v=500.0, N_vdot=-800.0)
     found = fit(nu, tau, matrices(p, nu, tau), StandardFitConfig(thin=1, starts=2))
-    assert set(found.undetermined) == {"I_z", "N_rdot"}
-    assert np.isinf(found.errors[[NAMES.index("I_z"), NAMES.index("N_rdot")]]).all()
-    for name, value in zip(NAMES, found.values, strict=True):
-        if name not in found.undetermined and name not in found.bound:
-            assert value == pytest.approx(p[name], abs=1e-4 * PARAMETERS[name].scale), name
-    assert found.sums["I_z - N_rdot"][0] == pytest.approx(p["I_z"] - p["N_rdot"], rel=1e-6)
-    assert found.sums["m - Y_vdot"][0] == pytest.approx(MASS - p["Y_vdot"], rel=1e-6)
+    assert set(found["undetermined"]) == {"I_z", "N_rdot"}
+    assert found["standard_errors"]["I_z"] is found["standard_errors"]["N_rdot"] is None
+    for name, scale in zip(NAMES, SCALE, strict=True):
+        if name not in (*found["undetermined"], *found["at_bound"]):
+            assert found["values"][name] == pytest.approx(p[name], abs=1e-4 * scale), name
+    assert found["sums"]["I_z - N_rdot"][0] == pytest.approx(p["I_z"] - p["N_rdot"], rel=1e-6)
+    assert found["sums"]["m - Y_vdot"][0] == pytest.approx(MASS - p["Y_vdot"], rel=1e-6)
 
 
 @pytest.mark.long
 def test_standard_errors_are_those_of_repeated_noise() -> None:
     nu, tau = states(800)
-    p = some() | {
-        "X_udot": -1500.0,
-        "Y_vdot": -2000.0,
-        "N_rdot": -6e3,
-        "X_u": -300.0,
-        "N_r": -2e3,
-        "Y_v": -700.0,
-    }
+    p = some(X_udot=-1500.0, Y_vdot=-2000.0, N_rdot=-6e3, X_u=-300.0, N_r=-2e3, Y_v=-700.0)
     clean, away = matrices(p, nu, tau), []
     names = ("X_udot", "Y_vdot", "X_|u|u", "Y_|v|v", "N_v", "Y_r")
     for seed in range(30):
         noise = np.random.default_rng(seed).normal(size=clean.shape) * [0.05, 0.05, 0.02]
         found = fit(nu, tau, clean + noise, StandardFitConfig(thin=1, starts=1))
-        away.append(
-            [(found.values[NAMES.index(n)] - p[n]) / found.errors[NAMES.index(n)] for n in names]
-        )
+        errors = found["standard_errors"]
+        away.append([(found["values"][name] - p[name]) / errors[name] for name in names])
     spread = np.std(away, axis=0)
     assert (spread > 0.65).all()
     assert (spread < 1.45).all()
@@ -177,16 +158,8 @@ def test_preparation_is_the_documents() -> None:
 
 
 def test_a_short_trial_runs(tmp_path: Path) -> None:
-    given = {
-        "programme": {
-            "drives": [0.35, 0.5],
-            "steers": [0.3],
-            "zigzag": 60,
-            "hold": 20,
-            "courses": [0],
-        }
-    }
-    over = [f"trials.calm.programme.{key}={value}" for key, value in given["programme"].items()]
+    programme = "{drives: [0.35, 0.5], steers: [0.3], zigzag: 60, hold: 20, courses: [0]}"
+    over = [f"trials.calm.programme={programme}"]
     over += [
         "~trials.planing",
         "~trials.standard",

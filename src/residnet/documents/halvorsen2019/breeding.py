@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from residnet.core import progress
-from residnet.core.config import Config, Newtons, Seconds
-from residnet.core.errors import require_package
+from residnet.core.config import Config, Seconds, apply_override, validate
+from residnet.core.errors import ConfigError, require_package
 from residnet.core.format import DASH, number
 from residnet.documents.study import Results, Study, pictures
 from residnet.heads.genetic import GeneticConfig
-from residnet.physics.parameters import Mass, Parameter, above_zero, of_dimension
 from residnet.regression.expressions import Algebra, term
 from residnet.regression.genetic import breed, limits_of, validating
 from residnet.report.blocks import Cell, Section, Text, table_of
@@ -28,42 +27,24 @@ Value = int | float | str
 Matrix = tuple[tuple[float | None, ...], ...]
 Record = dict[str, np.ndarray]
 CHANNELS = ("x", "u", "tau_x")
+MASS, DAMPING, STIFFNESS = 10.0, 13.0, 5.0
+"""The system m x_ddot + d x_dot + k x = tau (4.1) in kg, kg/s and N/m (section 5.3, (5.13)); that
+of (4.3) is another one: 20 kg, 10 kg/s, 12 N/m (correction H24).
+"""
+TRUTH = {"tau_x": 1.0 / MASS, "u": -DAMPING / MASS, "x": -STIFFNESS / MASS}
+"""True coefficients of u_dot (4.2) by term."""
 _LEAST = 1e-34
 """Least error in the picture, in (m/s^2)^2: what rounding leaves is less."""
 _PUBLISHED_RUNS = 10
 """Number of runs of each combination in Tables 5.2 and 5.3."""
 
 
-class MassSpringDamperConfig(Config):
-    """The mass-spring-damper m x_ddot + d x_dot + k x = tau (document 000, eqs. (4.1), (4.2)).
-
-    Attributes:
-        m: mass in kg; by default that of section 5.3. (4.3) is another system: m = 20 kg,
-            d = 10 kg/s, k = 12 N/m (correction H24).
-        d: damping in kg/s.
-        k: stiffness in N/m.
-        tau_max: amplitude of the force.
-    """
-
-    m: Annotated[Mass, AfterValidator(above_zero)] = Parameter(
-        value=10.0, unit="kg", source="document 000, section 5.3, (5.13)"
-    )
-    d: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -1))] = Parameter(
-        value=13.0, unit="kg/s", source="document 000, section 5.3, (5.13)"
-    )
-    k: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -2))] = Parameter(
-        value=5.0, unit="N/m", source="document 000, section 5.3, (5.13)"
-    )
-    tau_max: Newtons = Field(default=1.0, gt=0)
-
-
 class RecordConfig(Config):
-    """A record of the mass-spring-damper under a square wave of the force, from rest.
+    """A record of the mass-spring-damper under a square wave of a force of 1 N, from rest.
 
     Section 5.3.1 and Figure 5.3 of document 000.
 
     Attributes:
-        system: mass, damping, stiffness and amplitude of the force.
         length: length of the record in s.
         step: time between samples in s; the force is held over a step.
         period: period of the square wave in s; 6 pi s in the document.
@@ -73,7 +54,6 @@ class RecordConfig(Config):
             Listing 5.1 tries.
     """
 
-    system: MassSpringDamperConfig = Field(default_factory=MassSpringDamperConfig)
     length: Seconds = Field(default=50.0, gt=0)
     step: Seconds = Field(default=0.1, gt=0)
     period: Seconds = Field(default=float(6 * np.pi), gt=0)
@@ -93,27 +73,22 @@ class RecordConfig(Config):
         """
         from scipy.linalg import expm
 
-        m, d, k = (getattr(self.system, name).value for name in ("m", "d", "k"))
         t = self.step * np.arange(round(self.length / self.step))
-        given = self.system.tau_max * np.where(np.mod(t, period) < period / 2, 1.0, -1.0)
+        given = np.where(np.mod(t, period) < period / 2, 1.0, -1.0)
         # later than recorded, with its first value before
         force, told = (
             np.concatenate((np.full(steps, given[0]), given))[: len(given)]
             for steps in (round(seconds / self.step) for seconds in (self.delay, self.corrected))
         )
         block = np.zeros((3, 3))
-        block[:2] = [[0.0, 1.0, 0.0], [-k / m, -d / m, 1.0 / m]]
+        block[:2] = [[0.0, 1.0, 0.0], [TRUTH["x"], TRUTH["u"], TRUTH["tau_x"]]]
         transition = expm(block * self.step)[:2]
         state = np.zeros((len(t), 2))
         for i in range(1, len(t)):
             state[i] = transition @ [*state[i - 1], force[i - 1]]
         x, u = state.T
-        return {"x": x, "u": u, "tau_x": told, "u_dot": (force - d * u - k * x) / m}
-
-    def truth(self) -> dict[str, float]:
-        """Return the true coefficients of u_dot (4.2) by term."""
-        m, d, k = (getattr(self.system, name).value for name in ("m", "d", "k"))
-        return {"tau_x": 1.0 / m, "u": -d / m, "x": -k / m}
+        u_dot = (force - DAMPING * u - STIFFNESS * x) / MASS
+        return {"x": x, "u": u, "tau_x": told, "u_dot": u_dot}
 
 
 class NoiseConfig(Config):
@@ -154,16 +129,27 @@ class Axis(Config):
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
 
 
-@final
-class BreedingTaskConfig(Study):
-    """A search for the equation with every combination of two settings, several times each.
+class SearchConfig(Config):
+    """How an equation of the acceleration is searched, and in what.
 
     Attributes:
-        task: `breeding`.
         record: record that the equation is searched in.
         noise: noise on the record.
         head: how the equation is searched; `final: null` keeps the best individual as it is, as the
             document does.
+    """
+
+    record: RecordConfig = Field(default_factory=RecordConfig)
+    noise: NoiseConfig = Field(default_factory=NoiseConfig)
+    head: GeneticConfig = Field(default_factory=GeneticConfig)
+
+
+@final
+class BreedingTaskConfig(Study, SearchConfig):
+    """A search for the equation with every combination of two settings, several times each.
+
+    Attributes:
+        task: `breeding`.
         rows: first setting, one row of the table for each value.
         columns: second setting, one column of the table for each value.
         repeats: number of runs of each combination; their seeds are 0, 1, ...
@@ -175,9 +161,6 @@ class BreedingTaskConfig(Study):
     """
 
     task: Literal["breeding"]
-    record: RecordConfig = Field(default_factory=RecordConfig)
-    noise: NoiseConfig = Field(default_factory=NoiseConfig)
-    head: GeneticConfig = Field(default_factory=GeneticConfig)
     rows: Axis
     columns: Axis
     repeats: int = Field(default=10, ge=1, le=10_000)
@@ -198,14 +181,8 @@ class BreedingTaskConfig(Study):
         for row, column in self.cells():
             try:
                 self.cell(row, column)
-            except (ValidationError, KeyError) as error:
-                what = f"no key {error}"
-                if isinstance(error, ValidationError):
-                    what = error.errors()[0]["msg"]
-                raise ValueError(
-                    f"{self.rows.key}={self.rows.values[row]},"
-                    f" {self.columns.key}={self.columns.values[column]}: {what}"
-                ) from None
+            except ConfigError as error:
+                raise ValueError(str(error)) from None
         return self
 
     def cells(self) -> list[tuple[int, int]]:
@@ -217,29 +194,18 @@ class BreedingTaskConfig(Study):
             if self.published is None or self.published[i][j] is not None
         ]
 
-    def cell(self, row: int, column: int) -> tuple[RecordConfig, NoiseConfig, GeneticConfig]:
+    def cell(self, row: int, column: int) -> SearchConfig:
         """Return the settings of one combination.
 
         Raises:
-            KeyError: where a key of the two settings does not exist.
-            ValidationError: where a value is not allowed.
+            ConfigError: where a key of the two settings does not exist, or a value is not allowed.
         """
-        parts: dict[str, Any] = {
-            name: getattr(self, name).model_dump() for name in ("record", "noise", "head")
-        }
-        for axis, place_of in ((self.rows, row), (self.columns, column)):
-            *path, last = axis.key.split(".")
-            place = parts
-            for key in path:
-                place = place[key]
-            if last not in place:
-                raise KeyError(axis.key)
-            place[last] = axis.values[place_of]
-        return (
-            RecordConfig.model_validate(parts["record"]),
-            NoiseConfig.model_validate(parts["noise"]),
-            GeneticConfig.model_validate(parts["head"]),
-        )
+        parts = {name: getattr(self, name).model_dump() for name in SearchConfig.model_fields}
+        pairs = ((self.rows, row), (self.columns, column))
+        changes = [f"{axis.key}={axis.values[place]}" for axis, place in pairs]
+        for change in changes:
+            apply_override(parts, change)
+        return validate(parts, SearchConfig, ", ".join(changes))
 
     def check(self) -> None:
         require_package("deap", "genetic programming", "gp")
@@ -249,16 +215,15 @@ class BreedingTaskConfig(Study):
         for done, (i, j) in enumerate(cells):
             progress.report("searching equations", done, len(cells))
             settings, started = self.cell(i, j), time.process_time()
-            trials = [attempt(*settings, seed) for seed in range(self.repeats)]
+            trials = [attempt(settings, seed) for seed in range(self.repeats)]
             errors, equations = ([*part] for part in zip(*trials, strict=True))
-            true = set(settings[0].truth())
             rows.append(
                 {
                     "row": self.rows.values[i],
                     "column": self.columns.values[j],
                     "found": sum(error < self.threshold for error in errors),
                     "published_found": self.published and self.published[i][j],
-                    "right": sum(set(equation) == true for equation in equations),
+                    "right": sum(set(equation) == set(TRUTH) for equation in equations),
                     "error": sum(errors) / len(errors),
                     "published_error": self.published_error and self.published_error[i][j],
                     "seconds": (time.process_time() - started) / self.repeats,
@@ -368,14 +333,11 @@ class BreedingTaskConfig(Study):
         ]
 
 
-def attempt(
-    record: RecordConfig, noise: NoiseConfig, head: GeneticConfig, seed: int
-) -> tuple[float, dict[str, float]]:
+def attempt(settings: SearchConfig, seed: int) -> tuple[float, dict[str, float]]:
     """Search the equation of u_dot once.
 
     Args:
-        record: record that the equation is searched in.
-        noise: noise on the record.
+        settings: of the search.
         seed: seed of the noise and of the search.
 
     Returns:
@@ -385,8 +347,9 @@ def attempt(
         FitError: where the data do not determine an equation.
         UsageError: where DEAP is not installed.
     """
+    record, head = settings.record, settings.head
     clean = record.record(record.period)
-    data = noise.added(clean, np.random.default_rng(seed))
+    data = settings.noise.added(clean, np.random.default_rng(seed))
     algebra = Algebra(CHANNELS, limits_of(head.evolution))
     train = ~validating(np.zeros(len(clean["x"]), dtype=int), head.validate_every)
     bred = breed(algebra, data, data["u_dot"], train, head, seed)

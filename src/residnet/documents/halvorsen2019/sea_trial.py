@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple, final
 
 import numpy as np
 import torch
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import ConfigError
@@ -28,11 +28,12 @@ from residnet.data.simulated import Craft, Disturbance, Sea, SensorNoise, fly
 from residnet.documents import published
 from residnet.documents.halvorsen2019.standard_model import (
     NAMES,
-    PARAMETERS,
+    SCALE,
     SUMS,
-    StandardFit,
     StandardFitConfig,
+    accelerations,
     fit,
+    sums,
     truth,
 )
 from residnet.documents.study import Results, Study, compared, histories, pictures
@@ -89,6 +90,8 @@ _CUTOFFS = (0.025, 0.05, 0.1, 0.2)
 """Cut-offs of the filter that are drawn side by side."""
 _ACCELERATION_ROWS = (("u' [m/s²]", 1.0), ("v' [m/s²]", 1.0), ("r' [deg/s²]", DEG))
 _UNITS = dict(zip(ACCELERATION, ("m/s^2", "m/s^2", "rad/s^2"), strict=True))
+_STEP = 0.04
+"""Time step of the simulation in s, finer than the grid; its motion is sampled unevenly."""
 _SAME_COST = 1e-6
 """Costs that differ by a smaller share count as the same minimum."""
 
@@ -181,7 +184,6 @@ class SeaTrialConfig(Config):
         disturbance: waves and other forces.
         noise: noise of the measured velocities.
         preparation: how the logs become samples.
-        step: time step of the simulation in s; its motion is sampled unevenly.
         seed: seed of the sea, the noise and the times of the samples.
     """
 
@@ -191,17 +193,7 @@ class SeaTrialConfig(Config):
     disturbance: Disturbance = Disturbance()
     noise: SensorNoise = SensorNoise(u=0.02, v=0.02, r=float(np.radians(0.1)))
     preparation: PreparationConfig = PreparationConfig()
-    step: Seconds = Field(default=0.04, gt=0)
     seed: int = Field(default=0, ge=0)
-
-    @field_validator("step")
-    @classmethod
-    def _fine(cls, step: float) -> float:
-        if step > 0.05:
-            raise ValueError(
-                f"step: the simulation must be finer than the log, at most 0.05 s, given {step:g} s"
-            )
-        return step
 
     @model_validator(mode="after")
     def _fits(self) -> SeaTrialConfig:
@@ -287,15 +279,10 @@ class SeaTrialTaskConfig(Study, ComputingTask):
             except ConfigError as error:
                 raise ValueError(f"equations.{name}: {error}") from None
         known = (STANDARD, *self.equations)
-        for key in ("published", "published_absolute"):
-            for where, models in getattr(self, key).items():
-                if where not in SETS:
-                    raise ValueError(f"{key}: no set '{where}'{nearest(where, SETS)}")
-                for model in models:
-                    if model not in known:
-                        raise ValueError(
-                            f"{key}.{where}: no model '{model}'{nearest(model, known)}"
-                        )
+        for where, models in (*self.published.items(), *self.published_absolute.items()):
+            for what, names, one in (("set", SETS, where), *(("model", known, m) for m in models)):
+                if one not in names:
+                    raise ValueError(f"published: no {what} '{one}'{nearest(one, names)}")
         return self
 
     def recorded_seed(self) -> int:
@@ -426,7 +413,7 @@ def sailed(config: SeaTrialConfig) -> list[Log]:
     for place, course in enumerate(config.programme.courses):
         plant = vessel.build()
         given.check(plant, name)
-        dynamics = RecordedPlantDynamics(plant, config.step)
+        dynamics = RecordedPlantDynamics(plant, _STEP)
         craft = Craft(name, dynamics, Helm.from_plant(plant), plant.commands, plant.approach(1))
         turned = given
         if given.waves is not None:
@@ -435,7 +422,7 @@ def sailed(config: SeaTrialConfig) -> list[Log]:
             turned = given.model_copy(update={"waves": waves})
         sea = Sea(plant, turned, config.noise, config.seed + place)
         programme = config.programme.manoeuvres()
-        flights = fly(craft, programme, sea, config.programme.zigzag, config.step)
+        flights = fly(craft, programme, sea, config.programme.zigzag, _STEP)
         logs += [flight.log for flight in flights]
     return logs
 
@@ -541,12 +528,13 @@ def study(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], list
     }
     z, a = trial.samples.z.numpy(), trial.samples.target.numpy()
     nu, tau = z[:, RANGE_VELOCITIES], z[:, 5:]
-    standard: dict[str, StandardFit] = {}
+    standard: dict[str, Results] = {}
     models: dict[tuple[str, str], Fitted] = {}
     for where, keep in sets.items():
         train = keep & ~trial.validates
         standard[where] = found = fit(nu[train], tau[train], a[train], settings.standard)
-        models[STANDARD, where] = Fitted(found.accelerations(nu, tau), _STANDARD_PARAMETERS, {})
+        predicted = accelerations(np.array([*found["values"].values()]), mass, nu, tau)
+        models[STANDARD, where] = Fitted(predicted, _STANDARD_PARAMETERS, {})
         samples = trial.samples.where(torch.from_numpy(train))
         for equation, equation_config in settings.equations.items():
             head = equation_config.build()
@@ -581,11 +569,8 @@ def study(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], list
             phase: float((trial.phase == place).mean()) for place, phase in enumerate(PHASES)
         },
         "truth": known,
-        "true_sums": {
-            sum_of: sign * known[first] - known[second] if second else mass + sign * known[first]
-            for sum_of, (first, sign, second) in SUMS.items()
-        },
-        "standard": {where: found.as_json() for where, found in standard.items()},
+        "true_sums": sums(known, mass),
+        "standard": standard,
         "equations": {
             f"{model} on {on}": fitted.equations
             for (model, on), fitted in models.items()
@@ -692,16 +677,18 @@ def _turning(trial: Trial, keep: np.ndarray) -> np.ndarray:
 
 
 def _parameters_figure(
-    name: str, fits: Mapping[str, StandardFit], truth: Mapping[str, float]
+    name: str, fits: Mapping[str, Results], truth: Mapping[str, float]
 ) -> Figure:
-    undetermined = next(iter(fits.values())).undetermined
+    undetermined = next(iter(fits.values()))["undetermined"]
     shown = [i for i, name in enumerate(NAMES) if name not in undetermined]
-    scale = np.array([PARAMETERS[NAMES[i]].scale for i in shown])
-    known = np.array([truth[NAMES[i]] for i in shown])
     looks = {"zero": ZERO}
     curves: dict[str, Curve] = {"zero": (np.zeros(1), np.zeros(1))}
     for place, (where, found) in enumerate(fits.items()):
-        error, spread = (found.values[shown] - known) / scale, 2 * found.errors[shown] / scale
+        values, errors, known = (
+            np.array([of[NAMES[i]] for i in shown], dtype=float)
+            for of in (found["values"], found["standard_errors"], truth)
+        )
+        error, spread = (values - known) / SCALE[shown], 2 * errors / SCALE[shown]
         at = np.arange(len(shown)) + 0.16 * (place - (len(fits) - 1) / 2)
         looks[where] = Look(SET_NAMES[where], COLORS[place], kind="points", size=3)
         looks[f"{where} errors"] = Look("", COLORS[place], width=1)
@@ -840,8 +827,8 @@ def _parameters(trial: Results) -> Table:
         theirs = number(printed["start"][name], 5), number(printed["fitted"].get(name), 4)
         table.add(name, [number(trial["truth"][name], 5), *ours, *theirs])
     for name in SUMS:
-        sums = [with_error(*fit["sums"][name]) for fit in fits.values()]
-        table.add(name, [number(trial["true_sums"][name], 5), *sums, "", ""])
+        inertias = [with_error(*fit["sums"][name]) for fit in fits.values()]
+        table.add(name, [number(trial["true_sums"][name], 5), *inertias, "", ""])
     return table
 
 

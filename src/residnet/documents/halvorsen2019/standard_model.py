@@ -8,8 +8,8 @@ the table either).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -30,48 +30,43 @@ _OPEN_COMBINATION = 1e-3
 """A combination with a larger share in the open directions has no finite standard error."""
 
 
-class Entry(NamedTuple):
-    """What is known of a parameter before the fit; SI units.
-
-    Attributes:
-        low: lower bound.
-        high: upper bound.
-        scale: typical size.
-    """
-
-    low: float
-    high: float
-    scale: float
-
-
 _MASS, _INERTIA = 5e3, 2e4
 """Typical mass in kg and typical moment of inertia in kg m^2."""
-PARAMETERS: dict[str, Entry] = {
-    "I_z": Entry(1e3, 1e7, _INERTIA),
-    "X_udot": Entry(-1e6, 0.0, _MASS),
-    "Y_vdot": Entry(-1e6, 0.0, _MASS),
-    "Y_rdot": Entry(-1e6, 1e6, _INERTIA),
-    "N_vdot": Entry(-1e7, 1e7, _INERTIA),
-    "N_rdot": Entry(-1e7, 0.0, _INERTIA),
-    "X_u": Entry(-1e5, 0.0, 500.0),
-    "Y_v": Entry(-1e6, 0.0, 500.0),
-    "Y_r": Entry(-1e6, 1e6, 2e3),
-    "N_v": Entry(-1e6, 1e6, 2e3),
-    "N_r": Entry(-1e6, 0.0, 2e3),
-    "X_|u|u": Entry(-1e5, 0.0, 250.0),
-    "Y_|v|v": Entry(-1e6, 0.0, 2e3),
-    "N_|r|r": Entry(-1e7, 0.0, 3e3),
+PARAMETERS: dict[str, tuple[float, float, float]] = {
+    "I_z": (1e3, 1e7, _INERTIA),
+    "X_udot": (-1e6, 0.0, _MASS),
+    "Y_vdot": (-1e6, 0.0, _MASS),
+    "Y_rdot": (-1e6, 1e6, _INERTIA),
+    "N_vdot": (-1e7, 1e7, _INERTIA),
+    "N_rdot": (-1e7, 0.0, _INERTIA),
+    "X_u": (-1e5, 0.0, 500.0),
+    "Y_v": (-1e6, 0.0, 500.0),
+    "Y_r": (-1e6, 1e6, 2e3),
+    "N_v": (-1e6, 1e6, 2e3),
+    "N_r": (-1e6, 0.0, 2e3),
+    "X_|u|u": (-1e5, 0.0, 250.0),
+    "Y_|v|v": (-1e6, 0.0, 2e3),
+    "N_|r|r": (-1e7, 0.0, 3e3),
 }
-"""Bounds and sizes by name; the values before the fit stand in published.yaml."""
+"""Lower bound, upper bound and typical size in SI units by name; the values before the fit stand in
+published.yaml.
+"""
 NAMES = tuple(PARAMETERS)
-LIMITS = np.array([(entry.low, entry.high) for entry in PARAMETERS.values()])
-SCALE = np.array([entry.scale for entry in PARAMETERS.values()])
-SUMS: dict[str, tuple[str, float, str]] = {
-    "m - X_udot": ("X_udot", -1.0, ""),
-    "m - Y_vdot": ("Y_vdot", -1.0, ""),
-    "I_z - N_rdot": ("I_z", 1.0, "N_rdot"),
+LOW, HIGH, SCALE = np.array(list(PARAMETERS.values())).T
+SUMS: dict[str, tuple[float, dict[str, float]]] = {
+    "m - X_udot": (1.0, {"X_udot": -1.0}),
+    "m - Y_vdot": (1.0, {"Y_vdot": -1.0}),
+    "I_z - N_rdot": (0.0, {"I_z": 1.0, "N_rdot": -1.0}),
 }
-"""Inertias as the equations contain them: a parameter with its sign, minus another or plus mass."""
+"""Inertias as the equations contain them: factors of the mass and of parameters."""
+
+
+def sums(values: Mapping[str, float], mass: float) -> dict[str, float]:
+    """Return the inertias as the equations contain them, from parameters by name."""
+    return {
+        name: share * mass + sum(factor * values[part] for part, factor in parts.items())
+        for name, (share, parts) in SUMS.items()
+    }
 
 
 class StandardFitConfig(Config):
@@ -103,54 +98,12 @@ class StandardFitConfig(Config):
         """Return the values [14] that the searches start from, inside the bounds."""
         random = np.random.default_rng([self.seed, 14])
         start = np.array([published("halvorsen2019")["start"][name] for name in NAMES])
-        inside = 1e-9 * (LIMITS[:, 1] - LIMITS[:, 0])
+        inside = 1e-9 * (HIGH - LOW)
         points = [
             start,
             *(start + SCALE * random.normal(size=len(start)) for _ in range(self.starts - 1)),
         ]
-        return [np.clip(values, LIMITS[:, 0] + inside, LIMITS[:, 1] - inside) for values in points]
-
-
-@dataclass(frozen=True)
-class StandardFit:
-    """A fit of the standard model.
-
-    Attributes:
-        values: parameters [14] in SI units, in the order of `NAMES`.
-        errors: standard errors [14]; infinite in directions that the data leave open.
-        sums: estimate and standard error of the inertias as the equations contain them, by name.
-        undetermined: names of parameters of which only combinations are determined.
-        bound: names of parameters that end on a bound.
-        condition: condition number of the scaled Jacobian, without the open directions.
-        cost: half the weighted sum of squared errors of each starting point, least first.
-        mass: known mass in kg.
-    """
-
-    values: np.ndarray
-    errors: np.ndarray
-    sums: dict[str, tuple[float, float]]
-    undetermined: tuple[str, ...]
-    bound: tuple[str, ...]
-    condition: float
-    cost: tuple[float, ...]
-    mass: float
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fit as study.json holds it."""
-        errors = [float(error) if np.isfinite(error) else None for error in self.errors]
-        return {
-            "values": dict(zip(NAMES, self.values.tolist(), strict=True)),
-            "standard_errors": dict(zip(NAMES, errors, strict=True)),
-            "sums": {name: list(pair) for name, pair in self.sums.items()},
-            "undetermined": self.undetermined,
-            "at_bound": self.bound,
-            "condition": self.condition,
-            "cost": self.cost,
-        }
-
-    def accelerations(self, nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return nu_dot [N, 3] from velocities [N, 3] and forces [N, 3]."""
-        return accelerations(self.values, self.mass, nu, tau)
+        return [np.clip(values, LOW + inside, HIGH - inside) for values in points]
 
 
 def accelerations(p: np.ndarray, mass: float, nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
@@ -185,13 +138,24 @@ def accelerations(p: np.ndarray, mass: float, nu: np.ndarray, tau: np.ndarray) -
 
 def fit(
     nu: np.ndarray, tau: np.ndarray, nu_dot: np.ndarray, config: StandardFitConfig
-) -> StandardFit:
+) -> dict[str, Any]:
     """Fit the parameters with the least weighted squared error.
+
+    Their standard errors are those of a sandwich estimator: each axis has noise of its own,
+    correlated in time.
 
     Args:
         nu: velocities [N, 3].
         tau: forces [N, 3] in N, N, N m.
         nu_dot: accelerations [N, 3].
+
+    Returns:
+        The fit as study.json holds it. By name `values` and `standard_errors` (None in directions
+        that the data leave open) of the parameters in SI units, and `sums`, pairs of estimate and
+        standard error of the inertias; names of parameters that are `undetermined` but in
+        combinations, or end `at_bound`; `condition`, the condition number of the scaled Jacobian
+        without the open directions; `cost`, half the weighted sum of squared errors of each
+        starting point, least first.
 
     Raises:
         FitError: with fewer samples than parameters, or where no start leads to finite errors.
@@ -204,19 +168,19 @@ def fit(
             f"the standard model's {len(NAMES)} parameters need more than {len(nu)} samples; give a"
             " longer trial"
         )
-    root, limits, scale = np.sqrt(config.weights), LIMITS, SCALE
+    root = np.sqrt(config.weights)
 
     def weighted_errors(p: np.ndarray) -> np.ndarray:
         return np.asarray(
-            ((nu_dot - accelerations(p * scale, config.mass, nu, tau)) * root).ravel()
+            ((nu_dot - accelerations(p * SCALE, config.mass, nu, tau)) * root).ravel()
         )
 
     found = [
         least_squares(
             weighted_errors,
-            p / scale,
+            p / SCALE,
             jac="3-point",
-            bounds=(limits / scale[:, None]).T,
+            bounds=(LOW / SCALE, HIGH / SCALE),
             method="trf",
         )
         for p in config.starting_points()
@@ -224,79 +188,41 @@ def fit(
     best = min(found, key=lambda answer: float(answer.cost))
     if not np.isfinite(best.cost):
         raise FitError("the standard model's fit does not stay finite")
-    values = best.x * scale
-    near = np.minimum(values - limits[:, 0], limits[:, 1] - values) <= 1e-6 * scale
-    free = ~near
+    values = best.x * SCALE
+    near = np.minimum(values - LOW, HIGH - values) <= 1e-6 * SCALE
     # a bound fixes what the data leave open: what the data determine is judged without bounds
-    information = _information(np.asarray(best.jac), best.fun.reshape(-1, 3), free)
-    errors = np.array(
-        [_standard_error(information, scale[i] * np.eye(len(NAMES))[i]) for i in range(len(NAMES))]
-    )
-    return StandardFit(
-        values=values,
-        errors=errors,
-        sums=_inertias(best.x, config.mass, information),
-        undetermined=tuple(
-            NAMES[i]
-            for i in np.flatnonzero(np.abs(information.open).max(axis=1, initial=0.0) > _OPEN_SHARE)
-        ),
-        bound=tuple(NAMES[i] for i in np.flatnonzero(near)),
-        condition=information.condition,
-        cost=tuple(sorted(float(answer.cost) for answer in found)),
-        mass=config.mass,
-    )
-
-
-class _Information(NamedTuple):
-    """What the data say of scaled parameters, and the directions [14, k] that they leave open."""
-
-    covariance: np.ndarray
-    open: np.ndarray
-    condition: float
-
-
-def _information(jacobian: np.ndarray, errors: np.ndarray, free: np.ndarray) -> _Information:
-    """Return what the data say of the scaled parameters (sandwich estimator).
-
-    Each axis has noise of its own, correlated in time.
-
-    Args:
-        jacobian: derivatives of the weighted errors [3 N, 14].
-        errors: weighted errors [N, 3].
-        free: parameters that are not on a bound [14] bool.
-    """
-    count = jacobian.shape[1]
-    _, values, directions = np.linalg.svd(jacobian, full_matrices=False)
-    kept = values > _RANK * values[0]
+    jacobian, errors = np.asarray(best.jac), best.fun.reshape(-1, 3)
+    _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
+    kept = singular > _RANK * singular[0]
+    left_open = directions[~kept].T
     noise = np.square(errors).mean(axis=0) * correlation_time(errors)
-    inner = jacobian[:, free]
+    inner = jacobian[:, ~near]
     inverse = np.linalg.pinv(inner.T @ inner, rcond=_RANK**2, hermitian=True)
     middle = sum(noise[k] * inner[k::3].T @ inner[k::3] for k in range(3))
-    covariance = np.zeros((count, count))
-    covariance[np.ix_(free, free)] = inverse @ middle @ inverse
-    return _Information(covariance, directions[~kept].T, float(values[0] / values[kept][-1]))
+    covariance = np.zeros((len(NAMES), len(NAMES)))
+    covariance[np.ix_(~near, ~near)] = inverse @ middle @ inverse
 
+    def error(parts: Mapping[str, float]) -> float | None:
+        """Return the standard error of a sum of parameters; None where the data leave it open."""
+        along = np.array([parts.get(name, 0.0) for name in NAMES]) * SCALE
+        if np.linalg.norm(left_open.T @ along) > _OPEN_COMBINATION * np.linalg.norm(along):
+            return None
+        return float(np.sqrt(max(along @ covariance @ along, 0.0)))
 
-def _inertias(
-    scaled: np.ndarray, mass: float, information: _Information
-) -> dict[str, tuple[float, float]]:
-    out = {}
-    for name, (first, sign, second) in SUMS.items():
-        along = np.zeros(len(NAMES))
-        along[NAMES.index(first)] = sign * SCALE[NAMES.index(first)]
-        if second:
-            along[NAMES.index(second)] = -SCALE[NAMES.index(second)]
-        estimate = float(along @ scaled) + (0.0 if second else mass)
-        out[name] = (estimate, _standard_error(information, along))
-    return out
-
-
-def _standard_error(information: _Information, along: np.ndarray) -> float:
-    if information.open.size:
-        inside = np.linalg.norm(information.open.T @ along)
-        if inside > _OPEN_COMBINATION * np.linalg.norm(along):
-            return float("inf")
-    return float(np.sqrt(max(along @ information.covariance @ along, 0.0)))
+    by_name = dict(zip(NAMES, values.tolist(), strict=True))
+    loads = np.abs(left_open).max(axis=1, initial=0.0)
+    return {
+        "values": by_name,
+        "standard_errors": {name: error({name: 1.0}) for name in NAMES},
+        "sums": {
+            name: [estimate, error(SUMS[name][1])]
+            for name, estimate in sums(by_name, config.mass).items()
+        },
+        "undetermined": [NAMES[i] for i in np.flatnonzero(loads > _OPEN_SHARE)],
+        "at_bound": [NAMES[i] for i in np.flatnonzero(near)],
+        "condition": float(singular[0] / singular[kept][-1]),
+        "cost": sorted(float(answer.cost) for answer in found),
+    }
 
 
 def truth(vessel: OdinConfig, mass: float) -> dict[str, float]:

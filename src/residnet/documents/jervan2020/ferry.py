@@ -65,7 +65,6 @@ from residnet.report.figure import DASHED, SOLID, Case, Figure, Panel, family
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, ExportRequest, Exports, MainFigure, PartName
 
-
 _WORSE, _MATTERS, _MOST = 4.0, 0.02, 0.5
 """A model no longer fits an axis where the mean square residual of a share of the segments, so that
 one gust or one wake is no reason, and of the whole log is so many times what it was, and more than
