@@ -60,11 +60,8 @@ def hull(name: str) -> Any:
 
 
 def test_the_lag_and_the_missing_half_are_found_and_flown(short: Flown) -> None:
-    model, before, after = (
-        short.models["lag_ridge"],
-        short.courses["believed"].tracking,
-        short.courses["lag_ridge"].tracking,
-    )
+    model, course = short.models["lag_ridge"], short.flights["course"]
+    before, after = course["believed"].tracking, course["lag_ridge"].tracking
     left = model.test_mse(short.record)
     assert model.lag is not None
     assert model.lag.frequency == pytest.approx(2.0, rel=0.01)
@@ -212,7 +209,7 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
             "models.case={fit: {kind: plsr, order: 1}, fly: true}",
         )
     )
-    alone = found.alone
+    alone = found.flights["feed_forward_alone"]
     assert list(alone) == ["believed", "lag_ridge", "case"]
     assert not any(bool(flight.feedback.any()) for flight in alone.values())
     # the thrusters give what is asked for, and half a ferry moves about twice as much
@@ -221,7 +218,7 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
     )
     assert (
         alone["believed"].tracking.position_mae
-        > 10 * found.courses["believed"].tracking.position_mae
+        > 10 * found.flights["course"]["believed"].tracking.position_mae
     )
     upside_down = found.models["case"].force.corrections[0].coefficients
     assert isinstance(upside_down, torch.Tensor)

@@ -12,7 +12,7 @@ from residnet.api.values import PartGiven, PathGiven, described, hearing, part, 
 from residnet.core.arrays import paged
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import SIX, Live
+from residnet.core.layout import Live
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback, report, say
@@ -322,7 +322,11 @@ def prepare(
         splits, source = _splits(logs)
         given = settings.get("velocities")
         told = [Live.told(log.channels) for members in splits.values() for log in members]
-        live = Live.shared(told) if given is None else _named_live(given)
+        live = Live.shared(told)
+        if given is not None:
+            live = validate(
+                {"inputs": [], "velocities": plain(given)}, SignalsConfig, "prepare"
+            ).live
         whole = {
             name: [complete_motion(log, MotionConfig(), live) for log in members]
             for name, members in splits.items()
@@ -374,14 +378,6 @@ def prepare(
         judged = judging(whole, lasting, chosen.memory, live) | judged
         evaluation = validate(plain(judged), EvaluationConfig, "prepare")
         return Data(prepared, model, preparation, evaluation, source)
-
-
-def _named_live(given: Any) -> Live:
-    names = [given] if isinstance(given, str) else list(given)
-    for name in names:
-        if name not in (known := SIX.velocities):
-            raise UsageError(f"prepare: velocities: no velocity '{name}'{nearest(name, known)}")
-    return Live(tuple(name for name in SIX.velocities if name in names))
 
 
 def _prepared(

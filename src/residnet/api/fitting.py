@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-import torch
 
 from residnet.api.data import Data, LogsGiven, prepare
 from residnet.api.models import Model, require
@@ -29,6 +28,7 @@ from residnet.judge.metrics import columns_of, metrics_table
 from residnet.judge.selection import Selection
 from residnet.judge.verdict import Evidence, by_windows, verdict
 from residnet.report.run_reader import StoredWindow
+from residnet.runs.task import computing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -230,7 +230,7 @@ def free_run(
 
 
 @final
-class Models(Mapping[str, Model]):
+class Models(dict[str, Model]):
     """Fitted models by name: zero, the baselines, heads and ensembles, in this order.
 
     Attributes:
@@ -243,9 +243,9 @@ class Models(Mapping[str, Model]):
     """
 
     def __init__(self, identified: Identified, data: Data) -> None:
+        super().__init__({name: Model(fitted) for name, fitted in identified.items()})
         self.identified, self.data = identified, data
         self.settings: FitSettings = identified.settings
-        self._models = {name: Model(fitted) for name, fitted in identified.items()}
 
     @cached_property
     def runs(self) -> dict[str, FreeRuns]:
@@ -305,24 +305,11 @@ class Models(Mapping[str, Model]):
     def _table(self, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         return metrics_table([{**r, "selected": r["model"] == self.selected} for r in rows])
 
-    def __getitem__(self, name: str) -> Model:
-        return self._models[_named(name, self._models, "model")]
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """Return the model of that name, or the default."""
-        return self._models.get(name, default)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._models
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._models)
-
-    def __len__(self) -> int:
-        return len(self._models)
+    def __missing__(self, name: str) -> Model:
+        return self[_named(name, self, "model")]
 
     def __repr__(self) -> str:
-        return f"Models({', '.join(self._models)})"
+        return f"Models({', '.join(self)})"
 
 
 def fit(
@@ -389,18 +376,12 @@ def fit(
         given.setdefault("integrator", integrator(data.signals.live))
     sections = {"prepare": data.prepare, "signals": data.signals, "evaluation": data.evaluation}
     config: FitSettings = validate(plain({**sections, **given}), FitSettings, "fit")
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        with hearing(progress), spread(workers):
-            for split in ("validation", "test"):
-                for log in data.logs(split):
-                    require_window(log, config)
-            splits, _ = through_currents(data.splits, config)
-            moved = Data(splits, data.signals, data.prepare, data.evaluation, data.source)
-            return Models(identify(splits, config), moved)
-    finally:
-        torch.set_num_threads(before)
+    with computing(threads), hearing(progress), spread(workers):
+        for split in ("validation", "test"):
+            for log in data.logs(split):
+                require_window(log, config)
+        splits, _ = through_currents(data.splits, config)
+        return Models(identify(splits, config), replace(data, splits=splits))
 
 
 def metrics(

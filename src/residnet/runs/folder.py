@@ -402,18 +402,15 @@ def git_revision() -> str | None:
     """
     here = Path(__file__).parent
     try:
-        revision = _git("rev-parse", "HEAD", folder=here)
-        changes = _git("status", "--porcelain", folder=here)
+        revision, changes = (
+            subprocess.run(
+                ["git", *words], cwd=here, capture_output=True, text=True, timeout=10, check=True
+            ).stdout.strip()
+            for words in (("rev-parse", "HEAD"), ("status", "--porcelain"))
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     return revision + ("+changes" if changes else "")
-
-
-def _git(*words: str, folder: Path) -> str:
-    done = subprocess.run(
-        ["git", *words], cwd=folder, capture_output=True, text=True, timeout=10, check=True
-    )
-    return done.stdout.strip()
 
 
 def _version(name: str) -> str | None:

@@ -32,18 +32,6 @@ Exports = Mapping[str, Callable[[], Path]]
 """What writes each export and returns its file, by the name of the model."""
 
 
-class WrittenExports(NamedTuple):
-    """What came of the exports of a run.
-
-    Attributes:
-        files: that were written.
-        faults: of each export that failed, or was withheld.
-    """
-
-    files: tuple[Path, ...] = ()
-    faults: tuple[ResidnetError, ...] = ()
-
-
 class ExportRequest(NamedTuple):
     """Which model of a finished run is exported, and how.
 
@@ -304,7 +292,7 @@ class Task(Config):
             folder.write_summary(self.task, outcome.verdict, **about, finished=False)
             # the last time, since the report shows it and must come out the same again
             made_from.write(folder)
-            verdict, exported = list(outcome.verdict), WrittenExports()
+            verdict, files, faults = list(outcome.verdict), list[Path](), list[ResidnetError]()
             if report:
                 from residnet.report.page import draw_sections
 
@@ -312,18 +300,18 @@ class Task(Config):
                 drawn = draw_sections(sections)
                 self._write_page(folder, sections, drawn)
                 if outcome.exports:
-                    exported = _write_exports(folder, outcome.exports)
-                    verdict += [f"Not exported: {fault}." for fault in exported.faults]
+                    files, faults = _write_exports(folder, outcome.exports)
+                    verdict += [f"Not exported: {fault}." for fault in faults]
                     folder.write_summary(self.task, verdict, **about, finished=False)
                     self._write_page(folder, sections, drawn)
         seal(folder.path)
         folder.write_summary(self.task, verdict, **about, finished=True)
         if outcome.failure:
             raise DataError(outcome.failure)
-        for fault in exported.faults:
+        for fault in faults:
             if not isinstance(fault, WithheldError):
                 raise ExportError(f"{fault}; the run itself is complete: {folder.report}")
-        return Finished(folder, outcome, exported.files)
+        return Finished(folder, outcome, files)
 
     @classmethod
     def write_report(cls, run: RunFolder) -> Path:
@@ -361,6 +349,20 @@ class Task(Config):
         )
 
 
+@contextmanager
+def computing(threads: int) -> Iterator[None]:
+    """Set PyTorch's number of threads, put back in the end, and keep freed memory for tensors."""
+    import torch
+
+    keep_freed_memory()
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 class ComputingTask(Task):
     """A task that computes with PyTorch.
 
@@ -373,24 +375,16 @@ class ComputingTask(Task):
 
     @contextmanager
     def resources(self) -> Iterator[None]:
-        """Set the number of threads, put back in the end, and keep freed memory for tensors."""
-        import torch
-
-        keep_freed_memory()
-        before = torch.get_num_threads()
-        torch.set_num_threads(self.threads)
-        try:
+        with computing(self.threads):
             yield
-        finally:
-            torch.set_num_threads(before)
 
 
-def _write_exports(folder: RunFolder, exports: Exports) -> WrittenExports:
-    """Write all exports, and exports.json, which says what came of each.
+def _write_exports(folder: RunFolder, exports: Exports) -> tuple[list[Path], list[ResidnetError]]:
+    """Write all exports, and exports.json, which says what came of each; return files and faults.
 
     A model that cannot be exported does not keep the others, or the run, from coming to their end.
     """
-    files, faults, rows = [], [], []
+    files, faults, rows = list[Path](), list[ResidnetError](), []
     for name, write in exports.items():
         try:
             file = write()
@@ -402,4 +396,4 @@ def _write_exports(folder: RunFolder, exports: Exports) -> WrittenExports:
             place = file.relative_to(folder.path) if file.is_relative_to(folder.path) else file
             rows.append({"model": name, "file": place.as_posix(), "fault": None})
     folder.write_json(folder.path / EXPORTS, {"schema": "residnet.exports/1", "exports": rows})
-    return WrittenExports(tuple(files), tuple(faults))
+    return files, faults

@@ -393,9 +393,8 @@ class Flown:
             N^2, (N m)^2.
         models: fitted models by name, each from one half of the course.
         whole: those that search their settings, fitted to the whole course as they are exported.
-        courses: the course by model, `believed` first.
-        crossings: the crossing by model, `believed` first.
-        alone: the course without feedback, by model.
+        flights: by model, `believed` first, of the `course`, the `crossing`, and the course without
+            feedback (`feed_forward_alone`); empty where they were not flown.
         later: each model that flies, on the vessel as it is later: whether it still fits, and how
             the course is followed before and after it was identified again where it does not.
     """
@@ -405,9 +404,7 @@ class Flown:
     unmodelled: list[float]
     models: dict[str, FittedModel]
     whole: dict[str, FittedModel]
-    courses: dict[str, Flight]
-    crossings: dict[str, Flight]
-    alone: dict[str, Flight]
+    flights: dict[str, dict[str, Flight]]
     later: dict[str, dict[str, Any]]
 
 
@@ -491,9 +488,13 @@ def study(config: FerryStudyConfig) -> Flown:
         mse(residual[~record.train]),
         models,
         whole,
-        {_BELIEVED: first, **flown(ferry, config.course, flying)},
-        flown(ferry, config.crossing, every) if config.crossing is not None else {},
-        flown(ferry, config.course, every, feedback=False) if config.feed_forward_alone else {},
+        {
+            "course": {_BELIEVED: first, **flown(ferry, config.course, flying)},
+            "crossing": flown(ferry, config.crossing, every) if config.crossing else {},
+            "feed_forward_alone": flown(
+                ferry, config.course, every if config.feed_forward_alone else (), feedback=False
+            ),
+        },
         later,
     )
 
@@ -580,12 +581,7 @@ def written(
             **fit_as_json(config.models[name].terms, model.fit),
             "exported": _exported(config.models[name].terms, found, name),
         }
-    flights = {
-        "course": found.courses,
-        "crossing": found.crossings,
-        "feed_forward_alone": found.alone,
-    }
-    for kind, flown in flights.items():
+    for kind, flown in found.flights.items():
         figures += _flights(flown, kind) if flown else []
     content = {
         "schema": "residnet.ferry/1",
@@ -595,7 +591,7 @@ def written(
         "models": models,
         **{
             kind: {name: flight.tracking.row() for name, flight in flown.items()}
-            for kind, flown in flights.items()
+            for kind, flown in found.flights.items()
         },
         "later": found.later,
         "forward": forward,
