@@ -18,16 +18,8 @@ from residnet.report.blocks import Cell, Table, Text
 from residnet.report.figure import Figure
 
 MODELS = (
-    "zero",
-    "baseline",
-    "rbf_joint",
-    "rbf_each",
-    "p1_joint",
-    "p1_each",
-    "p2_joint",
-    "p2_each",
-    "symbolic",
-    "gptips",
+    *("zero", "baseline", "rbf_joint", "rbf_each", "p1_joint", "p1_each", "p2_joint", "p2_each"),
+    *("symbolic", "gptips"),
 )
 COLUMNS = ("u", "v", "r", "psi", "x", "y")
 
@@ -53,17 +45,9 @@ def write(run: Path, split: str, models: tuple[str, ...]) -> None:
 
 
 def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
-    kinds = {"zero": "zero", "baseline": "baseline"}
-    rows = [
-        {
-            "model": model,
-            "kind": kinds.get(model, "head"),
-            "split": "test",
-            "protocol": "record",
-            "rmse": dict.fromkeys("uvr", 1.0),
-        }
-        for model in models
-    ]
+    kinds, rmse = {"zero": "zero", "baseline": "baseline"}, dict.fromkeys("uvr", 1.0)
+    about = {"split": "test", "protocol": "record", "rmse": rmse}
+    rows = [{"model": model, "kind": kinds.get(model, "head"), **about} for model in models]
     (run / "metrics.json").write_text(json.dumps({"rows": rows, "run": "made"}))
     (run / "figures").mkdir()
     for split in ("train", "validation", "test"):

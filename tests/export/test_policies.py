@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from bad_measurements import check_bad_measurements
 from exported_policies import DEG, DT, GAIN, LIMIT, SETTINGS, SPEED, TIME, observed
 from s_functions import SFunction
 from torch import Tensor
@@ -24,7 +25,6 @@ from residnet.export import exporter, policy
 from residnet.export.base import Loaded
 from residnet.export.c import CompiledModel, compile_shared
 from residnet.export.policy import COURSE, ExportedController, ExportedCoursePolicy, ExportedHeading
-from residnet.testing.checks import check_bad_measurements
 
 FAR = 12_000.0
 """Metres from the origin of the chart, where single precision resolves a millimetre."""

@@ -13,49 +13,28 @@ from residnet.core.errors import UsageError
 from residnet.runs.folder import RunFolder, require_sealed, seal
 from residnet.runs.model_store import FolderStore
 
+SEALED = ("resolved.yaml", "metrics.json", "models/mlp/model.safetensors")
+
 
 def made(run: Path) -> Path:
-    for name in ("resolved.yaml", "metrics.json", "models/mlp/model.safetensors", "figures/a.png"):
+    others = ("figures/a.png", "external-1/summary.json", "external-1/metrics.json")
+    for name in (*SEALED, *others):
         (run / name).parent.mkdir(parents=True, exist_ok=True)
         (run / name).write_text(f"contents of {name}")
-    other = run / "external-1"
-    other.mkdir()
-    for name in ("summary.json", "metrics.json"):
-        (other / name).write_text("{}")
     seal(run)
     return run
 
 
 def test_results_alone_are_sealed(tmp_path: Path) -> None:
     run = made(tmp_path)
-    assert set(json.loads((run / "checksums.json").read_text())["files"]) == {
-        "resolved.yaml",
-        "metrics.json",
-        "models/mlp/model.safetensors",
-    }
-    (run / "figures" / "a.png").write_text("drawn anew")
-    (run / "external-1" / "metrics.json").write_text("judged anew")
-    (run / "summary.json").write_text("{}")
+    assert set(json.loads((run / "checksums.json").read_text())["files"]) == set(SEALED)
+    for name in ("figures/a.png", "external-1/metrics.json", "summary.json"):
+        (run / name).write_text("made anew")
     require_sealed(run)
-    seal(run)
+    # a run of an earlier version is taken as it is
+    (run / "checksums.json").unlink()
+    (run / "metrics.json").write_text("other")
     require_sealed(run)
-
-
-def _missing(file: Path) -> None:
-    file.unlink()
-
-
-def _folder(file: Path) -> None:
-    file.unlink()
-    file.mkdir()
-
-
-def _edited(file: Path) -> None:
-    file.write_text(file.read_text().replace("of", "0f"))
-
-
-def _cut(file: Path) -> None:
-    file.write_text(file.read_text()[:-1])
 
 
 @pytest.mark.parametrize("file", ["fit.json", "model.json"])
@@ -65,32 +44,30 @@ def test_a_resumed_run_takes_no_model_that_was_edited(file: str, tmp_path: Path)
     spec, model = nomoto_model(0.2, 5.0, 0.1)
     store.keep_module("ridge", spec, model, {"validation": 0.2})
     assert store.load("ridge").notes == {"validation": 0.2}
-    place = folder.models / "ridge" / file
-    place.write_text("{}")
+    (folder.models / "ridge" / file).write_text("{}")
     with pytest.raises(UsageError, match=f"{file}: its SHA-256 is not the one"):
         store.load("ridge")
 
 
-@pytest.mark.parametrize("damage", [_missing, _folder, _edited, _cut])
-@pytest.mark.parametrize("name", ["metrics.json", "models/mlp/model.safetensors"])
-def test_damage_is_one_line(tmp_path: Path, name: str, damage: Callable[[Path], None]) -> None:
-    run = made(tmp_path)
-    damage(run / name)
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "missing": Path.unlink,
+    "a folder": lambda file: (file.unlink(), file.mkdir()),
+    "edited": lambda file: file.write_text(file.read_text().replace("of", "0f")),
+    "cut off": lambda file: file.write_text(file.read_text()[:-1]),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_one_line(tmp_path: Path, damage: str) -> None:
+    name = SEALED[-1]
+    DAMAGES[damage](made(tmp_path) / name)
     with pytest.raises(UsageError, match=f"{name}.*run it again") as caught:
-        require_sealed(run)
+        require_sealed(tmp_path)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"files": {"a\\u0000": "1"}}', '{"files": []}'])
 def test_damaged_checksums_are_one_line(tmp_path: Path, text: str) -> None:
-    run = made(tmp_path)
-    (run / "checksums.json").write_text(text)
+    (made(tmp_path) / "checksums.json").write_text(text)
     with pytest.raises(UsageError, match="restore"):
-        require_sealed(run)
-
-
-def test_a_run_of_an_earlier_version_is_taken_as_it_is(tmp_path: Path) -> None:
-    run = made(tmp_path)
-    (run / "checksums.json").unlink()
-    (run / "metrics.json").write_text("other")
-    require_sealed(run)
+        require_sealed(tmp_path)

@@ -20,15 +20,11 @@ def one_line(wanted: str, path: Path, resolved: str = "a: 1\n", *, resume: bool 
 
 
 def test_a_new_folder_holds_the_configuration(tmp_path: Path) -> None:
-    path = tmp_path / "deep" / "run"
-    folder = RunFolder.create(path, "a: 1\n", resume=False)
-    assert folder.path == path
-    assert folder.resolved.read_text() == "a: 1\n"
     # an empty folder may be used too
     (tmp_path / "empty").mkdir()
-    assert (
-        RunFolder.create(tmp_path / "empty", "b: 2\n", resume=True).resolved.read_text() == "b: 2\n"
-    )
+    for path, resume in ((tmp_path / "deep" / "run", False), (tmp_path / "empty", True)):
+        folder = RunFolder.create(path, "a: 1\n", resume=resume)
+        assert (folder.path, folder.resolved.read_text()) == (path, "a: 1\n")
 
 
 def test_a_folder_is_taken_up_only_by_its_own_configuration(tmp_path: Path) -> None:
@@ -62,25 +58,19 @@ def test_a_run_is_replaced_where_that_is_asked_for(tmp_path: Path) -> None:
     assert folder.resolved.read_text() == "a: 2\n"
     with pytest.raises(UsageError, match="not both"):
         RunFolder.create(path, "a: 2\n", overwrite=True, resume=True)
-    # a folder of somebody else's files is never removed
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "notes.txt").write_text("precious")
-    with pytest.raises(UsageError, match="not the folder of a run"):
-        RunFolder.create(other, "a: 2\n", overwrite=True)
-    assert (other / "notes.txt").read_text() == "precious"
 
 
 def test_what_is_no_run_is_left_alone(tmp_path: Path) -> None:
-    file = tmp_path / "file"
-    file.write_text("precious")
-    other = tmp_path / "other"
+    file, other = tmp_path / "file", tmp_path / "other"
     other.mkdir()
-    (other / "notes.txt").write_text("precious")
-    for resume in (False, True):
-        one_line("exists already", file, resume=resume)
-        one_line("exists already", other, resume=resume)
-    assert file.read_text() == "precious"
+    for precious in (file, other / "notes.txt"):
+        precious.write_text("precious")
+    for path in (file, other):
+        for resume in (False, True):
+            one_line("exists already", path, resume=resume)
+    with pytest.raises(UsageError, match="not the folder of a run"):
+        RunFolder.create(other, "a: 2\n", overwrite=True)
+    assert file.read_text() == (other / "notes.txt").read_text() == "precious"
     assert [path.name for path in other.iterdir()] == ["notes.txt"]
 
 
@@ -90,20 +80,16 @@ def test_open_wants_a_finished_run(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run", "a: 1\n", resume=False)
     with pytest.raises(UsageError, match=r"is not finished .* --resume"):
         RunFolder.open(tmp_path / "run")
-    folder.write_summary("fit", ["Good."], {"error": {"value": 1.0, "unit": "m"}}, finished=False)
+    given = ("fit", ["Good."], {"error": {"value": 1.0, "unit": "m"}})
+    folder.write_summary(*given, finished=False)
     with pytest.raises(UsageError, match="is not finished"):
         RunFolder.open(tmp_path / "run")
-    folder.write_summary("fit", ["Good."], {"error": {"value": 1.0, "unit": "m"}}, finished=True)
+    folder.write_summary(*given, finished=True)
     folder.write_json(folder.metrics, {"rows": [1]})
     run = RunFolder.open(tmp_path / "run")
     assert run.read_metrics() == {"rows": [1]}
-    assert run.read_summary() == {
-        "schema": "residnet.summary/1",
-        "task": "fit",
-        "finished": True,
-        "verdict": ["Good."],
-        "figures": {"error": {"value": 1.0, "unit": "m"}},
-    }
+    about = dict(zip(("task", "verdict", "figures"), given, strict=True))
+    assert run.read_summary() == {"schema": "residnet.summary/1", "finished": True, **about}
 
 
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
@@ -118,19 +104,15 @@ def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
         folder.read_metrics()
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_json_holds_no_nan_and_the_old_file_stays(tmp_path: Path, value: float) -> None:
+def test_json_holds_no_nan_and_the_old_file_stays(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run", "a: 1\n", resume=False)
     file = folder.path / "deep" / "values.json"
     folder.write_json(file, {"a": [1.5, None]})
-    before = file.read_text()
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        folder.write_json(file, {"a": [value]})
-    assert file.read_text() == before
-    assert json.loads(before) == {"a": [1.5, None]}
-    assert [path.name for path in file.parent.iterdir()] == ["values.json"], (
-        "nothing partial is left"
-    )
+    for value in (math.nan, math.inf, -math.inf):
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            folder.write_json(file, {"a": [value]})
+    assert json.loads(file.read_text()) == {"a": [1.5, None]}
+    assert [path.name for path in file.parent.iterdir()] == ["values.json"], "nothing is left"
 
 
 def test_a_write_that_fails_leaves_the_old_file(

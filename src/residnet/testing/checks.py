@@ -10,7 +10,7 @@ import functools
 import math
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -117,14 +117,6 @@ def example_samples(
     logs = [flight.log for flight in fly_trials(trials.draw(), trials)]
     prepared = [prepare(log, "train", signals.columns, config, signals.live) for log in logs]
     return samples(prepared, signals.build())
-
-
-def residual_samples() -> Samples:
-    """Return the example samples with a target that heads are fitted on: what a line leaves."""
-    known = example_samples()
-    design = torch.cat((known.z, torch.ones(len(known), 1, dtype=torch.float64)), dim=1)
-    line = torch.linalg.lstsq(design, known.target, driver="gelsd").solution
-    return known.with_target(known.target - design @ line)
 
 
 def example_spec(head: FeatureConfig | None, signals: SignalsConfig = SIGNALS) -> ModelSpec:
@@ -572,27 +564,26 @@ def _check_refusals(reader: LogReader, folder: Path, file: Path, who: str) -> No
     empty, damaged = (folder / f"{name}{file.suffix}" for name in ("empty", "damaged"))
     empty.write_bytes(b"")
     damaged.write_bytes(np.random.default_rng(0).bytes(4096))
-    _require_refusal(reader, folder / f"absent{file.suffix}", "missing", UsageError, who)
-    nothing = folder / "nothing"
-    nothing.mkdir()
-    for path, what in ((nothing, "an empty folder"), (empty, "empty"), (damaged, "random bytes")):
-        _require_refusal(reader, path, what, ResidnetError, who)
-
-
-def _require_refusal(
-    reader: LogReader, path: Path, what: str, kind: type[ResidnetError], who: str
-) -> None:
-    try:
-        reader.read(path)
-    except kind as error:
-        text = str(error)
-        require("\n" not in text and str(path) in text, f"{who}: its error does not name the file")
-    except Exception as error:
-        raise AssertionError(
-            f"{who}: a file that is {what} raises {type(error).__name__}, not {kind.__name__}"
-        ) from error
-    else:
-        raise AssertionError(f"{who}: reads a file that is {what}")
+    (folder / "nothing").mkdir()
+    cases: list[tuple[Path, str, type[ResidnetError]]] = [
+        (folder / f"absent{file.suffix}", "missing", UsageError),
+        (folder / "nothing", "an empty folder", ResidnetError),
+        (empty, "empty", ResidnetError),
+        (damaged, "random bytes", ResidnetError),
+    ]
+    for path, what, kind in cases:
+        try:
+            reader.read(path)
+        except kind as error:
+            text = str(error)
+            named = "\n" not in text and str(path) in text
+            require(named, f"{who}: its error does not name the file")
+        except Exception as error:
+            raise AssertionError(
+                f"{who}: a file that is {what} raises {type(error).__name__}, not {kind.__name__}"
+            ) from error
+        else:
+            raise AssertionError(f"{who}: reads a file that is {what}")
 
 
 def check_exporter(exporter: Exporter) -> None:
@@ -677,7 +668,7 @@ def check_bad_inputs(
         _check_histories(exported, past, given, random, who)
 
 
-def _damage(values: Tensor, edge: Tensor, share: float, random: torch.Generator) -> Tensor:
+def damage(values: Tensor, edge: Tensor, share: float, random: torch.Generator) -> Tensor:
     """Return values [B, k] with a share of the entries replaced, some just beyond the edge [k]."""
     wrong = torch.tensor(_WRONG)[torch.randint(len(_WRONG), values.shape, generator=random)]
     times = 10.0 ** (6.0 * torch.rand(values.shape, generator=random) - 2.0)
@@ -702,11 +693,11 @@ def _check_steps(
         before, inputs, memory = x, w[:, k], s
         if k == _BAD_STEP:
             where = torch.rand(3, len(x), 1, generator=random) < 0.5
-            before = torch.where(where[0], _damage(x, guard.ranges.high[:columns], 0.4, random), x)
+            before = torch.where(where[0], damage(x, guard.ranges.high[:columns], 0.4, random), x)
             edge = guard.ranges.high[columns:]
-            inputs = torch.where(where[1], _damage(inputs, edge, 0.5, random), inputs)
+            inputs = torch.where(where[1], damage(inputs, edge, 0.5, random), inputs)
             edge = guard.memory_high
-            memory = torch.where(where[2], _damage(s, edge, 1.0 / (1 + s.shape[1]), random), s)
+            memory = torch.where(where[2], damage(s, edge, 1.0 / (1 + s.shape[1]), random), s)
         x, s, outside = exported.step(before, inputs, memory)
         _check_answer(guard, (before, inputs, memory), (x, s, outside), f"{who}, step {k}")
         if k == _BAD_STEP:
@@ -756,8 +747,8 @@ def _check_rollout(
 ) -> None:
     """Check that a rollout with bad samples is the same as its steps."""
     w = w.clone()
-    w[:, _BAD_STEP] = _damage(w[:, _BAD_STEP], w.amax((0, 1)), 0.5, random)
-    first = _damage(x, x.amax(0), 0.1, random)
+    w[:, _BAD_STEP] = damage(w[:, _BAD_STEP], w.amax((0, 1)), 0.5, random)
+    first = damage(x, x.amax(0), 0.1, random)
     states, last, flags = exported.rollout(first, w, s)
     require(
         states.shape == (len(x), w.shape[1] + 1, x.shape[1]) and flags.shape == w.shape[:2],
@@ -800,62 +791,3 @@ def _check_histories(
         1e-5,
         f"{who}: the last good sample does not stand for a bad one in a history",
     )
-
-
-def check_bad_measurements(
-    step: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]],
-    initial_state: Callable[[Tensor], Tensor],
-    low: Tensor,
-    high: Tensor,
-    memory: tuple[Tensor, Tensor],
-    limit: float,
-    *,
-    cases: int = 200,
-    seed: int = 0,
-) -> None:
-    """Check that an exported controller commands finite angles and flags what is wrong.
-
-    Among good measurements stand bad ones, bad memories, and memories whose entries lie within
-    their ranges but do not belong together.
-
-    Args:
-        step: command [B, 1], memory and fault [B] from measurements y [B, k] and memory.
-        initial_state: the memory from measurements.
-        low: smallest accepted measurements [k].
-        high: largest accepted measurements [k].
-        memory: smallest and largest accepted memory [n].
-        limit: of the command.
-        cases: number of rows.
-        seed: of the cases.
-
-    Raises:
-        AssertionError: one line that says which contract is broken.
-    """
-    random = torch.Generator().manual_seed(seed)
-    least, most = memory
-
-    def between(a: Tensor, b: Tensor) -> Tensor:
-        return a + torch.rand(cases, a.numel(), generator=random) * (b - a)
-
-    s = initial_state(_damage(between(low, high), high, 0.2, random))
-    require_finite(s, "the memory at a bad measurement is not finite")
-    for k in range(30):
-        y, given = between(low, high), s
-        if k % 5 == 1:
-            y = _damage(y, high, 0.3, random)
-        if k % 5 == 3:
-            given = _damage(s, most, 0.2, random)
-        if k == 20:
-            given = between(least, most)
-        command, s, fault = step(y, given)
-        who = f"exported controller, step {k}"
-        require_finite(command, f"{who}: a command is not finite")
-        require_finite(s, f"{who}: a memory is not finite")
-        require(bool((command.abs() <= 1.001 * limit).all()), f"{who}: a command exceeds its limit")
-        good = ((y >= low) & (y <= high)).all(dim=-1)
-        good &= ((given >= least) & (given <= most)).all(dim=-1)
-        require(bool((fault | good).all()), f"{who}: a bad sample raises no flag")
-        if k < 20:
-            require(not bool((fault & good).any()), f"{who}: a good sample raises a flag")
-        kept = ((s >= least) & (s <= most)).all()
-        require(bool(kept), f"{who}: leaves a memory that it would not accept")
