@@ -58,54 +58,21 @@ def written(folder: Path, names: list[str]) -> Path:
     return folder.parent / "bare.yaml"
 
 
+PLAIN = r"""
+.. . -rf --help ~ * ? [a] ' " `id` ;ls a:b ../../../escape /tmp/escape a/../../b a\b C:\x
+CON nul.txt $ $x a$b$c $\frac{1}{0}$ \alpha %s%d {0} {{x}} <b>&amp;</b>
+</script><script>alert(1)</script> é 日本語 عربي 🚤 $(reboot) |cat &&true >out <in !! # //host/x
+\\host\x ~root =1+1 +1 -1 @SUM(A1) nan null true 0 1e9 inf t psi u ${HOME} %HOME% %n
+{0.__class__} <!-- ]]> &#0; \n $$ COM1 LPT1.csv aux x. .hidden ... a,b;c a|b report.html
+metrics.json models figures naïve %2e%2e%2fescape file:///escape
+"""
+"""What shells, formats, templates and tables take for more than a name."""
 HOSTILE = [
-    *("..", ".", "", " ", "-rf", "--help", "~", "*", "?", "[a]", "'", '"', "`id`", ";ls", "a:b"),
-    *(
-        "../../../escape",
-        "/tmp/escape",
-        "a/../../b",
-        "a\\b",
-        "C:\\x",
-        "CON",
-        "nul.txt",
-        "zigzag 10/10",
-    ),
-    *("$", "$x", "a$b$c", "$\\frac{1}{0}$", "\\alpha", "%s%d", "{0}", "{{x}}", "<b>&amp;</b>"),
-    *(
-        "</script><script>alert(1)</script>",
-        "a\0b",
-        "\0",
-        "line\nbreak",
-        "\r",
-        "tab\there",
-        "\x1b[31m",
-    ),
-    *(
-        "Kür ß",
-        "é",
-        "\udce9t\udce9",
-        "日本語",
-        "عربي",
-        "\u202eabc",
-        "🚤",
-        "a\u0300",
-        "\ufeffx",
-        "x" * 300,
-    ),
-    # what shells, formats, templates and tables take for more than a name
-    *("$(reboot)", "|cat", "&&true", ">out", "<in", "!!", "#", "//host/x", "\\\\host\\x", "~root"),
-    *("=1+1", "+1", "-1", "@SUM(A1)", "nan", "null", "true", "0", "1e9", "inf", "t", "psi", "u"),
-    *("{% raw %}", "${HOME}", "%HOME%", "%n", "{0.__class__}", "<!--", "]]>", "&#0;", "\\n", "$$"),
-    *("COM1", "LPT1.csv", "aux", "x.", "x ", ".hidden", "...", "a,b;c", "a|b", "a\u2028b", "\x7f"),
-    *(
-        "report.html",
-        "metrics.json",
-        "models",
-        "figures",
-        "naïve",
-        "%2e%2e%2fescape",
-        "file:///escape",
-    ),
+    *PLAIN.split(),
+    # blanks, control characters, what is no UTF-8, and what runs backwards
+    *("", " ", "zigzag 10/10", "a\x00b", "\x00", "line\nbreak", "\r", "tab\there"),
+    *("\x1b[31m", "K\xfcr \xdf", "\udce9t\udce9", "\u202eabc", "a\u0300", "\ufeffx"),
+    *("x" * 300, "{% raw %}", "x ", "a\u2028b", "\x7f"),
 ]
 
 
