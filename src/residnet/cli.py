@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, final
 
@@ -19,9 +19,6 @@ from residnet.core.progress import Progress, ProgressCallback, listen
 from residnet.exits import enter
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as Bars
-    from rich.progress import TaskID
-
     from residnet.data.drafting.questions import Answer, Question
     from residnet.runs.task import Finished
 
@@ -40,33 +37,10 @@ def drawn_progress(*, quiet: bool = False, kept: Keep | None = None) -> Iterator
         quiet: draw nothing.
         kept: is given every line, whatever is drawn.
     """
-    if quiet:
-        with listen(_Kept(kept, None)):
-            yield
-        return
-    if not sys.stderr.isatty():
-        with _Lines() as lines, listen(_Kept(kept, lines)):
-            yield
-        return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.progress import Progress as Bars
-
-    console = Console(stderr=True, highlight=False, markup=False)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(elapsed_when_finished=True),
-        TimeElapsedColumn(),
-    )
-    with Bars(*columns, console=console, transient=True) as bars, listen(_Kept(kept, _Bars(bars))):
+    drawn: AbstractContextManager[ProgressCallback | None] = nullcontext()
+    if not quiet:
+        drawn = _bars() if sys.stderr.isatty() else _Lines()
+    with drawn as then, listen(_Kept(kept, then)):
         yield
 
 
@@ -77,10 +51,9 @@ class _Kept:
         self._kept, self._then = kept, then
 
     def __call__(self, progress: Progress) -> None:
-        if self._kept is not None and (progress.message or progress.done == progress.total):
-            text = progress.message or f"{progress.stage}: done"
-            if progress.message or progress.done is not None:
-                self._kept(text)
+        ended = progress.done is not None and progress.done == progress.total
+        if self._kept is not None and (progress.message or ended):
+            self._kept(progress.message or f"{progress.stage}: done")
         if self._then is not None:
             self._then(progress)
 
@@ -134,31 +107,42 @@ class _Lines:
                 self._print(f"  {progress.stage}: all {progress.total:g} done")
 
 
-class _Bars:
-    """One bar for each counted stage that is under way, and one for the stage that began last.
+@contextmanager
+def _bars() -> Iterator[ProgressCallback]:
+    """Draw one bar for each counted stage that is under way, and one for the stage begun last.
 
     Bars move, and tell the time that is gone, without a word of the work.
     """
+    from rich import progress as rich
+    from rich.console import Console
 
-    def __init__(self, bars: Bars) -> None:
-        self._bars = bars
-        self._stages: dict[str, TaskID] = {}
+    columns = (
+        rich.TextColumn("{task.description}", markup=False),
+        rich.BarColumn(),
+        rich.MofNCompleteColumn(),
+        rich.TimeRemainingColumn(elapsed_when_finished=True),
+        rich.TimeElapsedColumn(),
+    )
+    console = Console(stderr=True, highlight=False, markup=False)
+    stages: dict[str, rich.TaskID] = {}
 
-    def __call__(self, progress: Progress) -> None:
+    def hear(progress: Progress) -> None:
         if progress.message:
-            self._bars.console.print(progress.message)
+            console.print(progress.message)
         if progress.done is None and progress.total is None:
             if progress.stage:
-                if "" in self._stages:
-                    self._bars.remove_task(self._stages.pop(""))
-                self._stages[""] = self._bars.add_task(progress.stage, total=None)
+                if "" in stages:
+                    bars.remove_task(stages.pop(""))
+                stages[""] = bars.add_task(progress.stage, total=None)
             return
-        if progress.stage not in self._stages:
-            self._stages[progress.stage] = self._bars.add_task(progress.stage, total=None)
-        bar = self._stages[progress.stage]
-        self._bars.update(bar, completed=progress.done or 0, total=progress.total)
+        if progress.stage not in stages:
+            stages[progress.stage] = bars.add_task(progress.stage, total=None)
+        bars.update(stages[progress.stage], completed=progress.done or 0, total=progress.total)
         if progress.total is not None and (progress.done or 0) >= progress.total:
-            self._bars.remove_task(self._stages.pop(progress.stage))
+            bars.remove_task(stages.pop(progress.stage))
+
+    with rich.Progress(*columns, console=console, transient=True) as bars:
+        yield hear
 
 
 def asked() -> Answer | None:
