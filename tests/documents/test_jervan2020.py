@@ -15,7 +15,7 @@ import residnet
 from residnet.baselines.given import BelievedConfig
 from residnet.control.motion import Derivatives, Lag, course, needed_force
 from residnet.core.config import load_config
-from residnet.core.errors import DataError, FitError
+from residnet.core.errors import FitError
 from residnet.documents.jervan2020.ferry import (
     FerryModelConfig,
     FerryStudyConfig,
@@ -349,10 +349,6 @@ def test_a_model_is_identified_again_where_its_residual_has_grown_for_long() -> 
     assert still_fits(then, gust, force, fold)["fits"]
     grown = still_fits(then, now * torch.tensor([1.0, 3.0, 1.0]).double(), force, fold)
     assert (grown["fits"], grown["segments"]) == (False, [0.0, 1.0, 0.0])
-    with pytest.raises(DataError, match="does not vary"):
-        still_fits(then, now, 0.0 * force, fold)
-    with pytest.raises(DataError, match="not finite"):
-        still_fits(then, now * torch.nan, force, fold)
 
 
 def test_constant_force_needs_a_vessel_that_turns() -> None:

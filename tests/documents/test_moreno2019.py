@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 from made_run import stored
 
-from residnet.core.errors import UsageError
 from residnet.documents import study_sections
 from residnet.documents.moreno2019 import curves, errors_of_grid
 from residnet.report.blocks import Cell, Table, Text
@@ -106,11 +105,6 @@ def test_the_curves_are_what_the_search_tried() -> None:
     assert list(x) == [0.01, 0.1, 1.0]
     assert y == pytest.approx(10.0 + x)
     assert [figure.name for figure in (over_penalty, over_width)] == ["5", "6"]
-
-
-def test_a_run_without_a_model_of_the_study_says_which(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=f"'{MODELS[-2]}' is absent"):
-        study_sections("moreno2019", made(tmp_path, MODELS[:-2]))
 
 
 def test_a_run_without_the_optional_package_says_what_it_lacks(tmp_path: Path) -> None:

@@ -30,19 +30,11 @@ def study_sections(name: StudyName, run: Path) -> Sequence[Section]:
     """Draw a document's figures into a finished run and return its sections of the report.
 
     Raises:
-        UsageError: where the run lacks a model or a manoeuvre of the study.
+        UsageError: where the run lacks a protocol or a manoeuvre of the study.
     """
-    from residnet.core.errors import UsageError
     from residnet.report.run_reader import RunFiles
 
-    files = RunFiles(run)
-    wanted = STUDY_MODELS[name]
-    missing = [model for model in wanted if model not in files.kinds]
-    if missing:
-        raise UsageError(
-            f"{run}: study {name} needs the models {', '.join(wanted)}; '{missing[0]}' is absent"
-        )
-    found: Sequence[Section] = importlib.import_module(f"{__name__}.{name}").sections(files)
+    found: Sequence[Section] = importlib.import_module(f"{__name__}.{name}").sections(RunFiles(run))
     return found
 
 

@@ -7,7 +7,6 @@ tuned together and each for itself are compared on the same records.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from residnet.core.errors import UsageError
-from residnet.core.files import whole
 from residnet.core.format import DEG, fixed
 from residnet.documents import published
 from residnet.documents.study import histories
@@ -34,6 +32,7 @@ from residnet.report.figure import (
 )
 from residnet.report.figure_files import write_figure
 from residnet.report.run_reader import RunFiles, StoredWindow
+from residnet.runs.folder import RunFolder
 
 _PROTOCOL = "record"
 _OPTIONAL = "gptips"
@@ -80,8 +79,7 @@ def sections(files: RunFiles) -> list[Section]:
         for split in _SPLITS
     ]
     content = {"schema": "residnet.moreno2019/1", "rows": rows, "pairs": pairs}
-    with whole(files.path / "study.json") as file:
-        file.write_text(json.dumps(content, indent=1) + "\n")
+    RunFolder(files.path).write_json(files.path / "study.json", content)
     printed = published("moreno2019")
     for row in rows:
         row["name"] = _NAMES[row["model"]]

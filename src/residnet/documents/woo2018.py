@@ -8,14 +8,12 @@ on training and unseen data, and a zigzag with its track (18).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from residnet.core.errors import UsageError
-from residnet.core.files import whole
 from residnet.core.format import DEG, interval
 from residnet.documents import published
 from residnet.documents.study import beside_published, compared
@@ -40,6 +38,7 @@ from residnet.report.figure import (
 )
 from residnet.report.figure_files import write_figure
 from residnet.report.run_reader import RunFiles, StoredWindow
+from residnet.runs.folder import RunFolder
 
 PROTOCOL = "manoeuvre"
 LOOKS = {
@@ -92,9 +91,8 @@ def sections(files: RunFiles) -> list[Section]:
         " whose terms none of them has."
     )
     changes = {model: changes_of_error(files, model) for model in _LEARNED}
-    with whole(files.path / "study.json") as file:
-        content = {"schema": "residnet.woo2018/1", "changes": changes}
-        file.write_text(json.dumps(content, indent=1) + "\n")
+    content = {"schema": "residnet.woo2018/1", "changes": changes}
+    RunFolder(files.path).write_json(files.path / "study.json", content)
     shares = published("woo2018")["change_of_error"]
     printed = {channel: 100 * share for channel, share in shares.items()}
     table = table_of(

@@ -21,7 +21,7 @@ from residnet.baselines.given import BelievedConfig, HullEquations
 from residnet.control.guidance import CrossingConfig
 from residnet.control.motion import ReferenceFilterConfig
 from residnet.core.config import Config
-from residnet.core.errors import ConfigError, DataError, FitError, UsageError
+from residnet.core.errors import ConfigError, FitError, UsageError
 from residnet.core.files import read_json
 from residnet.core.format import DEG, number
 from residnet.core.frames import wrap
@@ -84,21 +84,8 @@ def still_fits(then: Tensor, now: Tensor, force: Tensor, fold: Tensor) -> dict[s
     Returns:
         Whether the model `fits`; by axis `growth` (mean square residual now over then), `share` of
         the force's variance, and `segments`, the share of those that show a worse fit.
-
-    Raises:
-        DataError: where the new data are empty or not finite, or their force does not vary.
     """
-    if len(now) == 0 or not bool(torch.isfinite(now).all()):
-        raise DataError(
-            "the new log has no samples or a residual that is not finite; mask it before it is"
-            " judged"
-        )
     variance, before = force.var(0), then.square().mean(0)
-    if bool((variance <= 0).any()):
-        raise DataError(
-            "the force of the new log does not vary on some axis: nothing can be said about the"
-            " model; give a log with manoeuvres"
-        )
     segments = [now[fold == one].square().mean(0) for one in torch.unique(fold)]
     # the segments, and the whole log as the last row
     squares = torch.stack([*segments, now.square().mean(0)])
@@ -294,9 +281,7 @@ class FerryStudyConfig(Study, ComputingTask):
         chain = [name]
         while below := self.models[chain[0]].on:
             chain.insert(0, below)
-        rows = [results["models"][one] for one in chain]
-        # runs of before the whole course was fitted again have one range for all
-        rows = [row.get("exported") or {**row, "range": results["training_range"]} for row in rows]
+        rows = [results["models"][one]["exported"] for one in chain]
         force = ForceModel(force_hull(self.believed)[0].hull)
         for row in rows:
             numbers = (torch.tensor(row[key]).double() for key in ("coefficients", "intercept"))
