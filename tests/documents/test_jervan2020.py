@@ -200,15 +200,9 @@ def test_a_feed_forward_worse_than_the_believed_one_is_objected_to() -> None:
 
 @pytest.mark.long
 def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) -> None:
-    found = study(
-        config(
-            "operation",
-            *SHORT,
-            "~crossing",
-            "feed_forward_alone=true",
-            "models.case={fit: {kind: plsr, order: 1}, fly: true}",
-        )
-    )
+    case = "models.case={fit: {kind: plsr, order: 1}, fly: true}"
+    wanted = config("operation", *SHORT, "~crossing", "feed_forward_alone=true", case)
+    found = study(wanted)
     alone = found.flights["feed_forward_alone"]
     assert list(alone) == ["believed", "lag_ridge", "case"]
     assert not any(bool(flight.feedback.any()) for flight in alone.values())
@@ -223,13 +217,6 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
     upside_down = found.models["case"].force.corrections[0].coefficients
     assert isinstance(upside_down, torch.Tensor)
     upside_down[:3] -= 5000.0 * torch.eye(3)
-    wanted = config(
-        "operation",
-        *SHORT,
-        "~crossing",
-        "feed_forward_alone=true",
-        "models.case={fit: {kind: plsr, order: 1}, fly: true}",
-    )
     folder = RunFolder.create(tmp_path / "run", "", resume=False)
     results, figures = written(wanted, found, folder)
     assert results["models"]["case"]["not_forward"].startswith("model case: its mass matrix")
@@ -252,68 +239,63 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
     assert row["power"][0] * float(found.first.t[-1]) == pytest.approx(row["energy"][0], rel=0.01)
 
 
+def loaded(force: RequiredForce, low: torch.Tensor, high: torch.Tensor, folder: Path) -> Any:
+    ranges = list(zip(low.tolist(), high.tolist(), strict=True))
+    exporter("torchscript").export(ExportedForce("ferry", force, ranges), folder / "f.pt")
+    return torch.jit.load(str(folder / "f.pt"))
+
+
+@torch.no_grad()
 def test_exported_feed_forward_is_the_model(short: Flown, tmp_path: Path) -> None:
-    model = short.models["lag_ridge"].force
-    force = RequiredForce(*model.parts(), mirrored=False)
-    exported = ExportedForce("ferry", force, [(-5.0, 5.0)] * 3 + [(-9.0, 9.0)] * 3)
-    exporter("torchscript").export(exported, tmp_path / "f.pt")
-    loaded = torch.jit.load(str(tmp_path / "f.pt"))
-    with torch.no_grad():
-        tau, outside = loaded(short.first.nu_dot, short.first.nu)
-        torch.testing.assert_close(tau, model(short.first.nu_dot, short.first.nu))
+    model, most = short.models["lag_ridge"].force, torch.tensor([5.0] * 3 + [9.0] * 3)
+    asked = loaded(RequiredForce(*model.parts(), mirrored=False), -most, most, tmp_path)
+    tau, outside = asked(short.first.nu_dot, short.first.nu)
+    torch.testing.assert_close(tau, model(short.first.nu_dot, short.first.nu))
     assert not outside.any()
 
 
+@torch.no_grad()
 def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
     short: Flown, tmp_path: Path
 ) -> None:
     """Far from what identified it, a wild correction commands no more than 1.2 times the hull."""
     record = record_of(short.first, 20.0, None)
-    hull_force = ForceModel(hull("milliampere"))
+    believed, random = ForceModel(hull("milliampere")), torch.Generator().manual_seed(2)
     wild = Correction(
         FERRY_TERMS,
-        300.0 * torch.randn(30, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64),
+        300.0 * torch.randn(30, 3, generator=random, dtype=torch.float64),
         torch.tensor([5.0, 20.0, 30.0], dtype=torch.float64),
     )
     motion = torch.cat((record.nu_dot, record.nu), dim=-1)[record.train]
     low, high = motion.amin(0), motion.amax(0)
-    exported = ExportedForce(
-        "ferry",
-        RequiredForce(*hull_force.extended(wild).parts(), mirrored=True),
-        list(zip(low.tolist(), high.tolist(), strict=True)),
-    )
-    exporter("torchscript").export(exported, tmp_path / "f.pt")
-    loaded = torch.jit.load(str(tmp_path / "f.pt"))
-    random = torch.Generator().manual_seed(3)
-    seen = low + (2.0 * torch.rand(2000, 6, generator=random, dtype=torch.float64) - 0.5) * (
-        high - low
-    )
-    tau, outside = loaded(seen[:, :3], seen[:, 3:])
-    with torch.no_grad():
-        believed = hull_force(seen[:, :3], seen[:, 3:])
+    force = RequiredForce(*believed.extended(wild).parts(), mirrored=True)
+    asked = loaded(force, low, high, tmp_path)
+    random, width = torch.Generator().manual_seed(3), high - low
+    seen = low + (2.0 * torch.rand(2000, 6, generator=random, dtype=torch.float64) - 0.5) * width
+    needed = believed(seen[:, :3], seen[:, 3:])
+    tau, outside = asked(seen[:, :3], seen[:, 3:])
     assert 500 < int(outside.sum()) < 2000
-    assert (tau[outside].abs() <= 1.2 * believed[outside].abs() + 1e-9).all()
+    assert (tau[outside].abs() <= 1.2 * needed[outside].abs() + 1e-9).all()
+    # the correction is there inside
+    assert ((tau - needed)[~outside].abs().amax(0) > 10.0).all()
     # nor does it where a motion is so far off that its nearest value stands for it
     far = 0.5 * (low + high) + 40.0 * (seen - 0.5 * (low + high))
-    asked, flags = loaded(far[:, :3], far[:, 3:])
-    with torch.no_grad():
-        needed = hull_force(far[:, :3], far[:, 3:])
+    tau, flags = asked(far[:, :3], far[:, 3:])
     assert flags.all()
-    assert (asked.abs() <= 1.2 * needed.abs() + 1e-9).all()
+    assert (tau.abs() <= 1.2 * believed(far[:, :3], far[:, 3:]).abs() + 1e-9).all()
     spoiled = seen.clone()
     spoiled[::3, 1], spoiled[1::3, 4], spoiled[2::3] = torch.nan, torch.inf, 1e200
-    answered, flags = loaded(spoiled[:, :3], spoiled[:, 3:])
+    answered, flags = asked(spoiled[:, :3], spoiled[:, 3:])
     assert answered.isfinite().all()
     assert flags.all()
-    # the correction is there inside, and nothing jumps at the edge
-    assert ((tau - believed)[~outside].abs().amax(0) > 10.0).all()
+    # nothing jumps at the edge
     path = torch.linspace(0.0, 1.5, 3001, dtype=torch.float64)[:, None]
-    along, _ = loaded(*(0.5 * (low + high) + path * (high - low)).split(3, dim=-1))
+    along, _ = asked(*(0.5 * (low + high) + path * width).split(3, dim=-1))
     assert (along.diff(dim=0).abs().amax(0) < 0.01 * along.abs().amax(0)).all()
     # straight ahead, at rest and straight astern there is neither sway force nor yaw moment
     straight = torch.zeros(41, 6, dtype=torch.float64)
     straight[:, 3], straight[:, 0] = torch.linspace(-1, 1, 41), torch.linspace(0.1, -0.1, 41)
-    tau, _ = loaded(straight[:, :3], straight[:, 3:])
+    tau, _ = asked(straight[:, :3], straight[:, 3:])
     assert tau[:, 1:].abs().max() < 1e-9
 
 
@@ -321,17 +303,17 @@ def test_one_segment_nan_and_too_few_samples_are_clear_errors(short: Flown) -> N
     wanted = config("operation").models["lag_ridge"].model_copy(update={"lag": False})
     base = ForceModel(hull("milliampere"))
     record = record_of(short.first, 20.0, None)
-    with pytest.raises(FitError, match="one run or segment only"):
-        identify(
-            wanted, type(record)(**{**record.__dict__, "fold": torch.zeros_like(record.fold)}), base
-        )
     spoiled = record.nu.clone()
     spoiled[5, 1] = torch.nan
-    with pytest.raises(FitError, match="not finite at sample 5"):
-        identify(wanted, type(record)(**{**record.__dict__, "nu": spoiled}), base)
     few = torch.arange(len(record.t)) % 100 == 7
-    with pytest.raises(FitError, match="samples do not determine 30"):
-        identify(wanted, type(record)(**{**record.__dict__, "train": few}), base)
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"fold": torch.zeros_like(record.fold)}, "one run or segment only"),
+        ({"nu": spoiled}, "not finite at sample 5"),
+        ({"train": few}, "samples do not determine 30"),
+    ]
+    for part, message in cases:
+        with pytest.raises(FitError, match=message):
+            identify(wanted, replace(record, **part), base)
 
 
 def test_a_model_is_identified_again_where_its_residual_has_grown_for_long() -> None:
