@@ -49,9 +49,14 @@ def test_a_resumed_run_takes_no_model_that_was_edited(file: str, tmp_path: Path)
         store.load("ridge")
 
 
+def _as_folder(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+
+
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "missing": Path.unlink,
-    "a folder": lambda file: (file.unlink(), file.mkdir()),
+    "a folder": _as_folder,
     "edited": lambda file: file.write_text(file.read_text().replace("of", "0f")),
     "cut off": lambda file: file.write_text(file.read_text()[:-1]),
 }
