@@ -69,15 +69,6 @@ def test_every_name_is_there_and_documented() -> None:
         _ = residnet.fitt  # type: ignore[attr-defined]
 
 
-@pytest.mark.long
-def test_units_are_converted_as_they_are_declared(trials: Path, logs: list[residnet.Log]) -> None:
-    flown = write_trials(trials.parent / "again", duration=40.0)
-    by_name = {log.name: log for log in logs}
-    for log in flown:
-        for channel in CHANNELS:
-            np.testing.assert_allclose(by_name[log.name][channel], log[channel], atol=1e-9)
-
-
 def test_defaults_come_from_the_logs(data: residnet.Data) -> None:
     assert data.prepare.grid.step == 0.1
     table = data.table

@@ -73,7 +73,8 @@ ALL = "all"
 STANDARD, SEPARATE, PLANT = "standard", "separate", "plant"
 SETS = (*PHASES, ALL)
 """Sets of samples that a model is fitted to and judged on."""
-Published = dict[str, tuple[float, float, float]]
+Published = dict[str, tuple[float, float, float, float, float, float]]
+"""Numbers of the document by acceleration."""
 SET_NAMES = {
     PHASES[0]: "displacement phase",
     PHASES[1]: "semi-displacement phase",
@@ -256,10 +257,9 @@ class SeaTrialTaskConfig(Study, ComputingTask):
         trials: trials by name; published figures stand beside the first one.
         standard: how the standard model is fitted.
         equations: equations by name.
-        published: root mean square error (m/s^2, m/s^2, rad/s^2), C_p and adjusted R^2 that the
-            document prints (Tables 7.3, 7.4), by set of samples, model and acceleration.
-        published_absolute: mean absolute residual (m/s^2, m/s^2, rad/s^2) and the ends of its 95 %
-            interval that the document prints (Table 7.5), likewise.
+        published: what the document prints by set of samples, model and acceleration: root mean
+            square error (m/s^2, m/s^2, rad/s^2), C_p and adjusted R^2 (Tables 7.3, 7.4), mean
+            absolute residual and the ends of its 95 % interval (Table 7.5).
     """
 
     task: Literal["sea_trial"]
@@ -267,7 +267,6 @@ class SeaTrialTaskConfig(Study, ComputingTask):
     standard: StandardFitConfig = StandardFitConfig()
     equations: dict[str, EquationConfig] = Field(default_factory=dict)
     published: dict[str, dict[str, Published]] = Field(default_factory=dict)
-    published_absolute: dict[str, dict[str, Published]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _names(self) -> SeaTrialTaskConfig:
@@ -279,7 +278,7 @@ class SeaTrialTaskConfig(Study, ComputingTask):
             except ConfigError as error:
                 raise ValueError(f"equations.{name}: {error}") from None
         known = (STANDARD, *self.equations)
-        for where, models in (*self.published.items(), *self.published_absolute.items()):
+        for where, models in self.published.items():
             for what, names, one in (("set", SETS, where), *(("model", known, m) for m in models)):
                 if one not in names:
                     raise ValueError(f"published: no {what} '{one}'{nearest(one, names)}")
@@ -348,9 +347,8 @@ class SeaTrialTaskConfig(Study, ComputingTask):
         out = [Section("", [*drawn, first])]
         for place, (name, trial) in enumerate(results["trials"].items()):
             blocks: list[Text | Section] = [Text(_about(trial))]
-            printed = ({}, {}) if place else (self.published, self.published_absolute)
             for where, rows in trial["rows"].items():
-                table = _goodness(where, rows, *(of.get(where, {}) for of in printed))
+                table = _goodness(where, rows, {} if place else self.published.get(where, {}))
                 title = f"Validation, {SET_NAMES[where]}"
                 blocks.append(Section(title, [table, *pictures(run, f"{where}_{name}")]))
             parameters: list[Block] = [_parameters(trial), Bullets(_notes(trial))]
@@ -759,21 +757,14 @@ def _about(trial: Results) -> str:
     )
 
 
-def _goodness(
-    where: str, rows: Sequence[Results], printed: Mapping[str, Any], absolute: Mapping[str, Any]
-) -> Table:
+def _goodness(where: str, rows: Sequence[Results], printed: Mapping[str, Published]) -> Table:
     """Return the goodness of fit of all models on one set (Tables 7.3 to 7.5)."""
-    shown = []
+    names, shown = ("rmse", "cp", "r2_adjusted", "mae", "low", "high"), []
     for row in rows:
-        beside: dict[str, Any] = {}
         # the document fits its standard model to the phase, and its equations to all samples
-        if row["on"] == (where if row["model"] == STANDARD else ALL):
-            goodness, residual = (
-                of.get(row["model"], {}).get(row["axis"], ()) for of in (printed, absolute)
-            )
-            beside = dict(zip(("rmse", "cp", "r2_adjusted"), goodness, strict=False))
-            beside |= dict(zip(("mae", "low", "high"), residual, strict=False))
-        shown.append({**row, "published": beside})
+        own = row["on"] == (where if row["model"] == STANDARD else ALL)
+        beside = printed.get(row["model"], {}).get(row["axis"], ()) if own else ()
+        shown.append({**row, "published": dict(zip(names, beside, strict=False))})
 
     def as_printed(row: Results) -> Cell:
         of = row["published"]
