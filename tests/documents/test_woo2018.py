@@ -80,9 +80,13 @@ def made_study(run: Path, kinds: tuple[str, ...] = KINDS) -> Path:
     fit.parent.mkdir(parents=True)
     fit.write_text(json.dumps(STEADY))
     (run / "metrics.json").write_text(json.dumps({"run": "made", "selected": "lstm", "rows": rows}))
+    quality = []
     for kind in kinds:
         for number, size in enumerate((3.0, 1.0, 2.0)):
-            rollouts(run / "rollouts" / "test", f"{kind}_{number + 1:02d}", size)
+            log = f"{kind}_{number + 1:02d}"
+            rollouts(run / "rollouts" / "test", log, size)
+            quality.append({"log": log, "manoeuvre": kind})
+    (run / "data_quality.json").write_text(json.dumps(quality))
     return run
 
 
