@@ -16,12 +16,12 @@ import residnet
 
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
-    "api": (723, 84),
+    "api": (706, 79),
     "baselines": (884, 128),
     "control": (3179, 362),
     "core": (1602, 244),
     "data": (9705, 851),
-    "documents": (2602, 239),
+    "documents": (2462, 227),
     "dynamics": (2292, 284),
     "export": (1504, 172),
     "heads": (1233, 178),
@@ -31,12 +31,12 @@ STATEMENTS_AND_FUNCTIONS = {
     "physics": (2124, 263),
     "regression": (1739, 192),
     "report": (2712, 296),
-    "runs": (384, 50),
+    "runs": (380, 50),
     "simulators": (355, 42),
     "tasks": (3072, 252),
-    "testing": (480, 30),
+    "testing": (446, 26),
     "training": (1362, 153),
-    "": (458, 52),
+    "": (448, 52),
 }
 
 
