@@ -139,6 +139,8 @@ def errors_table(run: RunFiles, split: str) -> Table:
             ),
         ],
         caption=f"Free-run errors on {split} data, mean over windows.",
+        selected=lambda row: row["model"] == run.selected,
+        rule=lambda row: row["protocol"],
     )
 
 
