@@ -318,3 +318,12 @@ def test_faults_of_the_file_are_not_attributed_to_overrides(failure: Failure) ->
 
 def test_override_repairs_the_file(load: Callable[..., Fit]) -> None:
     assert load("epochs: x\n", "epochs=3").epochs == 3
+
+
+def test_keys_that_are_gone_may_stand_where_they_did_nothing(failure: Failure) -> None:
+    lstm = {"kind": "lstm", "hidden_size": 3}
+    given = {"task": "fit", "heads": {"a": lstm | {"encoder": False}}, "policy": lstm}
+    assert validate(given, Fit, "run").heads["a"] == Lstm(hidden_size=3)
+    assert failure("heads: {a: {kind: lstm, hidden_size: 3, encoder: true}}\n").startswith(
+        "run.yaml:2: heads.a.encoder: unknown key; it is gone: the memory"
+    )

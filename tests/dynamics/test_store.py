@@ -186,16 +186,22 @@ def test_another_kind_is_named(tmp_path: Path) -> None:
         load_model(tmp_path / "m")
 
 
-def test_a_run_of_before_names_an_unknown_force_that_its_model_has_not(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("key", "idle", "busy"),
+    [("disturbance", None, {"settle": 20.0}), ("encoder", False, True)],
+)
+def test_keys_of_before_that_did_nothing_are_dropped(
+    tmp_path: Path, key: str, idle: object, busy: object
+) -> None:
     saved = spec()
     save_model(tmp_path / "baseline", saved, saved.build())
     file = tmp_path / "baseline" / "model.json"
     content = json.loads(file.read_text())
-    content["disturbance"] = None
+    content[key] = idle
     # one without a sum of its own is older still
     del content["description_sha256"]
     file.write_text(json.dumps(content))
     assert load_model(tmp_path / "baseline")[0] == saved
-    file.write_text(json.dumps(content | {"disturbance": {"settle": 20.0}}))
-    with pytest.raises(ConfigError, match="disturbance"):
+    file.write_text(json.dumps(content | {key: busy}))
+    with pytest.raises(ConfigError, match=key):
         load_model(tmp_path / "baseline")

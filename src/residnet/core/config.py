@@ -7,11 +7,12 @@ with a unit (`20 deg`). Every error is one line.
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 import re
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -63,6 +64,8 @@ GONE: dict[str, str] = {
     "encoder": "the memory of a measured past is that of the steps along it",
 }
 """Keys that nothing took the place of, and what holds instead."""
+IDLE: dict[str, Any] = {"disturbance": None, "encoder": False, "intercept": False, "one": False}
+"""Keys that are gone, and the value with which they did nothing: runs of before hold them so."""
 
 
 def renamed(path: tuple[str | int, ...], value: str | None = None) -> str:
@@ -217,9 +220,27 @@ def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> A
     try:
         return adapter(model).validate_json(to_json(data), strict=True, context={"folder": folder})
     except ValidationError as error:
-        raise ConfigError(describe(error, model, origin.source)) from error
+        idle = {
+            _locate(one["loc"], model)[0]
+            for one in error.errors(include_url=False)
+            if one["type"] == "extra_forbidden" and (one["loc"][-1], one["input"]) in IDLE.items()
+        }
+        if not idle:
+            raise ConfigError(describe(error, model, origin.source)) from error
+        return _validated(_without(data, idle), model, origin, folder)
     except PydanticSerializationError as error:
         raise ConfigError(f"{origin.where}: holds a value that YAML cannot ({error})") from error
+
+
+def _without(data: Any, paths: Iterable[KeyPath]) -> Any:
+    """Return plain values without the entries at some key paths."""
+    out = copy.deepcopy(data)
+    for *parents, key in paths:
+        here = out
+        for parent in parents:
+            here = here[parent]
+        del here[key]
+    return out
 
 
 def _require_usual(data: Any, origin: _Origin, least: float, path: KeyPath = ()) -> None:

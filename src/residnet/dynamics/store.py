@@ -271,10 +271,6 @@ def read_spec(folder: Path, kind: type[SpecT]) -> SpecT:
     content = _description(folder)
     content.pop("sha256", None)
     content.pop(_OWN_SUM, None)
-    for part in (content, *content.get("members", ())):
-        # older runs name the unknown force that their models have not
-        if part.get("disturbance", "") is None:
-            del part["disturbance"]
     wanted = kind.model_fields["schema_name"].default
     if content.get("schema") != wanted:
         raise UsageError(
