@@ -62,6 +62,8 @@ GONE: dict[str, str] = {
     "identify": "the first half identifies, as in the document",
     "spectrum.kind=ittc": "jonswap with gamma: 1 is the same",
     "encoder": "the memory of a measured past is that of the steps along it",
+    "acceleration": "the derivative of the measured velocity is taken",
+    "published_absolute": "its numbers are the last three of `published`",
 }
 """Keys that nothing took the place of, and what holds instead."""
 IDLE: dict[str, Any] = {"disturbance": None, "encoder": False, "intercept": False, "one": False}
