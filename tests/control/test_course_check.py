@@ -62,6 +62,14 @@ def test_a_circle_that_is_touched_between_samples_is_entered(offset: float) -> N
     assert first_fault(track, [missed], "enter", turn, missed=0.02) is None
 
 
+def test_a_circle_that_is_cut_by_two_millimetres_is_cut() -> None:
+    """Between samples a track is nearer to a buoy, never farther: nothing is let pass for it."""
+    track = line((0.0, 0.0), (0.0, 40.0))
+    for nearer, fault in ((0.002, True), (-0.002, False)):
+        buoy = BuoyConfig(north=10.0 - nearer, east=20.0, radius=10.0, leave_to="port")
+        assert (first_fault(track, [buoy], "sides", 5.0) is not None) == fault
+
+
 def test_each_buoy_is_judged_in_its_turn_and_its_distance_over_the_whole_course() -> None:
     """The track comes by the first buoy again, nearer and with it on the other side."""
     track = line((0.0, 0.0), (60.0, 0.0), (60.0, 30.0), (0.0, 30.0), (0.0, 10.0), (60.0, 10.0))

@@ -105,12 +105,12 @@ class PlannedCourse:
 
     @cached_property
     def reference(self) -> float:
-        """The length in m of the shortest such course found, which times are compared with.
-
-        Raises:
-            ConfigError: where none is found.
-        """
-        return plan(self.shortest, self.course.step, self.course.step).length
+        """The length in m of the shortest course found, which times are compared with."""
+        try:
+            found = plan(self.shortest, self.course.step, self.course.step).length
+        except ConfigError:
+            return self.course.length
+        return min(found, self.course.length)
 
 
 def smallest_turn(

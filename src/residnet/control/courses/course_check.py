@@ -121,7 +121,7 @@ def first_fault(
 ) -> tuple[int, str] | None:
     """Return the first buoy, from 0, where a track [N, 2] does wrong, and what; None where nowhere.
 
-    Between its samples the track may be nearer to a buoy by what `_between` says.
+    A circle may be entered between the samples: nearer by what `_between` says.
 
     Args:
         track: north, east in m.
@@ -130,20 +130,22 @@ def first_fault(
         missed: by which circles may be missed, in m.
     """
     step = float(np.hypot(*np.diff(track, axis=0).T).max())
-    for place, (passage, buoy) in enumerate(zip(passages(track, buoys), buoys, strict=True)):
-        number = place + 1
-        slack = missed + _between(buoy.radius, step, turn)
+    for number, (passage, buoy) in enumerate(zip(passages(track, buoys), buoys, strict=True), 1):
         if protocol == "enter":
-            if passage.distance > buoy.radius + slack:
-                return place, (
+            if passage.distance > buoy.radius + missed + _between(buoy.radius, step, turn):
+                return number - 1, (
                     f"buoy {number}: passed at {passage.distance:.4g} m, its circle of"
                     f" {buoy.radius:.4g} m is not entered in its turn"
                 )
-        elif passage.least < buoy.radius - slack:
-            cut = f"its circle of {buoy.radius:.4g} m is cut, {passage.least:.4g} m"
-            return place, f"buoy {number}: {cut}"
+        elif passage.least < buoy.radius - missed:
+            return number - 1, (
+                f"buoy {number}: its circle of {buoy.radius:.4g} m is cut, {passage.least:.4g} m"
+            )
         elif {passage.side, passage.side_there} != {buoy.leave_to}:
-            return place, f"buoy {number}: it is not left to {buoy.leave_to} where it is nearest"
+            return (
+                number - 1,
+                f"buoy {number}: it is not left to {buoy.leave_to} where it is nearest",
+            )
     return None
 
 
