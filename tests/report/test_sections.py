@@ -27,7 +27,12 @@ from residnet.report.blocks import Section
 from residnet.report.fit import fit_sections, write_fit_figures
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections import actuators, autopilot, course, import_logs, manoeuvres, study
+from residnet.report.sections import autopilot, course, manoeuvres
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import Task
+from residnet.tasks.actuators import ActuatorsTaskConfig
+from residnet.tasks.import_logs import ImportConfig
+from residnet.tasks.study import StudyConfig
 
 needs_browser = pytest.mark.skipif(browser() is None, reason="no browser is installed")
 
@@ -40,14 +45,18 @@ class Reported:
     sections: Callable[[RunFiles], Sequence[Section]]
 
 
+def page(task: type[Task]) -> Callable[[RunFiles], Sequence[Section]]:
+    return lambda run: task.report_sections(RunFolder(run.path))
+
+
 TASKS = {
-    "actuators": Reported(made_actuators, actuators.sections),
+    "actuators": Reported(made_actuators, page(ActuatorsTaskConfig)),
     "autopilot": Reported(made_autopilot, autopilot.sections),
     "course": Reported(made_course, course.sections),
     "fit": Reported(made_run, fit_sections),
-    "import": Reported(made_import, import_logs.sections),
+    "import": Reported(made_import, page(ImportConfig)),
     "simulate": Reported(made_simulate, manoeuvres.sections),
-    "study": Reported(made_study, study.sections),
+    "study": Reported(made_study, page(StudyConfig)),
 }
 
 

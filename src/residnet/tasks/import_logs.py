@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from residnet.core.config import ConfigPath
 from residnet.core.errors import ConfigError
 from residnet.core.files import file_stem
+from residnet.core.format import minus, number, shown_unit, whole
+from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.base import files_of
 from residnet.data.split import log_names
-from residnet.report.sections.import_logs import log_row, log_table, loud_lines
+from residnet.report.blocks import Block, Bullets, Section, Table, Text, bad_where, table_of
+from residnet.report.figure import GLANCE, SOLID, START, Case, Curve, Figure, Panel
+from residnet.report.figure_files import write_figure
+from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 
 _READ_AT_ONCE = 50_000_000
 """Bytes of the largest recording that a check reads."""
+_NOTE = "note"
 
 
 class ImportConfig(Task):
@@ -31,8 +40,6 @@ class ImportConfig(Task):
         root: folder that `logs` start from; the current folder where not given.
         logs: files, folders (for readers of folders) or patterns such as `raw_*`.
     """
-
-    page: ClassVar[str] = "import_logs"
 
     task: Literal["import"]
     reader: ReaderConfig
@@ -72,8 +79,8 @@ class ImportConfig(Task):
         reader, names = self.reader.build(), log_names(paths)
         findings: dict[str, Any] = {}
         rows = []
-        for number, path in enumerate(paths):
-            report("reading recordings", number, len(paths))
+        for place, path in enumerate(paths):
+            report("reading recordings", place, len(paths))
             log = reader.read(path).replace(name=names[path])
             log.save(folder.path / "logs" / f"{file_stem(log.name)}.parquet")
             findings[log.name] = log.meta.get("findings", [])
@@ -89,6 +96,28 @@ class ImportConfig(Task):
         figures = {"logs": MainFigure(len(paths)), "logs_with_findings": MainFigure(loud)}
         text = "\n".join([log_table(rows).text(), *loud_lines(findings)])
         return Outcome([sentence], figures, text)
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
+        findings: Mapping[str, Sequence[Mapping[str, Any]]] = RunFiles(run.path).json(
+            "findings.json"
+        )
+        logs = [Log.load(path) for path in sorted((run.path / "logs").glob("*.parquet"))]
+        channels = [Section(log.name, [channel_table(log)], folded=True) for log in logs]
+        table = log_table([log_row(log, findings.get(log.name, [])) for log in logs])
+        severe = loud_lines(findings)
+        blocks: list[Block] = (
+            [Bullets(severe, warning=True)] if severe else [Text("Nothing needs a look.")]
+        )
+        for log, found in findings.items():
+            notes = [minus(str(finding["text"])) for finding in found if finding["level"] == _NOTE]
+            if notes:
+                blocks.append(Section(f"Notes on {log}", [Bullets(notes)], folded=True))
+        return [
+            Section("", [write_figure(run.figures, motion(logs)), table]),
+            Section("Channels", channels),
+            Section("What was noticed on the way in", blocks),
+        ]
 
     def _paths(self) -> list[Path]:
         root = self.root or Path.cwd()
@@ -113,3 +142,104 @@ def _globbed(root: Path, pattern: str) -> list[Path]:
         raise ConfigError(
             f"logs: '{pattern}' is not a pattern relative to {root} ({error}); set `root` instead"
         ) from error
+
+
+def motion(logs: Sequence[Log]) -> Figure:
+    """Return the tracks of the recordings, one to be chosen; else a channel that all of them hold.
+
+    Args:
+        logs: at least one; positions count from the first of each.
+    """
+    shared = [name for name in logs[0].channels if all(name in log.channels for log in logs)]
+    if placed := {"x", "y"} <= set(shared):
+        panel = Panel("north [m]", "east [m]", kind="map", height=GLANCE)
+    else:
+        name = next(iter(shared), next(iter(logs[0].channels)))
+        unit, factor = shown_unit(logs[0].units.get(name, "-"))
+        panel = Panel(f"{name} [{unit}]", "time [s]", height=GLANCE)
+
+    def curves(log: Log) -> dict[str, Curve]:
+        if not placed:
+            return {"log": (log.t, factor * log[name])} if name in log.channels else {}
+        known = np.isfinite(log["x"]) & np.isfinite(log["y"])
+        first = int(np.argmax(known))
+        track = tuple(log[axis][known] - log[axis][first] for axis in ("y", "x"))
+        return {"log": (track[0], track[1]), "start": (np.zeros(1), np.zeros(1))}
+
+    return Figure(
+        "recordings",
+        "What was recorded",
+        "",
+        {"log": replace(SOLID, label="measured"), "start": START},
+        [panel],
+        [Case(log.name, [curves(log)], still=log is logs[0]) for log in logs],
+        "Recording",
+    )
+
+
+def loud_lines(findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+    """Return a line for each finding above a note, by the name of its log."""
+    return [
+        f"{log}: {finding['level']}: {minus(str(finding['text']))}"
+        for log, found in findings.items()
+        for finding in found
+        if finding["level"] != _NOTE
+    ]
+
+
+def log_row(log: Log, findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what a log holds, and how many of its findings are above a note."""
+    return {
+        "log": log.name,
+        "samples": len(log),
+        "duration": float(log.t[-1] - log.t[0]),
+        "channels": len(log.channels),
+        "lost": sum(int(mask.sum()) for why, mask in log.masks.items() if why.startswith("hard:")),
+        "loud": sum(finding["level"] != _NOTE for finding in findings),
+        "findings": len(findings),
+    }
+
+
+def log_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return a row for each log, as `log_row` describes it."""
+    return table_of(
+        rows,
+        [
+            ("log", "log"),
+            ("samples", "samples", whole),
+            ("step [s]", lambda row: number(row["duration"] / max(row["samples"] - 1, 1), 4), str),
+            ("duration [s]", lambda row: number(row["duration"], 4), str),
+            ("channels", "channels", str),
+            ("samples in gaps", "lost", whole),
+            ("to look at", lambda row: bad_where(row["loud"], row["loud"])),
+            ("notes", lambda row: row["findings"] - row["loud"], str),
+        ],
+    )
+
+
+def channel_table(log: Log) -> Table:
+    """Return a row for each channel: unit, range, and how many samples are missing."""
+    rows = []
+    for name, values in log.channels.items():
+        unit, factor = shown_unit(log.units.get(name, "-"))
+        finite = factor * np.asarray(values, dtype=float)[np.isfinite(values)]
+        known = finite if finite.size else np.array([np.nan])
+        rows.append(
+            {
+                "channel": name,
+                "unit": unit,
+                "least": float(known.min()),
+                "mean": float(known.mean()),
+                "largest": float(known.max()),
+                "missing": number(100.0 * (1.0 - finite.size / max(values.size, 1)), 2),
+            }
+        )
+    return table_of(
+        rows,
+        [
+            ("channel", "channel"),
+            ("unit", "unit", str),
+            *((name, name, number) for name in ("least", "mean", "largest")),
+            ("missing [%]", "missing", str),
+        ],
+    )
