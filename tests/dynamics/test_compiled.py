@@ -63,6 +63,18 @@ def loop(longest: int = 3) -> tuple[Rollout, tuple[Tensor, Tensor, Tensor]]:
     return Rollout(Boat(DT, "rk4"), Helm(longest)), (torch.randn(rows, 2), w, torch.zeros(rows, 1))
 
 
+def assert_close_slopes(
+    rollout: Rollout, fast: CompiledRollout, given: tuple[Tensor, Tensor, Tensor]
+) -> None:
+    weights = list(rollout.parameters())
+    found, known = (
+        torch.autograd.grad(x.square().mean() + w.sum() * 0.01, weights)
+        for x, w, _ in (fast(*given), rollout(*given))
+    )
+    for one, other in zip(found, known, strict=True):
+        torch.testing.assert_close(one, other, rtol=2e-3, atol=2e-4)
+
+
 @pytest.mark.parametrize(
     ("longest", "most"), [(3, torch.inf), (3, 1e9), (40, torch.inf)], ids=["sum", "rows", "late"]
 )
@@ -70,16 +82,9 @@ def test_flights_and_gradient_are_those_of_torch(longest: int, most: float) -> N
     """Gradients are summed, or each row's is looked at before; commands may be 40 steps late."""
     rollout, given = loop(longest)
     fast = CompiledRollout(rollout, *given, most=most)
-    flown = [run(*given)[:2] for run in (fast, rollout)]
-    (states, inputs), (wanted, acted) = flown
-    assert torch.allclose(states, wanted, atol=2e-5)
-    assert torch.allclose(inputs, acted, atol=2e-5)
-    weights = list(rollout.parameters())
-    found, known = (
-        torch.autograd.grad(x[:, :, 1].square().mean() + w.sum() * 0.01, weights) for x, w in flown
-    )
-    for one, other in zip(found, known, strict=True):
-        assert torch.allclose(one, other, rtol=2e-3, atol=2e-4)
+    for one, other in zip(fast(*given)[:2], rollout(*given)[:2], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=2e-5)
+    assert_close_slopes(rollout, fast, given)
 
 
 def test_what_is_no_number_stays_so_and_subnormal_numbers_stay_numbers() -> None:
@@ -149,14 +154,7 @@ def test_what_a_loop_detaches_has_no_gradient_and_a_steep_one_is_compiled() -> N
     rollout, given = loop()
     rollout.source = Cut()
     fast = CompiledRollout(rollout, *given)
-    short = (given[0], given[1][:, :3], given[2])
-    weights = list(rollout.parameters())
-    found, known = (
-        torch.autograd.grad(x.square().mean() + w.sum() * 0.01, weights)
-        for x, w, _ in (fast(*short), rollout(*short))
-    )
-    for one, other in zip(found, known, strict=True):
-        assert torch.allclose(one, other, rtol=2e-3, atol=2e-4)
+    assert_close_slopes(rollout, fast, (given[0], given[1][:, :3], given[2]))
 
 
 def test_a_loop_that_is_off_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,7 +166,13 @@ def test_a_loop_that_is_off_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         CompiledRollout(rollout, *given)
 
 
-def test_a_missing_compiler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_compiler_and_source_that_does_not_compile_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RESIDNET_CACHE", str(tmp_path))
+    with pytest.raises(ExportError, match="does not compile"):
+        c_code.compiled_library("int f(")
+    assert not list(tmp_path.iterdir())
     monkeypatch.setenv("PATH", "/nowhere")
     monkeypatch.delenv("CC", raising=False)
     rollout, given = loop()
@@ -204,15 +208,6 @@ def test_the_same_source_is_compiled_once(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv("RESIDNET_CACHE", str(next((tmp_path / "kept").iterdir()) / "below"))
     assert called(c_code.compiled_library(SOURCE)) == 3.0
     assert len(calls) == 3
-
-
-def test_source_that_does_not_compile_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("RESIDNET_CACHE", str(tmp_path))
-    with pytest.raises(ExportError, match="does not compile"):
-        c_code.compiled_library("int f(")
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_flight_whose_gradient_explodes_does_not_drown_the_others() -> None:

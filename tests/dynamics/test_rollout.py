@@ -1,21 +1,29 @@
-"""The time loop: batches, stopping rows, gradients, memory; the hybrid model against the matrix
-exponential.
+"""The time loop: batches, memory, what does not hang on positions; the hybrid model against the
+matrix exponential.
 """
 
 from __future__ import annotations
 
+import copy
+from typing import Any, get_args
+
 import numpy as np
 import pytest
 import torch
+from made_samples import sampled
 from scipy.linalg import expm
-from torch import Tensor, nn
+from torch import Tensor
 
 from residnet.baselines.regressors import RegressorBaseline
+from residnet.core.layout import HEADING, MOTION, POSITION
 from residnet.dynamics.base import Integrator
+from residnet.dynamics.ensemble import SampledDynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout, Source
+from residnet.dynamics.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.lstm import LstmConfig
+from residnet.heads.mlp import MlpConfig
+from residnet.heads.recurrent import RecurrentConfig
 from residnet.physics.signals import SignalsConfig
 
 A = np.array([[-0.5, 0.0, 0.0], [0.0, -0.6, -0.4], [0.0, 0.2, -0.9]])
@@ -23,13 +31,11 @@ B = np.array([[0.003, 0.0], [0.0, 0.0004], [0.0, 0.002]])
 C = np.array([0.1, 0.01, -0.02])
 
 
-def linear(
-    dt: float = 0.1, head: ResidualHead | None = None, integrator: Integrator = "rk4"
-) -> HybridDynamics:
+def linear(dt: float = 0.1, head: ResidualHead | None = None) -> HybridDynamics:
     signals = SignalsConfig(inputs=("tau_x", "tau_n")).build()
     baseline = RegressorBaseline([("u", "v", "r", "tau_x", "tau_n", "1")] * 3, signals.names)
     baseline.theta.data.copy_(torch.from_numpy(np.concatenate((A, B, C[:, None]), axis=1)))
-    return HybridDynamics(signals, baseline, head or ZeroHead(), dt, integrator)
+    return HybridDynamics(signals, baseline, head or ZeroHead(), dt, "rk4")
 
 
 def inputs(batch: int, steps: int) -> Tensor:
@@ -52,9 +58,8 @@ def lstm_model() -> HybridDynamics:
 
 def test_linear_baseline_equals_the_matrix_exponential() -> None:
     """ZeroHead on a linear baseline: velocities by exact zero-order-hold discretisation."""
-    block = np.zeros((6, 6))
+    block, dt = np.zeros((6, 6)), 0.05
     block[:3, :3], block[:3, 3:5], block[:3, 5] = A, B, C
-    dt = 0.05
     exact = expm(block * dt)
     x0, w = starts(4), inputs(4, 100)
     with torch.no_grad():
@@ -78,18 +83,6 @@ def test_heading_and_position_follow_the_velocities() -> None:
     np.testing.assert_allclose(states[0, :, 2], psi, atol=1e-12)
     np.testing.assert_allclose(states[0, :, 0], 1 + 20 * (np.sin(psi) - np.sin(0.5)), atol=1e-8)
     np.testing.assert_allclose(states[0, :, 1], 2 - 20 * (np.cos(psi) - np.cos(0.5)), atol=1e-8)
-
-
-def test_batch_equals_row_by_row() -> None:
-    model, x0, w = lstm_model(), starts(5), inputs(5, 40)
-    s = torch.from_numpy(np.random.default_rng(2).normal(size=(5, model.n_state)) * 0.2)
-    with torch.no_grad():
-        whole = Rollout(model)(x0, w, s)
-        for i in range(5):
-            for part, row in zip(
-                whole, Rollout(model)(x0[i : i + 1], w[i : i + 1], s[i : i + 1]), strict=True
-            ):
-                torch.testing.assert_close(part[i : i + 1], row, rtol=1e-11, atol=1e-12)
 
 
 def test_a_run_in_two_parts_is_the_whole_run() -> None:
@@ -119,73 +112,6 @@ def test_the_head_is_asked_once_per_step_and_held() -> None:
     np.testing.assert_allclose(states[0, :, 3], 0.07 * np.arange(11), atol=1e-12)
 
 
-class StopAt(Source):
-    """Inputs as they are given; rows stop once they are `distance` [B] north of the origin."""
-
-    def __init__(self, distance: Tensor) -> None:
-        super().__init__()
-        self.may_stop = True
-        self.distance = distance
-
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        return w, memory
-
-    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        return x[:, 0] >= self.distance
-
-
-def test_rows_stop_on_their_own() -> None:
-    model = linear()
-    x0 = torch.zeros(3, 6, dtype=torch.float64)
-    x0[:, 3] = 1.0
-    w = torch.zeros(3, 60, 2, dtype=torch.float64)
-    w[:, :, 0] = 100.0
-    with torch.no_grad():
-        free, _, _ = Rollout(model)(x0, w, x0[:, :0])
-        states, _, _ = Rollout(model, StopAt(torch.tensor([1.0, 3.0, 1e9], dtype=torch.float64)))(
-            x0, w, x0[:, :0]
-        )
-    for i, distance in enumerate((1.0, 3.0, 1e9)):
-        over = torch.nonzero(free[i, :, 0] >= distance)
-        last = int(over[0]) if over.numel() else 60
-        assert torch.equal(states[i, : last + 1], free[i, : last + 1])
-        assert torch.equal(states[i, last:], free[i, last].expand(61 - last, -1))
-    assert not torch.equal(states[0, -1], states[1, -1])
-
-
-@pytest.mark.parametrize("integrator", ["rk4", "heun", "euler", "semi_implicit_euler"])
-def test_gradients_flow_through_a_run(integrator: Integrator) -> None:
-    model = linear(integrator=integrator)
-    x0, w = starts(2), inputs(2, 6)
-
-    def end(x: Tensor, u: Tensor) -> Tensor:
-        return Rollout(model)(x, u, x[:, :0])[0][:, -1]
-
-    assert torch.autograd.gradcheck(end, (x0.requires_grad_(), w.requires_grad_()))
-
-
-def test_gradients_reach_every_weight_and_the_initial_memory() -> None:
-    model, x0, w = lstm_model(), starts(2), inputs(2, 15)
-    s = torch.zeros(2, model.n_state, dtype=torch.float64, requires_grad=True)
-    states, _, _ = Rollout(model)(x0, w, s)
-    states[:, -1, 3:].square().sum().backward()
-    for name, parameter in [*model.head.named_parameters(), ("s", s)]:
-        assert parameter.grad is not None, name
-        assert bool(torch.isfinite(parameter.grad).all()), name
-        assert float(parameter.grad.abs().max()) > 0, name
-    # and they are right: finite differences of one weight
-    weight = model.head.networks[0].core.w_hidden  # type: ignore[union-attr, index]
-    assert isinstance(weight, nn.Parameter)
-    slope, step = float(weight.grad[0, 0]), 1e-6  # type: ignore[index]
-    losses = []
-    with torch.no_grad():
-        for sign in (1, -1):
-            weight[0, 0] += sign * step
-            losses.append(float(Rollout(model)(x0, w, s)[0][:, -1, 3:].square().sum()))
-            weight[0, 0] -= sign * step
-    assert slope == pytest.approx((losses[0] - losses[1]) / (2 * step), rel=1e-5)
-
-
 def test_warm_up_is_the_memory_that_the_past_leaves() -> None:
     """Along measured states the memory after a warm-up is that of stepping the head."""
     model = lstm_model()
@@ -196,3 +122,100 @@ def test_warm_up_is_the_memory_that_the_past_leaves() -> None:
             _, s = model.step(y[:, k], w[:, k], s)
         torch.testing.assert_close(model.warmup(y, w), s, rtol=1e-9, atol=1e-12)
         assert torch.equal(model.warmup(y[:, :0], w[:, :0]), torch.zeros_like(s))
+
+
+def test_each_draw_steps_as_the_model_with_its_parameters() -> None:
+    model = linear().double()
+    theta = 0.3 * torch.randn(4, 3, 6, dtype=torch.float64)
+    x, w = starts(12), inputs(12, 1)[:, 0]
+    with torch.no_grad():
+        after, memory = SampledDynamics(model, "baseline.theta", theta).step(x, w, x[:, :0])
+        for row in range(12):
+            alone: Any = copy.deepcopy(model)
+            alone.baseline.theta.copy_(theta[row % 4])
+            one = slice(row, row + 1)
+            torch.testing.assert_close(after[one], alone.step(x[one], w[one], x[:1, :0])[0])
+    assert memory.shape == (12, 0)
+
+
+STEP = 0.05
+TERMS = {"linear": ["u", "v", "r", "a", "b"], "nonlinear": ["u", "v|v|", "r", "a", "u b"]}
+
+
+@pytest.mark.parametrize("integrator", get_args(Integrator))
+@pytest.mark.parametrize(
+    ("terms", "wind", "told"),
+    [
+        ("linear", False, False),
+        ("nonlinear", True, False),
+        ("linear", True, True),
+        ("nonlinear", False, True),
+    ],
+)
+def test_heading_and_velocities_do_not_hang_on_positions(
+    integrator: Integrator, terms: str, wind: bool, told: bool
+) -> None:
+    torch.manual_seed(3)
+    exogenous = ("wind_speed", "wind_dir") if wind else ()
+    signals = SignalsConfig(inputs=("a", "b"), exogenous=exogenous).build()
+    names = [*TERMS[terms], "wind_u", "wind_v"] if wind else TERMS[terms]
+    baseline = RegressorBaseline([names] * 3, signals.names)
+    baseline.theta.data.copy_(0.3 * torch.randn(3, len(names)) - 0.6 * torch.eye(3, len(names)))
+    kind = RecurrentConfig(members=1, hidden_size=6, step=STEP) if told else LstmConfig()
+    head = kind.build(signals.names)
+    model = HybridDynamics(signals, baseline, head, STEP, integrator).double().eval()
+    assert (model.missed is not None) == told
+    x0 = torch.randn(5, 6, dtype=torch.float64)
+    w = torch.randn(5, 20, 4 if wind else 2, dtype=torch.float64)
+    slopes, states = [], []
+    for model.positions in (True, False):
+        held = w.clone().requires_grad_(True)
+        x, _, _ = Rollout(model)(x0, held, model.initial_state(5).double())
+        slopes.append(torch.autograd.grad(x[:, -1, HEADING : MOTION.stop].square().sum(), held)[0])
+        states.append(x.detach())
+    whole, alone = (x[..., HEADING : MOTION.stop] for x in states)
+    assert float(whole.diff(dim=1).abs().max()) > 0.01
+    torch.testing.assert_close(alone, whole, rtol=0, atol=1e-13)
+    torch.testing.assert_close(*slopes, rtol=0, atol=1e-13)
+    assert torch.equal(states[1][..., POSITION], x0[:, None, POSITION].expand(5, 21, 2))
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        MlpConfig(hidden=(5, 4)),
+        LstmConfig(hidden_size=4, features=("b", "r", "u"), readout=3, memory=("b",)),
+        LstmConfig(hidden_size=4, readout=3, memory=("u", "a"), per_axis=True),
+        RecurrentConfig(members=2, hidden_size=4, step=STEP),
+    ],
+    ids=["mlp", "lstm of inputs", "lstm by axis", "recurrent"],
+)
+@pytest.mark.parametrize("terms", TERMS)
+def test_gradients_are_those_of_single_steps(head: Any, terms: str) -> None:
+    torch.manual_seed(5)
+    signals = SignalsConfig(inputs=("a", "b")).build()
+    baseline = RegressorBaseline([TERMS[terms]] * 3, signals.names, bounded=terms != "linear")
+    z = torch.randn(60, len(signals.names), dtype=torch.float64)
+    known = sampled(z, z[:, :3].flip(1), signals.names)
+    if baseline.bound is not None:
+        baseline.bound.calibrate(known)
+    baseline.theta.data.copy_(0.2 * torch.randn(3, 5) - 0.6 * torch.eye(3, 5))
+    model = HybridDynamics(signals, baseline, head.build(signals.names), STEP)
+    model.head.calibrate(known)
+    model = model.double()
+    rows = 3 * model.head.copies
+    x0 = torch.randn(rows, 6, dtype=torch.float64)
+    w, s = torch.randn(rows, 20, 2, dtype=torch.float64), torch.rand(rows, model.n_state).double()
+    free = Rollout(model)
+    # several stretches, the last one shorter
+    free.together = 7 * rows
+    found = []
+    for model.positions in (True, False):
+        model.zero_grad()
+        states, _, memory = free(x0, w, s)
+        (states[..., HEADING : MOTION.stop].square().sum() + memory.square().sum()).backward()
+        slopes = [p.grad for p in model.head.parameters() if p.grad is not None]
+        found.append([states[..., HEADING : MOTION.stop].detach(), memory.detach(), *slopes])
+    assert len(found[0]) == len(found[1]) > 4
+    for alone, ahead in zip(*found, strict=True):
+        torch.testing.assert_close(ahead, alone, rtol=1e-8, atol=1e-10)

@@ -118,16 +118,8 @@ def bollard_test(unit: Thrusters, seed: int, noise: float = 5.0) -> tuple[np.nda
     return n, pull + np.random.default_rng(seed).normal(size=n.size) * noise
 
 
-def changed_pull(
-    unit: Thrusters, change: Callable[[np.ndarray], np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Revolutions and pull of a bollard test, both changed in the same way."""
-    n, pull = bollard_test(unit, 0)
-    return change(n), change(pull)
-
-
 def first_samples(unit: Thrusters, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The first samples of a step response: times, commands and revolutions."""
+    """The first times, commands and revolutions of a step response."""
     t, command, n = step_test(unit, 0)[0]
     return t[:count], command[:count], n[:count]
 
@@ -159,18 +151,9 @@ def test_thrust_curves_of_both_directions(
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda u: fit_thrust(*changed_pull(u, lambda part: part[part > 0]), 2),
-            "bollard pull astern: 0 points",
-        ),
-        (
-            lambda u: fit_thrust(*changed_pull(u, lambda part: part[::8]), 2),
-            "needs 5 at 4 revolutions",
-        ),
-        (
-            lambda u: fit_thrust(bollard_test(u, 0)[0], -bollard_test(u, 0)[1], 2),
-            "wrong sign",
-        ),
+        (lambda u: pulls(u, lambda n, pull: (n[n > 0], pull[pull > 0])), "astern: 0 points"),
+        (lambda u: pulls(u, lambda n, pull: (n[::8], pull[::8])), "needs 5 at 4 revolutions"),
+        (lambda u: pulls(u, lambda n, pull: (n, -pull)), "wrong sign"),
         (lambda u: fit_throttle(*(part[20:] for part in throttle_test(0))), "only one direction"),
         (lambda u: fit_throttle(*(part[:3] for part in throttle_test(0))), "3 points"),
         (lambda u: fit_throttle(throttle_test(0)[0], -throttle_test(0)[1]), "do not rise"),
@@ -178,19 +161,17 @@ def test_thrust_curves_of_both_directions(
         (lambda u: fit_step([first_samples(u, 60)]), "never changes"),
         (lambda u: fit_step([first_samples(u, 75)]), "hardly follow"),
     ],
-    ids=[
-        "one direction",
-        "few points",
-        "sign",
-        "throttle ahead",
-        "few throttles",
-        "falling",
-        "short",
-        "no step",
-        "cut off",
-    ],
 )
-def test_tests_that_say_too_little(unit: Thrusters, call: object, message: str) -> None:
+def test_tests_that_say_too_little(
+    unit: Thrusters, call: Callable[[Thrusters], object], message: str
+) -> None:
     with pytest.raises(FitError, match=message) as caught:
-        call(unit)  # type: ignore[operator]
+        call(unit)
     assert "\n" not in str(caught.value)
+
+
+def pulls(
+    unit: Thrusters,
+    change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+) -> object:
+    return fit_thrust(*change(*bollard_test(unit, 0)), 2)

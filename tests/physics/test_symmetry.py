@@ -17,91 +17,56 @@ from residnet.physics.terms import TermLibrary
 
 NAMES = ("u", "v", "r", "delta", "n", "tau_x", "tau_y", "tau_n", "wind_u", "wind_v", "wind_mag")
 # what a mirror at the vessel's centre plane does to each, from the definition of the channels
-SIGNS = (1, -1, -1, -1, 1, 1, -1, -1, 1, -1, 1)
-TURNED = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+SIGNS = torch.tensor([1, -1, -1, -1, 1, 1, -1, -1, 1, -1, 1], dtype=torch.float64)
 
 
-def random_channels(count: int = 50, width: int = len(NAMES)) -> Tensor:
-    return torch.from_numpy(np.random.default_rng(0).normal(size=(count, width)))
-
-
-def mirrored(z: Tensor, names: tuple[str, ...]) -> Tensor:
-    found = mirrored_channels(names)
-    assert found is not None
-    index, sign = found
-    return z[..., index] * torch.tensor(sign, dtype=z.dtype)
-
-
-def test_parity_of_each_channel() -> None:
-    assert tuple(channel_parity(name) for name in NAMES) == SIGNS
-    assert [channel_parity(name) for name in ("n_port", "cmd_stbd", "psi", "anything")] == [
-        None
-    ] * 4
-
-
-def test_parity_of_terms_is_the_sign_that_the_mirror_gives_their_values() -> None:
-    factors = [
-        form.format(name)
-        for name in NAMES
-        for form in ("{}", "|{}|", "{}^2", "|{}|^3", "{}^-1", "|{}|^-1", "{}^-2")
-    ]
-    factors += [
-        form.format(name)
-        for name in ("v", "u")
-        for form in ("sin({})", "cos({})", "sqrt({})", "ssqrt({})", "inv({})", "sin({})^2")
-    ]
-    terms = [
-        "1",
-        *factors,
-        *(f"{a} {b}" for a, b in combinations_with_replacement(factors, 2)),
-        "v |v| r",
-        "|u| v |v|",
-        "n^2 delta",
-        "v r delta^3 u",
-    ]
-    z = random_channels()
+def values(terms: list[str]) -> tuple[Tensor, Tensor]:
+    """The terms [50, J] of random channels, and of those in the mirror."""
+    z = torch.from_numpy(np.random.default_rng(0).normal(size=(50, len(NAMES))))
     library = TermLibrary(terms, NAMES)
-    here, there = library(z), library(z * torch.tensor(SIGNS, dtype=z.dtype))
-    parity = torch.tensor([term_parity(term, NAMES) or 0 for term in terms], dtype=z.dtype)
+    return library(z), library(z * SIGNS)
+
+
+def test_parity_of_channels_and_terms_is_the_sign_that_the_mirror_gives_their_values() -> None:
+    assert [channel_parity(name) for name in NAMES] == SIGNS.tolist()
+    unknown = ("n_port", "cmd_stbd", "psi", "anything")
+    assert [channel_parity(name) for name in unknown] == [None] * 4
+    powers = ("{}", "|{}|", "{}^2", "|{}|^3", "{}^-1", "|{}|^-1", "{}^-2")
+    functions = ("sin({})", "cos({})", "sqrt({})", "ssqrt({})", "inv({})", "sin({})^2")
+    factors = [form.format(name) for name in NAMES for form in powers]
+    factors += [form.format(name) for name in ("v", "u") for form in functions]
+    pairs = [f"{a} {b}" for a, b in combinations_with_replacement(factors, 2)]
+    terms = ["1", *factors, *pairs, "v |v| r", "|u| v |v|", "n^2 delta", "v r delta^3 u"]
+    here, there = values(terms)
+    parity = torch.tensor([term_parity(term, NAMES) or 0 for term in terms], dtype=here.dtype)
     torch.testing.assert_close(there, here * parity, rtol=1e-12, atol=0)
     assert set(parity.tolist()) == {-1.0, 1.0}
 
 
-def test_a_lone_propeller_heels() -> None:
-    def names(*inputs: str) -> tuple[str, ...]:
-        return SignalsConfig(inputs=inputs, velocities=("u", "v", "r", "p")).build().names
-
-    lone, pair = names("delta", "n"), names("delta", "n_port", "n_stbd")
-    assert mirrored_channels(lone) is None
-    assert mirrored_channels(pair) is not None
-    # its torque acts about the roll, and no thrust to a side
-    assert [wrong_parity("|n| u", axis, lone) for axis in range(4)] == [False, True, True, False]
-    assert wrong_parity("u|u|", 3, lone)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_term_is_wrong_where_it_breaks_the_symmetry_of_its_axis(axis: int) -> None:
+@pytest.mark.parametrize(("axis", "turned"), [(0, 1.0), (1, -1.0), (2, -1.0)])
+def test_a_term_is_wrong_where_it_breaks_the_symmetry_of_its_axis(axis: int, turned: float) -> None:
     """A symmetric vessel's acceleration f has f(M z) = M f(z)."""
-    terms = [
-        "1",
-        *NAMES,
-        *(f"{a} {b}" for a, b in combinations_with_replacement(NAMES, 2)),
-        *(f"|{a}|" for a in NAMES),
-    ]
-    z = random_channels()
-    library = TermLibrary(terms, NAMES)
-    broken = (
-        library(z * torch.tensor(SIGNS, dtype=z.dtype)) - TURNED[axis] * library(z)
-    ).abs().amax(0) > 1e-9
+    terms = ["1", *NAMES, *(f"|{a}|" for a in NAMES)]
+    terms += [f"{a} {b}" for a, b in combinations_with_replacement(NAMES, 2)]
+    here, there = values(terms)
+    broken = (there - turned * here).abs().amax(0) > 1e-9
     assert [wrong_parity(term, axis, NAMES) for term in terms] == broken.tolist()
 
 
-def test_what_nobody_said_is_not_called_wrong() -> None:
-    names = ("u", "v", "trim")
-    assert term_parity("u trim", names) is None
-    assert term_parity("|trim|", names) is None
-    assert term_parity("u |v|", names) == 1
-    assert not any(wrong_parity("trim", axis, names) for axis in range(3))
+def test_a_lone_propeller_heels_and_what_nobody_said_is_not_called_wrong() -> None:
+    def names(*inputs: str) -> tuple[str, ...]:
+        return SignalsConfig(inputs=inputs, velocities=("u", "v", "r", "p")).build().names
+
+    lone = names("delta", "n")
+    assert mirrored_channels(lone) is None
+    assert mirrored_channels(names("delta", "n_port", "n_stbd")) is not None
+    # its torque acts about the roll, and no thrust to a side
+    assert [wrong_parity("|n| u", axis, lone) for axis in range(4)] == [False, True, True, False]
+    assert wrong_parity("u|u|", 3, lone)
+    unsaid = ("u", "v", "trim")
+    parities = [term_parity(term, unsaid) for term in ("u trim", "|trim|", "u |v|")]
+    assert parities == [None, None, 1]
+    assert not any(wrong_parity("trim", axis, unsaid) for axis in range(3))
 
 
 def test_channels_are_those_of_the_scene_in_the_mirror() -> None:
@@ -117,29 +82,24 @@ def test_channels_are_those_of_the_scene_in_the_mirror() -> None:
     x_there = x * torch.tensor([1, -1, -1, 1, -1, -1.0], dtype=x.dtype)
     w_there = w[:, [1, 0, 2, 3]] * torch.tensor([1, 1, 1, -1.0], dtype=x.dtype)
     z, z_there = signals(x, signals.prepare(w)), signals(x_there, signals.prepare(w_there))
-    torch.testing.assert_close(mirrored(z, signals.names), z_there, rtol=1e-12, atol=1e-9)
+    found = mirrored_channels(signals.names)
+    assert found is not None
+    mirrored = z[:, found[0]] * torch.tensor(found[1], dtype=z.dtype)
+    torch.testing.assert_close(mirrored, z_there, rtol=1e-12, atol=1e-9)
     assert float((z - z_there).abs().max()) > 1
 
 
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
-        (("u", "v", "r", "n", "delta"), ([0, 1, 2, 3, 4], [1.0, -1.0, -1.0, 1.0, -1.0])),
-        (("u", "n_port", "n_stbd"), ([0, 2, 1], [1.0, 1.0, 1.0])),
-        (
-            ("cmd_stbd", "n_port", "v", "n_stbd", "cmd_port"),
-            ([4, 3, 2, 1, 0], [1.0, 1.0, -1.0, 1.0, 1.0]),
-        ),
+        ("u v r n delta", ([0, 1, 2, 3, 4], [1.0, -1.0, -1.0, 1.0, -1.0])),
+        ("cmd_stbd n_port v n_stbd cmd_port", ([4, 3, 2, 1, 0], [1.0, 1.0, -1.0, 1.0, 1.0])),
+        ("u n_port", None),
+        ("u trim", None),
+        ("u n_port m_stbd", None),
     ],
 )
-def test_pairs_change_places(
-    names: tuple[str, ...], expected: tuple[list[int], list[float]]
+def test_pairs_change_places_and_no_mirror_is_without_a_partner(
+    names: str, expected: tuple[list[int], list[float]] | None
 ) -> None:
-    assert mirrored_channels(names) == expected
-    z = random_channels(5, len(names))
-    assert torch.equal(mirrored(mirrored(z, names), names), z), "twice mirrored is as before"
-
-
-@pytest.mark.parametrize("names", [("u", "n_port"), ("u", "trim"), ("u", "n_port", "m_stbd")])
-def test_no_mirror_where_a_channel_or_its_partner_is_unknown(names: tuple[str, ...]) -> None:
-    assert mirrored_channels(names) is None
+    assert mirrored_channels(tuple(names.split())) == expected

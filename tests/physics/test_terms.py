@@ -1,30 +1,37 @@
-"""Terms by name against NumPy."""
+"""Terms by name against NumPy, and candidate terms against their definition."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from residnet.core.errors import ConfigError
-from residnet.physics.terms import Factor, TermLibrary, parse_term, polynomial_terms
+from residnet.physics.terms import (
+    CandidatesConfig,
+    Factor,
+    TermLibrary,
+    parse_term,
+    polynomial_terms,
+    rated,
+)
 
 NAMES = ("u", "v", "r", "n_port", "delta2")
 
-READ = {
+READ: dict[str, tuple[tuple[Any, ...], ...]] = {
     "1": (),
-    "u": (("u", False, 1),),
     "u|u|": (("u", False, 1), ("u", True, 1)),
     "|u|v": (("u", True, 1), ("v", False, 1)),
-    "v |r|": (("v", False, 1), ("r", True, 1)),
     "  v   r ": (("v", False, 1), ("r", False, 1)),
     "v*r": (("v", False, 1), ("r", False, 1)),
     "n_port^2 delta2": (("n_port", False, 2), ("delta2", False, 1)),
     "|v|^3 u^9": (("v", True, 3), ("u", False, 9)),
     "1 u": (("u", False, 1),),
     "|u||v|": (("u", True, 1), ("v", True, 1)),
+    "u sin(v)": (("u", False, 1), ("v", False, 1, "sin")),
 }
 
 
@@ -36,10 +43,8 @@ def test_parse(term: str) -> None:
 @pytest.mark.parametrize(
     ("term", "message"),
     [
-        ("", "empty"),
         ("   ", "empty"),
         ("n_prt u", "did you mean 'n_port'"),
-        ("w", "no channel 'w'"),
         ("|w|", "no channel 'w'"),
         ("uv", "no channel 'uv'"),
         ("u|v", "cannot read it from '|v'"),
@@ -63,95 +68,74 @@ def test_what_cannot_be_read_is_one_line(term: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_library_equals_numpy() -> None:
-    terms = ["1", "u", "u|u|", "|u|v", "v |r|", "n_port^2 delta2", "|v|^3 u^2", "1"]
-    z = np.random.default_rng(0).normal(size=(7, 11, len(NAMES)))
-    u, v, r, n, d = (z[..., i] for i in range(5))
-    truth = [
-        np.ones_like(u),
-        u,
-        u * abs(u),
-        abs(u) * v,
-        v * abs(r),
-        n**2 * d,
-        abs(v) ** 3 * u**2,
-        np.ones_like(u),
-    ]
-    library = TermLibrary(terms, NAMES)
-    assert library.count == len(terms)
-    np.testing.assert_allclose(library(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-14)
-    single = library(torch.from_numpy(z).float())
-    assert single.dtype == torch.float32
-    np.testing.assert_allclose(single, np.stack(truth, axis=-1), rtol=3e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("terms", [NAMES, NAMES[::-1], ["r", "u"], ["u", "u"]])
-def test_library_of_channels_alone(terms: Sequence[str]) -> None:
-    z = torch.randn(3, 4, len(NAMES), dtype=torch.float64)
-    columns = [list(NAMES).index(term) for term in terms]
-    assert torch.equal(TermLibrary(terms, NAMES)(z), z[..., columns])
-
-
-def test_division_keeps_signs_and_leaves_other_gradients_finite() -> None:
-    z = torch.tensor([[-2.0, 0.0, 0.5, -4.0, 0.0]], dtype=torch.float64, requires_grad=True)
-    out = TermLibrary(["n_port^-1", "u |n_port|^-2", "|u|^-1 r", "v"], NAMES)(z)
-    np.testing.assert_allclose(out.detach(), [[-0.25, -0.125, 0.25, 0.0]], rtol=1e-14)
-    out.sum().backward()
-    assert z.grad is not None
-    assert bool(torch.isfinite(z.grad).all())
-
-
-def test_library_of_constants_and_of_nothing() -> None:
-    z = torch.randn(4, 2, len(NAMES))
-    assert torch.equal(TermLibrary(["1", "1"], NAMES)(z), torch.ones(4, 2, 2))
-    assert TermLibrary([], NAMES)(z).shape == (4, 2, 0)
-    beside = TermLibrary(["r", "1"], NAMES)(z)
-    assert torch.equal(beside, torch.stack((z[..., 2], torch.ones(4, 2)), dim=-1))
-
-
-def test_functions_equal_numpy() -> None:
-    terms = [
-        "sin(u)",
-        "cos(v)^2 n_port",
-        "u^2 n_port^2 cos(delta2)",
-        "sqrt(r)",
-        "ssqrt(r) |v|",
-        "inv(n_port) u",
-        "inv(r)^2",
-        "u^-1 sin(v)",
-    ]
-    z = np.random.default_rng(1).normal(size=(9, len(NAMES)))
-    u, v, r, n, d = z.T
-    truth = [
-        np.sin(u),
-        np.cos(v) ** 2 * n,
-        u**2 * n**2 * np.cos(d),
-        np.sqrt(abs(r)),
-        np.sign(r) * np.sqrt(abs(r)) * abs(v),
-        u / n,
-        1 / r**2,
-        np.sin(v) / u,
-    ]
-    library = TermLibrary(terms, NAMES)
-    np.testing.assert_allclose(library(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-13)
-    np.testing.assert_allclose(
-        torch.jit.script(library)(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-13
-    )
-
-
-def test_protected_functions_are_finite_at_zero_with_their_gradients() -> None:
-    z = torch.zeros(1, len(NAMES), dtype=torch.float64, requires_grad=True)
-    out = TermLibrary(["sqrt(u)", "ssqrt(v)", "inv(r)"], NAMES)(z)
-    np.testing.assert_allclose(out.detach(), np.zeros((1, 3)), atol=1e-11)
-    out.sum().backward()
-    assert z.grad is not None
-    assert bool(torch.isfinite(z.grad).all())
-
-
 def test_functions_can_be_forbidden() -> None:
-    assert parse_term("u sin(v)", NAMES)[1] == Factor("v", False, 1, "sin")
     with pytest.raises(ConfigError, match="only products of channels"):
         parse_term("u sin(v)", NAMES, functions=False)
+
+
+U, V, R, N, D = np.moveaxis(np.random.default_rng(0).normal(size=(7, 11, 5)), -1, 0)
+ONE = np.ones_like(U)
+LIBRARIES: dict[str, tuple[list[str], list[np.ndarray]]] = {
+    "products": (
+        ["1", "u", "u|u|", "|u|v", "v |r|", "n_port^2 delta2", "|v|^3 u^2", "1", "u^-1 r"],
+        [ONE, U, U * abs(U), abs(U) * V, V * abs(R), N**2 * D, abs(V) ** 3 * U**2, ONE, R / U],
+    ),
+    "functions": (
+        ["sin(u)", "cos(v)^2 n_port", "sqrt(r)", "ssqrt(r) |v|", "inv(n_port) u", "inv(r)^2"],
+        [
+            np.sin(U),
+            np.cos(V) ** 2 * N,
+            np.sqrt(abs(R)),
+            np.sign(R) * np.sqrt(abs(R)) * abs(V),
+            U / N,
+            1 / R**2,
+        ],
+    ),
+    "channels": ([*NAMES[::-1], "u"], [D, N, R, V, U, U]),
+    "some channels": (["r", "1", "u"], [R, ONE, U]),
+    "constants": (["1", "1"], [ONE, ONE]),
+}
+
+
+@pytest.mark.parametrize("name", LIBRARIES)
+def test_a_library_equals_numpy_with_its_derivatives(name: str) -> None:
+    terms, truth = LIBRARIES[name]
+    z, wanted = torch.from_numpy(np.stack((U, V, R, N, D), axis=-1)), np.stack(truth, axis=-1)
+    library = TermLibrary(terms, NAMES)
+    assert library.count == len(terms)
+    for module in (library, torch.jit.script(library)):
+        np.testing.assert_allclose(module(z), wanted, rtol=1e-13)
+    single = library(z.float())
+    assert single.dtype == torch.float32
+    np.testing.assert_allclose(single, wanted, rtol=3e-5, atol=1e-6)
+    torch.manual_seed(2)
+    flat, ahead = z.reshape(-1, 5)[:6], torch.randn(3, 6, 5, dtype=torch.float64)
+    about = (library(flat + 1e-6 * ahead) - library(flat - 1e-6 * ahead)) / 2e-6
+    torch.testing.assert_close(library.along(flat, ahead), about, rtol=1e-6, atol=1e-5)
+
+
+def test_a_library_of_nothing_has_no_columns() -> None:
+    assert TermLibrary([], NAMES)(torch.randn(4, 2, 5)).shape == (4, 2, 0)
+
+
+@pytest.mark.parametrize(
+    ("z", "terms", "expected"),
+    [
+        (
+            [-2.0, 0.0, 0.5, -4.0, 0.0],
+            ["n_port^-1", "u |n_port|^-2", "|u|^-1 r", "v"],
+            [-0.25, -0.125, 0.25, 0.0],
+        ),
+        ([0.0] * 5, ["sqrt(u)", "ssqrt(v)", "inv(r)"], [0.0] * 3),
+    ],
+)
+def test_division_and_roots_leave_gradients_finite_at_zero(
+    z: list[float], terms: list[str], expected: list[float]
+) -> None:
+    at = torch.tensor([z], dtype=torch.float64, requires_grad=True)
+    out = TermLibrary(terms, NAMES)(at)
+    np.testing.assert_allclose(out.detach()[0], expected, rtol=1e-14, atol=1e-11)
+    assert bool(torch.isfinite(torch.autograd.grad(out.sum(), at)[0]).all())
 
 
 def test_polynomials_are_all_products_once() -> None:
@@ -160,25 +144,79 @@ def test_polynomials_are_all_products_once() -> None:
     # binomial(3 + 3, 3) - 1 products, then the magnitudes
     assert len(terms) == len(set(terms)) == 19 + 2
     assert terms[-2:] == ("u|u|", "r|r|")
-    z = torch.rand(1, 3, dtype=torch.float64) + 0.5
-    values = TermLibrary(terms[:19], names)(z)[0]
-    assert len({round(float(value), 12) for value in values}) == 19
+    found = TermLibrary(terms[:19], names)(torch.rand(1, 3, dtype=torch.float64) + 0.5)[0]
+    assert len({round(float(value), 12) for value in found}) == 19
 
 
-@pytest.mark.parametrize(
-    "terms",
-    [
-        ["1", "u", "u|u|", "|u|v", "v |r|", "n_port^2 delta2", "|v|^3 u^2"],
-        ["r", "v"],
-        ["1"],
-        ["u sin(v)", "n_port^-1 r", "sqrt(r) u"],
-    ],
+JETS = CandidatesConfig(
+    inputs=("rpm",), input_degree=2, coupling=("u",), coupling_degree=2, angles=("nozzle",)
 )
-def test_derivatives_along_directions(terms: Sequence[str]) -> None:
-    torch.manual_seed(2)
-    library = TermLibrary(terms, NAMES)
-    z = torch.randn(6, len(NAMES), dtype=torch.float64)
-    ahead = torch.randn(3, 6, len(NAMES), dtype=torch.float64)
-    step = 1e-6
-    about = (library(z + step * ahead) - library(z - step * ahead)) / (2.0 * step)
-    torch.testing.assert_close(library.along(z, ahead), about, rtol=1e-6, atol=1e-6)
+JET_NAMES = ("u", "v", "r", "rpm", "nozzle")
+SHIP = ("u", "v", "r", "n", "delta")
+
+
+def terms_of(names: Sequence[str], **config: Any) -> set[str]:
+    return {c.term for c in CandidatesConfig(**config).candidates(tuple(names))}
+
+
+def test_motions_with_magnitudes() -> None:
+    plain = {"1", "u", "v", "u^2", "u v", "v^2"}
+    assert terms_of("uv", inputs=(), magnitudes=False) == plain
+    sized = {"|u|", "|v|", "u |u|", "u |v|", "v |u|", "v |v|", "|u| |v|"}
+    assert terms_of("uv", inputs=()) == plain | sized
+
+
+def test_jets_have_every_term_of_the_document_by_degree_then_by_effort() -> None:
+    found = JETS.candidates(JET_NAMES)
+    place = {c.term: i for i, c in enumerate(found)}
+    assert len(found) == len(place) == 49
+    # (6.21)-(6.23): nine products with the cosine, nine with the sine, and the hull
+    for speed in ("", "u ", "u^2 "):
+        for turns in ("", "rpm ", "rpm^2 "):
+            assert {f"{speed}{turns}{f}(nozzle)" for f in ("sin", "cos")} <= set(place)
+    assert {"v r", "u r", "u", "v", "r", "u |u|", "v |v|", "r |r|"} <= set(place)
+    assert not {"v rpm", "nozzle"} & set(place)
+    degree = {c.term: c.degree for c in found}
+    assert [*degree.values()] == sorted(degree.values())
+    assert (degree["1"], degree["u |u|"], degree["u^2 rpm^2 cos(nozzle)"]) == (0, 2, 5)
+    assert place["1"] == 0
+    assert place["u"] < place["|u|"] < place["u^2"] < place["u |u|"]
+    assert place["u"] < place["sin(nozzle)"]
+
+
+def test_candidates_know_propellers_and_rudders_unless_told_otherwise() -> None:
+    """Thrust of both directions, lift in the flow past the hull and in the propeller's."""
+    assert {"tau_x", "tau_n"} <= terms_of(("u", "v", "r", "tau_x", "tau_n"))
+    named = terms_of(("u", "tau_x"), inputs=(), extra=("tau_x inv(u)",))
+    assert [term for term in named if "tau" in term] == ["tau_x inv(u)"]
+    ship = {"n |n|", "u |n|", "u^2 delta", "u |u| delta", "|u| delta", "n |n| delta", "u n delta"}
+    assert ship <= terms_of(SHIP)
+    assert not ship & terms_of(SHIP, input_degree=1)
+    plain = terms_of(SHIP, magnitudes=False)
+    assert {"u^2 delta", "n^2 delta"} <= plain
+    assert not any("|" in term for term in plain)
+    assert {"|r|", "r |r|", "delta |delta|"} <= terms_of(("r", "delta"))
+
+
+def test_nothing_divides_by_what_comes_near_zero() -> None:
+    names = ("u", "n", "delta")
+    config = CandidatesConfig(extra=("u inv(delta)",))
+    terms = [c.term for c in config.candidates(names)]
+    z = torch.tensor([[1.0, 4.0, 0.3], [-1.0, 20.0, -0.3], [0.5, 9.0, 0.1]]).double()
+
+    def kept(z: torch.Tensor) -> set[str]:
+        clear = config.clear(terms, names, z)
+        return {t for t, good in zip(terms, clear.tolist(), strict=True) if good and "inv" in t}
+
+    # what is named by hand stays
+    over = {"inv(n)", "u inv(n)", "u^2 inv(n)", "delta inv(n)", "u inv(delta)"}
+    assert kept(z) == kept(-z) == over
+    z[0, 1] = 1.9
+    assert kept(z) == {"u inv(delta)"}
+
+
+def test_unknown_channels_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"'nozle' is not a channel.*did you mean 'nozzle'"):
+        CandidatesConfig(angles=("nozle",)).candidates(JET_NAMES)
+    with pytest.raises(ConfigError, match="no channel 'w'"):
+        rated(["u w"], JET_NAMES)

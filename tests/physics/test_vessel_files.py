@@ -24,9 +24,7 @@ WRONG = [
     ("wam_v_cal", "rigid_body.m.value=.nan", "finite"),
     ("wam_v_cal", "rigid_body.m.source=' '", "needs its source"),
     ("wam_v_cal", "rigid_body.mass.value=3", "rigid_body.m"),
-    ("wam_v_cal", "length.value=-3", "must be positive"),
     ("wam_v_cal", "actuators.kind=sail", "sail"),
-    ("wam_v_cal", "actuators.n_max=2380 rpm/s", "rpm/s"),
     ("wam_v_cal", "damping.X.w={value: 1, unit: kg/s, source: made}", "no channel 'w'"),
     ("wam_v_cal", "damping.X.u.unit=kg", "kg/s"),
     (
@@ -35,7 +33,6 @@ WRONG = [
         "divides by what may be zero",
     ),
     ("wam_v_cal", "damping.N.r.unit=kg/s", "kg m\\^2/s"),
-    ("wam_v_cal", "damping.Y.v.unit=kg2/s", "kg/s"),
     ("wam_v_cal", "damping.N.|u|v|v|={value: 1, unit: kg, source: made}", "kg s/m"),
     ("wam_v_cal", "actuators.curve_range=[-1500 rpm, 2400 rpm]", "does not reach n_max"),
     ("wam_v_cal", "added_mass.X_udot.value=400", "wam_v_cal.*mass matrix is not positive definite"),
@@ -49,19 +46,14 @@ WRONG = [
         "two thrusters are named 'bow'",
     ),
     ("milliampere_azimuth", "actuators.places=[{name: bow, x: 1.8}]", "give two places"),
-    ("patrol_p06", "rigid_body.z_G.unit=kg", "rigid_body.z_G.*does not measure \\[m\\]"),
-    ("patrol_p06", "rigid_body.I_x.value=-1", "must be positive"),
     ("patrol_p06", "hydrostatics.GM.value=-0.2", "hydrostatics.*must be positive"),
-    ("patrol_p06", "hydrostatics.volume.unit=m^2", "does not measure \\[m\\^3\\]"),
     ("patrol_p06", "forces.K.p.unit=kg m^2", "K.p: its unit must be kg m\\^2/s"),
     ("patrol_p06", "forces.K.phi^2={value: 1, unit: N, source: made}", "kg m\\^2/s\\^2"),
     ("patrol_p06", "forces.N.sin(phi)={value: 1, unit: N m, source: made}", "no function 'sin'"),
     ("patrol_p06", "base=wam_v_clean", "no vessel 'wam_v_clean'"),
-    ("mariner", "coefficients.Y.u=1", "no channel 'u'"),
     ("mariner", "coefficients.Y.v^-1=1", "divides"),
     ("mariner", "coefficients.X.dn=1", "belong together"),
     ("mariner", "delta_sign=1", "check delta_sign"),
-    ("mariner", "speed=15 m", "m/s"),
     ("example_rudder_boat", "actuators.rudder.area=0.1 m", "m\\^2"),
     (
         "example_rudder_boat",
@@ -72,7 +64,6 @@ WRONG = [
     ("example_rudder_boat", "kind=fosen", "did you mean 'fossen'"),
     ("nomoto_oceanos", "T.value=0", "T must not be zero"),
     ("nomoto_oceanos", "K.value=-1", "turns to starboard"),
-    ("nomoto_oceanos", "K.unit=s", "does not measure \\[1/s\\]"),
     ("nomoto_mariner", "T_v.value=18.530161", "T_v must differ from T3"),
     ("nomoto_mariner_yaw", "T2.value=-7", "turns to starboard"),
 ]
@@ -112,20 +103,6 @@ def test_units_are_converted_at_the_door() -> None:
     nu = torch.tensor([[1.5, -0.4, 0.3]], dtype=torch.float64)
     known = load_vessel("wam_v_cal")
     torch.testing.assert_close(vessel.hull().load(nu), known.hull().load(nu))
-
-
-def test_calibrated_numbers_are_those_of_errata() -> None:
-    vessel = load_vessel("wam_v_cal")
-    body, added, unit = vessel.rigid_body, vessel.added_mass, vessel.actuators
-    assert (body.m.value, body.I_z.value, body.x_G.value) == (315, 760, 0)
-    assert (added.X_udot.value, added.Y_vdot.value, added.N_rdot.value) == (-42, -250, -500)
-    assert vessel.damping.values() == [
-        {"u": 180, "u|u|": 83},
-        {"v": 250, "|u|v": 150, "v|v|": 600},
-        {"r": 900, "r|r|": 1700, "|u|v": -320},
-    ]
-    numbers = (unit.spacing, unit.n_max * 60, unit.n_rate * 60)
-    assert numbers == pytest.approx((2.44, 2380, 1500))
 
 
 def test_a_set_has_its_base_but_for_what_it_says() -> None:
