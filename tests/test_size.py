@@ -33,7 +33,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2516, 280),
     "runs": (380, 50),
     "simulators": (355, 42),
-    "tasks": (3233, 268),
+    "tasks": (3207, 265),
     "testing": (446, 26),
     "training": (1362, 153),
     "": (448, 52),

@@ -30,7 +30,7 @@ from forks import Ending, attempt, command
 
 # imported before the forks, which then begin at once
 import residnet.report.still
-import residnet.tasks.fit_run
+import residnet.tasks.fit
 
 _SCHEDULE = {
     "steps": 3,

@@ -40,7 +40,7 @@ import residnet
 import residnet.api.models
 import residnet.api.tasks
 import residnet.report.still
-import residnet.tasks.fit_run
+import residnet.tasks.fit
 import residnet.tasks.inspection
 from residnet.core.errors import ResidnetError
 

@@ -2,24 +2,69 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
+import numpy as np
 from pydantic import PrivateAttr, model_validator
 
-from residnet.core.config import Config
-from residnet.data.simulated import SimulatedTrials
+from residnet.core.config import Config, dump_config
+from residnet.core.errors import DataError, UsageError
+from residnet.core.log import Log
+from residnet.core.names import CHANNEL_UNITS, END_UNITS, nearest, si_unit
+from residnet.core.progress import begin, say
+from residnet.data.drafting.reading import log_files
+from residnet.data.masks import Spike
+from residnet.data.prepare import Prepared, prepare
+from residnet.data.readers.base import CanonicalConfig
+from residnet.data.simulated import SimulatedTrials, stand_ins
 from residnet.data.sources import DataConfig, Splits, input_files, read_logs
-from residnet.documents import STUDY_MODELS, StudyName
+from residnet.data.split import log_names
+from residnet.documents import STUDY_MODELS, StudyName, study_sections
+from residnet.dynamics.store import ModelSpec, load_model, model_names
+from residnet.export.vessel import ExportedVessel
+from residnet.identification.fit import fit
+from residnet.identification.fitter import FittedModel, require_fit
+from residnet.identification.identified import (
+    Evaluation,
+    candidates,
+    evaluate,
+    goodness_rows,
+    residual_table,
+    term_table,
+)
+from residnet.identification.prepared import (
+    prepare_logs,
+    require_window,
+    through_currents,
+    velocity_limit,
+)
 from residnet.identification.settings import FitSettings, require_known
+from residnet.judge.band import bands_content
 from residnet.judge.booklet import BookletConfig
+from residnet.judge.goodness import content, repeatability
+from residnet.judge.metrics import LIMITS_SCHEMA, metrics_content, write_rollouts
+from residnet.judge.soundness import sanity_content
+from residnet.judge.verdict import objections
 from residnet.report.blocks import Section
-from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, ExportRequest, Finished, Outcome
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.free_runs import errors_table
+from residnet.report.sections.verdict import evidence, level, verdict
+from residnet.runs.folder import Provenance, RunFolder
+from residnet.runs.model_store import FolderStore
+from residnet.runs.task import ComputingTask, ExportRequest, Exports, Finished, MainFigure, Outcome
+from residnet.tasks.booklet import require_flyable, write_booklet
 
 if TYPE_CHECKING:
     from residnet.tasks.fit_service import PlannedTrials, RefitRun, WatchedLog
+
+_CHOSEN = ("predictor", "selected")
+"""What stands for a model's name: the one reported first, and the single one chosen."""
+SPLIT = "external"
+"""Name of the split of logs that no fit has seen."""
 
 
 class ExportConfig(Config):
@@ -101,11 +146,6 @@ class FitConfig(FitSettings, ComputingTask):
         Raises:
             ResidnetError: what the run itself would refuse before it fits anything.
         """
-        from residnet.data.simulated import stand_ins
-        from residnet.identification.fitter import FittedModel, require_fit
-        from residnet.identification.prepared import prepare_logs
-        from residnet.tasks.booklet import require_flyable
-
         settings = self
         if isinstance(self.data, SimulatedTrials):
             logs: Splits = {"train": [], "validation": [], "test": []}
@@ -124,20 +164,61 @@ class FitConfig(FitSettings, ComputingTask):
             require_flyable(self.booklet, FittedModel(spec, spec.build(), {}))
 
     def carry_out(self, folder: RunFolder) -> Outcome:
-        """Fit all models and judge them in free run.
+        """Fit all models, judge them in free run, and write what was found.
+
+        Logs that ran in currents are taken through the water.
 
         Raises:
             ResidnetError: where the logs cannot be used, or do not determine a model.
         """
-        from residnet.tasks.fit_run import run_fit
-
-        return run_fit(self, folder)
+        begin(f"{self.name}: reading logs")
+        read = self.logs()
+        _write_inspection(folder, read, self)
+        logs = prepare_logs(read, self)
+        say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
+        logs, currents = through_currents(logs, self)
+        if self.current is not None:
+            folder.write_json(folder.path / "currents.json", currents)
+        identified = fit(logs, self, store=FolderStore(folder))
+        begin("free runs")
+        fitted, step = list(identified.values()), self.prepare.grid.step
+        if self.bands is not None:
+            bands = {entry.name: entry.bands for entry in fitted}
+            folder.write_json(folder.bands, bands_content(self.name, bands))
+        held = {str(split): logs[split] for split in self.evaluation.splits}
+        judged = identified.evaluate(held, self.data)
+        chosen = identified.select(judged)
+        told = "" if chosen.leading is None else f"; predictor: {chosen.leading}"
+        say(f"  selected: {chosen.selected}{told}")
+        folder.write_json(folder.selection, chosen.content())
+        folder.write_json(folder.sanity, sanity_content(identified.findings))
+        names = (chosen.selected, chosen.selected_ensemble, chosen.predictor)
+        write_judged(folder, self, judged, names, logs)
+        for place, found in {
+            folder.residuals: residual_table(fitted, logs["test"]),
+            folder.path / "terms.parquet": term_table(fitted, logs["test"]),
+        }.items():
+            if len(found):
+                folder.write_table(place, found)
+        splits = goodness_rows(fitted, logs, step)
+        folder.write_json(folder.goodness, content(self.name, splits, step))
+        failure = ""
+        if self.booklet is not None:
+            refitted = identified[self.booklet.model]
+            try:
+                say("  " + write_booklet(folder, self.booklet, refitted, logs, identified.limit))
+            except DataError as error:
+                # the fit itself is done, and its report is worth having
+                failure = str(error)
+        exports = {
+            name: partial(self.export_model, ExportRequest(folder, name))
+            for name in self.export.models
+        }
+        return fit_outcome(folder, "test", exports, failure)
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        from residnet.documents import study_sections
         from residnet.report.fit import fit_sections, write_fit_figures
-        from residnet.report.run_reader import RunFiles
 
         files = RunFiles(run.path)
         write_fit_figures(files)
@@ -148,9 +229,51 @@ class FitConfig(FitSettings, ComputingTask):
         return sections
 
     def evaluate_on(self, run: RunFolder, logs: Sequence[Path], out: Path | None) -> Finished:
-        from residnet.tasks.fit_run import evaluate_on
+        """Free-run every model of a fit on logs that it has never seen.
 
-        return evaluate_on(self, run, logs, out)
+        Its reader, masks, protocols and scales are used; `zero` comes first, then the config's
+        order.
+
+        Args:
+            out: folder of the results; RUN/external-<time> where none is given.
+
+        Raises:
+            DataError: where a log cannot be used or is too short.
+            UsageError: where a path or a channel is missing, or the folder may not be used.
+        """
+        files, read, prepared = external_logs(self, logs)
+        for log in prepared:
+            require_window(log, self)
+        made_from = Provenance(run.resolved, (), self.seed, files, time.time())
+        place = out or run.path / time.strftime("external-%Y%m%dT%H%M%S")
+        folder = RunFolder.create(place, dump_config(self))
+
+        def judge(folder: RunFolder) -> Outcome:
+            store, order = FolderStore(run), ["zero", *self.model_names]
+            fitted = [store.load(name) for name in store.names()]
+            fitted.sort(key=lambda model: (*order, model.name).index(model.name))
+            say(f"{self.name}: {len(prepared)} logs, {len(fitted)} models")
+            _write_inspection(folder, {SPLIT: read}, self)
+            simulated = isinstance(self.data, SimulatedTrials) and all(
+                "vessel" in log.meta for log in read
+            )
+            models = [c for c in candidates(fitted, self.data) if c.kind != "truth" or simulated]
+            limit = limit_of(fitted[0].spec, self)
+            judged = evaluate(
+                models, {SPLIT: prepared}, self.evaluation, self.prepare.grid.step, limit
+            )
+            # bands, and why the model was selected, are the fit's own; the report shows them
+            for own, copy in ((run.bands, folder.bands), (run.selection, folder.selection)):
+                if own.is_file():
+                    folder.write(copy, own.read_text(encoding="utf-8"))
+            chosen = run.read_metrics()
+            selected = str(chosen["selected"])
+            predictor = str(chosen.get("predictor", selected))
+            names = (selected, chosen.get("selected_ensemble"), predictor)
+            write_judged(folder, self, judged, names, {SPLIT: prepared})
+            return fit_outcome(folder, SPLIT)
+
+        return self.conduct(folder, made_from, judge)
 
     def monitor(
         self,
@@ -195,6 +318,167 @@ class FitConfig(FitSettings, ComputingTask):
         return plan_trials(self, run, model, limits)
 
     def export_model(self, asked: ExportRequest) -> Path:
-        from residnet.tasks.fit_run import export_model
+        """Export one model of a fit, and return the file.
 
-        return export_model(asked)
+        `predictor` stands for the one that is reported first, `selected` for the single one chosen
+        on validation data.
+
+        Raises:
+            UsageError: where there is no such model.
+            WithheldError: where it is worse than doing without it, but for `asked.anyway`.
+            ExportError: where the exported model does not agree with the one that it came from.
+        """
+        run, name, metrics = asked.run, asked.model, asked.run.read_metrics()
+        chosen = str(metrics.get(name, metrics["selected"])) if name in _CHOSEN else name
+        known = model_names(run.models)
+        if chosen not in known:
+            raise UsageError(f"{run.path}: no model '{name}'{nearest(name, [*_CHOSEN, *known])}")
+        spec, model = load_model(run.models / chosen)
+        rows = [
+            row for row in metrics["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"
+        ]
+        against = objections(evidence(RunFiles(run.path), chosen))
+        return asked.write(ExportedVessel(spec, model, rows), against, chosen)
+
+
+def _write_inspection(
+    folder: RunFolder, splits: Mapping[str, Sequence[Log]], config: FitConfig
+) -> None:
+    """Write doctor.json: what the doctor finds in all logs as the run's masks leave them."""
+    # a check does not wait for the doctor
+    from residnet.data.doctor import inspect, inspect_together, inspection, summary
+
+    begin("examining logs")
+    inputs, masks = config.signals.columns, (*config.prepare.masks, Spike())
+    logs = [log for members in splits.values() for log in members]
+    split_of = {log.name: split for split, members in splits.items() for log in members}
+    reports = [inspect(log, inputs, masks) for log in logs]
+    together = inspect_together(logs, inputs, split_of)
+    for report in reports:
+        for finding in report.find("fill_values"):
+            say(f"  {report.name}: {finding.text}")
+    found = inspection(reports, together)
+    folder.write_json(folder.path / "doctor.json", found)
+    # the tally stands in the verdict; what may be corrected is told before the fit takes its time
+    if first := summary(found).first:
+        say(f"  {first}")
+
+
+def write_judged(
+    folder: RunFolder,
+    config: FitConfig,
+    judged: Mapping[str, Evaluation],
+    names: tuple[str, str | None, str],
+    logs: Mapping[str, Sequence[Prepared]],
+) -> None:
+    """Write what free runs show: rollouts, metrics.json, limits.json and data_quality.json.
+
+    Args:
+        folder: of the run, or of an evaluation.
+        judged: free runs by split.
+        names: of the selected model, of the selected mean of models, and of the predictor.
+        logs: by split, those that were not judged too.
+    """
+    for split, part in judged.items():
+        write_rollouts(
+            folder.rollouts / split, part.runs, part.logs, config.signals.columns, part.bands
+        )
+    scales = config.evaluation.scales.named()
+    states = config.signals.live.states
+    units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in states}
+    rows = [row for part in judged.values() for row in part.rows]
+    folder.write_json(folder.metrics, metrics_content(config.name, units, scales, *names, rows))
+    commands, step = len(config.signals.inputs), config.prepare.grid.step
+    seen = [log for part in judged.values() for log in part.logs]
+    limits = {
+        "schema": LIMITS_SCHEMA,
+        "run": config.name,
+        "splits": {split: part.limits for split, part in judged.items()},
+        "repeatability": {
+            name: repeatability(protocol, seen, commands, scales, step)
+            for name, protocol in config.evaluation.protocols.items()
+        },
+    }
+    folder.write_json(folder.limits, limits)
+    quality = [
+        {
+            "log": log.log.name,
+            "split": split,
+            "manoeuvre": log.log.manoeuvre,
+            "seconds": float(log.log.t[-1] - log.log.t[0]),
+            "samples": len(log),
+            "usable": float(log.usable.mean()),
+            "learned_from": float(log.good.mean()),
+            "masked": {
+                reason: float(np.mean(mask)) for reason, mask in log.log.masks.items() if mask.any()
+            },
+            "largest": {
+                name: float(np.abs(log.y[log.usable, log.live.states.index(name)]).max())
+                for name in log.live.channels
+            },
+            **({"integrated": made} if (made := log.log.meta.get("integrated")) else {}),
+        }
+        for split, members in logs.items()
+        for log in members
+    ]
+    folder.write_json(folder.data_quality, quality)
+
+
+def fit_outcome(
+    folder: RunFolder, split: str, exports: Exports | None = None, failure: str = ""
+) -> Outcome:
+    """Return the verdict of a fit or an evaluation, and the errors of its selected model.
+
+    Args:
+        folder: where the results stand.
+        split: that is shown.
+        exports: what writes each export when the run ends; None for none.
+        failure: a line where a result fails a check.
+    """
+    files = RunFiles(folder.path)
+    row = files.row(files.lead, split, files.protocols[0])
+    figures: dict[str, MainFigure] = {}
+    if row is not None:
+        figures = {
+            "nrmse": MainFigure(row["nrmse"]["mean"]),
+            **{
+                f"rmse_{name}": MainFigure(row["rmse"][name], CHANNEL_UNITS[name])
+                for name in files.channels
+            },
+            **{
+                f"{end}_error_end": MainFigure(row[f"{end}_error_end"], END_UNITS[end])
+                for end in files.ends
+            },
+        }
+    sentences = [sentence for sentence in verdict(files) if sentence]
+    return Outcome(
+        sentences, figures, errors_table(files, split).text(), failure, exports or {}, level(files)
+    )
+
+
+def external_logs(
+    config: FitConfig, paths: Sequence[Path]
+) -> tuple[list[Path], list[Log], list[Prepared]]:
+    """Return the files of other logs, the logs, and the logs prepared as those of the fit.
+
+    They are read as the fit read its own; canonical files are recognised by their own mark.
+
+    Raises:
+        ResidnetError: where a file cannot be read.
+    """
+    data = config.data
+    own = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
+    # a folder may be one log, as a ROS 2 bag is, or hold sheets and lines of JSON
+    files = own.build().logs_among(log_files(paths))
+    readers = {path: (CanonicalConfig() if Log.recognises(path) else own).build() for path in files}
+    read = [readers[path].read(path).replace(name=name) for path, name in log_names(files).items()]
+    signals = config.signals
+    logs = [prepare(log, SPLIT, signals.columns, config.prepare, signals.live) for log in read]
+    return [part for path in files for part in readers[path].files(path)], read, logs
+
+
+def limit_of(spec: ModelSpec, config: FitConfig) -> np.ndarray:
+    """Return the |u, v, r| [3] beyond which a free run of a model has diverged."""
+    return velocity_limit(
+        np.array(spec.low), np.array(spec.high), config.evaluation.divergence, spec.signals.live
+    )
