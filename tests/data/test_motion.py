@@ -13,8 +13,9 @@ from residnet.core.layout import Live
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.align import GridConfig
-from residnet.data.motion import Antenna, MotionConfig, complete_motion, smooth_motion
+from residnet.data.motion import MotionConfig, complete_motion, smooth_motion
 from residnet.data.prepare import PrepareConfig, prepare
+from residnet.data.readers.quantities import Antenna
 
 TRUTH = wavy(seconds=120.0)
 

@@ -6,19 +6,21 @@ and how old its positions are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from residnet.core.config import Config, Metres, Seconds
+from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.log import Log
 from residnet.core.names import BOW_WIND, CHANNEL_UNITS, POSE, STATE, WIND_INPUTS
 from residnet.data.channels import noise_of, spikes, without_held
-from residnet.data.readers.base import unwrap
+from residnet.data.readers.base import turned, unwrap
+from residnet.data.readers.quantities import Antenna
 from residnet.data.readers.recording import remark
 
 _DENSE = 0.9
@@ -29,18 +31,6 @@ _LEVELS = 10.0 ** (0.5 * np.arange(-8, 5))
 """Jerk in units of the noise over the cube of the usual interval between positions."""
 _TRIED = 4000
 """Samples from which the intensity of the jerk is found."""
-
-
-class Antenna(Config):
-    """The place of the antenna whose position a log holds, from the vessel's centre.
-
-    Attributes:
-        x: forward of the centre in m.
-        y: to starboard of the centre in m.
-    """
-
-    x: Metres = 0.0
-    y: Metres = 0.0
 
 
 class MotionConfig(Config):
@@ -121,12 +111,24 @@ def _completed(log: Log, config: MotionConfig, live: Live) -> Log:
     smooth = _smoothed(told, config)
     text = f"{', '.join(names)} come from a smoother of the measured motion: "
     text += ", ".join(f"{name} {_told(told, name)}" for name in names)
-    note = remark("note", "smoothed_motion", text, channels=len(names))
-    findings = [*log.meta.get("findings", ()), note]
+    return _with(log, {name: smooth[name] for name in names}, text, smoothed=names)
+
+
+def _with(
+    log: Log,
+    made: Mapping[str, np.ndarray],
+    text: str = "",
+    code: str = "smoothed_motion",
+    **meta: Any,
+) -> Log:
+    """Return the log with channels that were made, and a note of it where there is a text."""
+    if text:
+        note = remark("note", code, text, channels=len(made))
+        meta["findings"] = [*log.meta.get("findings", ()), note]
     return log.replace(
-        channels={**log.channels, **{n: smooth[n] if n in made else log[n] for n in STATE}},
-        units={**log.units, **{name: CHANNEL_UNITS[name] for name in STATE}},
-        meta={**log.meta, "smoothed": names, "findings": findings},
+        channels={**log.channels, **made},
+        units={**log.units, **{name: CHANNEL_UNITS[name] for name in made}},
+        meta={**log.meta, **meta},
     )
 
 
@@ -153,11 +155,7 @@ def with_true_wind(log: Log) -> Log:
     else:
         speed, angle = log["wind_speed"], log["wind_angle"]
     psi = log["psi"] if turning == "psi" else _integral(log.t, log["r"])
-    told = {"wind_speed": speed, "wind_dir": unwrap(psi + angle)}
-    return log.replace(
-        channels={**log.channels, **told},
-        units={**log.units, **{name: CHANNEL_UNITS[name] for name in told}},
-    )
+    return _with(log, {"wind_speed": speed, "wind_dir": unwrap(psi + angle)})
 
 
 def as_recorded(log: Log, inputs: Sequence[str]) -> list[str]:
@@ -196,17 +194,9 @@ def _turning(log: Log) -> Log:
     known = np.isfinite(psi)
     if known.sum() < 5:
         return log
-    rate = _turned_by(log, psi, "r")[1]
-    note = remark("note", "smoothed_motion", "r comes from a smoother of the heading", channels=1)
-    return log.replace(
-        channels={
-            **log.channels,
-            "psi": psi,
-            "r": np.where(_near(log.t, log.t[known]), rate, np.nan),
-        },
-        units={**log.units, "r": CHANNEL_UNITS["r"]},
-        meta={**log.meta, "smoothed": ["r"], "findings": [*log.meta.get("findings", ()), note]},
-    )
+    rate = np.where(_near(log.t, log.t[known]), _turned_by(log, psi, "r")[1], np.nan)
+    log = log.replace(channels={**log.channels, "psi": psi})
+    return _with(log, {"r": rate}, "r comes from a smoother of the heading", smoothed=["r"])
 
 
 def _rolling(log: Log) -> Log:
@@ -223,18 +213,9 @@ def _rolling(log: Log) -> Log:
         return log
     near = _near(log.t, log.t[known])
     made = dict(zip(("phi", "p"), _turned_by(log, phi, "p"), strict=True))
-    note = remark(
-        "note",
-        "smoothed_motion",
-        f"{', '.join(lacking)} come from a smoother of the roll: "
-        + ", ".join(f"{name} {_told(log, name)}" for name in lacking),
-        channels=len(lacking),
-    )
-    return log.replace(
-        channels={**log.channels, **{n: np.where(near, made[n], np.nan) for n in lacking}},
-        units={**log.units, **{n: CHANNEL_UNITS[n] for n in lacking}},
-        meta={**log.meta, "findings": [*log.meta.get("findings", ()), note]},
-    )
+    text = f"{', '.join(lacking)} come from a smoother of the roll: "
+    text += ", ".join(f"{name} {_told(log, name)}" for name in lacking)
+    return _with(log, {n: np.where(near, made[n], np.nan) for n in lacking}, text)
 
 
 def _submerged(log: Log) -> Log:
@@ -250,14 +231,14 @@ def _submerged(log: Log) -> Log:
     rate = {name: _turned_by(log, log[name], "")[1] for name in needed}
     phi, theta = log["phi"], log["theta"]
     # of the angles of Euler, roll within pitch within heading
-    turned = np.stack((rate["theta"], rate["psi"] * np.cos(theta)))
+    pitching, yawing = rate["theta"], rate["psi"] * np.cos(theta)
     made = {
         "p": rate["phi"] - rate["psi"] * np.sin(theta),
-        "q": turned[0] * np.cos(phi) + turned[1] * np.sin(phi),
-        "r": turned[1] * np.cos(phi) - turned[0] * np.sin(phi),
+        "q": pitching * np.cos(phi) + yawing * np.sin(phi),
+        "r": yawing * np.cos(phi) - pitching * np.sin(phi),
     }
     if linear:
-        ahead, side = _turned(rate["x"], rate["y"], -log["psi"])
+        ahead, side = turned(rate["x"], rate["y"], -log["psi"])
         down = ahead * np.sin(theta) + rate["z"] * np.cos(theta)
         made["u"] = ahead * np.cos(theta) - rate["z"] * np.sin(theta)
         made["v"] = side * np.cos(phi) + down * np.sin(phi)
@@ -266,12 +247,7 @@ def _submerged(log: Log) -> Log:
         sunk = rate["z"] + log["u"] * np.sin(theta) - log["v"] * np.cos(theta) * np.sin(phi)
         made["w"] = sunk / (np.cos(theta) * np.cos(phi))
     text = f"{', '.join(lacking)} are not measured and follow from {', '.join(needed)}"
-    note = remark("note", "smoothed_motion", text, channels=len(lacking))
-    return log.replace(
-        channels={**log.channels, **{name: made[name] for name in lacking}},
-        units={**log.units, **{name: CHANNEL_UNITS[name] for name in lacking}},
-        meta={**log.meta, "findings": [*log.meta.get("findings", ()), note]},
-    )
+    return _with(log, {name: made[name] for name in lacking}, text)
 
 
 def _plunging(log: Log, live: Live) -> Log:
@@ -304,12 +280,7 @@ def _plunging(log: Log, live: Live) -> Log:
     if not made:
         return log
     text = f"{', '.join(made)} are not measured at every sample and follow from the motion"
-    note = remark("note", "smoothed_motion", text, channels=len(made))
-    return log.replace(
-        channels={**log.channels, **made},
-        units={**log.units, **{name: CHANNEL_UNITS[name] for name in made}},
-        meta={**log.meta, "findings": [*log.meta.get("findings", ()), note]},
-    )
+    return _with(log, made, text)
 
 
 def _turned_by(log: Log, angle: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -349,16 +320,7 @@ def _integrated(log: Log, missing: Sequence[str]) -> Log:
         f"{', '.join(missing)} were not measured and are integrated from the velocities: errors of"
         " position and heading are those of integrated velocities, and not of a place"
     )
-    note = remark("note", "integrated_pose", text, channels=len(missing))
-    return log.replace(
-        channels={**log.channels, **made},
-        units={**log.units, **{name: CHANNEL_UNITS[name] for name in missing}},
-        meta={
-            **log.meta,
-            "integrated": list(missing),
-            "findings": [*log.meta.get("findings", ()), note],
-        },
-    )
+    return _with(log, made, text, "integrated_pose", integrated=list(missing))
 
 
 def without_pauses(t: np.ndarray) -> np.ndarray:
@@ -417,12 +379,6 @@ def _near(t: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.asarray(inside & (right - left <= BRIDGED * usual * (1.0 + 1e-6)))
 
 
-def _turned(x: np.ndarray, y: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return vectors [T] turned by angles [T]."""
-    c, s = np.cos(angle), np.sin(angle)
-    return c * x - s * y, s * x + c * y
-
-
 def _smoothed(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
     """Return the smoothed motion by channel [T], NaN in gaps of position or heading."""
     t, psi = log.t, unwrap(log["psi"])
@@ -445,15 +401,15 @@ def _smoothed(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
     seen = np.full((clock.size, 2, 2), np.nan)
     seen[np.searchsorted(clock, seen_at), 0] = place[fixes]
     lever = config.antenna or Antenna()
-    seen[:, 0] -= np.stack(_turned(np.array(lever.x), np.array(lever.y), angle), axis=1)
+    seen[:, 0] -= np.stack(turned(lever.x, lever.y, angle), axis=1)
     ratio = 1.0
     if "u" in log.channels and "v" in log.channels:
-        seen[at, 1] = np.stack(_turned(u, v, angle[at]), axis=1)
+        seen[at, 1] = np.stack(turned(u, v, angle[at]), axis=1)
         places = seen[np.isfinite(seen[:, 0]).all(axis=1), 0]
         noise = max(noise_of(places[:, 0]), noise_of(places[:, 1]))
         ratio = max(noise_of(u), noise_of(v), 1e-6) / max(noise, 1e-6)
     track = smooth_track(clock, seen, (1.0, ratio))[at]
-    u, v = _turned(track[:, 1, 0], track[:, 1, 1], -heading)
+    u, v = turned(track[:, 1, 0], track[:, 1, 1], -heading)
     there = _near(t, seen_at) & _near(t, t[headings])
     motion = zip(STATE, (track[:, 0, 0], track[:, 0, 1], heading, u, v, rate), strict=True)
     return {name: np.where(there, values, np.nan) for name, values in motion}
@@ -484,12 +440,12 @@ def smooth_motion(seen: np.ndarray, noise: Sequence[float], dt: float) -> np.nda
     x, y, psi, u, v, r, along, across, turning = seen.T
     yaw = np.stack((psi, r, turning), axis=1)[:, :, None]
     psi, r, turning = smooth_track(t, yaw, spread[[2, 5, 8]])[:, :, 0].T
-    rates = _turned(u, v, psi), _turned(along - r * v, across + r * u, psi)
+    rates = turned(u, v, psi), turned(along - r * v, across + r * u, psi)
     earth = np.moveaxis(np.array(((x, y), *rates)), 2, 0)
     tracks = [smooth_track(t, earth[:, :, [a]], spread[[a, 3 + a, 6 + a]])[:, :, 0] for a in (0, 1)]
     (x, north, north_dot), (y, east, east_dot) = (track.T for track in tracks)
-    u, v = _turned(north, east, -psi)
-    along, across = _turned(north_dot, east_dot, -psi)
+    u, v = turned(north, east, -psi)
+    along, across = turned(north_dot, east_dot, -psi)
     return np.stack((x, y, psi, u, v, r, along + r * v, across - r * u, turning), axis=1)
 
 

@@ -229,7 +229,6 @@ class Seaway(Source):
         self.spread: Tensor
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the memory of the source inside."""
         return self.source.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -241,7 +240,6 @@ class Seaway(Source):
         return acting + (force @ self.spread).to(acting.dtype), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return the rows that the source inside stops."""
         return self.source.finished(x, k, memory)
 
 

@@ -442,15 +442,9 @@ def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
 def logs_below(folder: Path) -> list[Path]:
     """Return the recordings and files of logs in a folder, in order; a recording is one log."""
     # endings of one's own are looked into where there are no others
-    return _below(folder, _ends_as_log) or _below(folder, _holds_log)
-
-
-def _ends_as_log(path: Path) -> bool:
-    return path.suffix.lower() in LOG_ENDINGS
-
-
-def _holds_log(path: Path) -> bool:
-    return format_of(path) is not None or is_text_table(path)
+    return _below(folder, lambda path: path.suffix.lower() in LOG_ENDINGS) or _below(
+        folder, lambda path: format_of(path) is not None or is_text_table(path)
+    )
 
 
 def _below(folder: Path, is_log: Callable[[Path], bool]) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -146,7 +147,6 @@ _STATES = ("x", "y", "u", "v", "r")
 @check("between", "continued", "note")
 def continued(logs: Together, found: Check) -> Iterator[Finding]:
     """Report a log that goes on where another ended: one run, cut into files."""
-
     whole = [len(log) >= 20 and sum(n in log for n in _STATES) >= 4 for log in logs.logs]
     if sum(whole) < 2:
         return
@@ -201,32 +201,8 @@ def overlapping(logs: Together, found: Check) -> Iterator[Finding]:
             )
 
 
-def _perhaps_same(logs: Sequence[Record], names: Sequence[str]) -> Iterator[tuple[Record, Record]]:
-    """Yield the pairs of logs whose commands can be the same: their means from the start are.
-
-    Commands that rest so far tell nothing, so that means over ever longer starts are compared.
-    """
-    lengths = np.array([len(log) for log in logs])
-    starts = 50 * 4 ** np.arange(12)
-    starts = starts[starts <= lengths.max(initial=0)]
-    told = np.full((3, len(logs), len(names), starts.size), np.nan)
-    for i, log in enumerate(logs):
-        for n, name in enumerate(names):
-            for k in np.flatnonzero(starts <= len(log)):
-                part = log[name][: starts[k]]
-                part = part[np.isfinite(part)]
-                if part.size:
-                    told[:, i, n, k] = part.mean(), np.abs(part).mean(), part.std()
-    mean, size, spread = told
-    for i, log in enumerate(logs if names else ()):
-        k = np.searchsorted(starts, np.minimum(lengths[i], lengths[i + 1 :]), "right") - 1
-        beside = np.arange(i + 1, len(logs))
-        apart = np.abs(mean[i][:, k].T - mean[beside, :, k])
-        # with room for the rounding of means
-        same = apart <= 1e-8 + 1e-5 * size[beside, :, k]
-        moved = spread[i][:, k].T > 1e-8
-        for j in np.flatnonzero((same | ~moved).all(axis=1) & (k >= 0)).tolist():
-            yield log, logs[i + 1 + j]
+_LOOKED_AT = 50 * 4 ** np.arange(12) - 1
+"""Rows whose commands tell most logs apart: a manoeuvre may begin with a rest."""
 
 
 @check(
@@ -238,18 +214,22 @@ def _perhaps_same(logs: Sequence[Record], names: Sequence[str]) -> Iterator[tupl
 def same_commands(logs: Together, found: Check) -> Iterator[Finding]:
     """Report logs with the same commands."""
     names = [name for name in logs.inputs if not name.startswith(("wind", "current"))]
-    for a, b in _perhaps_same(logs.logs, names):
-        size = min(len(a), len(b))
-        moving = [name for name in names if deviation(a[name][:size]) > 1e-9]
-        if size < 50 or not moving:
-            continue
-
-        # a few samples tell most pairs apart
-        for rows in ([0, size // 3, 2 * size // 3, size - 1], slice(size)):
-            pairs = ((a[name][rows], b[name][rows]) for name in moving)
-            if not all(np.allclose(*pair, rtol=1e-6, atol=1e-9, equal_nan=True) for pair in pairs):
-                break
-        else:
+    few = np.full((len(logs.logs), len(names), _LOOKED_AT.size), np.nan)
+    for i, log in enumerate(logs.logs if names else ()):
+        at = _LOOKED_AT[len(log) > _LOOKED_AT]
+        few[i, :, : at.size] = [log[name][at] for name in names]
+    alike = functools.partial(np.isclose, rtol=1e-6, atol=1e-9)
+    for i, a in enumerate(logs.logs if names else ()):
+        rest = few[i + 1 :]
+        # what rests while both last tells nothing
+        moves = (np.abs(np.diff(few[i])) > 0.0) & np.isfinite(rest[..., 1:])
+        apart = ~alike(few[i], rest) & np.isfinite(few[i] - rest) & moves.any(-1, keepdims=True)
+        for b in itertools.compress(logs.logs[i + 1 :], ~apart.any(axis=(1, 2))):
+            size = min(len(a), len(b))
+            moving = [name for name in names if deviation(a[name][:size]) > 1e-9]
+            both = ((a[name][:size], b[name][:size]) for name in moving)
+            if size < 50 or not moving or not all(alike(*p, equal_nan=True).all() for p in both):
+                continue
             torn = logs.torn(a, b)
             text = (
                 f"{a.name} and {b.name} have the same commands ({', '.join(moving)}) over {size}"

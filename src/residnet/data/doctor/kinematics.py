@@ -38,7 +38,7 @@ _BESIDE = np.zeros(WINDOW)
 """Weights of the samples about one in the parabola that leaves it and its neighbours out."""
 _BESIDE[_APART] = np.linalg.pinv(np.vander(np.arange(-_REACH, _REACH + 1)[_APART], 3))[-1]
 _DEPENDENT = 1e-9
-"""Square of what others leave of a column of length 1, below which it is a sum of theirs."""
+"""Square of what others leave of columns of length 1, below which they are sums of theirs."""
 
 
 @dataclass(frozen=True)
@@ -239,37 +239,25 @@ def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray) -> dict[str, Cause
     def left(chosen: Iterable[str]) -> float:
         """Return the sum of squares that some causes leave."""
         part = np.concatenate([groups[name] for name in chosen])
-        values = np.linalg.lstsq(gram[part][:, part], product[part], rcond=1e-9)[0]
+        values = np.linalg.lstsq(gram[part][:, part], product[part], rcond=_DEPENDENT)[0]
         return energy - float(product[part] @ values)
 
     if not groups:
         return {}
     variance = max(left(groups) / y.size, 1e-12 * energy / y.size)
     price = {n: _WORTH * variance * (1.0 + 0.2 * part.size) for n, part in groups.items()}
-    chosen: list[str] = []
-    # what the causes chosen so far leave of columns and of what they have to explain
-    rest, unexplained = gram, product
-    first, last = np.array([part[[0, -1]] for part in groups.values()]).T
+    chosen, rest = list[str](), energy
     while len(chosen) < _MOST_CAUSES:
-        # one column of a group after the other, the second by what the first leaves of it
-        size, shared = rest[first, first], rest[first, last] * (last > first)
-        shared = np.where(size > _DEPENDENT, shared / np.maximum(size, _DEPENDENT), 0.0)
-        sizes = np.stack((size, rest[last, last] - shared * rest[first, last]))
-        told = np.stack((unexplained[first], unexplained[last] - shared * unexplained[first]))
-        gain = np.where(sizes > _DEPENDENT, told**2 / np.maximum(sizes, _DEPENDENT), 0.0)
-        gain[1] *= last > first
+        lower = {name: left([*chosen, name]) for name in groups if name not in chosen}
         # of causes that explain the same, as lags of all channels but one and of that one do, the
         # first counts
-        more = np.round((gain.sum(axis=0) - [*price.values()]) / max(energy, 1e-300), 9)
-        best = int(np.argmax(more))
-        if more[best] <= 0.0 or [*groups][best] in chosen:
+        more = {
+            n: round((rest - one - price[n]) / max(energy, 1e-300), 9) for n, one in lower.items()
+        }
+        best = max(more, key=lambda name: more[name], default="")
+        if not best or more[best] <= 0.0:
             break
-        chosen.append([*groups][best])
-        for i in groups[chosen[-1]]:
-            if rest[i, i] > _DEPENDENT:
-                share = rest[i] / rest[i, i]
-                unexplained = unexplained - share * unexplained[i]
-                rest = rest - np.outer(rest[:, i], share)
+        chosen, rest = [*chosen, best], lower[best]
     for name in list(chosen[:-1]):
         fewer = [cause for cause in chosen if cause != name]
         chosen = fewer if left(fewer) - left(chosen) < price[name] else chosen

@@ -155,6 +155,10 @@ class Rows:
         """Whether there are enough of them."""
         return len(self.y) >= _FEWEST
 
+    def some(self, rows: np.ndarray) -> Rows:
+        """Return some of them: indices, or [K] bool."""
+        return Rows(self.x[rows], self.y[rows], self.first[rows], self.size, self.noise)
+
     @cached_property
     def gram(self) -> np.ndarray:
         """x' x."""
@@ -166,7 +170,9 @@ class Rows:
         return np.asarray(self.x.T @ self.y)
 
 
-_SUMS = ("gram", "moments")
+def _totals(rows: Sequence[Rows]) -> list[np.ndarray]:
+    """Return the sums of x' x and x' y over the rows of some logs."""
+    return [np.sum([getattr(one, of) for one in rows], axis=0) for of in ("gram", "moments")]
 
 
 @dataclass(frozen=True)
@@ -198,19 +204,16 @@ class Score:
 class Model:
     """The fit to some logs: coefficients [k, n], their uncertainty, what is usually left [n]."""
 
-    def __init__(
-        self, gram: np.ndarray, moments: np.ndarray, usual: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, gram: np.ndarray, moments: np.ndarray) -> None:
         gram = gram + _RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
         self.inverse = np.linalg.inv(gram)
         self.theta = self.inverse @ moments
-        self.usual = np.ones(self.theta.shape[1]) if usual is None else usual
+        self.usual = np.ones(self.theta.shape[1])
 
     @classmethod
-    def of(cls, rows: Sequence[Rows], usual: np.ndarray | None = None) -> Model:
+    def of(cls, rows: Sequence[Rows]) -> Model:
         """Return the fit to the rows of some logs."""
-        gram, moments = (np.sum([getattr(r, of) for r in rows], axis=0) for of in _SUMS)
-        return cls(gram, moments, usual)
+        return cls(*_totals(rows))
 
     def unsure(self, rows: Rows) -> np.ndarray:
         """Return how much the coefficients' uncertainty adds to the variance [K], as a share."""
@@ -316,18 +319,17 @@ class Fleet:
         """Return the rows of a log, or of a changed one, in the scales of the fleet."""
         return self._scaled(self._rows(log))
 
+    def _without(self, i: int | None, totals: Sequence[np.ndarray], core: Sequence[int]) -> Model:
+        """Return the model of a core with such sums, one of its logs left out."""
+        gram, moments = totals
+        if i is not None and i in core:
+            gram, moments = gram - self.rows[i].gram, moments - self.rows[i].moments
+        return Model(gram, moments)
+
     def _others(self, core: Sequence[int], of: Sequence[int]) -> dict[int, Model]:
         """Return for each log the model of the others of a core."""
-        gram, moments = (np.sum([getattr(self.rows[j], s) for j in core], axis=0) for s in _SUMS)
-        out = {}
-        for i in of:
-            own = self.rows[i] if i in core else None
-            out[i] = (
-                Model(gram, moments)
-                if own is None
-                else Model(gram - own.gram, moments - own.moments)
-            )
-        return out
+        totals = _totals([self.rows[j] for j in core])
+        return {i: self._without(i, totals, core) for i in of}
 
     def _left(self, i: int, model: Model) -> np.ndarray:
         """Return the mean square [n] that a model leaves of a log."""
@@ -351,8 +353,7 @@ class Fleet:
     @staticmethod
     def _by_stretches(rows: Rows) -> np.ndarray:
         """Return the mean square [n] left of a log's quarters by models of its other quarters."""
-        parts = np.array_split(np.arange(len(rows.y)), _STRETCHES)
-        pieces = [Rows(rows.x[p], rows.y[p], rows.first[p], rows.size, rows.noise) for p in parts]
+        pieces = [rows.some(p) for p in np.array_split(np.arange(len(rows.y)), _STRETCHES)]
         out = []
         for k, piece in enumerate(pieces):
             model = Model.of([other for j, other in enumerate(pieces) if j != k])
@@ -460,8 +461,11 @@ class Fleet:
         whole = {i: self.rows[i] for i in gone}
         for i in gone:
             # a hand on the wheel for some seconds does not make it another vessel
-            kept = self._without(i, self.rests(i))
-            self.rows[i] = kept if kept.known else self.rows[i]
+            rows, clear = self.rows[i], np.ones(len(self.rows[i].first), dtype=bool)
+            for start, stop in self.rests(i):
+                clear &= (rows.first + rows.size <= start) | (rows.first >= stop)
+            kept = rows.some(clear)
+            self.rows[i] = kept if kept.known else rows
         scores = self.scores(self.core, gone) if gone else {}
         again = [i for i in gone if scores[i].size <= 1.0]
         self.apart = sorted(set(gone) - set(again), key=lambda i: -scores[i].size)
@@ -470,9 +474,9 @@ class Fleet:
 
     def _settle(self, core: list[int]) -> None:
         """Take logs for those that agree, and what is usually left of them."""
-        self.__dict__.pop("_whole", None)
         models = self._others(core, core) if len(core) > 1 else {}
         self.core, self._usually = core, self._beyond_noise(core, models)
+        self._whole = _totals([self.rows[j] for j in core])
 
     def unexplained_rests(
         self, log: Record, rows: Rows, without: int | None = None, at_zero: bool = False
@@ -512,14 +516,6 @@ class Fleet:
             self._rests[i] = self.unexplained_rests(log, rows, i, apart) if told else []
         return self._rests[i]
 
-    def _without(self, i: int, rests: Sequence[tuple[int, int]]) -> Rows:
-        """Return the rows of a log that touch none of some stretches."""
-        rows = self.rows[i]
-        clear = np.ones(len(rows.first), dtype=bool)
-        for start, stop in rests:
-            clear &= (rows.first + rows.size <= start) | (rows.first >= stop)
-        return Rows(rows.x[clear], rows.y[clear], rows.first[clear], rows.size, rows.noise)
-
     @cached_property
     def agreed(self) -> bool:
         """Whether most logs agree, so that the others can be told from them."""
@@ -527,23 +523,10 @@ class Fleet:
 
     def model(self, without: int | None = None) -> Model:
         """Return the model of the logs that agree, one of them left out."""
-        kept = [i for i in self.core if i != without]
-        if len(self.core) <= _MOST_USUAL:
-            usual = np.median([self._usually[i] for i in kept], axis=0)
-            return Model.of([self.rows[i] for i in kept], np.maximum(usual, 1e-12))
-        gram, moments, usual = self._whole
-        if without in self.core:
-            own = self.rows[without]
-            gram, moments = gram - own.gram, moments - own.moments
-        return Model(gram, moments, usual)
-
-    @cached_property
-    def _whole(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Sums over the rows of the logs that agree, and what is usually left of them [n]."""
-        sums = (np.sum([getattr(self.rows[i], of) for i in self.core], axis=0) for of in _SUMS)
-        gram, moments = sums
-        usual = np.median([*self._usually.values()], axis=0)
-        return gram, moments, np.maximum(usual, 1e-12)
+        model = self._without(without, self._whole, self.core)
+        usual = [left for i, left in self._usually.items() if i != without]
+        model.usual = np.maximum(np.median(usual, axis=0), 1e-12)
+        return model
 
     def harm(self, i: int) -> float:
         """Return by how much a log changes the predictions of a fit to all, as a share of them."""

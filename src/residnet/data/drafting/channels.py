@@ -29,7 +29,7 @@ from residnet.data.drafting.words import (
     written_unit,
 )
 from residnet.data.motion import without_pauses
-from residnet.data.readers.base import unwrap
+from residnet.data.readers.base import turned, unwrap
 from residnet.data.readers.quantities import (
     COSINE,
     QUATERNION,
@@ -153,13 +153,8 @@ def motion_of(raw: Raw, unit: str, frame: Frame) -> Motion | None:
     speed_north = rate(at, raw.columns[north][known])
     speed_east = rate(at, raw.columns[east][known])
     heading = np.interp(grid, raw.t[turns], psi[turns])
-    c, s = np.cos(heading), np.sin(heading)
-    return Motion(
-        grid,
-        c * speed_north + s * speed_east,
-        c * speed_east - s * speed_north,
-        rate(raw.t[turns], psi[turns]),
-    )
+    forward, sideways = turned(speed_north, speed_east, -heading)
+    return Motion(grid, forward, sideways, rate(raw.t[turns], psi[turns]))
 
 
 def along(motions: Sequence[Motion | None]) -> float:

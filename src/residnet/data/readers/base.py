@@ -111,6 +111,17 @@ def unwrap(angle: np.ndarray) -> np.ndarray:
     return out
 
 
+def turned(
+    x: np.ndarray | float, y: np.ndarray | float, angle: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return vectors [T] turned by angles [T]: from body axes to north and east by the heading.
+
+    Source: document 003 eq. (4); by minus the heading it is the way back.
+    """
+    c, s = np.cos(angle), np.sin(angle)
+    return c * x - s * y, s * x + c * y
+
+
 def require_samples(path: Path, t: np.ndarray) -> None:
     """Stop where a log is too short to have a time step.
 

@@ -20,10 +20,11 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, to_si
 from residnet.data.channels import without_fills
 from residnet.data.derivatives import SavitzkyGolay
-from residnet.data.readers.base import LogReader, digest, require_samples, unwrap
+from residnet.data.readers.base import LogReader, digest, require_samples, turned, unwrap
 from residnet.data.readers.messages import standard_plan
 from residnet.data.readers.quantities import (
     Angle,
+    Antenna,
     ClockConfig,
     CourseSpeed,
     Derived,
@@ -31,15 +32,12 @@ from residnet.data.readers.quantities import (
     FieldMap,
     Geodetic,
     HeadingConfig,
-    Lever,
     OfTopic,
     Plan,
     PositionConfig,
     Source,
     Uniform,
     VelocityConfig,
-    at_centre,
-    body_velocity,
     fixes_on_plane,
     given_by,
     unit_quaternion,
@@ -140,11 +138,6 @@ class RecordingReader(LogReader):
         """Return the log in `path`.
 
         See `LogReader.read`. `meta["findings"]` says what was noticed and mended on the way in.
-
-        Raises:
-            UsageError: where the file, a topic or a field is missing, or a package that the format
-                needs.
-            DataError: where the contents cannot be used.
         """
         return self.log_of(self._config.load(path, self._wanted()))
 
@@ -247,7 +240,7 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
     parts = _parts(recording, plan, longest_gap)
     times, step = _times(recording, parts, clock)
     derived = plan.velocity if isinstance(plan.velocity, Derived) else None
-    lever = Lever() if plan.position is None else plan.position.antenna
+    lever = Antenna() if plan.position is None else plan.position.antenna
     values: dict[str, np.ndarray] = {}
     units = {name: unit for part in parts for name, unit in part.log.units.items()}
     for part in parts:
@@ -382,8 +375,8 @@ def _present(recording: Recording, channels: Mapping[str, FieldMap]) -> dict[str
     return {name: entry for name, entry in channels.items() if entry.required or there(entry)}
 
 
-def _moved(lever: Lever, what: str) -> tuple[str, ...]:
-    if lever == Lever():
+def _moved(lever: Antenna, what: str) -> tuple[str, ...]:
+    if lever == Antenna():
         return ()
     return (f"{what}: moved to the vessel's centre from ({lever.x:g}, {lever.y:g}) m in body axes",)
 
@@ -518,18 +511,17 @@ def _times(
 
 
 def _move_and_turn(
-    values: dict[str, np.ndarray], velocity: VelocityConfig | None, lever: Lever
+    values: dict[str, np.ndarray], velocity: VelocityConfig | None, lever: Antenna
 ) -> None:
     """Bring position and velocity to the vessel's centre and into body axes, in place."""
-    if lever != Lever():
+    if lever != Antenna():
         if "psi" not in values:
             raise UsageError(
                 "position.antenna: needs the heading to move the position to the vessel's centre;"
                 " give `heading`"
             )
-        values["x"], values["y"] = at_centre(
-            values["x"], values["y"], values["psi"], lever.x, lever.y
-        )
+        north, east = turned(lever.x, lever.y, values["psi"])
+        values["x"], values["y"] = values["x"] - north, values["y"] - east
     if not isinstance(velocity, EarthFixed | CourseSpeed):
         return
     if "psi" not in values:
@@ -537,8 +529,8 @@ def _move_and_turn(
             "velocity: needs the heading to turn earth-fixed velocities into body axes; give"
             " `heading`"
         )
-    u, v = body_velocity(values.pop("north_rate"), values.pop("east_rate"), values["psi"])
-    if velocity.antenna != Lever():
+    u, v = turned(values.pop("north_rate"), values.pop("east_rate"), -values["psi"])
+    if velocity.antenna != Antenna():
         if "r" not in values:
             raise UsageError(
                 "velocity.antenna: needs the yaw rate to move the velocity to the vessel's centre;"
@@ -550,7 +542,7 @@ def _move_and_turn(
 
 
 def _derived_motion(
-    pose: Sequence[Part], config: Derived, lever: Lever, times: np.ndarray, step: float
+    pose: Sequence[Part], config: Derived, lever: Antenna, times: np.ndarray, step: float
 ) -> dict[str, np.ndarray]:
     """Return x, y, psi, u, v, r [T] on a uniform clock, smoothed and differentiated.
 
@@ -570,18 +562,16 @@ def _derived_motion(
     motion: dict[str, np.ndarray] = {}
     for part in pose:
         motion |= part.at(grid, fine)
-    place = at_centre(motion["x"], motion["y"], motion["psi"], lever.x, lever.y)
+    arm = np.stack(turned(lever.x, lever.y, motion["psi"]), axis=1)
+    place = np.stack((motion["x"], motion["y"]), axis=1) - arm
     whole = np.zeros(grid.size, dtype=int)
     windows = (config.window, config.yaw_window or config.window)
-    (place_fit, rate, _), (angle, turning, _) = (
+    (smooth, rate, _), (angle, turning, _) = (
         SavitzkyGolay(window=window, order=config.order).derive(values, fine, whole)
-        for window, values in zip(
-            windows, (np.stack(place, axis=1), motion["psi"][:, None]), strict=True
-        )
+        for window, values in zip(windows, (place, motion["psi"][:, None]), strict=True)
     )
     psi = angle[:, 0]
-    u, v = body_velocity(rate[:, 0], rate[:, 1], psi)
-    found = (place_fit[:, 0], place_fit[:, 1], psi, u, v, turning[:, 0])
+    found = (*smooth.T, psi, *turned(rate[:, 0], rate[:, 1], -psi), turning[:, 0])
     kept = slice(reach, grid.size - reach, share)
     return {n: values[kept] for n, values in zip(_STATE[:6], found, strict=True)}
 

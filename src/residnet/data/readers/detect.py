@@ -90,7 +90,6 @@ class AutoConfig(RecordingConfig):
     kind: Literal["auto"] = "auto"
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """Read a recording of any format that describes itself."""
         found = format_of(path)
         if found is None:
             names = ", ".join(name for config in _RECORDINGS for name in config.formats)

@@ -137,12 +137,7 @@ class JoinedReader(LogReader):
         return out
 
     def read(self, path: Path) -> Log:
-        """Return the log of one trip; see `LogReader.read`.
-
-        Raises:
-            DataError: where a file of the trip is missing or cannot be read, or their clocks have
-                nothing in common.
-        """
+        """Return the log of one trip; see `LogReader.read`."""
         files = self.parts(path)
         logs = {word: self._config.parts[word].build().read(file) for word, file in files.items()}
         first, *others = logs

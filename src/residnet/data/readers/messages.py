@@ -21,7 +21,6 @@ from residnet.data.readers.quantities import (
     EarthFixed,
     FieldMap,
     Geodetic,
-    HeadingConfig,
     Local,
     Plan,
     Quaternion,
@@ -35,9 +34,7 @@ _NAMES = "by its names, taken to be in SI, NED and body axes"
 _WORLD = ("map", "odom", "earth", "world", "enu", "ned")
 _INTEGERS = tuple(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64))
 _NUMBERS = ("Float64", "Float32", *_INTEGERS, "Float64Stamped", "Float32Stamped")
-
-
-_TILT = {"phi": "Roll", "theta": "Pitch"}
+_FIX = ("latitude", "longitude")
 
 
 @dataclass(frozen=True)
@@ -202,16 +199,6 @@ def _px4_gps(s: Series) -> Plan:
     return Plan({}, place, None, _earth_fixed(s, "vel_n_m_s", "vel_e_m_s"))
 
 
-def _over_ground(s: Series, course: str, speed: str, unit: str) -> CourseSpeed | None:
-    if not s.has(speed):
-        return None
-    return CourseSpeed(topic=s.name, course=course, speed=speed, speed_unit=unit)
-
-
-def _angle(s: Series, field: str) -> HeadingConfig:
-    return Angle(topic=s.name, field=field, unit="deg")
-
-
 def _local(north: str, east: str, down: str, v_north: str, v_east: str) -> Callable[[Series], Plan]:
     return lambda s: Plan(
         _depth(s, down),
@@ -219,6 +206,31 @@ def _local(north: str, east: str, down: str, v_north: str, v_east: str) -> Calla
         None,
         _earth_fixed(s, v_north, v_east),
     )
+
+
+def _gives(
+    fields: dict[str, str],
+    unit: str = "deg",
+    *,
+    fix: tuple[str, str] | None = None,
+    heading: str = "",
+    over_ground: tuple[str, str, str] | None = None,
+) -> Callable[[Series], Plan]:
+    """A message by its fields: channels -> fields, latitude and longitude, and a heading in deg,
+    and course in deg, speed and the unit of the speed over ground.
+    """
+
+    def plan(s: Series) -> Plan:
+        known = {name: field for name, field in fields.items() if s.has(field)}
+        place = Geodetic(topic=s.name, latitude=fix[0], longitude=fix[1]) if fix else None
+        angle = Angle(topic=s.name, field=heading, unit="deg") if heading else None
+        if over_ground is None or not s.has(over_ground[1]):
+            return Plan(_maps(s, unit, known), place, angle)
+        course, speed, per = over_ground
+        moves = CourseSpeed(topic=s.name, course=course, speed=speed, speed_unit=per)
+        return Plan(_maps(s, unit, known), place, angle, moves)
+
+    return plan
 
 
 MESSAGES = (
@@ -255,13 +267,7 @@ MESSAGES = (
         ("x", "y", "theta"),
     ),
     Message("Imu", ("Imu",), _imu, _ROS, ("angular_velocity.z", "linear_acceleration.x")),
-    Message(
-        "Fix",
-        ("NavSatFix",),
-        lambda s: Plan({}, Geodetic(topic=s.name)),
-        _ROS,
-        ("latitude", "longitude"),
-    ),
+    Message("Fix", ("NavSatFix",), _gives({}, fix=_FIX), _ROS, _FIX),
     Message(
         "Wrench", ("WrenchStamped", "Wrench"), _wrench, _ROS, ("wrench.force.x", "wrench.torque.z")
     ),
@@ -274,45 +280,28 @@ MESSAGES = (
     Message(
         "Px4AngularVelocity",
         ("vehicle_angular_velocity",),
-        lambda s: Plan(_maps(s, "rad/s", {"r": "xyz[2]", "p": "xyz[0]"})),
+        _gives({"r": "xyz[2]", "p": "xyz[0]"}, "rad/s"),
     ),
     Message("Px4Gps", ("vehicle_gps_position", "sensor_gps"), _px4_gps),
     Message("ArduPilotFilter", ("XKF1", "NKF1"), _local("PN", "PE", "PD", "VN", "VE")),
     Message(
-        "ArduPilotAttitude",
-        ("ATT",),
-        lambda s: Plan(
-            _maps(s, "deg", {n: f for n, f in _TILT.items() if s.has(f)}), None, _angle(s, "Yaw")
-        ),
+        "ArduPilotAttitude", ("ATT",), _gives({"phi": "Roll", "theta": "Pitch"}, heading="Yaw")
     ),
+    Message("ArduPilotImu", ("IMU",), _gives({"r": "GyrZ", "p": "GyrX"}, "rad/s")),
     Message(
-        "ArduPilotImu", ("IMU",), lambda s: Plan(_maps(s, "rad/s", {"r": "GyrZ", "p": "GyrX"}))
-    ),
-    Message(
-        "ArduPilotGps",
-        ("GPS",),
-        lambda s: Plan(
-            {},
-            Geodetic(topic=s.name, latitude="Lat", longitude="Lng"),
-            None,
-            _over_ground(s, "GCrs", "Spd", "m/s"),
-        ),
+        "ArduPilotGps", ("GPS",), _gives({}, fix=("Lat", "Lng"), over_ground=("GCrs", "Spd", "m/s"))
     ),
     Message(
         "NmeaFix",
         ("GGA", "GNS", "RMC", "GLL"),
-        lambda s: Plan(
-            {}, Geodetic(topic=s.name), None, _over_ground(s, "true_course", "spd_over_grnd", "kn")
-        ),
+        _gives({}, fix=_FIX, over_ground=("true_course", "spd_over_grnd", "kn")),
     ),
     Message(
-        "NmeaCourse",
-        ("VTG",),
-        lambda s: Plan({}, None, None, _over_ground(s, "true_track", "spd_over_grnd_kts", "kn")),
+        "NmeaCourse", ("VTG",), _gives({}, over_ground=("true_track", "spd_over_grnd_kts", "kn"))
     ),
     Message("MoosNavigation", ("Variables",), _moos),
-    Message("NmeaHeading", ("HDT",), lambda s: Plan({}, None, _angle(s, "heading"))),
-    Message("NmeaRateOfTurn", ("ROT",), lambda s: Plan(_maps(s, "deg/s", {"r": "rate_of_turn"}))),
+    Message("NmeaHeading", ("HDT",), _gives({}, heading="heading")),
+    Message("NmeaRateOfTurn", ("ROT",), _gives({"r": "rate_of_turn"}, "deg/s")),
     Message(
         "NmeaRudder", ("RSA",), lambda s: Plan(_maps(s, "deg", {"delta": next(iter(s.fields))}))
     ),

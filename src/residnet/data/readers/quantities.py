@@ -253,7 +253,7 @@ class FieldMap(Conversion):
     required: bool = True
 
 
-class Lever(Config):
+class Antenna(Config):
     """The place of an antenna from the vessel's centre, in body axes.
 
     Attributes:
@@ -303,7 +303,7 @@ class OfAntenna(Source):
             the centre needs the yaw rate r as a channel.
     """
 
-    antenna: Lever = Field(default_factory=Lever)
+    antenna: Antenna = Field(default_factory=Antenna)
 
 
 @final
@@ -580,25 +580,3 @@ def yaw_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray) -> np.nda
     """Return the rotation [T] about the vertical axis in rad of quaternions of length one."""
     yaw: np.ndarray = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return yaw
-
-
-def at_centre(
-    north: np.ndarray, east: np.ndarray, psi: np.ndarray, x: float, y: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the position [T] of the vessel's centre from that of an antenna at (x, y) in the body.
-
-    m and rad.
-    """
-    c, s = np.cos(psi), np.sin(psi)
-    return north - c * x + s * y, east - s * x - c * y
-
-
-def body_velocity(
-    north: np.ndarray, east: np.ndarray, psi: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the components along body x and y of an earth-fixed velocity, all [T].
-
-    Source: document 003 eq. (4), transposed.
-    """
-    c, s = np.cos(psi), np.sin(psi)
-    return c * north + s * east, c * east - s * north

@@ -205,7 +205,6 @@ class CsvConfig(TableConfig):
             ) from error
 
     def load(self, path: Path, columns: Sequence[str], advance: Advance) -> pd.DataFrame:
-        """Return the columns of a text table."""
         return read_csv(path, columns, self.delimiter, self.decimal, self.encoding, advance)
 
 
@@ -222,7 +221,6 @@ class ExcelConfig(TableConfig):
     row: ClassVar[str] = "row {1}"
 
     def load(self, path: Path, columns: Sequence[str], advance: Advance) -> pd.DataFrame:
-        """Return the columns of a sheet."""
         table = excel_sheet(path, self.sheet)
         wanted = table.iloc[:, positions(path, [str(name) for name in table.columns], columns)]
         wanted.attrs["above"] = table.attrs["above"] - 1
@@ -236,7 +234,6 @@ class ParquetConfig(TableConfig):
     kind: Literal["parquet"] = "parquet"
 
     def load(self, path: Path, columns: Sequence[str], advance: Advance) -> pd.DataFrame:
-        """Return the columns of a Parquet file."""
         import pyarrow.parquet as pq
 
         positions(path, _parquet_names(path), columns)
@@ -289,11 +286,6 @@ class TableReader(LogReader):
         See `LogReader.read`. Fill values far from all else (-999, 9.97e36) count as missing, and
         are counted. Rows without a measurement at either end, and blank rows, are dropped and
         counted; other rows keep NaN where a channel was not measured.
-
-        Raises:
-            UsageError: where the file or a column is missing.
-            DataError: where the file is empty, a cell is no finite number or none that a vessel can
-                have, a channel holds no number, or time is missing, repeats or runs backwards.
         """
         import pandas as pd
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from residnet.core.log import Log
+from residnet.data.readers.base import turned
 from residnet.data.readers.recording import Recording, Remark, Series, key_of, remark, same_topic
 from residnet.data.readers.written import as_before
 
@@ -276,9 +277,8 @@ def agreement(idle: Sequence[Series], log: Log, start: float) -> list[Remark]:
     """
     rates: dict[str, np.ndarray] = {n: log[n] for n in ("u", "v", "r") if n in log.channels}
     if {"u", "v", "psi"} <= set(log.channels):
-        c, s = np.cos(log["psi"]), np.sin(log["psi"])
-        rates["north velocity"] = c * log["u"] - s * log["v"]
-        rates["east velocity"] = s * log["u"] + c * log["v"]
+        over_ground = turned(log["u"], log["v"], log["psi"])
+        rates |= zip(("north velocity", "east velocity"), over_ground, strict=True)
     rates = {name: values for name, values in rates.items() if np.isfinite(values).sum() > _ENOUGH}
     out: list[Remark] = []
     for series in idle:

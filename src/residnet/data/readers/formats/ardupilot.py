@@ -55,11 +55,6 @@ class ArduPilotConfig(RecordingConfig):
         """Read the wanted messages of a dataflash log, on the boot clock (TimeUS).
 
         Dated by the receiver's GPS time where it logged one.
-
-        Raises:
-            UsageError: where the file is missing, nothing in it is wanted, or pymavlink is not
-                installed.
-            DataError: where it cannot be read.
         """
         require_file(path)
         with package("ardupilot", "pymavlink", "an ArduPilot log"):

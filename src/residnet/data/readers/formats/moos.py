@@ -35,12 +35,7 @@ class MoosConfig(RecordingConfig):
     }
 
     def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
-        """Read the variables that hold numbers.
-
-        Raises:
-            UsageError: where the file is missing.
-            DataError: where it holds no number.
-        """
+        """Read the variables that hold numbers."""
         require_file(path)
         times: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
         values: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))

@@ -68,10 +68,6 @@ class NmeaConfig(RecordingConfig):
         Sentences with a time of day are dated by the last RMC or ZDA; those without a time lie
         between the ones around them in the order of the lines, unless every line begins with a time
         of its own.
-
-        Raises:
-            UsageError: where the file is missing or pynmea2 is not installed.
-            DataError: where it holds no sentence, or none that tells the time.
         """
         require_file(path)
         with package("nmea", "pynmea2", "a file of NMEA 0183 sentences"):

@@ -61,10 +61,6 @@ class RosbagConfig(RecordingConfig):
         """Read the wanted topics of a bag, message by message.
 
         Memory grows with the numbers kept, not with the file.
-
-        Raises:
-            UsageError: where the bag is missing or rosbags is not installed.
-            DataError: where it cannot be read.
         """
         with package("ros", "rosbags", "a ROS bag or MCAP file"):
             from rosbags.highlevel import AnyReader

@@ -119,10 +119,6 @@ class TopicFolderConfig(RecordingConfig):
         """Read the wanted topics of a folder.
 
         Unwanted topics of a small folder are read too, so that what is wrong with them is reported.
-
-        Raises:
-            UsageError: where there is nothing at `path`.
-            DataError: where it holds no csv file, or none of them has a time.
         """
         if not path.is_dir():
             require_file(path)

@@ -108,12 +108,7 @@ class _TreeConfig(RecordingConfig):
     table: str | None = Field(default=None, min_length=1)
 
     def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
-        """Read the wanted groups of a file.
-
-        Raises:
-            UsageError: where the file is missing, has no time, or h5py is not installed.
-            DataError: where it cannot be read.
-        """
+        """Read the wanted groups of a file."""
         require_file(path)
         wanted = wanted if self.table is None else Wanted([(self.table, "")])
         if not is_hdf5(path) and isinstance(self, MatConfig):

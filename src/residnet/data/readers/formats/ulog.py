@@ -43,11 +43,6 @@ class UlogConfig(RecordingConfig):
         """Read the wanted messages of a ULog, on the boot clock.
 
         Dated by the receiver's UTC where it logged one.
-
-        Raises:
-            UsageError: where the file is missing, nothing in it is wanted, or pyulog is not
-                installed.
-            DataError: where it cannot be read.
         """
         require_file(path)
         with package("px4", "pyulog", "a PX4 flight log"):
