@@ -1,21 +1,31 @@
-"""Channel maps from tables that nobody described: names, units, signs and axes are found again."""
+"""Channel maps from tables that nobody described: names, units, signs and axes are found again,
+and are the same through every door of residnet.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import foreign_tables
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
+from drafted_logs import assert_read
 from foreign_tables import CHANNELS, NAMES, Style
 
+import residnet
 from residnet.core.config import validate
+from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks, Question
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.drafting.words import input_channel, state_channel, words_of, written_unit
 from residnet.data.readers import ReaderConfig
+from residnet.tasks.inspection import inspect_logs
 
 GERMAN = Style(
     language="German",
@@ -55,14 +65,10 @@ def test_a_table_is_read_as_it_was(style: Style, logs: list[Log], tmp_path: Path
     files, marks = foreign_tables.write(logs, tmp_path, style), Marks()
     content, _ = draft_tables(files, marks)
     reader = validate(content, ReaderConfig, "here").build()
-    for file, truth in zip(files, logs, strict=True):
-        read = reader.read(file)
-        for name in set(CHANNELS) & set(truth.channels):
-            there, was = read[name], truth[name]
-            if name == "psi":
-                there = there - 2 * np.pi * np.rint((there[0] - was[0]) / (2 * np.pi))
-            size = float(np.abs(was).max()) + 1e-3
-            np.testing.assert_allclose(there, was, atol=1e-6 * size, err_msg=name)
+    for file, log in zip(files, logs, strict=True):
+        for name in set(CHANNELS) & set(log.channels):
+            size = float(np.abs(log[name]).max()) + 1e-3
+            assert_read(reader.read(file), {name: log[name]}, 1e-6 * size)
     told = {".".join(key) for key, _ in marks.guesses}
     if not style.told:
         assert {f"data.reader.channels.{name}" for name in ("psi", "u", "r", "delta")} <= told
@@ -78,17 +84,6 @@ def test_a_heading_that_is_not_wrapped_may_be_large_in_radians(
     pd.DataFrame(columns).to_csv(tmp_path / "turn.csv", index=False)
     channels = draft_tables([tmp_path / "turn.csv"], Marks())[0]["channels"]
     assert (channels["psi"]["unit"], channels["r"]["unit"]) == ("rad", "rad/s")
-
-
-def test_letters_of_axes_are_told_by_their_units(logs: list[Log], tmp_path: Path) -> None:
-    """`N [m]` is no propeller, and `X [kN]` no place."""
-    log = logs[0]
-    columns = {"t [s]": log.t, "N [m]": log["x"], "E [m]": log["y"], "X [kN]": log["n"]}
-    columns |= {"HDG [deg]": np.degrees(log["psi"]) % 360.0, "left rpm": 60.0 * log["n"]}
-    pd.DataFrame(columns).to_csv(tmp_path / "turn.csv", index=False)
-    channels = draft_tables([tmp_path / "turn.csv"], Marks())[0]["channels"]
-    found = {name: entry["column"] for name, entry in channels.items()}
-    assert found == {"x": "N [m]", "y": "E [m]", "psi": "HDG [deg]", "n_port": "left rpm"}
 
 
 @pytest.mark.parametrize("language", NAMES)
@@ -158,17 +153,10 @@ def test_the_unit_in_a_header(column: str, expected: str, unit: str | None) -> N
 
 def test_axes_that_are_called_by_letters(logs: list[Log], tmp_path: Path) -> None:
     # x east, y north, heading counter-clockwise from east, velocities forward and to port
-    turned = []
-    for log in logs:
-        new = {
-            **log.channels,
-            "x": log["y"],
-            "y": log["x"],
-            "psi": np.pi / 2 - log["psi"],
-            "v": -log["v"],
-            "r": -log["r"],
-        }
-        turned.append(log.replace(channels=new))
+    log = logs[0]
+    new = {"x": log["y"], "y": log["x"], "psi": np.pi / 2 - log["psi"]}
+    new |= {name: -log[name] for name in ("v", "r")}
+    turned = [log.replace(channels={**log.channels, **new})]
     names = dict(zip(NAMES["English"][1:3], ("x", "y"), strict=True))
     files = foreign_tables.write(turned, tmp_path, Style())
     for file in files:
@@ -199,3 +187,52 @@ def test_a_header_that_is_wrong_is_asked_about(logs: list[Log], tmp_path: Path) 
     marks = Marks()
     draft_tables(files, marks)
     assert any("the header says deg/s" in text for _, text in marks.guesses)
+
+
+def _told(work: Callable[..., object], files: Sequence[Path]) -> dict[str, Any]:
+    """The map that a function of Python reports to whoever listens."""
+    lines: list[str] = []
+    work(files, lambda told: lines.append(told.message))
+    begun = next(i for i, line in enumerate(lines) if "channel map as guessed" in line)
+    drafted = takewhile(lambda line: line.startswith("  "), lines[begun + 1 :])
+    text = "\n".join(line.removeprefix("  ") for line in drafted)
+    return dict(yaml.safe_load(text)["data"]["reader"])
+
+
+def _doors(files: Sequence[Path]) -> dict[str, dict[str, Any]]:
+    shown = inspect_logs(files, None).text.partition("paste into a config:\n")[2]
+    return {
+        "new": residnet.draft(files).config["data"]["reader"],
+        "inspect": yaml.safe_load(shown)["data"]["reader"],
+        "read_logs": _told(lambda f, hear: residnet.read_logs(f, progress=hear), files),
+        "fit": _told(lambda f, hear: residnet.prepare(f, ["delta", "n"], progress=hear), files),
+    }
+
+
+@pytest.mark.parametrize("dated", [True, False])
+def test_one_map_from_every_door(dated: bool, logs: list[Log], tmp_path: Path) -> None:
+    degrees = {"psi": "deg", "r": "deg/s", "delta": "deg", "n": "rpm"}
+    style = GERMAN if dated else Style(units=degrees, signs=("delta",))
+    files = foreign_tables.write(logs, tmp_path, style)
+    for file in files[: 0 if dated else None]:
+        table = pd.read_csv(file)
+        table["time"] = 1_717_000_000_000 + np.rint(1e3 * table["time"]).astype(int)
+        table.to_csv(file, index=False)
+    found = _doors(files)
+    for door, reader in found.items():
+        assert reader == found["new"], door
+    for log, truth in zip(residnet.read_logs(files), logs, strict=True):
+        np.testing.assert_allclose(log.t - log.t[0], truth.t - truth.t[0], atol=1e-3)
+
+
+def test_no_log_is_lost_for_a_roll_that_not_all_of_them_hold(tmp_path: Path) -> None:
+    t = np.arange(0.0, 20.0, 0.1)
+    for number in range(3):
+        table = pd.DataFrame({"t": t, "surge [m/s]": 1.0 + 0.1 * np.sin(t), "rudder [deg]": t % 7})
+        table["roll [deg]"] = np.nan if number == 1 else 3.0 * np.sin(t)
+        table.to_csv(tmp_path / f"run_{number}.csv", index=False)
+    logs = residnet.read_logs(tmp_path)
+    assert [sorted(log.channels) for log in logs] == [["delta", "u"]] * 3
+    (tmp_path / "stopped.csv").write_text("t,surge [m/s],rudder [deg]\n")
+    with pytest.raises(DataError, match="no row of numbers below it"):
+        residnet.read_logs(tmp_path / "stopped.csv")
