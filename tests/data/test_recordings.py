@@ -27,11 +27,8 @@ def folder(tmp_path: Path, **topics: dict[str, Any]) -> Path:
 
 
 def read(path: Path, **config: Any) -> Log:
-    return (
-        validate({"kind": "csv_topics", "standard_messages": False, **config}, ReaderConfig, "test")
-        .build()
-        .read(path)
-    )
+    settings = {"kind": "csv_topics", "standard_messages": False, **config}
+    return validate(settings, ReaderConfig, "test").build().read(path)
 
 
 def field(name: str, unit: str = "-", **more: Any) -> dict[str, Any]:
@@ -56,103 +53,72 @@ def test_commands_hold_measurements_are_interpolated_gaps_stay_gaps(tmp_path: Pa
     np.testing.assert_allclose(np.degrees(log["r"][~gap]), 2.0 * log.t[~gap], atol=1e-9)
     expected = np.where(log.t < 1.05 - 1e-9, 1.0, np.where(log.t < 11.02 - 1e-9, 2.0, 3.0))
     before_the_last = log.t <= 11.02
-    np.testing.assert_allclose(
-        np.degrees(log["cmd_delta"][before_the_last]), expected[before_the_last]
-    )
+    held = np.degrees(log["cmd_delta"][before_the_last])
+    np.testing.assert_allclose(held, expected[before_the_last])
 
 
-def circle(t: np.ndarray) -> dict[str, np.ndarray]:
-    """A vessel on a circle of 20 m, bow along the track: u = 2 m/s, v = 0, r = 0.1 rad/s; x, y of
-    its centre.
-    """
-    psi = 0.1 * t
-    return {"psi": psi, "x": 20.0 * np.sin(psi), "y": -20.0 * np.cos(psi)}
+T = 0.05 * np.arange(2400)
+PSI = 0.1 * T
+# a vessel on a circle of 20 m, bow along the track: u = 2 m/s, v = 0, r = 0.1 rad/s
+NORTH, EAST = 20.0 * np.sin(PSI), -20.0 * np.cos(PSI)
+# an antenna 3 m ahead and 1 m to port
+ANTENNA = {"x": "3 m", "y": "-1 m"}
 
 
 def test_lever_and_derived_velocities(tmp_path: Path) -> None:
-    t = 0.05 * np.arange(2400)
-    truth = circle(t)
-    c, s = np.cos(truth["psi"]), np.sin(truth["psi"])
-    # an antenna 3 m ahead and 1 m to port
-    north, east = truth["x"] + 3.0 * c + 1.0 * s, truth["y"] + 3.0 * s - 1.0 * c
-    sign = np.where(np.arange(t.size) % 3, 1.0, -1.0)
-    quaternion = {
-        "q_x": 0 * t,
-        "q_y": 0 * t,
-        "q_z": sign * np.sin(truth["psi"] / 2),
-        "q_w": sign * np.cos(truth["psi"] / 2),
+    c, s = np.cos(PSI), np.sin(PSI)
+    sign = np.where(np.arange(T.size) % 3, 1.0, -1.0)
+    turned = {
+        "q_x": 0 * T,
+        "q_y": 0 * T,
+        "q_z": sign * np.sin(PSI / 2),
+        "q_w": sign * np.cos(PSI / 2),
     }
     place = folder(
         tmp_path,
-        fix={"time": t, "n": north, "e": east},
-        heading={"time": t, **quaternion},
+        fix={"time": T, "n": NORTH + 3.0 * c + 1.0 * s, "e": EAST + 3.0 * s - 1.0 * c},
+        heading={"time": T, **turned},
     )
-    config: dict[str, Any] = {
-        "position": {
-            "kind": "local",
-            "topic": "fix",
-            "north": "n",
-            "east": "e",
-            "antenna": {"x": "3 m", "y": "-1 m"},
-        },
-        "heading": {"kind": "quaternion", "topic": "heading", "field": "q", "frame": "ned"},
-    }
-    derived = read(
-        place,
-        **config,
-        velocity={"kind": "derived", "window": "1 s"},
-        clock={"kind": "uniform", "step": "0.1 s"},
-    )
+    local = {"kind": "local", "topic": "fix", "north": "n", "east": "e", "antenna": ANTENNA}
+    heading = {"kind": "quaternion", "topic": "heading", "field": "q", "frame": "ned"}
+    config: dict[str, Any] = {"position": local, "heading": heading}
+    clock, window = {"kind": "uniform", "step": "0.1 s"}, {"kind": "derived", "window": "1 s"}
+    derived = read(place, **config, velocity=window, clock=clock)
     assert len(derived) == 1200
-    for name, value in (("u", 2.0), ("v", 0.0), ("r", 0.1)):
+    truth = {"u": 2.0, "v": 0.0, "r": 0.1, "x": NORTH[::2], "y": EAST[::2], "psi": PSI[::2]}
+    for name, value in truth.items():
         np.testing.assert_allclose(derived[name], value, atol=5e-5, err_msg=name)
-    for name in ("x", "y", "psi"):
-        np.testing.assert_allclose(derived[name], truth[name][::2], atol=5e-5, err_msg=name)
     plain = read(place, **config)
-    np.testing.assert_allclose(plain["x"], truth["x"], atol=1e-9)
+    np.testing.assert_allclose(plain["x"], NORTH, atol=1e-9)
     with pytest.raises(ConfigError, match="uniform clock"):
         read(place, **config, velocity={"kind": "derived"})
 
 
 @pytest.mark.parametrize("kind", ["earth_fixed", "course_speed"])
 def test_velocity_of_an_antenna_in_earth_axes(kind: str, tmp_path: Path) -> None:
-    t = 0.1 * np.arange(600)
-    psi, r = 0.1 * t, np.full(t.size, 0.1)
-    # u = 2, v = 0.3 at the centre, an antenna at (3, -1) m
+    # u = 2, v = 0.3 at the centre
     u, v = 2.0 - 0.1 * -1.0, 0.3 + 0.1 * 3.0
-    north, east = u * np.cos(psi) - v * np.sin(psi), u * np.sin(psi) + v * np.cos(psi)
-    columns = {
-        "n": north,
-        "e": east,
-        "speed": np.hypot(north, east) * 3600 / 1852,
-        "course": np.degrees(np.arctan2(east, north)) % 360,
-    }
+    ground = (u + 1j * v) * np.exp(1j * PSI)
+    knots, course = np.abs(ground) * 3600 / 1852, np.degrees(np.angle(ground)) % 360
+    fixes = {"n": ground.real, "e": ground.imag, "speed": knots, "course": course}
     place = folder(
         tmp_path,
-        gps={"time": t, **columns},
-        compass={"time": t, "data": np.degrees(np.pi / 2 - psi) % 360},
-        gyro={"time": t, "data": -r},
+        gps={"time": T, **fixes},
+        compass={"time": T, "data": np.degrees(np.pi / 2 - PSI) % 360},
+        gyro={"time": T, "data": np.full(T.size, -0.1)},
     )
-    source = (
-        {"north": "n", "east": "e"}
-        if kind == "earth_fixed"
-        else {"course": "course", "speed": "speed", "speed_unit": "kn"}
-    )
+    source = {
+        "earth_fixed": {"north": "n", "east": "e"},
+        "course_speed": {"course": "course", "speed": "speed", "speed_unit": "kn"},
+    }[kind]
     log = read(
         place,
-        heading={
-            "kind": "angle",
-            "topic": "compass",
-            "field": "data",
-            "unit": "deg",
-            "frame": "enu",
-        },
-        velocity={"kind": kind, "topic": "gps", "antenna": {"x": "3 m", "y": "-1 m"}, **source},
+        heading={"kind": "angle", **field("compass", "deg"), "frame": "enu"},
+        velocity={"kind": kind, "topic": "gps", "antenna": ANTENNA, **source},
         channels={"r": field("gyro", "rad/s", frame="body_fpu")},
     )
-    np.testing.assert_allclose(log["u"], 2.0, atol=1e-9)
-    np.testing.assert_allclose(log["v"], 0.3, atol=1e-9)
-    np.testing.assert_allclose(log["psi"], psi, atol=1e-9)
+    for name, value in (("u", 2.0), ("v", 0.3), ("psi", PSI)):
+        np.testing.assert_allclose(log[name], value, atol=1e-9)
 
 
 def test_tangent_plane_against_the_ellipsoid() -> None:
@@ -196,59 +162,54 @@ def test_a_topic_that_lags_and_one_that_speaks_of_another_point(tmp_path: Path) 
 
 
 def test_topics_of_different_length_share_the_stretch_that_all_cover(tmp_path: Path) -> None:
-    place = folder(
-        tmp_path,
-        a={"time": 0.1 * np.arange(200), "data": np.ones(200)},
-        b={"time": 5.0 + 0.2 * np.arange(50), "data": np.ones(50)},
-    )
-    log = read(
-        place,
-        channels={"u": field("a", "m/s"), "v": field("b", "m/s")},
-        clock={"kind": "uniform", "step": "0.1 s"},
-    )
+    settings = {
+        "channels": {"u": field("a", "m/s"), "v": field("b", "m/s")},
+        "clock": {"kind": "uniform", "step": "0.1 s"},
+    }
+    a = {"time": 0.1 * np.arange(200), "data": 1}
+    place = folder(tmp_path, a=a, b={"time": 5.0 + 0.2 * np.arange(50), "data": 1})
+    log = read(place, **settings)
     assert (log.t[0], log.t[-1]) == pytest.approx((5.0, 14.8))
     assert not log.masks
-    (tmp_path / "far").mkdir()
-    far = folder(
-        tmp_path / "far",
-        a={"time": [0.0, 1.0], "data": [1, 1]},
-        b={"time": [5.0, 6.0], "data": [1, 1]},
-    )
+    pd.DataFrame({"time": [35.0, 36.0], "data": 1}).to_csv(place / "b.csv", index=False)
     with pytest.raises(DataError, match="share no stretch of time"):
-        read(
-            far,
-            channels={"u": field("a", "m/s"), "v": field("b", "m/s")},
-            clock={"kind": "uniform", "step": "0.1 s"},
-        )
+        read(place, **settings)
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("channels", "error", "words"),
+    [
+        ({"r": field("gyr", "rad/s")}, UsageError, "no topic 'gyr'; did you mean 'gyro'"),
+        (
+            {"r": field("gyro", "rad/s") | {"field": "date"}},
+            UsageError,
+            "no field 'date'; did you mean",
+        ),
+        (
+            {"r": field("gyro", "rad/s") | {"field": "none"}},
+            DataError,
+            "field 'none' holds no number",
+        ),
+        ({}, UsageError, "no channel to read"),
+        ({"r": field("gyro", "rad/s"), "delta": field("rudder", "rad", required=False)}, None, ""),
+    ],
+)
+def test_what_is_missing_is_named(
+    channels: dict[str, Any], error: type[Exception] | None, words: str, tmp_path: Path
+) -> None:
     t = 0.1 * np.arange(50)
-    place = folder(
-        tmp_path, gyro={"time": t, "data": t, "none": np.full(50, np.nan), "words": ["a"] * 50}
-    )
+    place = folder(tmp_path, gyro={"time": t, "data": t, "none": np.nan, "words": ["a"] * 50})
     (place / "silent.csv").write_text("")
-    with pytest.raises(UsageError, match="no topic 'gyr'; did you mean 'gyro'"):
-        read(place, channels={"r": field("gyr", "rad/s")})
-    with pytest.raises(UsageError, match="no field 'date'; did you mean 'data'"):
-        read(place, channels={"r": {"topic": "gyro", "field": "date", "unit": "rad/s"}})
-    with pytest.raises(DataError, match="field 'none' holds no number"):
-        read(place, channels={"r": {"topic": "gyro", "field": "none", "unit": "rad/s"}})
-    with pytest.raises(UsageError, match="no channel to read"):
-        read(place)
-    log = read(
-        place,
-        channels={"r": field("gyro", "rad/s"), "delta": field("rudder", "rad", required=False)},
-    )
+    if error is not None:
+        with pytest.raises(error, match=words):
+            read(place, channels=channels)
+        return
+    log = read(place, channels=channels)
     assert list(log.channels) == ["r"]
-    assert {entry["code"] for entry in log.meta["findings"]} >= {
-        "missing_channels",
-        "empty_topic",
-        "empty_columns",
-        "not_numbers",
-    }
+    found = {entry["code"] for entry in log.meta["findings"]}
+    assert found >= {"missing_channels", "empty_topic", "empty_columns", "not_numbers"}
     with pytest.raises(UsageError, match="no such file"):
-        read(tmp_path / "ran", channels={"r": field("gyro", "rad/s")})
+        read(tmp_path / "ran", channels=channels)
 
 
 def test_a_topic_cut_short_in_the_middle_of_a_row(tmp_path: Path) -> None:
@@ -284,26 +245,21 @@ def test_chunks_of_a_topic_give_the_whole(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_one_table_with_dates_latitudes_and_a_compass(tmp_path: Path) -> None:
-    t = 0.2 * np.arange(400)
-    truth = circle(t)
     # of curvature of WGS 84 at the origin
     radii = 6_386_688.0, 6_395_290.0 * np.cos(np.radians(63.4411))
+    times = [f"{pd.Timestamp(EPOCH + s, unit='s'):%Y-%m-%dT%H:%M:%S.%f}+01:00" for s in T[::4]]
     table = {
-        "time": [f"{pd.Timestamp(EPOCH + s, unit='s'):%Y-%m-%dT%H:%M:%S.%f}+01:00" for s in t],
-        "lat": 63.4411 + np.degrees(truth["x"] / radii[0]),
-        "lon": 10.4198 + np.degrees(truth["y"] / radii[1]),
-        "compass": np.degrees(truth["psi"]) % 360,
+        "time": times,
+        "lat": 63.4411 + np.degrees(NORTH[::4] / radii[0]),
+        "lon": 10.4198 + np.degrees(EAST[::4] / radii[1]),
+        "compass": np.degrees(PSI[::4]) % 360,
     }
-    path = tmp_path / "run.csv"
-    pd.DataFrame(table).to_csv(path, index=False)
+    pd.DataFrame(table)[:400].to_csv(path := tmp_path / "run.csv", index=False)
+    origin = {"latitude": "63.4411 deg", "longitude": "10.4198 deg"}
+    fixes = {"kind": "geodetic", "latitude": "lat", "longitude": "lon", "origin": origin}
     log = read(
         path,
-        position={
-            "kind": "geodetic",
-            "latitude": "lat",
-            "longitude": "lon",
-            "origin": {"latitude": "63.4411 deg", "longitude": "10.4198 deg"},
-        },
+        position=fixes,
         heading={"kind": "angle", "field": "compass", "unit": "deg"},
         velocity={"kind": "derived"},
         clock={"kind": "uniform", "step": "0.2 s"},

@@ -31,7 +31,7 @@ EXACT, WINDOW = 1e-9, 8
 # a failing case is one of few, and small already
 GENERATED = (Phase.explicit, Phase.generate)
 drawn = settings(max_examples=6, deadline=None, derandomize=True, phases=GENERATED)
-vessels = st.tuples(st.sampled_from(KINDS), st.integers(0, 2))
+vessels = st.tuples(st.sampled_from(KINDS), st.integers(0, 1))
 
 
 @cache
@@ -66,22 +66,15 @@ def changed(log: Log, **channels: np.ndarray) -> Log:
 
 
 def turned(log: Log, angle: float) -> Log:
-    c, s = np.cos(angle), np.sin(angle)
-    x, y = c * log["x"] - s * log["y"], s * log["x"] + c * log["y"]
-    return changed(log, x=x, y=y, psi=log["psi"] + angle)
+    place = (log["x"] + 1j * log["y"]) * np.exp(1j * angle)
+    return changed(log, x=place.real, y=place.imag, psi=log["psi"] + angle)
 
 
-def moved(log: Log, by: float) -> Log:
-    return changed(log, x=log["x"] + 100.0 * by, y=log["y"] - 70.0 * by)
-
-
-def later(log: Log, by: float) -> Log:
-    return log.replace(t=log.t + 64.0 * np.round(8.0 * by))
-
-
-def in_another_order(log: Log, by: float) -> Log:
-    names = [*log.channels][::-1]
-    return log.replace(channels={name: log[name] for name in names})
+def mirrored(log: Log) -> Log:
+    turning = [name for name in ("y", "psi", "v", "r", "delta") if name in log.channels]
+    sides = {"n_port": "n_stbd", "n_stbd": "n_port"} if "n_port" in log.channels else {}
+    swapped = {name: log[other] for name, other in sides.items()}
+    return changed(log, **{name: -log[name] for name in turning}, **swapped)
 
 
 def with_more(log: Log, by: float) -> Log:
@@ -89,54 +82,46 @@ def with_more(log: Log, by: float) -> Log:
     return log.replace(channels={**log.channels, "tank": idle}, units={**log.units, "tank": "-"})
 
 
-SAME: list[Callable[[Log, float], Log]] = [turned, moved, later, in_another_order, with_more]
+def ordered(log: Log) -> Log:
+    return log.replace(channels={name: log[name] for name in reversed(log.channels)})
 
 
-@pytest.mark.parametrize("change", SAME)
+Logs = Sequence[Log]
+RELATIONS: dict[str, Callable[[Logs, float], Logs]] = {
+    "turned": lambda logs, by: [turned(log, by) for log in logs],
+    "moved": lambda logs, by: [
+        changed(log, x=log["x"] + 100.0 * by, y=log["y"] - 70.0 * by) for log in logs
+    ],
+    "later": lambda logs, by: [log.replace(t=log.t + 64.0 * np.round(8.0 * by)) for log in logs],
+    "columns in another order": lambda logs, by: [ordered(log) for log in logs],
+    "a channel more": lambda logs, by: [with_more(log, by) for log in logs],
+    "mirrored": lambda logs, by: [mirrored(log) for log in logs],
+    "twice": lambda logs, by: [*logs, *logs],
+    "in another order": lambda logs, by: logs[::-1],
+}
+
+
+@pytest.mark.parametrize("name", RELATIONS)
 @given(vessel=vessels, by=st.floats(-3.0, 3.0))
 @drawn
-def test_what_changes_nothing_of_the_vessel(
-    change: Callable[[Log, float], Log], vessel: tuple[str, int], by: float
-) -> None:
+def test_what_changes_nothing_of_the_vessel(name: str, vessel: tuple[str, int], by: float) -> None:
     logs = logs_of(vessel)
     inputs = inputs_of(logs[0])
-    one, other = (prepared(each, inputs) for each in (logs, [change(log, by) for log in logs]))
-    np.testing.assert_allclose(other.z, one.z, rtol=EXACT, atol=EXACT)
-    np.testing.assert_allclose(other.target, one.target, rtol=EXACT, atol=EXACT)
-    np.testing.assert_allclose(fitted(other), fitted(one), rtol=EXACT, atol=EXACT)
-
-
-@given(vessel=vessels)
-@drawn
-def test_a_mirrored_vessel_turns_to_the_other_side(vessel: tuple[str, int]) -> None:
-    logs = logs_of(vessel)
-    inputs = inputs_of(logs[0])
-    turning = [name for name in ("y", "psi", "v", "r", "delta") if name in logs[0].channels]
-    mirrored = []
-    for log in logs:
-        other: dict[str, np.ndarray] = {name: -log[name] for name in turning}
-        if "n_port" in log.channels:
-            other |= {"n_port": log["n_stbd"], "n_stbd": log["n_port"]}
-        mirrored.append(changed(log, **other))
-    one, two = prepared(logs, inputs), prepared(mirrored, inputs)
-    side = np.array([1.0, -1.0, -1.0])
-    np.testing.assert_allclose(
-        two.z[:, :3].numpy(), one.z[:, :3].numpy() * side, rtol=EXACT, atol=EXACT
-    )
-    np.testing.assert_allclose(
-        two.target.numpy(), one.target.numpy() * side, rtol=EXACT, atol=EXACT
-    )
-    np.testing.assert_allclose(fitted(two), fitted(one) * side, rtol=EXACT, atol=EXACT)
-
-
-@given(vessel=vessels)
-@drawn
-def test_the_same_logs_twice_say_the_same(vessel: tuple[str, int]) -> None:
-    logs = logs_of(vessel)
-    inputs = inputs_of(logs[0])
-    one, two = prepared(logs, inputs), prepared([*logs, *logs], inputs)
-    np.testing.assert_array_equal(two.z[: len(one.z)], one.z)
-    np.testing.assert_allclose(fitted(two)[: len(one.z)], fitted(one), rtol=EXACT, atol=EXACT)
+    one, other = (prepared(each, inputs) for each in (logs, RELATIONS[name](logs, by)))
+    side = np.array([1.0, -1.0, -1.0]) if name == "mirrored" else 1.0
+    ends = np.cumsum([len(log) for log in logs[::-1]])[:-1]
+    # inputs stand behind the velocities; those of a mirrored vessel are others
+    columns = slice(3) if name == "mirrored" else slice(None)
+    for first, second in (
+        (one.z[:, columns], other.z[:, columns]),
+        (one.target, other.target),
+        (fitted(one), fitted(other)),
+    ):
+        again = np.asarray(second)
+        if name == "in another order":
+            again = np.concatenate(np.split(again, ends)[::-1])
+        now = np.asarray(first) * side
+        np.testing.assert_allclose(again[: len(now)], now, rtol=EXACT, atol=EXACT)
 
 
 @given(vessel=vessels, share=st.floats(0.3, 0.7))
@@ -179,18 +164,6 @@ def test_columns_in_any_unit_and_order(vessel: tuple[str, int], data: st.DataObj
         assert np.abs(apart).max() <= EXACT * size, name
 
 
-@given(vessel=vessels)
-@drawn
-def test_the_order_of_logs_says_nothing(vessel: tuple[str, int]) -> None:
-    logs = logs_of(vessel)
-    inputs = inputs_of(logs[0])
-    one, two = prepared(logs, inputs), prepared(logs[::-1], inputs)
-    ends = np.cumsum([len(log) for log in logs[::-1]])[:-1]
-    for first, other in ((one.z, two.z), (one.target, two.target), (fitted(one), fitted(two))):
-        again = np.concatenate(np.split(np.asarray(other), ends)[::-1])
-        np.testing.assert_allclose(again, np.asarray(first), rtol=EXACT, atol=EXACT)
-
-
 def sailed(rows: int, helm: float) -> Log:
     """A boat that weaves at 10 Hz, its rate late by .6 s, with a jump and spikes in it; with a mean
     rudder angle `helm` in rad it turns round many times.
@@ -213,7 +186,7 @@ def sailed(rows: int, helm: float) -> Log:
     return Log("long", t, {**channels, "delta": delta})
 
 
-@pytest.mark.parametrize(("helm", "gap"), [(0.0, 0), (0.03, 0), (0.0, 900)])
+@pytest.mark.parametrize(("helm", "gap"), [(0.03, 0), (0.0, 900)])
 def test_a_long_log_tells_by_stretches_what_it_tells_whole(
     monkeypatch: pytest.MonkeyPatch, helm: float, gap: int
 ) -> None:
