@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from residnet.core.layout import SIX
 from residnet.core.log import Log
 from residnet.core.stretches import stretches
 from residnet.data.readers.base import unwrap
@@ -32,7 +33,6 @@ CACHED = 8_192
 _FEW, _SPREAD = 40_000, 40
 """Samples of a long channel that tell how far samples usually lie from their neighbours, and in how
 many stretches these lie."""
-_MOVED = ("x", "y", "psi", "phi", "u", "v", "r", "p", "w", "q", "z", "theta")
 
 
 def noise_of(values: np.ndarray) -> float:
@@ -201,7 +201,7 @@ def spike_cells(log: Log) -> dict[str, np.ndarray]:
     out = {}
     for name, values in log.channels.items():
         turns = log.units[name] == "rad"
-        cells = _spikes(unwrap(values) if turns else values, name in _MOVED)
+        cells = _spikes(unwrap(values) if turns else values, name in SIX.names)
         if cells.any():
             out[name] = cells
     return out
@@ -225,7 +225,7 @@ def without_spikes(log: Log, needed: Collection[str] | None = None) -> Log:
         good = np.flatnonzero(~bad & np.isfinite(log[name]))
         at = np.flatnonzero(bad)
         values = log[name].copy()
-        if name in _MOVED:
+        if name in SIX.names:
             values[at] = np.interp(log.t[at], log.t[good], values[good])
         else:
             values[at] = values[good[np.maximum(np.searchsorted(good, at) - 1, 0)]]

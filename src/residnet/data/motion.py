@@ -426,9 +426,6 @@ def smooth_motion(seen: np.ndarray, noise: Sequence[float], dt: float) -> np.nda
             noise.
         noise: standard deviations of the nine.
         dt: sampling interval in s.
-
-    Raises:
-        DataError: where a value is not finite.
     """
     if not np.isfinite(seen).all():
         row, column = (int(part[0]) for part in np.nonzero(~np.isfinite(seen)))

@@ -225,9 +225,6 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
     """Return the samples of identification from prepared logs, float64.
 
     They hold smoothed channels and measured accelerations.
-
-    Raises:
-        DataError: where no log has a sample to learn from.
     """
     if not any(p.good.any() for p in logs):
         raise DataError(

@@ -148,11 +148,7 @@ class Disturbance(Config):
         return needs
 
     def check(self, plant: Plant, vessel: str) -> None:
-        """Stop where a plant cannot feel this disturbance.
-
-        Raises:
-            ConfigError: naming the key and what the vessel lacks.
-        """
+        """Stop where a plant cannot feel this disturbance."""
         for name, key in self.needs().items():
             if name not in plant.inputs:
                 hint = "; give its vessel file a section 'wind'" if key == "wind" else ""
@@ -333,11 +329,7 @@ class SensorNoise(Config):
         return self
 
     def check(self, channels: tuple[str, ...], step: float, vessel: str) -> None:
-        """Stop where a sensor measures what the log does not have, or samples more often than it.
-
-        Raises:
-            ConfigError: naming the sensor.
-        """
+        """Stop where a sensor measures what the log has not, or samples more often than it."""
         for name, sensor in self.sensors.items():
             if name not in channels:
                 raise ConfigError(
@@ -615,11 +607,7 @@ class SimulatedTrials(Config):
         ]
 
     def splits(self, manoeuvres: Sequence[Manoeuvre]) -> list[str]:
-        """Return `train`, `validation` or `test` of each manoeuvre; whole manoeuvres only.
-
-        Raises:
-            ValueError: where a split asks for more manoeuvres than there are.
-        """
+        """Return `train`, `validation` or `test` of each manoeuvre; whole manoeuvres only."""
         random = np.random.default_rng([self.seed, 2])
         out = ["train"] * len(manoeuvres)
         for kind, count in self.identification.items():

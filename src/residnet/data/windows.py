@@ -54,45 +54,28 @@ class WindowStore:
         Positions are counted from each log's start so that float32 keeps them exact enough.
         """
         lengths = [len(p) for p in logs]
-        total, inputs = sum(lengths), logs[0].w.shape[1]
+        total = sum(lengths)
         labels = np.empty(total, dtype=np.int64)
-        y, smooth, nu_dot = (
-            paged.rows(total, width, dtype=dtype)
-            for width in (logs[0].y.shape[1], logs[0].y.shape[1], logs[0].nu_dot.shape[1])
-        )
-        w, recorded = (paged.rows(total, inputs, dtype=dtype) for _ in range(2))
-        usable, good = (paged.rows(total, dtype=torch.bool) for _ in range(2))
+        whole: dict[str, Tensor] = {}
+        for name in COLUMNS:
+            first: np.ndarray = getattr(logs[0], name)
+            kind = torch.bool if first.dtype == bool else dtype
+            whole[name] = paged.rows(total, *first.shape[1:], dtype=kind)
         begin = 0
         for number, (p, length) in enumerate(zip(logs, lengths, strict=True)):
             rows = slice(begin, begin + length)
             start = np.zeros_like(p.y[0])
             start[POSITION] = p.y[0, POSITION]
-            for whole, part in (
-                (y, p.y - start),
-                (smooth, p.smooth - start),
-                (nu_dot, p.nu_dot),
-                (w, p.w),
-                (recorded, p.recorded),
-            ):
-                whole[rows] = torch.from_numpy(np.nan_to_num(part)).to(dtype)
-            usable[rows], good[rows] = torch.from_numpy(p.usable), torch.from_numpy(p.good)
+            for name, values in whole.items():
+                part = getattr(p, name) - start if name in ("y", "smooth") else getattr(p, name)
+                values[rows] = torch.from_numpy(np.nan_to_num(part)).to(values.dtype)
             labels[rows] = np.where(p.piece >= 0, p.piece + 1_000_000 * number, -1)
             begin += length
             paged.forget()
         begins, ends = stretch_bounds(labels)
-        depth, reach = np.arange(total) - begins, ends - np.arange(total)
-        return cls(
-            y,
-            smooth,
-            nu_dot,
-            w,
-            recorded,
-            usable,
-            good,
-            torch.from_numpy(reach),
-            torch.from_numpy(depth),
-            torch.from_numpy(np.repeat(np.arange(len(logs)), lengths)),
-        )
+        told = {"reach": ends - np.arange(total), "depth": np.arange(total) - begins}
+        told |= {"log": np.repeat(np.arange(len(logs)), lengths)}
+        return cls(**whole, **{name: torch.from_numpy(values) for name, values in told.items()})
 
     def coarse(self, steps: int, turning: Sequence[int] = ()) -> WindowStore:
         """Return the same logs in steps so many times as long: once for each sample to begin with.
@@ -137,9 +120,6 @@ class WindowStore:
 
         It lies within one stretch, its first sample is good, and at least `share` of all are
         usable.
-
-        Raises:
-            DataError: where no log holds such a window.
         """
         total = torch.nn.functional.pad(self.usable.cumsum(0), (1, 0))
         fits = self.good & (self.reach >= length)
@@ -153,11 +133,7 @@ class WindowStore:
         return rows
 
     def beginnings(self, length: int, lead: int) -> Tensor:
-        """Return the rows `lead` samples after the beginning of a stretch where a window may start.
-
-        Raises:
-            DataError: where no stretch is long enough.
-        """
+        """Return the rows `lead` samples after a stretch's beginning where a window may start."""
         rows = self.starts(length)
         rows = rows[self.depth[rows] == lead]
         if rows.numel() == 0:

@@ -21,12 +21,8 @@ from residnet.data.doctor.effects import Effects
 from residnet.data.doctor.excitation import conditioning
 from residnet.data.doctor.findings import (
     CHECKS,
-    Check,
     Finding,
-    Level,
     Report,
-    Summary,
-    check,
     imported,
     inspection,
     run,
@@ -39,13 +35,9 @@ from residnet.data.motion import as_recorded
 __all__ = [
     "CHECKS",
     "STAGES",
-    "Check",
     "Finding",
-    "Level",
     "Report",
-    "Summary",
     "actuators",
-    "check",
     "conditioning",
     "date_findings",
     "excitation",

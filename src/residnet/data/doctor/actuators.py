@@ -13,12 +13,9 @@ from residnet.core.stretches import stretches
 from residnet.data.channels import SIGMA_OF_MAD, deviation, quantiles
 from residnet.data.doctor.findings import Check, Finding, check, correction
 from residnet.data.doctor.statistics import (
-    AT_ONCE,
-    FEWEST,
     SECTIONS,
     STEERING,
     WINDOW,
-    Blocks,
     Fit,
     Record,
     blocks_of,
@@ -27,6 +24,7 @@ from residnet.data.doctor.statistics import (
     of_inputs,
     of_motion,
 )
+from residnet.data.statistics import AT_ONCE, FEWEST, Blocks
 
 _SURE = 6.0
 """Standard errors that call a sign wrong: many, since to turn a right one would ruin a fit."""
@@ -128,13 +126,10 @@ def _reversed(log: Record, names: Sequence[str]) -> dict[str, float]:
         return {}
     known, each = x[:, : -len(names)], x[:, -len(names) :]
 
-    def with_signs(signs: np.ndarray) -> Fit:
-        return fit(np.column_stack((known, each @ signs)), y)
-
     trials = [
         np.array((1.0, *rest)) for rest in itertools.product((1.0, -1.0), repeat=len(names) - 1)
     ]
-    fits = [with_signs(signs) for signs in trials]
+    fits = [fit(np.column_stack((known, each @ signs)), y) for signs in trials]
     best = min(range(len(fits)), key=lambda i: fits[i].left)
     # other signs must leave clearly less than those that were logged
     best = best if fits[best].left < 0.6 * fits[0].left else 0
@@ -170,14 +165,12 @@ def neutral_angle(log: Record) -> Neutral | None:
     return Neutral(-moment / effect, error, effect, float(found.errors[1]))
 
 
-def _yaw_fit(log: Record, *further: np.ndarray) -> Fit | None:
-    """Return a yaw model linear in the rudder angle; None where the log does not tell.
+def _yaw_table(log: Record, *further: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of a yaw model linear in the rudder angle, x [K, k] and y [K].
 
-    The first two coefficients are the moment without rudder and the effect of the rudder, those of
-    `further` columns [T], which act as the rudder does, come next.
+    The first two columns are the moment without rudder and the effect of the rudder, those of
+    `further` ones [T], which act as the rudder does, come next.
     """
-    if any(name not in log for name in ("delta", "u", "r")):
-        return None
     blocks, u, r = log.of(blocks_of, "r"), log["u"], log["r"]
     v = log["v"] if "v" in log else np.zeros(len(log))
     speed = u * np.abs(u)
@@ -190,7 +183,14 @@ def _yaw_fit(log: Record, *further: np.ndarray) -> Fit | None:
     if "wind_speed" in log and "wind_dir" in log:
         side = log["wind_dir"] - (log["psi"] if "psi" in log else np.zeros(len(log)))
         columns += [log["wind_speed"] ** 2 * np.sin(k * side) for k in (1.0, 2.0)]
-    found = fit(blocks.integrals(np.stack(columns, axis=-1))(0), blocks.change(r))
+    return blocks.integrals(np.stack(columns, axis=-1))(0), blocks.change(r)
+
+
+def _yaw_fit(log: Record, *further: np.ndarray) -> Fit | None:
+    """Return the fit of the yaw model; None where the log does not tell."""
+    if any(name not in log for name in ("delta", "u", "r")):
+        return None
+    found = fit(*_yaw_table(log, *further))
     varies = log.std("delta") >= math.radians(1.0)
     return found if found.rest.size >= 60 and varies else None
 
@@ -263,12 +263,7 @@ def _unexplained(log: Record, at_end: np.ndarray) -> float:
     The fit is one to all that lies off the limit, so it must hold rests at smaller angles; 0 where
     it does not, or explains what happens at the limit.
     """
-    blocks, u, r, values = log.of(blocks_of, "r"), log["u"], log["r"], log["delta"]
-    v = log["v"] if "v" in log else np.zeros(len(log))
-    flows = [log[name] * np.abs(log[name]) for name in ("u", "n") if name in log]
-    columns = [*flows, *(flow * values for flow in flows)]
-    columns += [np.abs(u) * r, r * np.abs(r), np.abs(u) * v, v * np.abs(v)]
-    x, y = blocks.integrals(np.stack(columns, axis=-1))(0), blocks.change(r)
+    blocks, values, (x, y) = log.of(blocks_of, "r"), log["delta"], _yaw_table(log)
     known = np.isfinite(x).all(axis=1) & np.isfinite(y)
     inside, outside = known & blocks.clear_of(~at_end), known & blocks.clear_of(at_end)
     first, half = values[blocks.first], replace(blocks, size=blocks.size // 2)
@@ -277,10 +272,8 @@ def _unexplained(log: Record, at_end: np.ndarray) -> float:
     if inside.sum() < 10 or resting.sum() < 20:
         return 0.0
     fitted = fit(x[outside], y[outside])
-    given = zip(fitted.values[len(flows) : 2 * len(flows)], flows, strict=True)
-    effect = sum(value * np.nanmean(flow) for value, flow in given)
     usual = max(float(np.sqrt(np.mean(fitted.rest**2))), 1e-300)
-    left = (y - x @ fitted.values)[inside] * np.sign(first[inside]) * np.sign(effect)
+    left = (y - x @ fitted.values)[inside] * np.sign(first[inside] * fitted.values[1])
     harder = float(np.mean(left)) / usual
     return harder if harder > _SURE_AT_END else 0.0
 

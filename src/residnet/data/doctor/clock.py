@@ -28,33 +28,24 @@ _BRIDGED = 3.0 * (1.0 + 1e-6)
 EPOCH = 1e8
 
 
+_RESTARTS = "sort the rows, or split the log where its clock restarts"
+
+
 @check("order", "time_missing", "fatal", "delete them or restore their time")
-def times_missing(log: Record, found: Check) -> Iterator[Finding]:
-    """Report samples without a time."""
-    count = int((~np.isfinite(log.t)).sum())
+def order(log: Record, found: Check) -> Iterator[Finding]:
+    """Report samples without a time, and times that run backwards or repeat."""
+    count, step = int((~np.isfinite(log.t)).sum()), np.diff(log.t)
     if count:
         yield found(f"{count} of {len(log)} samples have no time", {"count": count})
-
-
-@check(
-    "order", "time_backwards", "fatal", "sort the rows, or split the log where its clock restarts"
-)
-def backwards(log: Record, found: Check) -> Iterator[Finding]:
-    """Report a time that runs backwards."""
-    at = np.flatnonzero(np.diff(log.t) < 0.0)
-    if at.size and np.isfinite(log.t).all():
-        text = f"time runs backwards {at.size} times, first after t = {log.t[at[0]]:.6g} s"
-        yield found(text, {"count": at.size})
-
-
-@check("order", "duplicate_rows", "fatal", "delete the repeated rows")
-def repeated_stamps(log: Record, found: Check) -> Iterator[Finding]:
-    """Report times that repeat."""
-    at = np.flatnonzero(np.diff(log.t) == 0.0)
-    if at.size and np.isfinite(log.t).all():
-        yield found(
-            f"{at.size} time stamps repeat, first t = {log.t[at[0]]:.6g} s", {"count": at.size}
-        )
+        return
+    for code, bad, text, fix in (
+        ("time_backwards", step < 0.0, "time runs backwards {} times, first after", _RESTARTS),
+        ("duplicate_rows", step == 0.0, "{} time stamps repeat, first", "delete the repeated rows"),
+    ):
+        at = np.flatnonzero(bad)
+        if at.size:
+            text = f"{text.format(at.size)} t = {log.t[at[0]]:.6g} s"
+            yield found(text, {"count": at.size}, code=code, fix=fix)
 
 
 @check("clock", "clock")

@@ -12,7 +12,8 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.data.doctor.findings import Finding
-from residnet.data.doctor.statistics import Blocks, Record, blocks_of, bridged, regressors
+from residnet.data.doctor.statistics import Record, blocks_of, bridged, regressors
+from residnet.data.statistics import Blocks
 
 LEAST_EFFECT = 0.04
 """Change of a fit's predictions, as a share of what they predict, below which none is misled."""
@@ -146,8 +147,6 @@ class Effects:
 
         `learned` says whether a fit sees the channels concerned, and not dead reckoning alone.
         """
-        if not at.any():
-            return 0.0
         others = [np.roll(at, round(at.size * (k + 0.5) / _OTHERS)) for k in range(_OTHERS)]
         chance = [_beyond(self._astray, reckoning_error(self._log, one)) for one in others]
         astray = _beyond(self._astray, reckoning_error(self._log, at))

@@ -32,7 +32,8 @@ from residnet.data.doctor.kinematics import (
     position_causes,
     yaw_causes,
 )
-from residnet.data.doctor.statistics import FEWEST, Record, agreement, bridged
+from residnet.data.doctor.statistics import Record, bridged
+from residnet.data.statistics import FEWEST, agreement
 
 # (change of sign, constant angle in deg) -> how a user would say it; psi, y and v reversed cover
 # all, because any two equal the third

@@ -23,15 +23,8 @@ from residnet.data.doctor.findings import (
     show,
     slip_in_words,
 )
-from residnet.data.doctor.statistics import (
-    FEWEST,
-    STEERING,
-    Record,
-    bridged,
-    fit,
-    high,
-    reversals,
-)
+from residnet.data.doctor.statistics import STEERING, Record, bridged, fit, high, reversals
+from residnet.data.statistics import FEWEST
 
 _LATITUDE = ("latitude", "lat", "gps_lat", "gnss_lat", "latitude_deg", "lat_deg")
 _LONGITUDE = ("longitude", "lon", "lng", "long", "gps_lon", "gnss_lon", "longitude_deg", "lon_deg")

@@ -23,7 +23,8 @@ from residnet.core.log import Log
 from residnet.data.channels import SIGMA_OF_MAD, deviation, median
 from residnet.data.derivatives import local_polynomials
 from residnet.data.doctor.findings import Check, Finding, Level, correction, with_channels
-from residnet.data.doctor.statistics import FEWEST, SECTIONS, WINDOW, Record, bridged, fit
+from residnet.data.doctor.statistics import SECTIONS, WINDOW, Record, bridged, fit
+from residnet.data.statistics import FEWEST
 
 LEAST_LAG = 0.2
 """A lag below this matters to no rollout of a vessel, s."""

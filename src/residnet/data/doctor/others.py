@@ -25,14 +25,8 @@ from residnet.core.names import VELOCITY
 from residnet.core.stretches import stretches
 from residnet.data.channels import SIGMA_OF_MAD
 from residnet.data.doctor.findings import show, slip_in_words
-from residnet.data.doctor.statistics import (
-    FEWEST,
-    STEERING,
-    Record,
-    blocks_of,
-    bridged,
-    reversals,
-)
+from residnet.data.doctor.statistics import STEERING, Record, blocks_of, bridged, reversals
+from residnet.data.statistics import FEWEST
 
 _RIDGE = 1e-6
 """Of the mean of a diagonal: solves what moves together, and changes the rest by a millionth."""
@@ -753,15 +747,14 @@ def nothing_steers(fleet: Fleet) -> tuple[list[str], float]:
     left = float(fleet.unexplained()[fleet.moving.index("r")])
     if not dead or left <= _UNSTEERED:
         return [], left
-    weaving = [reversals(_heading(log), _SWING) >= 2 for log in fleet.logs]
+    headings = (
+        bridged(log.t, log["psi"])
+        if "psi" in log
+        else np.cumsum(np.nan_to_num(log["r"])) * log.step
+        for log in fleet.logs
+    )
+    weaving = [reversals(heading, _SWING) >= 2 for heading in headings]
     return (dead, left) if np.mean(weaving) >= _WEAVE else ([], left)
-
-
-def _heading(log: Record) -> np.ndarray:
-    """Return the heading [T] rad, from the yaw rate where it is not recorded."""
-    if "psi" in log:
-        return bridged(log.t, log["psi"])
-    return np.cumsum(np.nan_to_num(log["r"])) * log.step
 
 
 # with all records alive .02 to .31 of the change of r is left, with the steering dead .30 to .71

@@ -268,18 +268,15 @@ def _held(log: Record, names: tuple[str, ...]) -> np.ndarray:
     if not long.any():
         return out
     starts, stops = starts[long], stops[long]
-    noisy = (rare or names[0] not in POSE) and _noisy(log, names[0])
+    # noise is a good part of what it does from sample to sample
+    noisy = log.noise(names[0]) > 0.05 * deviation(np.diff(log[names[0]]))
+    noisy &= rare or names[0] not in POSE
     moved = np.full(starts.size, noisy)
     for name in () if noisy else names:
         moved |= _moves(log[name], stops)
     for start, stop in zip(starts[moved], stops[moved], strict=True):
         out[start : stop + 1] = True
     return out
-
-
-def _noisy(log: Record, name: str) -> bool:
-    """Return whether noise is a good part of what a channel does from sample to sample."""
-    return log.noise(name) > 0.05 * deviation(np.diff(log[name]))
 
 
 def _moves(values: np.ndarray, stops: np.ndarray) -> np.ndarray:

@@ -487,12 +487,7 @@ class Sheet:
 
 
 def peek(path: Path, rows: int = 20_000) -> Sheet:
-    """Return the first rows of a table, 20,000 where `rows` does not say otherwise.
-
-    Raises:
-        UsageError: where there is no file.
-        DataError: where it is empty or no table.
-    """
+    """Return the first rows of a table, 20,000 where `rows` does not say otherwise."""
     import pandas as pd
 
     require_file(path)
@@ -577,11 +572,7 @@ class Clock:
 
 
 def clock_of(sheet: Sheet) -> Clock:
-    """Return the time of a table.
-
-    Raises:
-        DataError: where no column holds any.
-    """
+    """Return the time of a table."""
     named = [name for name in sheet.header if words_of(name).has("time")]
     parts = [name for name in sheet.numbers if plain(name) in _PARTS_OF_TIME]
     whole = any(sheet.texts[name].astype("string").str.contains(":").any() for name in sheet.texts)

@@ -65,11 +65,7 @@ class ReaderKind(Config, ABC):
 
 
 def require_file(path: Path) -> None:
-    """Stop where `path` is not a file.
-
-    Raises:
-        UsageError: naming the nearest file of the same folder.
-    """
+    """Stop where `path` is not a file."""
     if path.is_dir():
         raise UsageError(
             f"{path}: is a folder, a log file was expected; name one file or a pattern such as"
@@ -123,11 +119,7 @@ def turned(
 
 
 def require_samples(path: Path, t: np.ndarray) -> None:
-    """Stop where a log is too short to have a time step.
-
-    Raises:
-        DataError: where there are fewer than two samples.
-    """
+    """Stop where a log is too short to have a time step."""
     if t.size < 2:
         raise DataError(f"{path}: {t.size} usable rows, at least 2 are needed; leave the file out")
 
@@ -136,9 +128,6 @@ def require_increasing(path: Path, t: np.ndarray, row: Callable[[int], str]) -> 
     """Stop where time [T] in s repeats or runs backwards.
 
     `row` names the row of a sample in the file.
-
-    Raises:
-        DataError: naming the first two rows concerned.
     """
     bad = np.flatnonzero(~(np.diff(t) > 0.0))
     if bad.size:
@@ -158,11 +147,7 @@ def require_increasing(path: Path, t: np.ndarray, row: Callable[[int], str]) -> 
 
 
 def require_values(path: Path, channel: str, column: str, values: np.ndarray) -> None:
-    """Stop where a channel [T] holds no number at all.
-
-    Raises:
-        DataError: naming channel and column.
-    """
+    """Stop where a channel [T] holds no number at all."""
     if not np.isfinite(values).any():
         raise DataError(
             f"{path}: column '{column}' (channel {channel}) holds no number in any of {values.size}"

@@ -53,7 +53,7 @@ from residnet.data.readers.recording import (
     remark,
     same_topic,
 )
-from residnet.data.readers.topics import agreement, align_clocks, traffic
+from residnet.data.readers.topics import align_clocks, beside, traffic
 
 _STATE = ("x", "y", "psi", "u", "v", "r", "p", "phi")
 _MOVING = {*_STATE, "north_rate", "east_rate"}
@@ -271,7 +271,7 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
     meta = _meta(recording, plan, parts, times)
     log = Log(recording.path.stem, t, values, units, masks=masks, meta=meta)
     idle = [recording.series[n] for n in meta["topics_not_used"] if n in recording.series]
-    findings = [*meta["findings"], *agreement(idle, log, float(times[0]))]
+    findings = [*meta["findings"], *beside(idle, log, float(times[0]))]
     return log.replace(meta={**meta, "findings": findings})
 
 
@@ -382,12 +382,7 @@ def _moved(lever: Antenna, what: str) -> tuple[str, ...]:
 
 
 def position_part(recording: Recording, config: PositionConfig, longest_gap: float) -> Part:
-    """Return x and y of the antenna, m.
-
-    Raises:
-        UsageError: where topic or field is missing, or PROJ is not installed.
-        DataError: where there is no position, or a latitude is none.
-    """
+    """Return x and y of the antenna, m."""
     series, moved = recording[config.topic], _moved(config.antenna, "x, y")
     first, second = (_numbers(recording, series, name, config.unit) for name in config.fields)
     if not isinstance(config, Geodetic):
@@ -408,12 +403,7 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
 
 
 def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float) -> Part:
-    """Return psi, unwrapped from its first value in [0, 2 pi); phi and theta where wanted.
-
-    Raises:
-        UsageError: where topic or field is missing.
-        DataError: where there is no heading.
-    """
+    """Return psi, unwrapped from its first value in [0, 2 pi); phi and theta where wanted."""
     series = recording[config.topic]
     values: dict[str, np.ndarray] = {}
     remarks: list[Remark] = []

@@ -122,11 +122,7 @@ def format_of(path: Path) -> Format | None:
 
 
 def kind_of(path: Path) -> str:
-    """Return the kind of a log: canonical, table, or the name of a format of recordings.
-
-    Raises:
-        UsageError: where there is nothing at `path`, or it is of no format that residnet knows.
-    """
+    """Return the kind of a log: canonical, table, or the name of a format of recordings."""
     if Log.recognises(path):
         return "canonical"
     recording = format_of(path)

@@ -27,6 +27,7 @@ from residnet.data.readers.tables import (
     ParquetConfig,
 )
 from residnet.data.readers.written import unix_unit
+from residnet.data.statistics import Blocks
 
 _LEAST = 0.5
 """Share of the shorter log that two clocks must have in common while their shift is looked for."""
@@ -115,11 +116,7 @@ class JoinedReader(LogReader):
         return [*self.parts(path).values()]
 
     def parts(self, path: Path) -> dict[str, Path]:
-        """Return word -> file of the trip that a file of the motion is of.
-
-        Raises:
-            DataError: where the name lacks the word of the motion, or a file is missing.
-        """
+        """Return word -> file of the trip that a file of the motion is of."""
         require_file(path)
         first, *others = self._config.parts
         before, found, after = path.name.rpartition(first)
@@ -232,29 +229,24 @@ def clock_shift(log: Log, other: Log) -> Shift:
 
     Args:
         log: of the motion, measured or by position and heading.
-
-    Raises:
-        DataError: where the log holds no motion.
     """
     whole = complete_motion(log, MotionConfig())
     every = max(1, len(whole) // _SAMPLES)
     t = whole.t[::every]
     size = max(4, round(_BLOCK / float(np.median(np.diff(t)))))
-    begin = np.arange(0, len(t) - size, max(1, size // 4))
-    if not begin.size:
+    blocks = Blocks(t, np.arange(0, len(t) - size, max(1, size // 4)), size)
+    if not blocks.first.size:
         raise DataError(f"log {log.name}: {t[-1] - t[0]:.1f} s are too short to tell")
 
-    def over(columns: np.ndarray) -> np.ndarray:
-        """Return the integrals of columns [T, k] over the blocks [B, k]."""
-        area = 0.5 * np.diff(t)[:, None] * (columns[1:] + columns[:-1])
-        total = np.concatenate((np.zeros((1, columns.shape[1])), np.cumsum(area, axis=0)))
-        return np.asarray(total[begin + size] - total[begin])
+    def over(*columns: np.ndarray) -> np.ndarray:
+        """Return the integrals of columns [T] over the blocks [B, k]."""
+        return blocks.integrals(np.stack(columns, axis=1))(0)
 
     known = {name: np.isfinite(whole[name]) for name in ("u", "r")}
     u, r = (np.interp(t, whole.t[k], whole[n][k]) for n, k in known.items())
-    gained = np.stack((u[begin + size] - u[begin], r[begin + size] - r[begin]), axis=1)
+    gained = blocks.change(np.stack((u, r), axis=1))
     gained /= np.maximum(gained.std(axis=0), 1e-12)
-    own = over(np.stack((np.ones_like(u), u, u * np.abs(u), r, r * np.abs(r), u * r), axis=1))
+    own = over(np.ones_like(u), u, u * np.abs(u), r, r * np.abs(r), u * r)
     # what the motion explains by itself, which says nothing of the commands
     rest = gained - own @ np.linalg.lstsq(own, gained, rcond=1e-9)[0]
     left_alone = (rest**2).sum(axis=1)
@@ -266,7 +258,8 @@ def clock_shift(log: Log, other: Log) -> Shift:
 
     def explained(shift: float) -> float:
         at = t - shift
-        inside = (at[begin] >= other.t[0]) & (at[begin + size] <= other.t[-1])
+        begin, end = at[blocks.first], at[blocks.first + size]
+        inside = (begin >= other.t[0]) & (end <= other.t[-1])
         if inside.sum() < 3 * (own.shape[1] + 3 * len(driving) + len(gains)) or not total:
             return 0.0
 
@@ -275,10 +268,8 @@ def clock_shift(log: Log, other: Log) -> Shift:
             return np.asarray(np.interp(at, other.t[there], values[there]))
 
         columns = [own[inside]]
-        columns += [(w[begin + size] - w[begin])[inside, None] for w in map(seen, gains)]
-        columns += [
-            over(np.stack((w, w * np.abs(w), w * u), axis=1))[inside] for w in map(seen, driving)
-        ]
+        columns += [blocks.change(w)[inside, None] for w in map(seen, gains)]
+        columns += [over(w, w * np.abs(w), w * u)[inside] for w in map(seen, driving)]
         x, y = np.concatenate(columns, axis=1), gained[inside]
         x = x / np.maximum(np.abs(x).max(axis=0), 1e-12)
         left = y - x @ np.linalg.lstsq(x, y, rcond=1e-9)[0]

@@ -100,11 +100,7 @@ class Series:
         return path in self.fields or key_of(path) in self._by_key
 
     def __getitem__(self, path: str) -> np.ndarray:
-        """Return the values [T] of one field.
-
-        Raises:
-            UsageError: where there is none.
-        """
+        """Return the values [T] of one field."""
         name = path if path in self.fields else self._by_key.get(key_of(path))
         if name is None:
             raise UsageError(f"topic {self.name}: no field '{path}'{nearest(path, self.fields)}")
@@ -125,11 +121,7 @@ class Series:
         return dataclasses.replace(self, stamp=moved[0], arrival=moved[1])
 
     def of_sender(self, sender: str) -> Series:
-        """Return the rows of one sender.
-
-        Raises:
-            UsageError: where no row has this sender.
-        """
+        """Return the rows of one sender."""
         known = (
             []
             if self.sender is None
@@ -182,11 +174,7 @@ class Recording:
         return ", ".join([*told[:_TOLD], *([f"and {more} more"] if more > 0 else [])]) or "nothing"
 
     def __getitem__(self, topic: str | None) -> Series:
-        """Return one series; None names the only one. A leading slash may be left out.
-
-        Raises:
-            UsageError: where there is no such series, or several and none was named.
-        """
+        """Return one series; None names the only one. A leading slash may be left out."""
         if topic is None:
             if len(self.series) == 1:
                 return next(iter(self.series.values()))

@@ -525,10 +525,6 @@ def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.Da
     Args:
         sheet: its name; None takes the first.
         rows: how many are read; None for all.
-
-    Raises:
-        UsageError: where there is no such sheet, or openpyxl is not installed.
-        DataError: where the file cannot be read.
     """
     import pandas as pd
 
@@ -596,11 +592,7 @@ def parquet_rows(path: Path, rows: int) -> pd.DataFrame:
 
 
 def json_rows(path: Path, rows: int) -> pd.DataFrame:
-    """Return the first rows of a file of JSON lines, a column for each key.
-
-    Raises:
-        DataError: where it is empty, or a line is no JSON object.
-    """
+    """Return the first rows of a file of JSON lines, a column for each key."""
     import pandas as pd
 
     found = list(islice(_JsonLines(path), rows))
@@ -622,11 +614,7 @@ def column_names(path: Path) -> tuple[str, ...]:
 
 @final
 class _JsonLines:
-    """The objects of a file, flat: `nav.lat` for a key within, `imu.q[0]` for an entry of a list.
-
-    Raises:
-        DataError: where a line is no JSON object.
-    """
+    """The objects of a file, flat: `nav.lat` is a key within, `imu.q[0]` an entry of a list."""
 
     def __init__(self, path: Path) -> None:
         self._path, self.cut = path, False
@@ -658,11 +646,7 @@ class _JsonLines:
 
 
 def _table_in(path: Path, file: Path) -> Sequence[Mapping[str, Any]] | None:
-    """Return the objects of the table that one JSON document holds; None for an object a line.
-
-    Raises:
-        DataError: where a document holds no table.
-    """
+    """Return the objects of the table that one JSON document holds; None for an object a line."""
     if path.suffix.lower() != ".json":
         return None
     try:

@@ -87,12 +87,7 @@ def numbered(names: Sequence[str]) -> list[str]:
 
 
 def positions(path: Path, header: Sequence[str], columns: Sequence[str]) -> list[int]:
-    """Return where the wanted columns stand in the header.
-
-    Raises:
-        UsageError: where one does not.
-        DataError: where one stands several times.
-    """
+    """Return where the wanted columns stand in the header."""
     names = numbered(header)
     for column in columns:
         if column in names:
@@ -125,10 +120,6 @@ def read_csv(
         columns: names of the wanted columns.
         encoding: of the text; None finds it.
         advance: is told the share that is read.
-
-    Raises:
-        UsageError: where a column is missing.
-        DataError: where the file is empty, not text of this encoding or not a regular table.
     """
     import pandas as pd
 
@@ -270,9 +261,6 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Return the first rows of a text table whose form nobody described, and its reader's settings.
 
     The `attrs` of the rows hold `between`: the cells of the lines between names and values.
-
-    Raises:
-        DataError: where it is empty or no table.
     """
     import pandas as pd
 
@@ -325,9 +313,6 @@ def _delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]], tupl
 
     Returns:
         The delimiter, the cells of the first lines, and the places of the names and first values.
-
-    Raises:
-        DataError: where there is none.
     """
     found: list[tuple[int, int, tuple[str, list[list[str]], tuple[int, int]]]] = []
     text = "".join(lines[:_GUESSED])
@@ -376,11 +361,7 @@ def _measures(cell: str) -> bool:
 
 
 def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str]) -> Header:
-    """Return the first line of a text table that holds all the names; else its first line.
-
-    Raises:
-        DataError: where the first line is blank or no line of cells.
-    """
+    """Return the first line of a text table that holds all the names; else its first line."""
     wanted = set(columns)
 
     def lines(stream: TextIO) -> Iterator[tuple[int, list[str]]]:
@@ -484,9 +465,6 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
     Returns:
         Whether the file ends within its last line, and the numbers of lines, from 0, that hold
         none: they begin with `#`, `%` or `//`, or repeat the names.
-
-    Raises:
-        DataError: where a line has more or fewer cells than the header, or a byte is zero.
     """
     wide, above = len(header.names), header.above
     # names that are missing at the end are those of cells that are not there
@@ -675,9 +653,6 @@ def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
 
     Args:
         encoding: its name; None finds it.
-
-    Raises:
-        DataError: where the text is not of this encoding.
     """
     name = codecs.lookup(encoding or encoding_of(path)).name
     wide = name.startswith(("utf-16", "utf-32"))

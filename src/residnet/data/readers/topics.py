@@ -16,6 +16,7 @@ from residnet.core.log import Log
 from residnet.data.readers.base import turned
 from residnet.data.readers.recording import Recording, Remark, Series, key_of, remark, same_topic
 from residnet.data.readers.written import as_before
+from residnet.data.statistics import agreement
 
 # zones differ by whole quarters of an hour
 _QUARTER = 900.0
@@ -29,12 +30,10 @@ _FEW, _NEAR = 0.01, 1.0
 _GAP_STEPS, _GAP_SECONDS = 5.0, 0.5
 # rows below which nothing is said about publishers, lags and levers
 _ENOUGH = 100
-# lags that are looked for, s
-_LAGS = np.arange(-2.0, 2.025, 0.05)
+# shortest step by which lags are looked for, s
+_STEP = 0.05
 # correlation that calls two signals the same quantity
 _SAME = 0.9
-_MOST_ROWS = 4000
-"""Rows, up to twice as many, that tell a lag; chosen by hand: every lag interpolates them."""
 _LEVER = 0.2
 """Distance of two points of a vessel, m, that is worth telling; chosen by hand."""
 
@@ -270,7 +269,7 @@ def _returns(known: np.ndarray) -> tuple[float, float, float]:
     return float(leap.mean()), float(back.mean()), width
 
 
-def agreement(idle: Sequence[Series], log: Log, start: float) -> list[Remark]:
+def beside(idle: Sequence[Series], log: Log, start: float) -> list[Remark]:
     """Return the remarks on velocities and positions in topics that the log was not made of.
 
     `start` is the log's first sample on the recording's clock, s.
@@ -300,18 +299,17 @@ def _at(t: np.ndarray, clock: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _lag(
     series: Series, path: str, t: np.ndarray, clock: np.ndarray, rates: dict[str, np.ndarray]
 ) -> list[Remark]:
-    every = max(1, len(series) // _MOST_ROWS)
-    at, values = t[::every], series[path][::every]
-    sizes = {
-        (name, float(lag)): abs(_correlation(values, _at(at - lag, clock, rate)))
-        for name, rate in rates.items()
-        for lag in _LAGS
-    }
-    (name, lag), size = max(sizes.items(), key=lambda entry: entry[1], default=(("", 0.0), 0.0))
-    # a lag is reported only where it explains a good part of what the two differ by
-    if size < _SAME or abs(lag) < _TELLING:
+    step = max(float(np.median(np.diff(t))), _STEP)
+    grid = np.arange(t[0], t[-1], step)
+    values, seen = _at(grid, t, series[path]), {n: _at(grid, clock, r) for n, r in rates.items()}
+    found = {name: match for name in seen if (match := agreement(seen[name], values, step))}
+    name = max(found, key=lambda name: abs(found[name].correlation), default="")
+    if not name or abs(found[name].correlation) < _SAME or abs(found[name].lag) < _TELLING:
         return []
-    without = abs(_correlation(values, _at(at, clock, rates[name])))
+    size, lag = abs(found[name].correlation), found[name].lag
+    known = np.isfinite(values) & np.isfinite(seen[name])
+    without = abs(float(np.corrcoef(values[known], seen[name][known])[0, 1]))
+    # a lag is reported only where it explains a good part of what the two differ by
     if 1.0 - size > 0.7 * (1.0 - without):
         return []
     verb = f"{'lags' if lag > 0.0 else 'leads'} {name} of the log by {abs(lag):.2f} s"
@@ -321,13 +319,6 @@ def _lag(
     )
     figures = {"lag": lag, "correlation": size, "correlation_without": without}
     return [remark("note", "topic_lag", text, **figures)]
-
-
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    known = np.isfinite(a) & np.isfinite(b)
-    if known.sum() < _ENOUGH or np.ptp(a[known]) == 0.0 or np.ptp(b[known]) == 0.0:
-        return 0.0
-    return float(np.corrcoef(a[known], b[known])[0, 1])
 
 
 def _lever(series: Series, t: np.ndarray, log: Log) -> list[Remark]:

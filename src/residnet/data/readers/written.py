@@ -88,11 +88,7 @@ _READ = (
 
 
 def zone_of(name: str) -> ZoneInfo:
-    """Return a time zone by its name, for example `Europe/Berlin`.
-
-    Raises:
-        ValueError: where there is none of this name.
-    """
+    """Return a time zone by its name, for example `Europe/Berlin`."""
     try:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
@@ -105,9 +101,6 @@ def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
     """Return the times from numbers [T], in units of `factor` seconds.
 
     None reads Unix time in s, ms, us or ns by its size, and anything smaller as s.
-
-    Raises:
-        DataError: where a value is not finite.
     """
     if not np.isfinite(values).all():
         raise DataError(f"{int((~np.isfinite(values)).sum())} rows have no time")
@@ -425,11 +418,7 @@ def from_form(values: np.ndarray, form: Form) -> np.ndarray:
 
 
 def side_signs(sides: pd.Series, name: str, letter_o: LetterO | None = None) -> np.ndarray:
-    """Return 1 or -1 [T] for the letters of hemispheres; 1 where there is none.
-
-    Raises:
-        DataError: where a letter is none of this channel's.
-    """
+    """Return 1 or -1 [T] for the letters of hemispheres; 1 where there is none."""
     letters = sides.astype("string").str.strip().str.lower()
     letters = letters.mask(letters == "")
     if letter_o is not None and name == "longitude":

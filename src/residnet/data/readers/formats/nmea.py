@@ -177,11 +177,7 @@ class _Lines:
         return day + ns
 
     def recording(self, path: Path, bad: int) -> Recording:
-        """Return the recording of what was added.
-
-        Raises:
-            DataError: where nothing tells the time.
-        """
+        """Return the recording of what was added."""
         ticks = np.frombuffer(self._ticks, dtype=np.int64)
         stamped = all(all(one.before) for one in self.series.values())
         if not ticks.size and not stamped:

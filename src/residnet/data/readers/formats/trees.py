@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, final
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, final
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -48,17 +48,8 @@ _MOST_COMPRESSED = 1000
 """Bytes of a dataset for each byte of its file at most; a constant channel has some 900."""
 
 
-class _Vector(Protocol):
-    """An array that may still lie in its file; `numpy.asarray` reads it."""
-
-    @property
-    def shape(self) -> tuple[int, ...]: ...
-
-    @property
-    def dtype(self) -> np.dtype: ...
-
-    @property
-    def size(self) -> int: ...
+_Vector: TypeAlias = Any
+"""An array that may still lie in its file, with shape, dtype and size; `numpy.asarray` reads it."""
 
 
 class TreeTime(Config):
