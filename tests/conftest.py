@@ -1,8 +1,15 @@
-"""The order of the files: dear ones first, so that two processes end together."""
+"""The order of the files, so that two processes end together, and runs for everybody."""
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import pytest
+from made_once import made_once
+from tiny import TINY, Command, Said, call, write_yaml
+
+from residnet.export import vessel
 
 DEAR = (
     "contracts/test_every_part.py",
@@ -15,7 +22,7 @@ DEAR = (
     "data/test_others.py",
     "tasks/test_fit.py",
     "export/test_formats.py",
-    "control/test_course_plan.py",
+    "control/test_courses.py",
     "training/test_current.py",
     "export/test_band.py",
     "tasks/test_simulate.py",
@@ -27,3 +34,34 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order the files; `--dist loadfile` gives each to one process, which makes its fixtures."""
     order = {f"tests/{name}": number for number, name in enumerate(DEAR)}
     items.sort(key=lambda item: order.get(item.nodeid.partition("::")[0], len(DEAR)))
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Carries out a command line in this process."""
+
+    def carried_out(*words: object) -> Said:
+        capsys.readouterr()
+        return Said(call(monkeypatch, *words), *capsys.readouterr())
+
+    return carried_out
+
+
+@pytest.fixture(scope="session")
+def tiny_config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The configuration of `tiny_run` as a file."""
+    return write_yaml(tmp_path_factory.mktemp("config") / "tiny.yaml", TINY)
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tiny_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run, a copy for each process."""
+
+    def make(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(vessel, "PARITY_STEPS", 60)
+            assert call(patch, "run", tiny_config, "--out", folder) == 0
+
+    out = tmp_path_factory.mktemp("runs") / "tiny"
+    shutil.copytree(made_once(tmp_path_factory, "tiny", make), out)
+    return out

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -12,9 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
-from tiny import TINY, call
-from written_trials import CHANNELS, write_trials
+from tiny import TINY, read_json
 
 import residnet
 from residnet.core.config import validate
@@ -24,15 +21,37 @@ from residnet.export import vessel
 from residnet.judge.metrics import metrics_table
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.runs.folder import RunFolder
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "fifteen_lines.py"
+CHANNELS = {
+    "x": ("north", "m"),
+    "y": ("east", "m"),
+    "psi": ("heading", "deg"),
+    "u": ("surge", "m/s"),
+    "v": ("sway", "m/s"),
+    "r": ("yaw rate", "deg/s"),
+    "n_port": ("port", "rpm"),
+    "n_stbd": ("starboard", "rpm"),
+}
+FACTORS = {"deg": 180.0 / math.pi, "deg/s": 180.0 / math.pi, "rpm": 60.0}
 
 
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("api") / "trials"
-    write_trials(folder, duration=40.0)
+    """Sea trials as a stranger would hand them over: csv, odd names, degrees and rpm."""
+    (folder := tmp_path_factory.mktemp("api") / "trials").mkdir()
+    zigzag = {"kind": "zigzag", "heading": "20 deg", "start": 3}
+    circle = {"kind": "turning_circle", "start": 3}
+    pairs = [(drive, steer) for drive in (0.4, 0.6, 0.8) for steer in (0.3, 0.5)]
+    flown = [zigzag | {"drive": drive, "steer": steer} for drive, steer in pairs]
+    flown += [circle | {"drive": d, "steer": s} for d in (0.4, 0.8) for s in (0.3, -0.5)]
+    noise = {"u": 0.01, "v": 0.01, "r": 0.002}
+    made = residnet.simulate("wam_v_cal", flown, duration=40.0, step=0.1, noise=noise, seed=1)
+    for log in made.logs:
+        columns = {"time": log.t}
+        for name, (column, unit) in CHANNELS.items():
+            columns[column] = log[name] * FACTORS.get(unit, 1.0)
+        pd.DataFrame(columns).to_csv(folder / f"{log.name}.csv", index=False)
     return folder
 
 
@@ -51,45 +70,41 @@ def models(data: residnet.Data) -> residnet.Models:
     return residnet.fit(data, heads={"ridge": "ridge", "net": {"kind": "mlp", "hidden": (8,)}})
 
 
-def test_the_import_is_quick_and_loads_nothing() -> None:
+def test_the_face_loads_nothing_and_every_name_is_there_and_documented() -> None:
     code = (
-        "import sys, time; start = time.perf_counter(); import residnet;"
+        "import sys, residnet;"
         "heavy = {'torch', 'pandas', 'numpy', 'pydantic', 'matplotlib'} & set(sys.modules);"
-        "print(time.perf_counter() - start, sorted(heavy), len(dir(residnet)))"
+        "print(sorted(heavy), len(dir(residnet)))"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "[]" in out.stdout
-    assert int(out.stdout.split()[-1]) == len(residnet.__all__)
-
-
-def test_every_name_is_there_and_documented() -> None:
+    assert out.stdout.split() == ["[]", str(len(residnet.__all__))]
     for name in residnet.__all__:
         assert getattr(residnet, name).__doc__
     with pytest.raises(AttributeError, match="no attribute 'fitt'"):
         _ = residnet.fitt  # type: ignore[attr-defined]
 
 
-def test_defaults_come_from_the_logs(data: residnet.Data) -> None:
+def test_logs_have_one_recipe_whoever_asks(trials: Path, data: residnet.Data) -> None:
     assert data.prepare.grid.step == 0.1
-    table = data.table
-    assert dict(table["split"].value_counts()) == {"train": 6, "validation": 2, "test": 2}
+    assert dict(data.table["split"].value_counts()) == {"train": 6, "validation": 2, "test": 2}
     assert data.prepare.hold == "mean"
     assert data.evaluation.selection == next(iter(data.evaluation.protocols))
-
-
-def test_logs_have_one_recipe_whoever_asks(trials: Path) -> None:
     draft = residnet.draft(trials, folder=trials.parent)
     logs = residnet.read_logs(trials, reader=draft.config["data"]["reader"])
-    data = residnet.prepare(logs)
-    fitted = residnet.fit(logs, "regressors", bands=None).settings
+    heard: list[residnet.Progress] = []
+    fitted = residnet.fit(logs, "regressors", bands=None, progress=heard.append).settings
+    assert any("fitting baseline" in entry.message for entry in heard)
+    prepared = residnet.prepare(logs)
     for key, kind in (
         ("prepare", PrepareConfig),
         ("signals", SignalsConfig),
         ("evaluation", EvaluationConfig),
     ):
         drafted = validate(draft.config[key], kind, key)
-        assert getattr(data, key) == drafted, key
+        assert getattr(prepared, key) == drafted, key
         assert getattr(fitted, key) == drafted, key
+    residnet.read_logs(trials, channels=CHANNELS, time="time", progress=heard.append)
+    assert heard[-1].done == heard[-1].total == 10
 
 
 @pytest.mark.long
@@ -176,36 +191,17 @@ def test_save_load_export(
         residnet.save(models["net"], tmp_path / "net")
 
 
-def test_progress_is_told_to_one_callback(trials: Path, data: residnet.Data) -> None:
-    heard: list[residnet.Progress] = []
-    residnet.read_logs(trials, channels=CHANNELS, time="time", progress=heard.append)
-    assert heard[-1].done == heard[-1].total == 10
-    residnet.fit(data, heads="ridge", progress=heard.append)
-    assert any("fitting ridge" in entry.message for entry in heard)
-
-
-def cli_rows(config: dict[str, Any], folder: Path, patch: pytest.MonkeyPatch) -> RunFolder:
-    """The same config by the command line."""
-    file = folder / "config.yaml"
-    file.write_text(yaml.safe_dump(config, sort_keys=False))
-    assert call(patch, "run", file, "--out", folder / "run") == 0
-    return RunFolder(folder / "run")
-
-
 @pytest.mark.long
-def test_a_fit_by_function_mapping_and_command_line_is_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = copy.deepcopy(TINY)
-    run = cli_rows(config, tmp_path, monkeypatch)
-    table = metrics_table(run.read_metrics()["rows"])
-    result = residnet.run(config, report=False)
+def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> None:
+    metrics = read_json(tiny_run / "metrics.json")
+    table = metrics_table(metrics["rows"])
+    result = residnet.run(TINY, report=False)
     pd.testing.assert_frame_equal(result.metrics, table, rtol=1e-12)
-    prepared, evaluation = config["prepare"], config["evaluation"]
+    prepared, evaluation = TINY["prepare"], TINY["evaluation"]
     data = residnet.prepare(
-        config["data"],
-        config["signals"]["inputs"],
-        forces=config["signals"]["forces"],
+        TINY["data"],
+        TINY["signals"]["inputs"],
+        forces=TINY["signals"]["forces"],
         step=prepared["grid"]["step"],
         derivative=prepared["derivative"],
         hold="start",
@@ -214,71 +210,130 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(
     )
     models = residnet.fit(
         data,
-        config["baseline"],
-        {name: residnet.head(head) for name, head in config["heads"].items()},
-        ensembles=config["ensembles"],
-        training=config["training"],
+        TINY["baseline"],
+        {name: residnet.head(head) for name, head in TINY["heads"].items()},
+        ensembles=TINY["ensembles"],
+        training=TINY["training"],
     )
     pd.testing.assert_frame_equal(models.metrics, table, rtol=1e-9)
-    assert models.selected == run.read_metrics()["selected"]
-    loaded = residnet.load(tmp_path / "run", "ridge")
+    assert models.selected == metrics["selected"]
+    loaded = residnet.load(tiny_run, "ridge")
     assert loaded.coefficients.empty
     assert loaded.notes["validation"] == pytest.approx(models["ridge"].notes["validation"])
 
 
-@pytest.mark.long
-def test_a_simulation_by_function_mapping_and_command_line_is_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_simulation_by_function_and_mapping_is_one() -> None:
+    zigzag = {"kind": "zigzag", "drive": 0.6, "steer": 0.4, "heading": "20 deg", "start": 3}
+    way = {"kind": "waypoints", "drive": 0.7, "points": [[20, 0], [20, 20]], "acceptance": 3}
     programme: dict[str, Any] = {
         "vessel": "wam_v_cal",
-        "manoeuvres": [
-            {"kind": "zigzag", "drive": 0.6, "steer": 0.4, "heading": "20 deg", "start": 3},
-            {"kind": "waypoints", "drive": 0.7, "points": [[20, 0], [20, 20]], "acceptance": 3,
-             "lookahead": 6},
-        ],
+        "manoeuvres": [zigzag, way | {"lookahead": 6}],
         "duration": "60 s",
         "step": 0.1,
         "noise": {"u": 0.02},
         "seed": 3,
-    }  # fmt: skip
-    config = {"task": "simulate", "name": "flown", "programme": programme}
-    run = cli_rows(config, tmp_path, monkeypatch)
-    result = residnet.run(config)
-    assert result.read("indices.json") == json.loads((run.path / "indices.json").read_text())
+    }
+    config = {"task": "simulate", "name": "gone", "programme": programme}
+    result = residnet.run(config, report=False)
     trials = residnet.simulate(**programme)
     for log in trials.logs:
-        stored = residnet.Log.load(run.path / "logs" / f"{log.name}.parquet")
+        stored = residnet.Log.load(result.folder / "logs" / f"{log.name}.parquet")
         for name, values in log.channels.items():
             np.testing.assert_array_equal(stored[name], values)
-    rows = result.read("indices.json")["rows"]
     overshoot = trials.indices["first_overshoot"].iloc[0]
-    assert rows[0]["indices"]["first_overshoot"] == pytest.approx(overshoot, rel=1e-12)
+    found = result.read("indices.json")["rows"][0]["indices"]
+    assert found["first_overshoot"] == pytest.approx(overshoot, rel=1e-12)
+    assert result.read("summary.json")["figures"]["logs"]["value"] == 2
+    assert result.verdict[0].startswith("All 2 manoeuvres ended as they should")
+    assert "logs/zigzag_01.parquet" in result.files
+    folder = result.folder
+    assert folder.exists()
+    del result
+    assert not folder.exists(), "without a folder of one's own nothing is left behind"
 
 
 @pytest.mark.long
 def test_logs_alone_are_fitted_by_the_recipe(logs: list[residnet.Log]) -> None:
-    models = residnet.fit([_coarse(log) for log in logs[:6]], effort=0.01)
+    coarse = [log.rows(slice(None, None, 8)).replace(masks={}) for log in logs[:6]]
+    models = residnet.fit(coarse, effort=0.01)
     assert models.settings.recipe == "standard"
     assert models.settings.signals.inputs == ("n_port", "n_stbd")
     assert {"zero", "baseline", "hull", "hull_network", "mean"} <= set(models)
     assert models.selected in models
 
 
-def _coarse(log: residnet.Log) -> residnet.Log:
-    """Every eighth sample of a log."""
-    channels = {name: values[::8] for name, values in log.channels.items()}
-    return log.replace(t=log.t[::8], channels=channels, masks={})
+WRONG = [
+    ("read_logs([])", "no log is given"),
+    ("read_logs(pd.DataFrame())", "expected a path, given a DataFrame"),
+    ("read_logs('nowhere.csv')", "no such file"),
+    ("read_logs('no*where.csv')", "matches no file"),
+    ("read_logs(folder / 'empty')", "holds no log"),
+    (
+        "read_logs(folder, channels={'u': 'surge'})",
+        r"channels: u: give the column and its unit, for example \('surge', 'm/s'\)",
+    ),
+    (
+        "read_logs(folder, channels={'u': ('surg', 'm/s')}, time='time')",
+        "no column 'surg'; did you mean 'surge'",
+    ),
+    ("read_logs(folder, reader='cvs')", "unknown value 'cvs'; did you mean 'csv'"),
+    ("prepare([coasting(log) for log in logs])", "inputs: no"),
+    ("prepare(logs, 'n_port')", "expected a list"),
+    ("prepare(logs, ['n_prt', 'n_stbd'])", "no channel 'n_prt'; did you mean 'n_port'"),
+    ("prepare(logs, ['n_port'], step='0.1 m')", "step: unit 'm' does not measure"),
+    ("fit(data, heads=['lsmt'])", "unknown value 'lsmt'; did you mean 'lstm'"),
+    ("fit(data, 'regresors')", "unknown value 'regresors'; did you mean 'regressors'"),
+    ("head('lstm', hiden_size=3)", "hiden_size: unknown key; did you mean 'hidden_size'"),
+    ("head('lstm', hidden_size='3')", "a whole number"),
+    ("fit(3)", "expected logs, or data from"),
+    ("models['rigde']", "no model 'rigde'; did you mean 'ridge'"),
+    (
+        "ridge.step(x, np.zeros(3))",
+        r"w has the shape \[3\], expected \[B, 2\] or \[2\] \(inputs n_port, n_stbd\)",
+    ),
+    ("ridge.rollout(x, np.zeros((10, 5)))", r"w has the shape \[10, 5\], expected \[B, T, 2\]"),
+    ("ridge.step(np.zeros(3), w)", r"x has the shape \[3\]"),
+    ("ridge.step(x, [np.nan, 1.0])", "w holds a value that is not finite"),
+    ("ridge.step('here', w)", "x: expected numbers"),
+    ("ridge.step(np.zeros((2, 6)), np.zeros((3, 2)))", "2 states, but inputs for 3"),
+    (
+        "free_run(models, prepare(logs, ['n_port']))",
+        "has the inputs n_port, n_stbd, the data have n_port",
+    ),
+    ("free_run(models, data, 'tset')", "no split 'tset'; did you mean 'test'"),
+    ("free_run(models, data).plot_track('zigzag')", "no log 'zigzag'; "),
+    ("export_model(ridge, 'x', 'torchscrip')", "did you mean 'torchscript'"),
+    ("save(data, 'x')", "expected a model, given a Data"),
+    ("load(folder)", "no model here"),
+    ("vessel('wam_v_call')", "did you mean 'wam_v_cal'"),
+    ("simulate('wam_v_cal', 'zigzagg')", "unknown value 'zigzagg'; did you mean 'zigzag'"),
+    ("simulate('wam_v_cal')", "nothing is flown"),
+    ("available('head')", "did you mean 'heads'"),
+    ("run({'task': 'fitt'})", "did you mean 'fit'"),
+    ("run(3)", "expected the path of a YAML file"),
+    ("run({'task': 'fit'}, overrides=['seed=1'])", "overrides are for a file"),
+    ("fit(data, progress=3)", "progress: expected a function"),
+]
 
 
-def test_a_run_without_a_folder_leaves_nothing_behind() -> None:
-    """Its files last as long as the result."""
-    flown = {"vessel": "wam_v_cal", "manoeuvres": [{"kind": "constant", "drive": 0.5, "steer": 0}]}
-    config = {"task": "simulate", "name": "gone", "programme": {**flown, "duration": 5}}
-    result = residnet.run(config)
-    assert result.read("summary.json")["figures"]["logs"]["value"] == 1
-    assert result.verdict[0].startswith("All 1 manoeuvres ended as they should")
-    assert "logs/constant_01.parquet" in result.files
-    folder = result.folder
-    del result
-    assert not folder.exists()
+def coasting(log: residnet.Log) -> residnet.Log:
+    return log.replace(channels={k: v for k, v in log.channels.items() if not k.startswith("n_")})
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG)
+def test_what_a_stranger_does_wrong_is_answered_in_one_plain_line(
+    call: str,
+    message: str,
+    trials: Path,
+    logs: list[residnet.Log],
+    data: residnet.Data,
+    models: residnet.Models,
+) -> None:
+    (trials / "empty").mkdir(exist_ok=True)
+    names = {name: getattr(residnet, name) for name in residnet.__all__}
+    names |= {"np": np, "pd": pd, "coasting": coasting, "x": np.zeros(6), "w": np.zeros(2)}
+    names |= {"folder": trials, "logs": logs, "data": data, "models": models}
+    with pytest.raises(ResidnetError, match=message) as caught:
+        eval(call, {**names, "ridge": models["ridge"]})
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400

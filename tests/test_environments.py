@@ -8,12 +8,11 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from random_vessels import random_logs
+from tiny import write_yaml
 
 from residnet.tasks.drafting import new_config
 from residnet.tasks.inspection import inspect_logs
@@ -21,41 +20,39 @@ from residnet.tasks.registry import finished_task, load_task
 
 pytestmark = pytest.mark.long
 
-CONFIG: dict[str, Any] = {
-    "task": "fit",
-    "name": "bare",
-    "signals": {"inputs": ["n", "delta"]},
-    "baseline": {"kind": "regressors", "sets": ["linear"], "ridge": 0.01},
-    "evaluation": {"scales": {"u": 1.0, "v": 0.3, "r": 0.1}},
-    "export": {"models": []},
-}
-
 
 def written(folder: Path, names: list[str]) -> Path:
     """Return a config of a baseline beside logs of a boat in canonical files, one of each name."""
-    source, folder, files = random_logs("boat", 3, 1)[0], folder / "logs", list[str]()
-    folder.mkdir()
+    source, logs, files = random_logs("boat", 3, 1)[0], folder / "logs", list[str]()
+    logs.mkdir()
     length = len(source[0]) // -(-len(names) // 3)
     for number, name in enumerate(names):
         log = source[number % 3].rows(slice(number // 3 * length, (number // 3 + 1) * length))
         # pyarrow opens no file whose name is not UTF-8
         bare = name.replace("/", "_").replace("\0", "_").encode("utf-8", "replace")[:200]
-        path = folder / os.fsdecode(b"%03d_%b.parquet" % (number, bare))
+        path = logs / os.fsdecode(b"%03d_%b.parquet" % (number, bare))
         log.replace(name=name, meta={**log.meta, "manoeuvre": name}).save(path)
         files.append(path.name)
     parts = {"train": files[::3], "validation": files[1::3], "test": files[2::3]}
-    data = {"kind": "measured", "reader": {"kind": "canonical"}, "split": {"root": "logs", **parts}}
     step = float(np.median(np.diff(source[0].t)))
-    config = {**CONFIG, "data": data, "prepare": {"grid": {"step": step}}}
-    config["prepare"]["derivative"] = {"kind": "savitzky_golay", "window": 10 * step, "order": 2}
+    derivative = {"kind": "savitzky_golay", "window": 10 * step, "order": 2}
     windows = {"kind": "windows", "length": 100 * step, "first": 20 * step}
-    config["evaluation"] = {
-        **CONFIG["evaluation"],
-        "protocols": {"T100": windows},
-        "selection": "T100",
+    split = {"root": "logs", **parts}
+    config = {
+        "task": "fit",
+        "name": "bare",
+        "data": {"kind": "measured", "reader": {"kind": "canonical"}, "split": split},
+        "prepare": {"grid": {"step": step}, "derivative": derivative},
+        "signals": {"inputs": ["n", "delta"]},
+        "baseline": {"kind": "regressors", "sets": ["linear"], "ridge": 0.01},
+        "evaluation": {
+            "scales": {"u": 1.0, "v": 0.3, "r": 0.1},
+            "protocols": {"T100": windows},
+            "selection": "T100",
+        },
+        "export": {"models": []},
     }
-    (folder.parent / "bare.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
-    return folder.parent / "bare.yaml"
+    return write_yaml(folder / "bare.yaml", config)
 
 
 PLAIN = r"""

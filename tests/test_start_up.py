@@ -34,20 +34,17 @@ def loaded(*commands: str) -> list[str]:
     return [name for name in HEAVY if f"'{name}'" in line]
 
 
-def test_lists_and_errors_of_files_and_tasks_import_nothing_heavy(tmp_path: Path) -> None:
+def test_lists_tables_and_errors_of_files_and_tasks_import_nothing_heavy(tmp_path: Path) -> None:
     wrong = tmp_path / "task.yaml", tmp_path / "twice.yaml"
     for file, text in zip(wrong, ("task: fitt\n", "task: fit\ntask: fit\n"), strict=True):
         file.write_text(text + "name: a\n")
     checks = [f"check {one}" for one in (*wrong, "quickstrat")]
     assert loaded(*(f"list {what}" for what in NAMES), *checks) == []
+    rows = [f"{0.1 * k:.1f},{0.1 * k % 3:.3f},{0.01 * (k % 7):.3f}" for k in range(60)]
+    (tmp_path / "log.csv").write_text("\n".join(["t [s],u [m/s],delta [rad]", *rows]))
+    assert loaded(f"inspect {tmp_path / 'log.csv'}") == ["pandas"]
 
 
 def test_a_check_and_errors_of_a_fit_import_torch_alone() -> None:
     """Its models are built as they are read, so that what does not fit together is refused."""
     assert loaded("check quickstart -s nme=3", "check quickstart") == ["torch"]
-
-
-def test_looking_at_a_table_imports_no_torch(tmp_path: Path) -> None:
-    rows = [f"{0.1 * k:.1f},{0.1 * k % 3:.3f},{0.01 * (k % 7):.3f}" for k in range(60)]
-    (tmp_path / "log.csv").write_text("\n".join(["t [s],u [m/s],delta [rad]", *rows]))
-    assert loaded(f"inspect {tmp_path / 'log.csv'}") == ["pandas"]

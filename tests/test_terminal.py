@@ -14,27 +14,22 @@ from residnet.core.progress import begin, report, say
 
 
 def test_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """A message stands for the end of its stage, and one that begins again is told again."""
     with drawn_progress():
         say("reading logs")
         for done in range(4):
             report("training lstm", done, 3)
         report("training lstm", 3, 3)
         report("searching")
-    assert capsys.readouterr() == ("", "reading logs\n  training lstm: all 3 done\n")
-
-
-def test_a_message_stands_for_the_end_of_its_stage(capsys: pytest.CaptureFixture[str]) -> None:
-    with drawn_progress():
         report("training mlp", 2, 2, "mlp: epoch 2/2")
-    assert capsys.readouterr().err == "mlp: epoch 2/2\n"
-
-
-def test_a_stage_that_begins_again_is_told_again(capsys: pytest.CaptureFixture[str]) -> None:
-    with drawn_progress():
         for _ in range(2):
             report("free runs", 1, 2)
             report("free runs", 2, 2)
-    assert capsys.readouterr().err == "  free runs: all 2 done\n" * 2
+    ran = "  free runs: all 2 done\n" * 2
+    told = f"reading logs\n  training lstm: all 3 done\nmlp: epoch 2/2\n{ran}"
+    assert capsys.readouterr() == ("", told)
+    say("nobody listens")
+    assert capsys.readouterr() == ("", "")
 
 
 class Terminal(io.StringIO):
@@ -74,10 +69,3 @@ def test_long_work_is_never_silent(
     assert "  free runs, 3 of 8: 0 s so far" in told
     time.sleep(0.1)
     assert capsys.readouterr().err == ""
-
-
-def test_nothing_is_drawn_outside(capsys: pytest.CaptureFixture[str]) -> None:
-    with drawn_progress():
-        pass
-    say("nobody listens")
-    assert capsys.readouterr() == ("", "")

@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 from pydantic import ValidationError
+from tiny import write_yaml
 
 from residnet.control.heading.conditions import ConditionedRun, ConditionsConfig, DepthChanges
 from residnet.control.heading.controllers import DepthConfig, DepthPolicySpec, Steering
@@ -25,23 +26,17 @@ from residnet.tasks.autopilot import AutopilotConfig
 DEG = math.pi / 180
 CONFIG = Path(__file__).parents[2] / "configs" / "autopilot_remus_depth.yaml"
 TURNING = Turning(0.88, 0.81, 2.55, 0.28)
-LAWS: dict[str, dict[str, Any]] = {
-    "pid": {"kind": "pid", "kp": 1.5, "damping_time": 0.5, "integral_time": 5.0},
-    "ptos": {
-        "kind": "ptos", "lag": 1.0, "steepness": 6.2, "share": 0.34, "damping": 0.8,
-        "heading_rate": 4.0, "yaw_rate_rate": 15.0, "push_rate": 0.25, "cross_rate": 1.2,
-    },
+LAW: dict[str, Any] = {
+    "kind": "ptos", "lag": 1.0, "steepness": 6.2, "share": 0.34, "damping": 0.8,
+    "heading_rate": 4.0, "yaw_rate_rate": 15.0, "push_rate": 0.25, "cross_rate": 1.2,
 }  # fmt: skip
 SIGHT = {"lookahead": 10.0, "depth_rate": 1.0, "drift_rate": 0.2}
+COMPLETE = DepthConfig.model_validate({"pitch": LAW, **SIGHT})
 
 
 @pytest.fixture(scope="module")
 def vessel() -> SteeredPlant:
     return SteeredPlant(load_vessel("remus_100").build(), axis=DEPTH)
-
-
-def config(law: str) -> DepthConfig:
-    return DepthConfig.model_validate({"pitch": LAWS[law], **SIGHT})
 
 
 def test_the_planes_come_first_and_nothing_varied_is_the_plant(vessel: SteeredPlant) -> None:
@@ -58,11 +53,8 @@ def test_the_planes_come_first_and_nothing_varied_is_the_plant(vessel: SteeredPl
     assert mine[0, -1, vessel.column("z")] > 1.0
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_a_depth_is_held_to_a_centimetre_with_a_trim_that_is_off(
-    vessel: SteeredPlant, law: str
-) -> None:
-    policy = config(law).build(Steering(vessel, TURNING, 15 * DEG, 0.1))
+def test_a_depth_is_held_to_a_centimetre_with_a_trim_that_is_off(vessel: SteeredPlant) -> None:
+    policy = COMPLETE.build(Steering(vessel, TURNING, 15 * DEG, 0.1))
     biased = torch.tensor([[1.0, 1.0, 2 * DEG], [0.8, 1.2, -DEG]])
     flown = fly(vessel, policy, torch.tensor([3.0, -2.0]), biased, dt=0.1, duration=45.0)
     assert float(flown.error[:, -100:].abs().max()) < 0.01
@@ -72,12 +64,12 @@ def test_a_depth_is_held_to_a_centimetre_with_a_trim_that_is_off(
 
 def test_rows_are_the_policies_of_their_own_constants(vessel: SteeredPlant) -> None:
     steering = Steering(vessel, TURNING, 15 * DEG, 0.1)
-    wanted = config("ptos").complete()
+    wanted = COMPLETE.complete()
     open_ = DepthConfig.model_validate({"pitch": {"kind": "ptos", "lag": 1.0}})
     assert list(open_.parameters()) == list(wanted) == list(open_.axes(TURNING))
-    assert open_.tuned(wanted) == config("ptos")
+    assert open_.tuned(wanted) == COMPLETE
     rows = {name: torch.tensor([value, 2.0 * value]) for name, value in wanted.items()}
-    many, one = open_.rows(rows, steering).float(), config("ptos").build(steering).float()
+    many, one = open_.rows(rows, steering).float(), COMPLETE.build(steering).float()
     x = torch.zeros(2, len(vessel.state))
     x[:, vessel.column("u")], x[:, vessel.column("theta")] = 2.5, -0.1
     reference, s = torch.tensor([[0.5], [0.5]]), one.initial_state(x)
@@ -91,7 +83,7 @@ def test_gradients_of_the_cost_reach_law_line_of_sight_and_network(vessel: Steer
     torch.manual_seed(0)
     described = {
         "state": vessel.state, **vars(TURNING), "limit": 15 * DEG, "rate": None, "dt": 0.1,
-        "trained_at": 0.1, "units": 3, "law": LAWS["ptos"],
+        "trained_at": 0.1, "units": 3, "law": LAW,
     }  # fmt: skip
     law: Any = described
     policy = DepthPolicySpec(law=law, steepest=0.5, sight=SIGHT).build().float()
@@ -109,20 +101,19 @@ def test_gradients_of_the_cost_reach_law_line_of_sight_and_network(vessel: Steer
         assert float(part.grad.abs().max()) > 0
 
 
-def test_planes_that_are_reversed_are_refused(vessel: SteeredPlant) -> None:
-    reversed_ = DEPTH._replace(side=1.0)
-    torpedo = SteeredPlant(load_vessel("remus_100").build(), axis=reversed_)
-    with pytest.raises(FitError, match="check the sign"):
-        torpedo.turning(10 * DEG, 8.0, 0.1)
-
-
-def test_a_vessel_that_nothing_rights_is_refused(tmp_path: Path) -> None:
+def test_planes_that_are_reversed_and_a_vessel_that_nothing_rights_are_refused(
+    tmp_path: Path,
+) -> None:
     content = yaml.safe_load(Path("configs/vessels/remus_100.yaml").read_text())
     content["rigid_body"]["z_G"]["value"] = 0.0
-    (file := tmp_path / "neutral.yaml").write_text(yaml.safe_dump(content))
-    neutral = SteeredPlant(load_vessel(str(file)).build(), axis=DEPTH)
-    with pytest.raises(FitError, match="nothing rights it"):
-        neutral.turning(math.radians(15.0), 20.0, 0.1)
+    neutral = write_yaml(tmp_path / "neutral.yaml", content)
+    for name, axis, seconds, said in (
+        ("remus_100", DEPTH._replace(side=1.0), 8.0, "check the sign"),
+        (str(neutral), DEPTH, 20.0, "nothing rights it"),
+    ):
+        torpedo = SteeredPlant(load_vessel(name).build(), axis=axis)
+        with pytest.raises(FitError, match=said):
+            torpedo.turning(15 * DEG, seconds, 0.1)
 
 
 def test_vessels_without_planes_and_mixed_axes_are_refused() -> None:

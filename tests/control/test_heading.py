@@ -1,36 +1,46 @@
-"""Heading autopilots: their laws by hand, and what flies with them."""
+"""Heading autopilots: their laws by hand, what flies with them on vessels and on learned models,
+and the time-optimal floor of a rudder of finite rate.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from exact_steps import NomotoDynamics
 from kinds import of_kind
+from made_models import nomoto_model
+from scipy.integrate import solve_ivp
+from scipy.optimize import linprog
 from torch import Tensor
 
-from residnet.control import (
-    BangBangHeading,
-    ClosedLoop,
-    GivenReference,
-    HeadingPD,
-    Policy,
-)
-from residnet.control.heading.controllers import PidConfig, Steering
+from residnet.baselines.regressors import RegressorsConfig
+from residnet.control import BangBangHeading, ClosedLoop, GivenReference, HeadingPD, Policy
+from residnet.control.heading.classical import RatedBangBangHeading
+from residnet.control.heading.controllers import BangBangConfig, PdConfig, PidConfig, Steering
 from residnet.control.heading.turning import Turning
-from residnet.control.heading.vessels import SteeredPlant
+from residnet.control.heading.vessels import Flights, SteeredModel, SteeredPlant, fly
 from residnet.core.errors import ConfigError
 from residnet.documents.gouletas2020.law import DocumentAutopilot, Predictor, SimulatedPredictor
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.steering_variation import DEPTH
 from residnet.physics.nomoto import SteeringVessel
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
+from residnet.testing.checks import SUBMERGED, example_spec
 
-GAIN, TIME, LIMIT = 3.47, 3.94, float(np.radians(5.0))
+DEG = math.pi / 180
+GAIN, TIME, LIMIT = 3.47, 3.94, 5 * DEG
 STATE = ("x", "y", "psi", "u", "v", "r")
+OCEANOS = of_kind(load_vessel("nomoto_oceanos").build(), SteeringVessel)
+RATED = SteeredPlant(load_vessel("nomoto_oceanos_rate10").build())
+NOMINAL = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+NONE = torch.zeros(1, 0, dtype=torch.float64)
 
 
 def at(psi: float, r: float) -> Tensor:
@@ -41,29 +51,28 @@ def heading(*psi: float) -> Tensor:
     return torch.tensor(psi, dtype=torch.float64)[:, None]
 
 
-def flown(policy: Policy, target: float, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Headings and rudder angles of a step of heading, 0.01 s apart."""
-    plant = of_kind(load_vessel("nomoto_oceanos").build(), SteeringVessel)
-    steps = round(100 * seconds)
-    x0 = plant.approach(1)
+def flown(
+    policy: Policy, target: float, seconds: float, dt: float = 0.01
+) -> tuple[np.ndarray, np.ndarray]:
+    """Headings and rudder angles of a step of heading."""
+    x0 = OCEANOS.approach(1)
     source = ClosedLoop(policy, GivenReference(torch.full((1, 1, 1), target, dtype=torch.float64)))
+    w = torch.zeros(1, round(seconds / dt), 1, dtype=torch.float64)
     with torch.no_grad():
-        states, inputs, _ = Rollout(NomotoDynamics(plant, 0.01), source)(
-            x0, torch.zeros(1, steps, 1, dtype=torch.float64), x0[:, :0]
-        )
+        states, inputs, _ = Rollout(NomotoDynamics(OCEANOS, dt), source)(x0, w, x0[:, :0])
     return states[0, :, 2].numpy(), inputs[0, :, 0].numpy()
 
 
-def test_pd_law_saturation_and_wrapped_error() -> None:
+def test_the_pd_law_saturates_and_takes_the_shorter_way_round() -> None:
     policy = HeadingPD(STATE, kp=2.0, kd=3.0, limit=0.5)
-    none = torch.zeros(1, 0, dtype=torch.float64)
-    assert policy(at(0.1, 0.02), heading(0.2), none)[0].item() == pytest.approx(2 * 0.1 - 3 * 0.02)
-    assert policy(at(0.0, 0.0), heading(1.0), none)[0].item() == 0.5
-    # 170 deg to -170 deg is 20 deg to starboard, and a heading that has gone round is where it is
-    assert policy(at(np.radians(170), 0.0), heading(np.radians(-170)), none)[
-        0
-    ].item() == pytest.approx(0.5)
-    assert policy(at(4 * np.pi + 0.1, 0.0), heading(0.2), none)[0].item() == pytest.approx(0.2)
+    for psi, r, wanted, expected in (
+        (0.1, 0.02, 0.2, 2 * 0.1 - 3 * 0.02),
+        (0.0, 0.0, 1.0, 0.5),
+        # 170 to -170 deg is 20 deg to starboard, and a heading that has gone round is where it is
+        (170 * DEG, 0.0, -170 * DEG, 0.5),
+        (4 * np.pi + 0.1, 0.0, 0.2, 0.2),
+    ):
+        assert policy(at(psi, r), heading(wanted), NONE)[0].item() == pytest.approx(expected)
 
 
 def test_placed_poles_show_in_the_response() -> None:
@@ -72,34 +81,34 @@ def test_placed_poles_show_in_the_response() -> None:
     """
     policy = HeadingPD.placed(STATE, gain=GAIN, time=TIME, frequency=0.5, damping=0.6, limit=LIMIT)
     target = 0.05
-    psi, rudder = flown(policy, target, 40.0)
+    psi, rudder = flown(policy, target, 40.0, 0.02)
     assert np.abs(rudder).max() < LIMIT
     assert psi.max() / target - 1 == pytest.approx(np.exp(-np.pi * 0.6 / 0.8), rel=0.03)
     assert psi[-1] == pytest.approx(target, rel=1e-3)
 
 
+class Askew(Policy):
+    """A rudder that stands askew."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        self.policy, self.n_state = policy, policy.n_state
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        command, s = self.policy(x, reference, s)
+        return command + 0.01, s
+
+
 def test_integral_action_against_a_bias_without_winding_up() -> None:
-    """A rudder that stands askew leaves an error that only the integral takes away; during
-    saturation it does not grow.
-    """
-
-    class Askew(Policy):
-        def __init__(self, policy: Policy) -> None:
-            super().__init__()
-            self.policy, self.n_state = policy, policy.n_state
-
-        def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-            command, s = self.policy(x, reference, s)
-            return command + 0.01, s
-
-    target = float(np.radians(30.0))
+    """Only the integral takes away the error that it leaves; during saturation it does not grow."""
+    target = 30 * DEG
     pd = HeadingPD(STATE, kp=1.0, kd=1.0, limit=LIMIT)
-    vessel = SteeredPlant(load_vessel("nomoto_oceanos").build())
     gains = PidConfig(kp=1.0, damping_time=1.0, integral_time=5.0, filter_time=0.0)
-    pid = gains.build(Steering(vessel, Turning(GAIN, TIME, 3.2), LIMIT, 0.01))
-    assert flown(Askew(pd), target, 60.0)[0][-1] - target == pytest.approx(0.01, rel=1e-3)
-    psi, _ = flown(Askew(pid), target, 60.0)
+    steering = Steering(SteeredPlant(OCEANOS), Turning(GAIN, TIME, 3.2), LIMIT, 0.05)
+    assert flown(Askew(pd), target, 40.0, 0.05)[0][-1] - target == pytest.approx(0.01, rel=1e-3)
+    psi, _ = flown(Askew(gains.build(steering)), target, 60.0, 0.05)
     assert psi[-1] == pytest.approx(target, abs=1e-5)
+    pid = gains.build(steering._replace(dt=0.01))
     s = torch.tensor([[0.3, 0.0, 0.0]], dtype=torch.float64)
     held, after = pid(at(0.0, 0.0), heading(target), s)
     waits = "saturated towards the target: the integral waits"
@@ -113,7 +122,7 @@ def test_time_optimal_switches_where_the_closed_form_says() -> None:
     """The shortest turn from rest to rest: full rudder for t1, full counter-rudder for t2, with the
     sums of their effects on r and psi.
     """
-    target = float(np.radians(30.0))
+    target = 30 * DEG
     psi, rudder = flown(BangBangHeading(STATE, gain=GAIN, time=TIME, limit=LIMIT), target, 20.0)
     steady = GAIN * LIMIT
     # r(t1) = steady (1 - e^(-t1/T)), back to zero in t2 = T ln(1 + r1/steady), heading steady (t1 -
@@ -148,56 +157,41 @@ def test_document_law_mixes_two_choices() -> None:
     command, _ = policy(x, heading(np.radians(3.1), np.radians(40.0)), x[:, :0])
     # row 0: error wants 1.55 deg -> 1.5, rate wants 1.2 deg -> 1.25; row 1: the error saturates,
     # the rate wants none
-    assert np.degrees(command[:, 0].numpy()).tolist() == pytest.approx(
-        [0.2 * 1.5 + 0.8 * 1.25, 1.0]
-    )
-
-
-def test_document_law_takes_the_shorter_way_round() -> None:
-    """A vessel that has turned once around, under a heading within +-pi."""
-    policy = DocumentAutopilot(Linear(), limit=LIMIT)
-    x = torch.cat(
-        (at(0.0, np.radians(0.6)), at(2 * np.pi, np.radians(0.6)), at(-4 * np.pi, np.radians(0.6)))
-    )
-    command, _ = policy(x, heading(*[np.radians(3.1)] * 3), x[:, :0])
-    assert command[:, 0].tolist() == pytest.approx([float(command[0, 0])] * 3)
+    expected = [0.2 * 1.5 + 0.8 * 1.25, 1.0]
+    assert np.degrees(command[:, 0].numpy()).tolist() == pytest.approx(expected)
+    # a vessel that has turned once around, under a heading within +-pi
+    x = torch.cat([at(2 * np.pi * turns, 0.6 * DEG) for turns in (1, -2)])
+    again, _ = policy(x, heading(*[3.1 * DEG] * 2), x[:, :0])
+    assert again[:, 0].tolist() == pytest.approx([float(command[0, 0])] * 2)
 
 
 @pytest.mark.long
-def test_document_autopilot_creeps_as_errata_says() -> None:
+def test_the_document_s_autopilot_creeps_as_errata_says() -> None:
     """With the source's horizon of one step it turns at 0.011 deg/s; with 2 s it arrives."""
-    plant = of_kind(load_vessel("nomoto_oceanos").build(), SteeringVessel)
-    target = float(np.radians(30.0))
-    near = DocumentAutopilot(
-        SimulatedPredictor(NomotoDynamics(plant, 0.01), plant.state, 1), limit=LIMIT
+    near, far = (
+        DocumentAutopilot(SimulatedPredictor(NomotoDynamics(OCEANOS, dt), STATE, 1), limit=LIMIT)
+        for dt in (0.01, 2.0)
     )
-    far = DocumentAutopilot(
-        SimulatedPredictor(NomotoDynamics(plant, 2.0), plant.state, 1), limit=LIMIT
-    )
-    psi, _ = flown(near, target, 20.0)
+    psi, _ = flown(near, 30 * DEG, 20.0)
     assert np.degrees(psi[-1] - psi[1000]) / 10.0 == pytest.approx(0.0107, abs=0.0005)
-    psi, _ = flown(far, target, 40.0)
+    psi, _ = flown(far, 30 * DEG, 40.0)
     assert np.degrees(psi[-1]) == pytest.approx(30.0, abs=0.3)
 
 
 def test_a_simulated_predictor_is_the_simulation_of_each_candidate() -> None:
     plant = of_kind(load_vessel("patrol_p06").build(), HullPlant).in_calm_water()
-    model = PlantDynamics(plant, 0.25)
+    model, held = PlantDynamics(plant, 0.25), torch.tensor([1e5], dtype=torch.float64)
     x = plant.approach(2)
     x[1, 3], x[1, 7] = 0.3, 0.02
-    rudder = torch.tensor([-0.08, 0.0, 0.08], dtype=torch.float64)
-    error, rate = SimulatedPredictor(
-        model, plant.state, 8, torch.tensor([1e5], dtype=torch.float64)
-    )(x, torch.tensor([0.5, 0.4], dtype=torch.float64), rudder)
+    rudder, targets = torch.tensor([-0.08, 0.0, 0.08]).double(), torch.tensor([0.5, 0.4]).double()
+    error, rate = SimulatedPredictor(model, plant.state, 8, held)(x, targets, rudder)
     assert error.shape == rate.shape == (2, 3)
-    for row, target in enumerate((0.5, 0.4)):
+    for row, target in enumerate(targets.tolist()):
         for column, angle in enumerate(rudder.tolist()):
             w = torch.tensor([angle, 1e5], dtype=torch.float64).expand(1, 8, -1)
-            states, _, _ = Rollout(model)(x[row : row + 1], w, x[:1, :0])
-            assert error[row, column].item() == pytest.approx(
-                target - states[0, -1, 3].item(), abs=1e-13
-            )
-            assert rate[row, column].item() == pytest.approx(states[0, -1, 7].item(), abs=1e-13)
+            end = Rollout(model)(x[row : row + 1], w, x[:1, :0])[0][0, -1]
+            assert error[row, column].item() == pytest.approx(target - end[3].item(), abs=1e-13)
+            assert rate[row, column].item() == pytest.approx(end[7].item(), abs=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -206,14 +200,206 @@ def test_a_simulated_predictor_is_the_simulation_of_each_candidate() -> None:
         (lambda: HeadingPD(STATE, kp=1, kd=1, limit=0), "limit must be positive"),
         (lambda: BangBangHeading(STATE, gain=1, time=-1, limit=1), "must be positive"),
         (lambda: DocumentAutopilot(Linear(), limit=1, candidates=1), "candidates >= 2"),
-        (
-            lambda: SimulatedPredictor(
-                PlantDynamics(load_vessel("nomoto_oceanos").build(), 0.1), STATE, 0
-            ),
-            "one step or more",
-        ),
+        (lambda: SimulatedPredictor(PlantDynamics(OCEANOS, 0.1), STATE, 0), "one step or more"),
     ],
 )
 def test_wrong_numbers_stop(make: Callable[[], object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make()
+
+
+def made(error: list[list[float]], dt: float = 0.5) -> Flights:
+    errors = torch.tensor(error, dtype=torch.float64)
+    rudder = torch.full((*errors[:, 1:].shape, 1), 0.2, dtype=torch.float64)
+    return Flights(-errors.unsqueeze(-1), rudder, 0.0 * errors[:, 0], dt, ("psi",))
+
+
+def test_what_is_read_from_a_flight() -> None:
+    """It has settled at the last entry between samples, and never where it breaks off."""
+    flights = made(
+        [
+            [3.0, 1.5, 0.5, 0.2, 0.1],
+            [3.0, 0.5, -1.5, -0.5, 0.0],
+            [0.5, 0.4, 0.3, 0.2, 0.1],
+            [3.0, 2.0, 2.0, 2.0, 1.5],
+        ]
+    )
+    assert flights.settled(1.0).tolist() == pytest.approx([0.75, 1.25, 0.0, 2.0])
+    assert float(made([[3.0, 0.5, math.nan, math.nan]]).settled(1.0)[0]) == 1.5
+    flights = made([[3.0, 1.0, -1.0, 1.0, -1.0]])
+    assert float(flights.effort()[0]) == pytest.approx(4 * 0.04 * 0.5)
+    assert float(flights.rms("psi", 0.5)[0]) == pytest.approx(1.0)
+    assert float(flights.rudder_rms()[0]) == pytest.approx(0.2)
+
+
+def shortest_to_rest(change: float, rate: float, limit: float, dt: float = 0.1) -> float:
+    """Least time from rest to rest with the rudder amidships at both ends: linear programmes over
+    rudder sequences, halving the horizon.
+    """
+
+    def possible(steps: int) -> bool:
+        # delta_k piecewise linear between samples; r and psi at the end are linear in it (trapezoid
+        # over fine cells)
+        lag = np.array([(steps - k) * dt for k in range(steps + 1)])
+        to_r = GAIN / TIME * np.exp(-lag / TIME) * dt
+        to_psi = GAIN * (1 - np.exp(-lag / TIME)) * dt
+        equal = np.vstack([to_r, to_psi, np.eye(steps + 1)[0], np.eye(steps + 1)[-1]])
+        change_of = np.diff(np.eye(steps + 1), axis=0)
+        result = linprog(
+            np.zeros(steps + 1),
+            A_ub=np.vstack([change_of, -change_of]),
+            b_ub=np.full(2 * steps, rate * dt),
+            A_eq=equal,
+            b_eq=[0.0, change, 0.0, 0.0],
+            bounds=(-limit, limit),
+        )
+        return bool(result.status == 0)
+
+    low, high = 40, 80
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if possible(middle) else (middle, high)
+    return high * dt
+
+
+def test_the_floor_of_a_slow_rudder_comes_to_rest_in_the_least_time() -> None:
+    floor = BangBangConfig().build(Steering(RATED, RATED.turning(LIMIT, 60.0), LIMIT, 0.01))
+    assert isinstance(floor, RatedBangBangHeading)
+    changes = torch.tensor([30 * DEG, -30 * DEG])
+    flights = fly(RATED, floor, changes, NOMINAL.float().expand(2, -1), dt=0.01, duration=10.0)
+    least = shortest_to_rest(30 * DEG, 10 * DEG, 5 * DEG)
+    # on the way to rest the rudder comes back at its rate: heading K/T rate t^3 / 6 is left a time
+    # t before
+    early = (0.1 * DEG * 6.0 * TIME / (GAIN * 10 * DEG)) ** (1 / 3)
+    assert float(flights.settled(0.1 * DEG).max()) == pytest.approx(least - early, abs=0.15)
+    assert float(flights.overshoot().max()) < 0.05 * DEG
+    assert torch.allclose(flights.states[0, :, 2], -flights.states[1, :, 2], atol=1e-9)
+
+
+class HardOver(Policy):
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.full_like(reference, LIMIT), s
+
+
+def test_a_flight_is_what_an_ode_solver_says() -> None:
+    """Rudder hard over from the start: it moves at its rate, and the heading follows Nomoto's
+    equation.
+    """
+    varied = torch.tensor([[0.9, 1.1, 0.0]])
+    flights = fly(RATED, HardOver(), torch.tensor([1.0]), varied, dt=0.005, duration=3.0)
+
+    def rates(t: float, y: np.ndarray) -> list[float]:
+        return [y[1], (0.9 * GAIN * min(10 * DEG * t, LIMIT) - y[1]) / (1.1 * TIME)]
+
+    truth = solve_ivp(rates, (0.0, 3.0), [0.0, 0.0], rtol=1e-9, atol=1e-12, max_step=0.01).y[:, -1]
+    # the rudder moves in steps, which is half a step late
+    found = [float(flights.state(name)[0, -1]) for name in ("psi", "r")]
+    assert found == pytest.approx(truth.tolist(), rel=5e-3)
+
+
+def test_the_turn_of_a_slow_vessel_is_waited_for() -> None:
+    """Nomoto's model of second order: the area above the answer is T1 + T2 - T3."""
+    turning = SteeredPlant(load_vessel("nomoto_mariner_yaw").build()).turning(LIMIT, 100.0, 0.2)
+    assert turning.gain == pytest.approx(0.18499155, rel=0.01)
+    assert turning.time == pytest.approx(117.97831 + 7.7630075 - 18.530161, rel=0.02)
+    # the Mariner turns far less in a hard turn than about straight ahead: a yaw rate that
+    # overshoots has the time constant of a zigzag
+    turning = SteeredPlant(load_vessel("mariner").build()).turning(20 * DEG, 60.0, 0.4)
+    assert 0.02 < turning.gain < 0.06
+    assert 15.0 < turning.time < 40.0
+
+
+def test_a_vessel_that_starts_at_rest_runs_up_and_has_the_rate_of_its_lagging_rudder() -> None:
+    boat = SteeredPlant(load_vessel("example_rudder_boat").build())
+    x, w = boat.start(torch.ones(1, dtype=torch.float64))
+    speed = float(x[0, boat.column("u")])
+    assert speed > 3.0
+    assert boat.rate == pytest.approx(25 * DEG)
+    variation = NOMINAL
+    for _ in range(50):
+        x, variation = boat.model(0.1).step(x, w, variation)
+    assert float(x[0, boat.column("u")]) == pytest.approx(speed, rel=1e-4)
+
+
+VARIED = torch.tensor(
+    [[1.0, 1.0, 0.0], [0.8, 1.2, 0.5 * DEG], [1.2, 0.8, -DEG]], dtype=torch.float64
+)
+
+
+def steered(name: str) -> tuple[SteeredPlant, SteeredModel]:
+    vessel = SteeredPlant(load_vessel(name).build())
+    spec, model = nomoto_model(GAIN, TIME, 0.1)
+    return vessel, SteeredModel(model, spec.signals.columns, spec.hold, vessel)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["nomoto_oceanos", "nomoto_oceanos_rate10"])
+def test_a_perfect_model_flies_as_its_vessel(name: str) -> None:
+    """A learned model that is Nomoto's own: with any variation both move alike."""
+    pair, flights = steered(name), []
+    turning, changes = pair[0].turning(LIMIT, 60.0), torch.tensor([0.5, 0.3, -0.4])
+    for vessel in pair:
+        pd = PdConfig(kp=3.0, damping_time=1.5).build(Steering(vessel, turning, LIMIT, 0.01))
+        flights.append(fly(vessel, pd, changes, VARIED, dt=0.01, duration=8.0))
+    # the model divides what a step changes by `time`, which is of first order in the step
+    assert float((flights[0].state("psi") - flights[1].state("psi")).abs().max()) < 1e-3
+    assert float((flights[0].inputs - flights[1].inputs).abs().max()) < 0.1 * DEG
+
+
+def test_turning_is_that_of_the_model_and_of_a_rudder_that_lags() -> None:
+    turning = steered("nomoto_oceanos")[1].turning(LIMIT, 60.0)
+    assert turning.gain == pytest.approx(GAIN, rel=1e-6)
+    assert turning.time == pytest.approx(TIME, rel=1e-3)
+    # fins of a torpedo in six degrees of freedom follow with a time constant of a second
+    vessel, learned = steered("remus_100")
+    assert (vessel.rate, vessel.lag) == (None, pytest.approx(1.0, rel=1e-3))
+    turning = learned.turning(LIMIT, 60.0)
+    assert turning.gain == pytest.approx(GAIN, rel=1e-6)
+    assert turning.time == pytest.approx(TIME + 1.0, rel=1e-2)
+
+
+def test_planes_of_a_learned_torpedo_pitch_it_as_the_vessel_does() -> None:
+    vessel = SteeredPlant(load_vessel("remus_100").build(), axis=DEPTH)
+    # accelerations as the parameters of the vessel have them
+    known = {
+        "u": {"u|u|": -0.192, "n|n|": 0.00508, "|n| u": -0.0312, "w q": -1.9},
+        "w": {"u w": -0.48, "w|w|": -2.58, "u q": 0.527, "u^2 delta_s": -0.0594},
+        "q": {"q": -1.44, "q|q|": -2.7, "sin(theta)": -0.81, "u^2 delta_s": -0.383},
+    }
+    known["u"]["u^2 delta_s^2"] = -0.113
+    rows = {axis: tuple(known.get(axis, ("u v",))) for axis in SUBMERGED.live.velocities}
+    changes = {"baseline": RegressorsConfig.model_validate({"terms": rows}), "integrator": "rk4"}
+    model = example_spec(None, SUBMERGED).model_copy(update=changes).build().double()
+    baseline: Any = model.baseline
+    with torch.no_grad():
+        for axis, row in known.items():
+            for term, value in row.items():
+                place = baseline.outputs.index(f"{axis}_dot"), baseline.library.terms.index(term)
+                baseline.theta[place] = value
+    learned = SteeredModel(model, SUBMERGED.columns, "start", vessel)
+    found, wanted = (one.turning(5 * DEG, 20.0, 0.1) for one in (learned, vessel))
+    assert found.gain == pytest.approx(wanted.gain, rel=0.05)
+    assert found.time == pytest.approx(wanted.time, rel=0.1)
+    with pytest.raises(ConfigError, match="depth control needs a model that tells z"):
+        SteeredModel(nomoto_model(GAIN, TIME, 0.1)[1], ("delta",), "start", vessel)
+
+
+def test_gradients_pass_through_the_model_in_single_precision() -> None:
+    _, learned = steered("nomoto_oceanos_rate10")
+    model = learned.model(0.1)
+    x, w = learned.start(torch.ones(3))
+    command = torch.full((3, 20, 1), 0.02, requires_grad=True)
+    states, _, _ = Rollout(model, None)(x, command, learned.memory(VARIED.float()))
+    states[:, -1, 2].sum().backward()
+    assert states.dtype == torch.float32
+    # heading per rad of rudder that is held grows with the time that is left
+    assert command.grad is not None
+    assert bool((command.grad[:, 1] > command.grad[:, 10]).all())
+    assert w.shape == (3, 1)
+
+
+def test_a_model_without_rudder_is_refused() -> None:
+    _, model = nomoto_model(GAIN, TIME, 0.1)
+    for inputs, said in ((("n_port",), "driven by 'delta'"), (("delta", "n"), "does not command")):
+        with pytest.raises(ConfigError, match=said):
+            SteeredModel(model, inputs, "start", RATED)

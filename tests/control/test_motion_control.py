@@ -4,9 +4,12 @@ waypoints.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from kinds import of_kind
 from scipy.integrate import solve_ivp
 from scipy.signal import step
 
@@ -82,47 +85,40 @@ def test_headings_are_followed_as_written() -> None:
     """0 to 180 deg is clockwise, 135 to -45 deg is not: no wrapping (correction J13)."""
     points = ((0.0, 0.0, np.pi), (0.0, 0.0, 0.75 * np.pi), (0.0, 0.0, -0.25 * np.pi))
     config = ReferenceFilterConfig(waypoints=points, interval=60.0)
-    psi = asked(config.build(0.1), 1800, torch.zeros(1, 6, dtype=torch.float64))[0, :, 2].numpy()
-    assert psi[:600].min() >= 0
-    assert psi[599] == pytest.approx(np.pi, abs=0.01)
-    turning = psi[1205:]
+    psi = asked(config.build(0.2), 900, torch.zeros(1, 6, dtype=torch.float64))[0, :, 2].numpy()
+    assert psi[:300].min() >= 0
+    assert psi[299] == pytest.approx(np.pi, abs=0.01)
+    turning = psi[603:]
     assert (np.diff(turning)[turning[:-1] > 0] < 0).all()
     assert -0.9 < turning.min() < -0.25 * np.pi
     assert psi[-1] == pytest.approx(-0.25 * np.pi, abs=0.01)
 
 
-def test_one_config_for_each_row() -> None:
-    """Rows fly their own waypoints and bandwidths, and stay at their last one."""
+def test_rows_fly_their_own_waypoints_and_bandwidths_and_stay_at_their_last() -> None:
     short = ReferenceFilterConfig(waypoints=WAYPOINTS[:1], interval=10.0, frequency=(0.9, 0.9, 0.9))
     long = ReferenceFilterConfig(waypoints=WAYPOINTS, interval=10.0)
     x = torch.zeros(2, 6, dtype=torch.float64)
     both = asked(ReferenceFilter([short, long], 0.1), 300, x)
     for row, config in enumerate((short, long)):
-        torch.testing.assert_close(
-            both[row], asked(config.build(0.1), 300, x[:1])[0], rtol=1e-12, atol=1e-12
-        )
+        alone = asked(config.build(0.1), 300, x[:1])[0]
+        torch.testing.assert_close(both[row], alone, rtol=1e-12, atol=1e-12)
     assert both[0, -1, 1] == pytest.approx(-15.0, abs=1e-3)
     assert long.duration == 30.0
 
 
-@pytest.mark.parametrize(("intervals", "dt"), [((10.0,), 0.3), ((0.05,), 0.1), ((10.0, 20.0), 0.1)])
-def test_intervals_of_whole_steps(intervals: tuple[float, ...], dt: float) -> None:
-    configs = [
-        ReferenceFilterConfig(waypoints=WAYPOINTS, interval=interval) for interval in intervals
-    ]
-    with pytest.raises(ConfigError, match="whole number of steps"):
-        ReferenceFilter(configs, dt)
-
-
-def test_units_of_waypoints_in_a_file(tmp_path: object) -> None:
+def test_waypoints_have_units_in_a_file_and_intervals_of_whole_steps(tmp_path: Path) -> None:
     text = "waypoints: [[15 m, -15, -90 deg]]\ninterval: 1 min\nfrequency: [0.2, 0.2, 0.4]\n"
-    file = tmp_path / "guidance.yaml"  # type: ignore[operator]
+    file = tmp_path / "guidance.yaml"
     file.write_text(text)
     config = load_config(file, [], ReferenceFilterConfig)
     assert config.waypoints[0] == pytest.approx((15.0, -15.0, -np.pi / 2))
     assert config.interval == 60.0
     with pytest.raises(ConfigError, match="frequency"):
         load_config(file, ["frequency=[0.2, 0, 0.4]"], ReferenceFilterConfig)
+    for intervals, dt in (((10.0,), 0.3), ((0.05,), 0.1), ((10.0, 20.0), 0.1)):
+        configs = [ReferenceFilterConfig(waypoints=WAYPOINTS, interval=one) for one in intervals]
+        with pytest.raises(ConfigError, match="whole number of steps"):
+            ReferenceFilter(configs, dt)
 
 
 GAINS = MotionPIDConfig(
@@ -144,18 +140,14 @@ def test_pid_by_hand() -> None:
     np.testing.assert_allclose(second[0], rest + np.array([6, 7, 45]) * e * dt, rtol=1e-12)
     np.testing.assert_allclose(s[0], 2 * dt * e, rtol=1e-12)
     hull = ferry("milliampere").hull
-    forward = (
-        GAINS.build(dt, HullFeedForward(hull))(x, reference, controller.initial_state(x))[0] - first
-    )
-    np.testing.assert_allclose(
-        hull(reference[:, 3:6], forward), reference[:, 6:9], rtol=1e-9, atol=1e-12
-    )
+    begin = controller.initial_state(x)
+    forward = GAINS.build(dt, HullFeedForward(hull))(x, reference, begin)[0] - first
+    moved = hull(reference[:, 3:6], forward)
+    np.testing.assert_allclose(moved, reference[:, 6:9], rtol=1e-9, atol=1e-12)
 
 
 def ferry(name: str) -> HullPlant:
-    plant = load_vessel(name).build()
-    assert isinstance(plant, HullPlant)
-    return plant
+    return of_kind(load_vessel(name).build(), HullPlant)
 
 
 def test_the_exact_model_follows_without_feedback() -> None:
@@ -211,16 +203,14 @@ def test_allocated_to_azimuth_thrusters() -> None:
     point = torch.zeros(1, 1, 9, dtype=torch.float64)
     point[0, 0, :3] = torch.tensor([0.5, -0.3, 0.2], dtype=torch.float64)
     x0 = plant.approach(1)
-    asked_for = controller(x0, point[:, 0], torch.zeros(1, 3, dtype=torch.float64))[0]
-    command = Allocated(controller, plant.actuators.allocate)(
-        x0, point[:, 0], torch.zeros(1, 3, dtype=torch.float64)
-    )[0]
-    torch.testing.assert_close(
-        plant.actuators.force(x0[:, 6:], command, x0[:, 3:6]), asked_for, rtol=1e-9, atol=1e-9
-    )
+    allocated = Allocated(controller, plant.actuators.allocate)
+    begin = torch.zeros(1, 3, dtype=torch.float64)
+    asked_for, command = (one(x0, point[:, 0], begin)[0] for one in (controller, allocated))
+    made = plant.actuators.force(x0[:, 6:], command, x0[:, 3:6])
+    torch.testing.assert_close(made, asked_for, rtol=1e-9, atol=1e-9)
     w = torch.zeros(1, 600, len(plant.inputs), dtype=torch.float64)
     w[..., plant.inputs.index("force_north")] = 40.0
-    loop = ClosedLoop(Allocated(controller, plant.actuators.allocate), GivenReference(point))
+    loop = ClosedLoop(allocated, GivenReference(point))
     with torch.no_grad():
         states, _, _ = Rollout(RecordedPlantDynamics(plant, dt), loop)(x0, w, x0[:, :0])
     torch.testing.assert_close(states[0, -1, :3], point[0, 0, :3], atol=0.02, rtol=0)

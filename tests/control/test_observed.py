@@ -73,51 +73,44 @@ def test_the_predictor_is_the_model_run_forward_with_the_pending_commands() -> N
     assert torch.allclose(r_ahead, r, atol=1e-12)
 
 
-@pytest.mark.parametrize("rate", [None, 10 * DEG])
-def test_port_and_starboard_are_alike(rate: float | None) -> None:
-    made = trained(8, rate)
+def network() -> Any:
+    """A network without a law, which gives nothing yet."""
+    torch.manual_seed(2)
+    spec = NetworkPolicySpec(
+        state=STATE, gain=3.47, time=3.94, speed=3.2, limit=5 * DEG, rate=10 * DEG, dt=0.02,
+        trained_at=0.04, units=6,
+    )  # fmt: skip
+    return spec.build().double().requires_grad_(False)
+
+
+@pytest.mark.parametrize("kind", ["at once", "rated", "network"])
+def test_port_and_starboard_are_alike(kind: str) -> None:
     x, reference = measured(20)
+    if kind == "network":
+        made = network()
+        assert float(made(x, reference, made.initial_state(x))[0].abs().max()) == 0.0, "amidships"
+        made.network.out.weight.normal_(generator=torch.Generator().manual_seed(1))
+    else:
+        made = trained(8, 10 * DEG if kind == "rated" else None)
     mirrored = x * torch.tensor([-1.0, 1.0, -1.0])
     s, t = made.initial_state(x), made.initial_state(mirrored)
     for _ in range(30):
         one, s = made(x, reference, s)
         other, t = made(mirrored, -reference, t)
     assert torch.allclose(one, -other, atol=1e-9)
-    assert float(one.abs().max()) <= 5 * DEG
-
-
-def test_a_network_without_a_law_is_alike_on_both_sides_and_starts_amidships() -> None:
-    torch.manual_seed(2)
-    spec = NetworkPolicySpec(
-        state=STATE, gain=3.47, time=3.94, speed=3.2, limit=5 * DEG, rate=10 * DEG, dt=0.02,
-        trained_at=0.04, units=6,
-    )  # fmt: skip
-    made = spec.build().double().requires_grad_(False)
-    x, reference = measured(20)
-    mirrored = x * torch.tensor([-1.0, 1.0, -1.0])
-    s = made.initial_state(x)
-    assert float(made(x, reference, s)[0].abs().max()) == 0.0
-    made.network.out.weight.normal_(generator=torch.Generator().manual_seed(1))
-    t = s
-    for _ in range(10):
-        one, s = made(x, reference, s)
-        other, t = made(mirrored, -reference, t)
-    assert torch.allclose(one, -other, atol=1e-12)
     assert 0.0 < float(one.abs().max()) <= 5 * DEG
 
 
 def test_an_untrained_network_and_one_set_to_zero_are_the_law_itself() -> None:
     x, reference = measured(20)
-    law, untrained, off = policy(), policy(16), trained(16).without_network()
-    states = [p.initial_state(x) for p in (law, untrained, off)]
+    policies = [policy(), policy(16), trained(16).without_network(), trained(16)]
+    states = [one.initial_state(x) for one in policies]
     for _ in range(20):
-        commands = []
-        for i, p in enumerate((law, untrained, off)):
-            command, states[i] = p(x, reference, states[i])
-            commands.append(command)
-        assert torch.equal(commands[0], commands[1])
-        assert torch.equal(commands[0], commands[2])
-    assert float((trained(16)(x, reference, trained(16).initial_state(x))[0] - commands[0]).std())
+        moved = [one(x, reference, s) for one, s in zip(policies, states, strict=True)]
+        (law, untrained, off, other), states = map(list, zip(*moved, strict=True))
+        assert torch.equal(law, untrained)
+        assert torch.equal(law, off)
+    assert float((other - law).abs().max()) > 0
 
 
 def test_a_jump_of_the_reference_and_full_turns_leave_the_estimate_alone() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import shlex
 import subprocess
@@ -28,14 +27,8 @@ def test_the_tutorial_ends_with_the_numbers_that_it_prints(tmp_path: Path) -> No
     ]
     said = ""
     for command in commands:
-        done = subprocess.run(
-            [sys.executable, "-m", "residnet.cli", *command[1:]],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            env=os.environ,
-            check=False,
-        )
+        words = [sys.executable, "-m", "residnet.cli", *command[1:]]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         said = done.stdout
     assert "finished" in said
@@ -46,12 +39,9 @@ def test_the_tutorial_ends_with_the_numbers_that_it_prints(tmp_path: Path) -> No
     assert all(row["diverged"] == 0 for row in metrics["rows"])
     printed = re.findall(r"^\| (\w+) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", text, re.M)
     assert [name for name, *_ in printed] == ["zero", "baseline", "hull", "mean"]
+    keys = ("model", "split", "protocol", "manoeuvre")
+    rows = {tuple(row[key] for key in keys): row["rmse"] for row in metrics["rows"]}
     for name, *numbers in printed:
-        row = next(
-            row
-            for row in metrics["rows"]
-            if (row["model"], row["split"], row["protocol"], row["manoeuvre"])
-            == (name, "test", "T30", "all")
-        )
-        found = [row["rmse"]["u"], row["rmse"]["v"], math.degrees(row["rmse"]["r"])]
+        rmse = rows[name, "test", "T30", "all"]
+        found = [rmse["u"], rmse["v"], math.degrees(rmse["r"])]
         assert found == pytest.approx([float(number) for number in numbers], rel=0.02), name

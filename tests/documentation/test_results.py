@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+import results
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(scope="module")
-def results() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("results", ROOT / "scripts" / "results.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["results"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_every_figure_names_a_source_that_exists(results: ModuleType) -> None:
+def test_every_figure_names_a_source_that_exists() -> None:
     found = [where for page in results.pages() for where, _ in results.marks(page)]
     assert len(found) > 40
     for where in found:
@@ -38,7 +26,7 @@ def test_every_figure_names_a_source_that_exists(results: ModuleType) -> None:
         assert (ROOT / source.command[0]).is_file(), source.command
 
 
-def test_figures_are_read_from_runs_and_put_into_pages(results: ModuleType, tmp_path: Path) -> None:
+def test_figures_are_read_from_runs_and_put_into_pages(tmp_path: Path) -> None:
     run = tmp_path / "quickstart"
     run.mkdir()
     rows = [{"model": "a", "value": 1}, {"model": "b", "value": [0.123456, 2.0]}]
@@ -54,26 +42,7 @@ def test_figures_are_read_from_runs_and_put_into_pages(results: ModuleType, tmp_
         results.figure("quickstart metrics.json rows[model=c].value", tmp_path)
 
 
-def test_only_runs_of_this_state_count_and_a_lacking_figure_is_named(
-    results: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("<!--= made stdout took\\s(\\d+) -->old<!--/-->")
-    monkeypatch.setattr(results, "pages", lambda: [page])
-    script = tmp_path / "bench.py"
-    script.write_text("print('took 7')")
-    source = results.Source((str(script),), 1)
-    assert results.make("made", source, tmp_path, "first", again=False) == ""
-    script.write_text("print('took long')")
-    assert results.make("made", source, tmp_path, "first", again=False) == ""
-    assert results.lacking("made", tmp_path) == ""
-    assert results.make("made", source, tmp_path, "second", again=False) == ""
-    assert "has no figure made stdout" in results.lacking("made", tmp_path)
-
-
-def test_what_cannot_be_run_is_said(
-    results: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_what_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
     source = results.SOURCES["tanker"]
     assert "needs esso_osaka/" in results.why_not(source, 1000)
@@ -83,41 +52,43 @@ def test_what_cannot_be_run_is_said(
 
 
 def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
-    results: ModuleType,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    page = tmp_path / "page.md"
-    names = ("good", "bad", "long", "other")
-    page.write_text(
-        "\n".join(f"<!--= {name} stdout took\\s(\\d+) -->old<!--/-->" for name in names)
-    )
-    (tmp_path / "good.py").write_text("import sys; print('took', sys.argv[1])")
-    (tmp_path / "bad.py").write_text("raise SystemExit('no such luck')")
     minutes = {"good": 1, "bad": 2, "long": 99, "other": 1}
+    lines = [f"<!--= {name} stdout took\\s(\\d+) -->old<!--/-->" for name in minutes]
+    page, good = tmp_path / "page.md", tmp_path / "good.py"
+    page.write_text("\n".join(lines))
+    good.write_text("import sys; print('took', sys.argv[1])")
+    (tmp_path / "bad.py").write_text("raise SystemExit('no such luck')")
     made = {
-        name: results.Source((str(tmp_path / f"{name}.py"), "7"), minutes[name]) for name in names
+        name: results.Source((str(tmp_path / f"{name}.py"), "7"), least)
+        for name, least in minutes.items()
     }
-    for name, value in {
-        "pages": lambda: [page],
-        "SOURCES": made,
-        "state": lambda: "now",
-        "git": lambda *words: "abc",
-    }.items():
-        monkeypatch.setattr(results, name, value)
+    monkeypatch.setattr(results, "pages", lambda: [page])
+    monkeypatch.setattr(results, "SOURCES", made)
+    monkeypatch.setattr(results, "state", lambda: "now")
+    monkeypatch.setattr(results, "git", lambda *words: "abc")
     call = ["results.py", "--runs", str(tmp_path / "runs"), "--only", "good,bad,long"]
     monkeypatch.setattr(sys, "argv", call)
-    results.main()
+
+    def said() -> str:
+        results.main()
+        return capsys.readouterr().out
+
+    told = said()
     assert [text for _, text in results.marks(page)] == ["7", "old", "old", "old"]
-    said = capsys.readouterr().out
-    assert "1 figures changed; those that were run are of commit abc." in said
-    assert "not run: bad: failed: no such luck" in said
-    assert "not run: long: takes 99 minutes" in said
-    assert "not run: other: not asked for" in said
-    # what is finished is not run again, unless its command is another one
-    results.main()
-    assert "running good" not in capsys.readouterr().out
-    made["good"] = results.Source((str(tmp_path / "good.py"), "8"), 1)
-    results.main()
+    for words in (
+        "1 figures changed; those that were run are of commit abc.",
+        "not run: bad: failed: no such luck",
+        "not run: long: takes 99 minutes",
+        "not run: other: not asked for",
+    ):
+        assert words in told
+    # what is finished is not run again, unless its command or its source is another one
+    assert "running good" not in said()
+    made["good"] = results.Source((str(good), "8"), 1)
+    said()
     assert next(text for _, text in results.marks(page)) == "8"
+    good.write_text("print('took long')")
+    monkeypatch.setattr(results, "state", lambda: "later")
+    assert "has no figure good stdout" in said()

@@ -20,6 +20,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+import readability
 import yaml
 from typer.main import get_command
 
@@ -33,7 +34,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FENCE = re.compile(r"```(?P<kind>\w+)\n(?P<text>.*?)```", re.S)
 TEXT = "\n".join(page.read_text() for page in PAGES)
-NAMED = sorted(set(re.findall(r"residnet run ((?!configs\b)[a-z_0-9]+)\b(?!\.)", TEXT)))
+NAMED = set(re.findall(r"residnet run ((?!configs\b)[a-z_0-9]+)\b(?!\.)", TEXT))
 FILES = sorted(set(re.findall(r"residnet (?:run|check) (configs/[\w./-]+\.yaml)", TEXT)))
 
 
@@ -50,16 +51,11 @@ class Block:
         return f"{self.page}:{self.number}"
 
 
-def blocks() -> list[Block]:
-    found = []
-    for page in PAGES:
-        for number, match in enumerate(FENCE.finditer(page.read_text())):
-            name = page.relative_to(ROOT).as_posix()
-            found.append(Block(name, number, match["kind"], match["text"]))
-    return found
-
-
-BLOCKS = blocks()
+BLOCKS = [
+    Block(page.relative_to(ROOT).as_posix(), number, match["kind"], match["text"])
+    for page in PAGES
+    for number, match in enumerate(FENCE.finditer(page.read_text()))
+]
 
 
 def of_kind(kind: str) -> list[Any]:
@@ -69,6 +65,8 @@ def of_kind(kind: str) -> list[Any]:
 def test_pages_show_what_they_should() -> None:
     assert {"sh", "yaml", "python"} <= {block.kind for block in BLOCKS}
     assert len((ROOT / "README.md").read_text().splitlines()) <= 90
+    assert {path.stem for path in (ROOT / "configs").rglob("*.yaml")} >= NAMED
+    assert all(re.search(rf"^{re.escape(line)}", TEXT, re.M) for line in NOT_RUN)
 
 
 GUIDES = [page for page in PAGES if page.parent.name in ("howto", "tutorials", "results")]
@@ -82,19 +80,6 @@ def test_a_guide_begins_with_what_one_gets_then_the_command(page: Path) -> None:
     assert body.startswith(("| ", "!["))
     before = re.sub(r"(?m)^\|.*$|<!--.*?-->|^!\[.*$", "", body.partition("```")[0])
     assert page.stem == "index" or len(before.split()) <= MOST_WORDS
-
-
-def test_sentences_are_short() -> None:
-    said = subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "readability.py")],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    for line in said.splitlines():
-        found = re.search(r"mean +([\d.]+) words", line)
-        assert found is not None
-        assert float(found[1]) <= 25, line
 
 
 @pytest.mark.parametrize("block", of_kind("yaml"))
@@ -153,11 +138,6 @@ def test_commands_exist(block: Block) -> None:
                 assert word in options, f"{block}: {words[1]} has no option {word}"
 
 
-@pytest.mark.parametrize("name", NAMED)
-def test_named_configs_come_with_residnet(name: str) -> None:
-    assert any(path.stem == name for path in (ROOT / "configs").rglob("*.yaml"))
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_config_files_that_are_named_are_read(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -197,10 +177,11 @@ def test_the_head_of_contributing_keeps_the_contract(tmp_path: Path) -> None:
         "from residnet.testing import check_head",
         "check_head(BrakeConfig())",
     ]
+    path = os.pathsep.join((str(source), str(tmp_path)))
     run = subprocess.run(
         [sys.executable, "-c", "\n".join(lines)],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(source), str(tmp_path)))},
+        env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,
         check=False,
@@ -369,15 +350,13 @@ def test_the_blocks_of_a_page_run(page: str, workspace: Path, tmp_path: Path) ->
             carry_out(block, tmp_path)
 
 
-def test_what_is_not_carried_out_is_shown_somewhere() -> None:
-    assert all(re.search(rf"^{re.escape(line)}", TEXT, re.M) for line in NOT_RUN)
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_files_and_links_exist(page: Path) -> None:
+def test_files_and_links_exist_and_sentences_are_short(page: Path) -> None:
     text = page.read_text()
     for name in re.findall(r"`((?:configs|scripts|src|examples)/[\w./-]+)`", text):
         assert (ROOT / name).exists(), f"{page.name} names {name}"
     if page.name in ("README.md", "CONTRIBUTING.md"):
         for link in re.findall(r"\]\((?!http)([^)#]+)", text):
             assert (page.parent / link).exists(), f"{page.name} links to {link}"
+    counts = readability.sentences(text)
+    assert sum(counts) <= 25 * len(counts), "words of a sentence in the mean"

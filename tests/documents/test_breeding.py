@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from read_page import plain
 from scipy.integrate import solve_ivp
-from tiny import call
+from tiny import Command, read_json, write_yaml
 
 from residnet.documents.halvorsen2019.breeding import TRUTH, NoiseConfig, RecordConfig
 
@@ -62,28 +60,23 @@ def test_noise_as_a_share_of_the_range(on: str, noisy: set[str]) -> None:
         assert (0.19 < largest / np.ptp(values) <= 0.2) if name in noisy else largest == 0
 
 
-def test_a_grid_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_grid_runs(tmp_path: Path, command: Command) -> None:
     pytest.importorskip("deap", reason="genetic programming needs the extra gp")
-    (tmp_path / "c.yaml").write_text(yaml.safe_dump(SMALL))
-    assert call(monkeypatch, "run", tmp_path / "c.yaml", "--out", tmp_path / "run") == 0
-    study = json.loads((tmp_path / "run" / "study.json").read_text())
-    cells = {(row["row"], row["column"]): row for row in study["rows"]}
-    assert set(cells) == {
-        (10, 0.0),
-        (10, 0.5),
-        (300, 0.0),
-    }, "what has no published number is left out"
-    assert cells[300, 0.0]["found"] == 3
-    assert cells[300, 0.0]["published_found"] == 3
-    assert cells[300, 0.0]["error"] < 1e-20
+    run = tmp_path / "run"
+    assert command("run", write_yaml(tmp_path / "c.yaml", SMALL), "--out", run).code == 0
+    cells = {(row["row"], row["column"]): row for row in read_json(run / "study.json")["rows"]}
+    # what has no published number is left out
+    assert set(cells) == {(10, 0.0), (10, 0.5), (300, 0.0)}
+    good = cells[300, 0.0]
+    assert good["found"] == good["published_found"] == len(good["equations"]) == 3
+    assert good["error"] < 1e-20
     assert cells[10, 0.5]["found"] == 0
-    assert len(cells[300, 0.0]["equations"]) == 3
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    summary = read_json(run / "summary.json")
     assert summary["finished"]
     assert summary["figures"]["share of runs that find the equation"]["value"] >= 3 / 9
     assert "of the 30 runs of the same table" in " ".join(summary["verdict"])
-    assert "published 3; " in plain(tmp_path / "run" / "report.html")
-    assert (tmp_path / "run" / "figures" / "study.png").stat().st_size > 1000
+    assert "published 3; " in plain(run / "report.html")
+    assert (run / "figures" / "study.png").stat().st_size > 1000
 
 
 def test_a_late_force_and_its_correction() -> None:

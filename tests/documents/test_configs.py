@@ -10,64 +10,31 @@ from residnet.core.errors import ConfigError
 from residnet.tasks.registry import load_task
 
 STUDIES = Path(__file__).parents[2] / "configs" / "studies"
-REFUSED = (
-    ("jervan2020/operation", ("true=wam_v_cal",), "actuators push in surge, sway and yaw"),
-    ("jervan2020/operation", ("models.lag_ridge.on=nothing",), "no model before it"),
-    ("jervan2020/operation", ("models.lag_ridge.terms=[u_dott]",), "u_dott"),
-    ("jervan2020/operation", ("course.interval=0.05",), "whole number of steps"),
-    ("jervan2020/measured", ("models.ridge.lag=true",), "set force to 'commanded'"),
-    (
-        "jervan2020/measured",
-        ("models.ridge.fit={kind: surface, choose: test}",),
-        "judge a model choose it",
-    ),
-    ("jervan2020/measured", ("models.ridge.terms=[u_dott]",), "u_dott"),
-    ("jervan2020/measured", ("models.zero={fit: {kind: ols}}",), "cannot name a model"),
-    ("jervan2020/measured", ("believed=nomoto_mariner",), "a believed hull needs"),
-    ("jervan2020/measured", ("models.ols.fit.order=3",), "belongs to kind plsr"),
-    ("jervan2020/measured", ("validation.gap=0",), "at least one step"),
-    ("jervan2020/measured", ("prepare.hold=mean",), "leave it out"),
-    (
-        "halvorsen2019/table_5_2",
-        ("rows.key=head.evolution.populaton",),
-        "did you mean 'population'",
-    ),
-    (
-        "halvorsen2019/table_5_2",
-        (
-            "rows={key: head.evolution.crossover, values: [0.1, 0.9]}",
-            "~published",
-            "~published_error",
-        ),
-        "together at most 1",
-    ),
-    ("halvorsen2019/table_5_2", ("published=[[1, 2]]",), "expected . rows of . numbers"),
-    ("halvorsen2019/standard_model", ("standard.weights=[1, 1, 0]",), "positive"),
-    (
-        "halvorsen2019/standard_model",
-        ("equations.force.head.features=[u]",),
-        "give `inputs` instead",
-    ),
-    (
-        "halvorsen2019/standard_model",
-        ("equations.force.head.candidates.coupling=[cmd_n]",),
-        "'cmd_n' is not a channel",
-    ),
-    (
-        "halvorsen2019/standard_model",
-        ("trials.calm.vessel=odin_forces",),
-        "needs a vessel of kind 'odin' with water jets",
-    ),
-    (
-        "moreno2019/moreno2019",
-        ("~heads.p2_each", "~base_of.p2_each"),
-        "'p2_each' is absent; give it, or leave the study out",
-    ),
-    (
-        "woo2018/woo2018",
-        ("~heads.lstm_rate", "~training.lstm_rate"),
-        "'lstm_rate' is absent; give it, or leave the study out",
-    ),
+FERRY, SEA = "jervan2020/operation", "jervan2020/measured"
+GRID, TRIAL = "halvorsen2019/table_5_2", "halvorsen2019/standard_model"
+FAST = "rows={key: head.evolution.crossover, values: [0.1, 0.9]}"
+REFUSED: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    (FERRY, ("true=wam_v_cal",), "actuators push in surge, sway and yaw"),
+    (FERRY, ("models.lag_ridge.on=nothing",), "no model before it"),
+    (FERRY, ("models.lag_ridge.terms=[u_dott]",), "u_dott"),
+    (FERRY, ("course.interval=0.05",), "whole number of steps"),
+    (SEA, ("models.ridge.lag=true",), "set force to 'commanded'"),
+    (SEA, ("models.ridge.fit={kind: surface, choose: test}",), "judge a model choose it"),
+    (SEA, ("models.ridge.terms=[u_dott]",), "u_dott"),
+    (SEA, ("models.zero={fit: {kind: ols}}",), "cannot name a model"),
+    (SEA, ("believed=nomoto_mariner",), "a believed hull needs"),
+    (SEA, ("models.ols.fit.order=3",), "belongs to kind plsr"),
+    (SEA, ("validation.gap=0",), "at least one step"),
+    (SEA, ("prepare.hold=mean",), "leave it out"),
+    (GRID, ("rows.key=head.evolution.populaton",), "did you mean 'population'"),
+    (GRID, (FAST, "~published", "~published_error"), "together at most 1"),
+    (GRID, ("published=[[1, 2]]",), "expected . rows of . numbers"),
+    (TRIAL, ("standard.weights=[1, 1, 0]",), "positive"),
+    (TRIAL, ("equations.force.head.features=[u]",), "give `inputs` instead"),
+    (TRIAL, ("equations.force.head.candidates.coupling=[cmd_n]",), "'cmd_n' is not a channel"),
+    (TRIAL, ("trials.calm.vessel=odin_forces",), "needs a vessel of kind 'odin' with water jets"),
+    ("moreno2019/moreno2019", ("~heads.p2_each", "~base_of.p2_each"), "'p2_each' is absent"),
+    ("woo2018/woo2018", ("~heads.lstm_rate", "~training.lstm_rate"), "or leave the study out"),
 )
 
 

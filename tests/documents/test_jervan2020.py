@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from kinds import of_kind
 
 import residnet
 from residnet.baselines.given import BelievedConfig
@@ -54,9 +55,7 @@ def short() -> Flown:
 
 
 def hull(name: str) -> Any:
-    built = load_vessel(name).build()
-    assert isinstance(built, HullPlant)
-    return built.hull
+    return of_kind(load_vessel(name).build(), HullPlant).hull
 
 
 def test_the_lag_and_the_missing_half_are_found_and_flown(short: Flown) -> None:
@@ -90,24 +89,24 @@ def test_a_fitted_model_runs_forward_as_the_true_ferry(short: Flown) -> None:
     torch.testing.assert_close(nu_dot, short.first.nu_dot[half], rtol=0, atol=2e-3)
 
 
+MISSING = {
+    "u_dot": [-1194.83, 0, 0],
+    "v_dot": [0, -1266.96, -14.07],
+    "r_dot": [0, -31.19, -2534.45],
+    "u": [-13.82, 0, 0],
+    "r^2": [31.19, 0, 0],
+    "u v": [0, 0, -72.13],
+    "u r": [0, -1194.83, -31.19],
+    "v r": [1266.96, 0, 0],
+    "|v|r": [0, 286.07, -60.98],
+    "|r|v": [0, -770.19, 168.41],
+}
+"""Minus half of the believed model (correction J19), which Table 4.11 misprints."""
+
+
 def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
-    """Minus half of the believed model (correction J19), which Table 4.11 misprints."""
     truth = missing_coefficients("milliampere_half", "milliampere")
-    expected = {
-        "u_dot": [-1194.83, 0, 0],
-        "v_dot": [0, -1266.96, -14.07],
-        "r_dot": [0, -31.19, -2534.45],
-        "u": [-13.82, 0, 0],
-        "r^2": [31.19, 0, 0],
-    }
-    expected |= {
-        "u v": [0, 0, -72.13],
-        "u r": [0, -1194.83, -31.19],
-        "v r": [1266.96, 0, 0],
-        "|v|r": [0, 286.07, -60.98],
-        "|r|v": [0, -770.19, 168.41],
-    }
-    for term, values in expected.items():
+    for term, values in MISSING.items():
         assert truth[term] == pytest.approx(values, abs=0.006)
     assert set(truth) <= set(FERRY_TERMS)
 
@@ -119,10 +118,8 @@ def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
     # the logged force is the controller's: feed-forward and feedback, not what the thrusters make
     motion = course(flown.course, flown.loop.step)
     needed = needed_force(ForceModel(hull("milliampere")), motion, None, flown.loop.step)
-    every = slice(None, None, flown.loop.every)
-    torch.testing.assert_close(
-        flight.command, needed[every, :3] + flight.feedback, rtol=1e-9, atol=1e-6
-    )
+    expected = needed[:: flown.loop.every, :3] + flight.feedback
+    torch.testing.assert_close(flight.command, expected, rtol=1e-9, atol=1e-6)
     # and what they make is what moves the hull
     moved = hull("milliampere_azimuth_half").required(flight.nu_dot, flight.nu)
     torch.testing.assert_close(flight.acting, moved, rtol=1e-9, atol=1e-6)
@@ -131,10 +128,8 @@ def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
 
 
 def test_lag_and_no_residual_are_tried_with_every_order(short: Flown) -> None:
-    believed, wanted = (
-        ForceModel(hull("milliampere")),
-        FerryModelConfig.model_validate({"fit": {"kind": "plsr"}}),
-    )
+    believed = ForceModel(hull("milliampere"))
+    wanted = FerryModelConfig.model_validate({"fit": {"kind": "plsr"}})
     late = identify(wanted, short.record, believed)
     assert late.lag is not None
     assert late.fit.notes["left_out"] < 0.1
@@ -184,15 +179,10 @@ def test_what_searches_its_settings_leaves_with_the_whole_course(short: Flown) -
 
 def test_a_feed_forward_worse_than_the_believed_one_is_objected_to() -> None:
     flown = {"believed": {"position_mae": 0.232}, "plsr": {"position_mae": 0.688}}
-    results: dict[str, Any] = {
-        "models": {"plsr": {"share_left": [1.47, 1.47, 1.28]}},
-        "course": flown,
-        "crossing": {},
-        "feed_forward_alone": {},
-    }
-    against = objections("plsr", results)
-    assert len(against) == 2
-    assert "0.688 m, the believed model's 0.232 m" in against[1]
+    results: dict[str, Any] = {"course": flown, "crossing": {}, "feed_forward_alone": {}}
+    results["models"] = {"plsr": {"share_left": [1.47, 1.47, 1.28]}}
+    _, worse = objections("plsr", results)
+    assert "0.688 m, the believed model's 0.232 m" in worse
     results["models"]["plsr"]["share_left"] = [0.1, 0.2, 1.1]
     flown["plsr"]["position_mae"] = 0.1
     assert objections("plsr", results) == []
@@ -207,34 +197,24 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
     assert list(alone) == ["believed", "lag_ridge", "case"]
     assert not any(bool(flight.feedback.any()) for flight in alone.values())
     # the thrusters give what is asked for, and half a ferry moves about twice as much
-    assert (
-        alone["lag_ridge"].tracking.motion_mse[0] < 0.02 * alone["believed"].tracking.motion_mse[0]
-    )
-    assert (
-        alone["believed"].tracking.position_mae
-        > 10 * found.flights["course"]["believed"].tracking.position_mae
-    )
+    ridge, believed = (alone[name].tracking for name in ("lag_ridge", "believed"))
+    assert ridge.motion_mse[0] < 0.02 * believed.motion_mse[0]
+    in_course = found.flights["course"]["believed"].tracking
+    assert believed.position_mae > 10 * in_course.position_mae
     upside_down = found.models["case"].force.corrections[0].coefficients
     assert isinstance(upside_down, torch.Tensor)
     upside_down[:3] -= 5000.0 * torch.eye(3)
     folder = RunFolder.create(tmp_path / "run", "", resume=False)
     results, figures = written(wanted, found, folder)
     assert results["models"]["case"]["not_forward"].startswith("model case: its mass matrix")
-    assert any(
-        sentence.startswith("With lag_ridge as feed-forward, the mean position error in the course")
-        for sentence in wanted.verdict(results)
-    )
-    titles = [section.title for section in wanted.sections(results, folder.path)]
-    assert "Models that cannot run forward in time" in titles
-    assert "Feed-forward without feedback" in titles
-    assert {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")} == {
-        "lag_ridge_forward.yaml"
-    }
-    assert {figure.name for figure in figures} >= {
-        "errors_course",
-        "forces_course",
-        "errors_feed_forward_alone",
-    }
+    told = "With lag_ridge as feed-forward, the mean position error in the course"
+    assert any(sentence.startswith(told) for sentence in wanted.verdict(results))
+    titles = {section.title for section in wanted.sections(results, folder.path)}
+    assert titles >= {"Models that cannot run forward in time", "Feed-forward without feedback"}
+    left = {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")}
+    assert left == {"lag_ridge_forward.yaml"}
+    drawn = {"errors_course", "forces_course", "errors_feed_forward_alone"}
+    assert {figure.name for figure in figures} >= drawn
     row = results["course"]["lag_ridge"]
     assert row["power"][0] * float(found.first.t[-1]) == pytest.approx(row["energy"][0], rel=0.01)
 
@@ -246,19 +226,15 @@ def loaded(force: RequiredForce, low: torch.Tensor, high: torch.Tensor, folder: 
 
 
 @torch.no_grad()
-def test_exported_feed_forward_is_the_model(short: Flown, tmp_path: Path) -> None:
+def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
+    short: Flown, tmp_path: Path
+) -> None:
+    """Far from what identified it, a wild correction commands no more than 1.2 times the hull."""
     model, most = short.models["lag_ridge"].force, torch.tensor([5.0] * 3 + [9.0] * 3)
     asked = loaded(RequiredForce(*model.parts(), mirrored=False), -most, most, tmp_path)
     tau, outside = asked(short.first.nu_dot, short.first.nu)
     torch.testing.assert_close(tau, model(short.first.nu_dot, short.first.nu))
     assert not outside.any()
-
-
-@torch.no_grad()
-def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
-    short: Flown, tmp_path: Path
-) -> None:
-    """Far from what identified it, a wild correction commands no more than 1.2 times the hull."""
     record = record_of(short.first, 20.0, None)
     believed, random = ForceModel(hull("milliampere")), torch.Generator().manual_seed(2)
     wild = Correction(
@@ -338,47 +314,32 @@ def test_constant_force_needs_a_vessel_that_turns() -> None:
     psi = torch.linspace(0, 5, 500, dtype=torch.float64)
     x = torch.randn(500, 4, generator=random, dtype=torch.float64)
     zero = torch.zeros_like(psi)
-    earthly = torch.stack(
-        (
-            torch.stack((psi.cos(), -psi.sin(), zero), -1),
-            torch.stack((psi.sin(), psi.cos(), zero), -1),
-        ),
-        -1,
-    )
-    y = x @ torch.randn(4, 3, generator=random, dtype=torch.float64) + earthly @ torch.tensor(
-        [200.0, 100.0], dtype=torch.float64
-    )
-    torch.testing.assert_close(
-        constant_force(x, y, earthly),
-        torch.tensor([200.0, 100.0], dtype=torch.float64),
-        rtol=1e-8,
-        atol=1e-6,
-    )
+    columns = (psi.cos(), -psi.sin(), zero), (psi.sin(), psi.cos(), zero)
+    earthly = torch.stack([torch.stack(column, -1) for column in columns], -1)
+    force = torch.tensor([200.0, 100.0], dtype=torch.float64)
+    y = x @ torch.randn(4, 3, generator=random, dtype=torch.float64) + earthly @ force
+    torch.testing.assert_close(constant_force(x, y, earthly), force, rtol=1e-8, atol=1e-6)
     with pytest.raises(FitError, match="kept its heading"):
         constant_force(x, y, earthly[:1].expand(500, 3, 2))
 
 
-def test_course_is_the_filters_own_and_its_derivatives_are_consistent() -> None:
+def test_the_course_is_the_filters_own_and_its_derivatives_are_consistent() -> None:
     wanted = config("operation").course
     motion, filtered = course(wanted, 0.02), wanted.build(0.02)
     s, x, rows = torch.zeros(1, 9, dtype=torch.float64), torch.zeros(1, 6, dtype=torch.float64), []
-    for k in range(3100):
+    for k in range(1100):
         reference, s = filtered(x, k, s)
         rows.append(reference[0])
     _, nu, nu_dot = motion.later(0.0)
-    torch.testing.assert_close(
-        torch.cat((motion.pose, nu, nu_dot), -1)[:3100], torch.stack(rows), rtol=1e-9, atol=1e-10
-    )
+    found = torch.cat((motion.pose, nu, nu_dot), -1)[:1100]
+    torch.testing.assert_close(found, torch.stack(rows), rtol=1e-9, atol=1e-10)
     ahead = Derivatives(*(part[500] for part in motion)).later(0.2)
     torch.testing.assert_close(ahead[1], nu[510], rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(ahead[2], nu_dot[510], rtol=1e-2, atol=1e-4)
-
-
-def test_needed_force_and_its_derivatives_along_the_course() -> None:
-    model = ForceModel(hull("milliampere"))
-    motion = course(config("operation").course, 0.02)
-    lag = Lag(frequency=2.0, damping=0.8)
-    needed = needed_force(model, motion, lag, 0.0)
-    inside = slice(200, 2800)
+    # the needed force and its derivatives
+    needed = needed_force(
+        ForceModel(hull("milliampere")), motion, Lag(frequency=2.0, damping=0.8), 0.0
+    )
     slope = (needed[2:, :3] - needed[:-2, :3]) / 0.04
+    inside = slice(200, 2800)
     torch.testing.assert_close(needed[1:-1, 3:6][inside], slope[inside], rtol=2e-2, atol=0.5)

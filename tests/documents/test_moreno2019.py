@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from kinds import of_kind
 from made_run import stored
 
 from residnet.documents import study_sections
@@ -58,27 +59,21 @@ def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
     (section,) = study_sections("moreno2019", made(tmp_path))
     errors, _, figure, _ = section.blocks
     content = json.loads((tmp_path / "study.json").read_text())
-    assert {(row["model"], row["split"]) for row in content["rows"]} == {
-        (m, s) for m in MODELS for s in ("train", "validation", "test")
-    }
+    found = {(row["model"], row["split"]) for row in content["rows"]}
+    assert found == {(m, s) for m in MODELS for s in ("train", "validation", "test")}
     for row in content["rows"]:
         number = MODELS.index(row["model"]) + 1
         assert row["u"] == pytest.approx(1e-2 * number)
         assert row["r"] == pytest.approx(1e-3 * number)
         assert row["u_ci95"][0] <= row["u"] * 1.0001
         assert row["u_ci95"][1] >= row["u"] * 0.9999
-    pair = next(
-        row for row in content["pairs"] if (row["model"], row["split"]) == ("rbf_joint", "test")
-    )
+    rows = {(row["model"], row["split"]): row for row in content["pairs"]}
     # of squares: (3 / 4)^2 - 1
-    assert pair["v"] == pytest.approx(9 / 16 - 1)
+    assert rows["rbf_joint", "test"]["v"] == pytest.approx(9 / 16 - 1)
     assert isinstance(errors, Table)
-    shown = next(
-        row.cells
-        for row in errors.rows
-        if row.label == "polynomial p = 2, together" and row.cells[0].text == "test"
-    )
-    assert shown[1] == Cell("0.0700", "0.0700 to 0.0700; published 0.2249")
+    cells = {(row.label, row.cells[0].text): row.cells for row in errors.rows}
+    shown = cells["polynomial p = 2, together", "test"][1]
+    assert shown == Cell("0.0700", "0.0700 to 0.0700; published 0.2249")
     assert isinstance(figure, Figure)
     assert figure.stills[0].stat().st_size > 10_000
 
@@ -95,9 +90,8 @@ def test_the_curves_are_what_the_search_tried() -> None:
     errors = np.arange(1.0, 19.0).reshape(2, 3, 3)
     notes = {"free_run_choice": choice, "cross_validated_error": errors.tolist()}
     grid, one_step = errors_of_grid(notes)
-    assert grid == {
-        (entry["penalty"][0], entry["sigma"][0]): entry["validation"] for entry in tried
-    }
+    widths = {(one["penalty"][0], one["sigma"][0]): one["validation"] for one in tried}
+    assert grid == widths
     assert one_step[0.01, 1.0] == 1.0
     assert one_step[0.1, 10.0] == pytest.approx(np.mean([13 / 1, 14 / 2, 15 / 3]))
     over_penalty, over_width = curves(notes)
@@ -109,6 +103,5 @@ def test_the_curves_are_what_the_search_tried() -> None:
 
 def test_a_run_without_the_optional_package_says_what_it_lacks(tmp_path: Path) -> None:
     (section,) = study_sections("moreno2019", made(tmp_path, MODELS[:-1]))
-    said = section.blocks[0]
-    assert isinstance(said, Text)
+    said = of_kind(section.blocks[0], Text)
     assert "Not run: symbolic regression, GPTIPS settings" in str(said)

@@ -69,7 +69,7 @@ def test_errors_over_the_order_are_those_of_scikit_learn_with_folds_left_out() -
 
 
 @pytest.mark.parametrize("kind", ["plsr", "surface", "ridge", "lasso", "elastic_net"])
-@pytest.mark.parametrize("apart", [None, 0.0, 1e-13, 1e-9])
+@pytest.mark.parametrize("apart", [None, 0.0, 1e-9])
 def test_what_is_chosen_predicts_and_collinear_columns_make_no_garbage(
     kind: str, apart: float | None
 ) -> None:
@@ -90,14 +90,12 @@ def test_the_documents_own_choice_is_at_least_as_good_on_the_half_that_it_saw() 
     data = made(noise=1.0)
     assert data.test is not None
     x, y = data.test
-    errors = [
-        (y - fitted(data, kind="surface", choose=choose).predict(x)).square().mean(0)
-        for choose in ("test", "least")
-    ]
-    assert bool((errors[0] <= errors[1] + 1e-9).all())
+    found = [fitted(data, kind="surface", choose=choose) for choose in ("test", "least")]
+    own, least = ((y - one.predict(x)).square().mean(0) for one in found)
+    assert bool((own <= least + 1e-9).all())
 
 
-def test_clear_errors() -> None:
+def test_what_cannot_be_fitted_is_refused() -> None:
     data = made()
     spoiled, double = data.x.clone(), data.x.clone()
     spoiled[7, 2] = torch.nan

@@ -19,14 +19,10 @@ from residnet.report.run_reader import RunFiles
 
 KINDS = ("zigzag", "acceleration_deceleration", "three_two_one_one")
 MODELS = ("zero", "nomoto", "nomoto_side_slip", "baseline", "lstm_printed", "lstm_rate", "lstm")
+STATES = {"u": [0.5, 1.0, 1.5], "v": [-0.1, 0.0, 0.1], "r": [-0.2, 0.0, 0.2]}
+FORCES = {"tau_x": [100.0, 200.0, 300.0], "tau_n": [-100.0, 0.0, 100.0]}
 STEADY = {
-    "steady_states": {
-        "u": [0.5, 1.0, 1.5],
-        "v": [-0.1, 0.0, 0.1],
-        "r": [-0.2, 0.0, 0.2],
-        "tau_x": [100.0, 200.0, 300.0],
-        "tau_n": [-100.0, 0.0, 100.0],
-    },
+    "steady_states": STATES | FORCES,
     "steady_constraints": {
         state: {"of": force, "phi": phi, "phi_error": 1e-5, "bias": 0.0, "bias_error": 0.01}
         for state, force, phi in (("u", "tau_x", 5e-3), ("v", "tau_n", 1e-3), ("r", "tau_n", 2e-3))
@@ -52,14 +48,8 @@ def row(model: str, split: str, manoeuvre: str) -> dict[str, Any]:
 def rollouts(folder: Path, log: str, size: float) -> None:
     """One log of 8 s; a model's velocities are off by `size` times its place in the list."""
     t = np.arange(81) * 0.1
-    measured = {
-        "u": 1.0 + 0.2 * np.sin(t),
-        "v": 0.1 * np.sin(2 * t),
-        "r": 0.2 * np.cos(t),
-        "psi": 0.2 * np.sin(t),
-        "x": t,
-        "y": 0.2 * t**2,
-    }
+    waves = (1.0 + 0.2 * np.sin(t), 0.1 * np.sin(2 * t), 0.2 * np.cos(t), 0.2 * np.sin(t))
+    measured = dict(zip(COLUMNS, (*waves, t, 0.2 * t**2), strict=True))
     parts = []
     for place, model in enumerate(reversed(MODELS), start=1):
         wave = size * place * 0.02 * np.sin(3 * t + place)
@@ -97,15 +87,16 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_seven_figures_and_two_tables(study: Path) -> None:
     (section,) = study_sections("woo2018", study)
-    figures = [block for block in section.blocks if isinstance(block, Figure)]
-    assert [path.relative_to(study).as_posix() for figure in figures for path in figure.stills] == [
-        f"figures/woo2018/{number}.png" for number in (9, *range(13, 19))
+    stills = [
+        path for block in section.blocks if isinstance(block, Figure) for path in block.stills
     ]
-    assert all(path.stat().st_size > 5_000 for figure in figures for path in figure.stills)
+    numbers = (9, *range(13, 19))
+    assert stills == [study / "figures" / "woo2018" / f"{number}.png" for number in numbers]
+    assert all(path.stat().st_size > 5_000 for path in stills)
     steady, changes = (block for block in section.blocks if isinstance(block, Table))
     # made up: the error of the linear model is 0.04, that of the best LSTM 0.01
-    assert changes.rows[-1].cells[0].text == "−75.0"
-    assert changes.rows[-1].cells[0].note == "published −76.9"
+    last = changes.rows[-1].cells[0]
+    assert (last.text, last.note) == ("−75.0", "published −76.9")
     written = json.loads((study / "study.json").read_text())["changes"]
     assert written["lstm"]["u"] == pytest.approx(-0.75)
     yaw = steady.rows[-1].cells

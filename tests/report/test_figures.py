@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from browser import browser, layout
 from made_run import LEVEL, made_run, metrics, residuals, write_fit_page, write_json
 from PIL import Image
+from read_page import Page
 
 from residnet.core.errors import UsageError
 from residnet.report.blocks import Section
@@ -97,12 +99,8 @@ def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
     assert [path.name for path in read.stills] == ["01_every_kind.png"]
     assert read.stills == written.stills
     assert (read.looks, read.chooser) == (given.looks, "Run")
-    assert [panel.words for panel in read.panels] == [
-        "north [m]",
-        "heading [deg]",
-        "first: error",
-        "u",
-    ]
+    words = ["north [m]", "heading [deg]", "first: error", "u"]
+    assert [panel.words for panel in read.panels] == words
     assert (read.panels[1].y_limits, read.panels[2].y_log) == ([-2.0, 2.0], True)
     assert [case.note for case in read.cases] == ["A note.", "Other."]
     x, y = read.cases[0].curves[1]["a"]
@@ -118,11 +116,8 @@ def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
     Image.new("RGB", (10, 10)).save(tmp_path / "mine.png")
     assert len(read_figures(tmp_path)) == 1
     write_figures(tmp_path, [])
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "damaged.json",
-        "foreign.json",
-        "mine.png",
-    }
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"damaged.json", "foreign.json", "mine.png"}
 
 
 def test_still_pictures_show_what_is_switched_on() -> None:
@@ -152,13 +147,12 @@ def test_outlines_and_steps() -> None:
     assert joined([])[0].size == 0
 
 
-@pytest.mark.long
 def test_cases_on_a_page_hold_their_curves_to_a_part_in_sixty_thousand() -> None:
     figure = every_kind()
     drawn = draw([figure])
     assert drawn is not None
-    text = drawn.figures["figure-every-kind"]
-    one, two = (case["panels"] for case in json.loads(text)["cases"])
+    cases = json.loads(drawn.figures["figure-every-kind"])["cases"]
+    one, two = (case["panels"] for case in cases)
     curve = figure.cases[0].curves[1]["measured"][1]
     np.testing.assert_allclose(unpacked(one[1], "measured")[: len(T)], curve, atol=2 / 60_000)
     np.testing.assert_allclose(unpacked(one[1], "x of a")[: len(T)], T, atol=10 / 60_000)
@@ -191,28 +185,40 @@ def test_every_figure_of_a_fit_is_a_light_picture_that_shows_something(run: Path
         assert np.concatenate(edges).min() > 250, path.name
 
 
+def test_the_page_of_a_fit_stands_alone_and_loads_nothing(run: Path) -> None:
+    path = write_fit_page(RunFiles(run))
+    text = path.read_text()
+    assert path.stat().st_size < _MOST_BYTES
+    scripts = re.findall(r"<script([^>]*)>", text)
+    assert scripts
+    assert all("src" not in attributes for attributes in scripts)
+    assert "<link" not in text
+    assert "&lt;script&gt;" in text
+    assert '<meta name="viewport"' in text
+    sources = Page(text).sources
+    assert all(source.startswith(("data:image/png;base64,", "#")) for source in sources)
+    assert sum(source.startswith("data:") for source in sources) == 8
+    markup = re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
+    assert not re.search(r"url\(|@import|https?://", markup)
+    assert not list(run.glob("*.partial"))
+    path.unlink()
+    assert write_fit_page(RunFiles(run)).read_text() == text
+
+
 def test_runs_to_choose_from_are_the_median_worst_and_best_of_each_kind(run: Path) -> None:
     files = RunFiles(run)
-    windows = files.windows("test")
-    figure = runs.free_runs(files, windows)
+    figure = runs.free_runs(files, files.windows("test"))
     assert figure is not None
-    titles = [case.title for case in figure.cases]
+    cases = {case.title: case for case in figure.cases}
     # errors grow with the number of the log: of zigzags 01, 02, 03 the second is the median
-    assert "zigzag, whole: median error (zigzag_02)" in titles
-    assert [case.title.split(":")[0] for case in figure.pictured] == [
-        "zigzag, whole",
-        "turning, whole",
-    ]
+    median = cases["zigzag, whole: median error (zigzag_02)"]
+    pictured = [case.title.split(":")[0] for case in figure.pictured]
+    assert pictured == ["zigzag, whole", "turning, whole"]
     looks = figure.looks
-    assert {name for name in ("measured", "plsr", "baseline", "truth") if looks[name].shown} == {
-        "measured",
-        "plsr",
-        "baseline",
-        "truth",
-    }
+    assert all(looks[name].shown for name in ("measured", "plsr", "baseline", "truth"))
     assert not looks["zero"].shown
     assert (looks["plsr"].color, looks["baseline"].dash) == (BLUE, "dashed")
-    track, surge = figure.cases[titles.index("zigzag, whole: median error (zigzag_02)")].curves[:2]
+    track, surge = median.curves[:2]
     assert np.isnan(track["measured"][0]).sum() == 10, "masked samples are a gap"
     assert len(surge["masked"][0]) == 1
     assert np.isfinite(surge["plsr"][1]).all()
@@ -236,22 +242,17 @@ def test_masked_samples_do_not_count(run: Path) -> None:
     assert runs.growth([window], "plsr")["psi"].max() < 0.1
 
 
-def test_many_heads_keep_distinct_looks(tmp_path: Path) -> None:
-    content = metrics(("test",), ("plsr",))
-    content["rows"] = [
-        content["rows"][0] | {"model": f"head{i}", "selected": False} for i in range(12)
-    ]
-    content["selected"] = None
-    write_json(tmp_path / "metrics.json", content)
-    looks = runs.model_looks(RunFiles(tmp_path)).values()
-    assert len({(look.color, look.dash) for look in looks}) == 12
-
-
-def test_metrics_alone_give_no_figure_and_a_folder_without_is_refused(tmp_path: Path) -> None:
+def test_metrics_alone_give_no_figure_and_many_heads_distinct_looks(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no metrics\.json"):
         write_fit_figures(RunFiles(tmp_path))
     write_json(tmp_path / "metrics.json", metrics(("external",), ("baseline", "plsr")))
     assert write_fit_figures(RunFiles(tmp_path)) == []
+    content = metrics(("test",), ("plsr",))
+    first = content["rows"][0] | {"selected": False}
+    content |= {"selected": None, "rows": [first | {"model": f"head{i}"} for i in range(12)]}
+    write_json(tmp_path / "metrics.json", content)
+    looks = runs.model_looks(RunFiles(tmp_path)).values()
+    assert len({(look.color, look.dash) for look in looks}) == 12
 
 
 def test_a_bred_equation_shows_its_generations(tmp_path: Path) -> None:
@@ -272,19 +273,11 @@ def test_trials_of_a_sweep_over_their_keys() -> None:
         {"number": i, "value": 0.1 * i, "values": {"heads.size": i, "kind": "ab"[i % 2]}}
         for i in range(20)
     ]
-    content = {
-        "trials": [*trials, {"number": 20, "value": None, "values": {}}],
-        "keys": ["heads.size", "kind"],
-        "log": [],
-        "minimized": False,
-        "objective": "score [-]",
-    }
-    figure = parallel_coordinates(content)
-    assert figure.panels[0].x_names == {
-        "0": "heads.size\n0 to 19",
-        "1": 'kind\n"a" to "b"',
-        "2": "score\n0 to 1.9",
-    }
+    content = {"keys": ["heads.size", "kind"], "log": [], "objective": "score [-]"}
+    content |= {"trials": [*trials, {"number": 20, "value": None, "values": {}}]}
+    figure = parallel_coordinates({**content, "minimized": False})
+    names = ("heads.size\n0 to 19", 'kind\n"a" to "b"', "score\n0 to 1.9")
+    assert figure.panels[0].x_names == {str(place): name for place, name in enumerate(names)}
     curves = figure.cases[0].curves[0]
     assert [values.tolist() for values in curves["best"]] == [[0, 1, 2], [1.0, 1.0, 1.0]]
     counts = {name: len(parts(*curve)) for name, curve in curves.items()}
@@ -305,16 +298,11 @@ def test_a_browser_draws_every_kind_of_curve(tmp_path: Path) -> None:
 @needs_browser
 def test_a_browser_draws_every_panel_of_a_fit_and_the_controls_work(run: Path) -> None:
     page = write_fit_page(RunFiles(run))
-    assert page.stat().st_size < _MOST_BYTES
     for width in (390, 820):
         found = layout(page, width, run)
         assert (found.overflow, found.broken) == (0, []), width
         assert found.smallest >= 11
         assert all(found.panels), "every panel is drawn"
-        assert found.used == {
-            "focused": True,
-            "zoomed": pytest.approx(0.5, abs=0.01),
-            "reset": pytest.approx(1.0, abs=0.01),
-            "hidden": True,
-            "chosen": True,
-        }
+        near, whole = pytest.approx(0.5, abs=0.01), pytest.approx(1.0, abs=0.01)
+        done = dict.fromkeys(("focused", "hidden", "chosen"), True)
+        assert found.used == {**done, "zoomed": near, "reset": whole}

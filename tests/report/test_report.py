@@ -1,5 +1,5 @@
-"""The report: its numbers are those of metrics.json, it stands alone, and what a folder lacks is
-left out.
+"""The page of a fit: its numbers are those of the folder's files, and what a folder lacks is left
+out.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_fit_page, write_json
+from browser import browser, layout
+from made_run import DEG, LEVEL, made_run, metrics, row, write_fit_page, write_json
 from made_series import autoregressive
 from read_page import Page, plain
 
@@ -22,10 +23,13 @@ from residnet.core.log import Log
 from residnet.data.doctor import inspect, inspect_together, inspection
 from residnet.judge.goodness import OneStep, content, table
 from residnet.judge.soundness import CHECKS, Finding, sanity_content
+from residnet.judge.verdict import LEVELS
 from residnet.report.blocks import Section, Table, Text
 from residnet.report.fit import write_fit_figures
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.models import goodness, term_unit
+
+REFITTED = "values and standard errors are those after the refit through rollouts"
 
 
 def shown(run: Path) -> str:
@@ -33,52 +37,41 @@ def shown(run: Path) -> str:
     return plain(write_fit_page(RunFiles(run)))
 
 
+def part(text: str, section: str) -> str:
+    (found,) = re.findall(rf'<section[^>]* ?id="{section}">.*?</section>', text, re.DOTALL)
+    return str(found)
+
+
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     return made_run(tmp_path / "made")
 
 
-def test_free_run_numbers_are_those_of_metrics(run: Path) -> None:
-    text = shown(run)
-    (where,) = re.findall(r'<section id="free-runs">.*?</section>', text, re.DOTALL)
-    cells = Page(where).table("model", "plsr (selected)")
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The page of the made-up run as it is."""
+    return shown(made_run(tmp_path_factory.mktemp("made") / "run"))
+
+
+def test_free_run_numbers_are_those_of_metrics(page: str) -> None:
+    cells = Page(part(page, "free-runs")).table("model", "plsr (selected)")
     # train and test of u, v, r, then nrmse with its interval, position, heading, diverged; the
     # protocol that selects comes first
-    assert cells["plsr (selected)"][:6] == [
-        "0.0320|−60 %",
-        "0.0400|−60 %",
-        "0.0240|−40 %",
-        "0.0300|−40 %",
-        "0.458|−50 %",
-        "0.573|−50 %",
-    ]
+    plsr = cells["plsr (selected)"]
+    assert plsr[:3] == ["0.0320|−60 %", "0.0400|−60 %", "0.0240|−40 %"]
+    assert plsr[3:6] == ["0.0300|−40 %", "0.458|−50 %", "0.573|−50 %"]
     assert row("plsr", "test", "whole")["nrmse"]["mean"] == pytest.approx(0.08)
-    assert cells["plsr (selected)"][7] == "0.0800|0.0720–0.0880"
-    assert cells["plsr (selected)"][9] == "0.40"
-    assert cells["plsr (selected)"][11] == number(DEG * LEVEL["plsr"][2], 2)
-    assert cells["plsr (selected)"][13] == "0/6"
+    turned = number(DEG * LEVEL["plsr"][2], 2)
+    assert plsr[7:14:2] == ["0.0800|0.0720–0.0880", "0.40", turned, "0/6"]
     assert cells["mlp"][3] == "0.0510|+2 %"
     assert cells["baseline"][1] == "0.100"
-    assert 'class="bad">0.0510' in text
+    assert 'class="bad">0.0510' in page
+    cells = Page(page).table("manoeuvre, model", "turning: baseline")
+    assert [cells[f"{kind}: baseline"][1] for kind in ("turning", "zigzag")] == ["0.110", "0.120"]
 
 
-def test_manoeuvres_stand_apart(run: Path) -> None:
-    cells = Page(shown(run)).table("manoeuvre, model", "turning: baseline")
-    assert cells["turning: baseline"][1] == "0.110"
-    assert cells["zigzag: baseline"][1] == "0.120"
-
-
-def test_verdict(run: Path) -> None:
-    page = html.unescape(shown(run))
-    verdict = re.search(r'<section class="verdict limited".*?</section>', page, re.DOTALL)
-    assert verdict is not None
-    assert "On test data model plsr is" in verdict[0]
-    assert "Before you use it" not in page
-
-
-def test_the_first_screen_answers_how_far_off_and_which_model(run: Path) -> None:
-    text = shown(run)
-    first = text.partition('id="at-a-glance"')[2].partition("</section>")[0]
+def test_the_first_screen_answers_how_far_off_and_which_model(page: str) -> None:
+    first = page.partition('id="at-a-glance"')[2].partition("</section>")[0]
     (table,) = Page(f"<section>{first}</section>").tables
     assert table[0] == ["model", "error after 30 s", ""]
     # what is selected, then what it is to be better than, then the others, the nearest first
@@ -87,14 +80,34 @@ def test_the_first_screen_answers_how_far_off_and_which_model(run: Path) -> None
     assert table[2][1:3] == ["0.40", number(DEG * LEVEL["plsr"][2], 2)]
     assert "Mean of 6 free runs on test data (T30, which start elsewhere than those of" in first
     # the run holds no errors after single times, so that nothing is known to be good
-    assert '<section class="verdict limited"' in text
-    assert "! Limited" in text
+    text = html.unescape(page)
+    verdict = re.search(r'<section class="verdict limited".*?</section>', text, re.DOTALL)
+    assert verdict is not None
+    assert "On test data model plsr is" in verdict[0]
+    assert "! Limited" in page
+    for absent in ("Before you use it", "Physical sanity", 'id="data-doctor"', REFITTED):
+        assert absent not in text
+
+
+def test_parameters_heads_data_and_provenance(page: str) -> None:
+    read = Page(page)
+    terms = read.table("term", "u′: u")
+    assert terms["u′: u"] == ["−0.914", "0.076", "12", "1/s"]
+    assert terms["r′: v|v|"] == ["0.50", "0.10", "5.0", "rad/m²"]
+    heads = read.table("head", "plsr (selected)")
+    assert heads["plsr (selected)"][1:3] == ["23 basis functions; order 7 (latent variables)", "72"]
+    assert heads["mlp"][2] == "1\u2009347"
+    quality = read.table("split, manoeuvre", "test: zigzag")["test: zigzag"]
+    assert quality[:6] == ["3", "180", "1800", "97.5", "95.0", "frozen 2.5 %"]
+    assert quality[6:] == ["1.50", "0.200", "5.73"]
+    told = ("9.8.7", "abc123", "f00d", "torch 2.13.0", "on 2400 samples", "selection: whole")
+    assert [words for words in told if words not in page] == []
 
 
 def test_bad_news_is_told(run: Path) -> None:
     content = metrics()
     for line in content["rows"]:
-        if line["model"] == "plsr" and line["split"] == "test" and line["manoeuvre"] == "all":
+        if (line["model"], line["split"], line["manoeuvre"]) == ("plsr", "test", "all"):
             line["diverged"] = 2
             line["rmse"] = line["rmse"] | {"v": 0.06}
             line["nrmse"] = line["nrmse"] | {"mean": 0.3}
@@ -106,81 +119,78 @@ def test_bad_news_is_told(run: Path) -> None:
     assert "times its training error" in page
 
 
-def test_parameters_heads_data_and_provenance(run: Path) -> None:
-    text = shown(run)
-    page = Page(text)
-    terms = page.table("term", "u′: u")
-    assert terms["u′: u"] == ["−0.914", "0.076", "12", "1/s"]
-    assert terms["r′: v|v|"] == ["0.50", "0.10", "5.0", "rad/m²"]
-    heads = page.table("head", "plsr (selected)")
-    assert heads["plsr (selected)"][1:3] == ["23 basis functions; order 7 (latent variables)", "72"]
-    assert heads["mlp"][2] == "1\u2009347"
-    quality = page.table("split, manoeuvre", "test: zigzag")
-    assert quality["test: zigzag"] == [
-        "3",
-        "180",
-        "1800",
-        "97.5",
-        "95.0",
-        "frozen 2.5 %",
-        "1.50",
-        "0.200",
-        "5.73",
-    ]
-    for part in (
-        "9.8.7",
-        "abc123",
-        "f00d",
-        "torch 2.13.0",
-        "fitted on 2400 samples",
-        "selection: whole",
-    ):
-        assert part in text
+def judged(run: Path, level: str) -> Path:
+    """A made-up run whose verdict has that level; a log has a clock that jumps."""
+    ends = {"position": 0.4, "heading": 0.01}
+    # what the end of an interval allows counts
+    most = 100.0 if level == "limited" else 1.1
+    spans = {of: [0.9 * x, most * x] for of, x in ends.items()}
+    windows = 3 if level == "too few windows" else 12
+    horizon = {"seconds": 30.0, "windows": windows, "logs": 4, "slowest": 0.9, "fastest": 1.1}
+    horizon |= {"sailed": 30.0, "floor": ends, "models": {"plsr": {**ends, "intervals": spans}}}
+    path = made_run(run)
+    write_json(path / "limits.json", {"splits": {"test": {"whole": {"horizons": [horizon]}}}})
+    late = {"code": "gaps", "level": "will mislead", "text": "a gap", "action": "", "effect": 0.2}
+    logs = [{"name": "zigzag_01", "findings": [late]}, {"name": "zigzag_02", "findings": []}]
+    write_json(path / "doctor.json", {"logs": logs, "together": []})
+    if level == "do not use":
+        content = metrics()
+        for line in content["rows"]:
+            line["nrmse"]["mean"] *= 100.0 if line["model"] == "plsr" else 1.0
+        write_json(path / "metrics.json", content)
+    return path
+
+
+def five_answers(seen: str, level: str) -> bool:
+    """How far off after 30 s, better than doing nothing, which model, is it of use, which data."""
+    rows = ("error after 30 s", "plsr (selected) | 0.40 | 0.57", "zero | 12 | 12")
+    doctor = "1 of 2 logs hold something that would mislead a fit: gaps (1)."
+    return all(words in seen for words in (*rows, LEVELS[level], doctor))
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_five_questions_are_answered_before_the_first_section(level: str, tmp_path: Path) -> None:
+    text = html.unescape(shown(judged(tmp_path / "run", level)))
+    opening = text.partition("<main")[2].partition('id="at-a-glance"')
+    glance = Page(f"<section>{opening[2].partition('</section>')[0]}</section>").tables[0]
+    rows = " | ".join(" | ".join(line) for line in glance)
+    assert five_answers(f"{opening[0]} {rows}", level)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(browser() is None, reason="no browser is installed")
+@pytest.mark.parametrize("level", ["good", "do not use"])
+def test_five_questions_are_answered_by_the_first_screen_alone(level: str, tmp_path: Path) -> None:
+    run = RunFiles(judged(tmp_path / "run", level))
+    write_fit_figures(run)
+    page = write_fit_page(run)
+    for width, height in ((1400, 900), (390, 844)):
+        first = layout(page, width, tmp_path).first
+        assert first["pictures"]
+        assert max(first["verdict"], *first["pictures"]) < height
+        # what is selected, the baseline, and zero
+        assert first["rows"][2] < height
+        assert first["words"] < 6_000
+        told = [" ".join(text.split()) for text, end in first["told"] if end < height]
+        assert five_answers(" | ".join(told), level)
 
 
 def limits_file() -> dict[str, Any]:
     """Contents of limits.json for the protocol that selects."""
-    paired = {
-        "to": "baseline",
-        "nrmse_mean": -0.02,
-        "ci95": [-0.03, -0.01],
-        "excludes_zero": True,
-        "ratio": 0.8,
-        "worse": False,
-    }
-    bands = [
-        {
-            "by": "wind",
-            "low": 1.0,
-            "high": 2.5,
-            "windows": 4,
-            "models": {"plsr": {"nrmse_mean": 0.08, "difference": paired}},
-        }
-    ]
-    worst = [
-        {
-            "log": "zigzag_02",
-            "manoeuvre": "zigzag",
-            "t": 12.5,
-            "nrmse": 0.3,
-            "rmse": {"u": 0.1, "v": 0.2, "r": 0.01},
-            "position_error_end": 4.2,
-        }
-    ]
-    part = {"bands": bands, "worst": {"plsr": worst}}
+    paired = {"to": "baseline", "nrmse_mean": -0.02, "ci95": [-0.03, -0.01]}
+    paired |= {"excludes_zero": True, "ratio": 0.8, "worse": False}
+    of_plsr = {"plsr": {"nrmse_mean": 0.08, "difference": paired}}
+    bands = [{"by": "wind", "low": 1.0, "high": 2.5, "windows": 4, "models": of_plsr}]
+    worst = {"log": "zigzag_02", "manoeuvre": "zigzag", "t": 12.5, "nrmse": 0.3}
+    worst |= {"rmse": {"u": 0.1, "v": 0.2, "r": 0.01}, "position_error_end": 4.2}
     tolerance = {"command_share_of_range": 0.05, "start": {"u": 0.125, "v": 0.0625, "r": 0.0625}}
     motion = {"u": 0.04, "v": 0.02, "r": 1 / DEG, "position": 2.0, "heading": 5 / DEG, "nrmse": 0.2}
-    repeats = {
-        "tolerance": tolerance,
-        "pairs": 3,
-        "logs": 2,
-        **motion,
-        "manoeuvres": {"zigzag": {"pairs": 3, **motion}},
-    }
+    repeats = {"tolerance": tolerance, "pairs": 3, "logs": 2, **motion}
+    repeats["manoeuvres"] = {"zigzag": {"pairs": 3, **motion}}
     return {
         "schema": "residnet.limits/1",
         "run": "made",
-        "splits": {"test": {"whole": part}},
+        "splits": {"test": {"whole": {"bands": bands, "worst": {"plsr": [worst]}}}},
         "repeatability": {"whole": repeats},
     }
 
@@ -194,14 +204,8 @@ def compared(change: dict[str, float]) -> dict[str, Any]:
         ratio = change.get(line["manoeuvre"], 0.8) if line["model"] == "plsr" else 0.9
         apart = line["nrmse"]["mean"] * (1 - 1 / ratio)
         span = [1.5 * apart, 0.5 * apart] if line["manoeuvre"] == "all" else None
-        found = {
-            "to": "baseline",
-            "nrmse_mean": apart,
-            "ci95": span,
-            "excludes_zero": span is not None,
-            "ratio": ratio,
-            "worse": ratio > 1.05,
-        }
+        found = {"to": "baseline", "nrmse_mean": apart, "ci95": span, "ratio": ratio}
+        found |= {"excludes_zero": span is not None, "worse": ratio > 1.05}
         line["difference"] = found if line["kind"] == "head" else None
         line["ci95_blocks"] = {"of": "logs", "count": 6}
     return content
@@ -213,98 +217,37 @@ def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
     text = shown(run)
     cells = Page(text).table("windows of", "all")
     # plsr has 0.08, 0.8 times its reference, so that has 0.1
-    assert cells["all"] == ["6", "0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
+    paired = ["0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
+    assert cells["all"] == ["6", *paired]
     assert cells["turning"] == ["6", "0.0880", "0.0733", "+20 %", "+0.0147", "–"]
-    assert cells["wind 1.0 to 2.5 m/s"] == [
-        "4",
-        "0.0800",
-        "0.100",
-        "−20 %",
-        "−0.0200",
-        "−0.0300 to −0.0100",
-    ]
+    assert cells["wind 1.0 to 2.5 m/s"] == ["4", *paired]
     worst = Page(text).table("worst windows", "zigzag_02 (zigzag)")
     assert worst["zigzag_02 (zigzag)"] == ["12.5", "0.300", "0.100", "0.200", "0.573", "4.2"]
     page = html.unescape(text)
-    for part in (
-        (
-            "3 pairs of stretches (zigzag 3) in 2 of the logs of all splits have commands within 5"
-            " % of their range"
-        ),
-        (
-            "differ by u 0.0400 m/s, v 0.0200 m/s, r 1.00 deg/s (root mean square), and by 2.0 m"
-            " and 5.0 deg at the end"
-        ),
+    for words in (
+        "3 pairs of stretches (zigzag 3) in 2 of the logs of all splits have commands within 5 %",
+        "differ by u 0.0400 m/s, v 0.0200 m/s, r 1.00 deg/s (root mean square), and by 2.0 m and"
+        " 5.0 deg at the end",
         "an NRMSE of 0.141 and 1.4 m",
-        (
-            "Protocol whole: worse by more than 5 % in NRMSE on test data: plsr against baseline"
-            " (turning +20 %)."
-        ),
+        "Protocol whole: worse by more than 5 % in NRMSE on test data: plsr against baseline"
+        " (turning +20 %).",
     ):
-        assert part in page
+        assert words in page
 
 
 def test_no_repeats_no_reference_and_no_interval_are_said(run: Path) -> None:
-    content = compared({})
+    content, found = compared({}), limits_file()
+    none = dict.fromkeys(("difference", "ci95_blocks", "nrmse_mean_ci95"))
     for line in content["rows"]:
-        line |= {
-            "difference": None,
-            "ci95_blocks": None,
-            "nrmse_mean_ci95": None,
-            "rmse_ci95": dict.fromkeys("uvr"),
-        }
+        line |= {**none, "rmse_ci95": dict.fromkeys("uvr")}
     write_json(run / "metrics.json", content)
-    found = limits_file()
-    found["repeatability"]["whole"] = {
-        "tolerance": found["repeatability"]["whole"]["tolerance"],
-        "pairs": 0,
-        "logs": 0,
-    }
+    tolerance = found["repeatability"]["whole"]["tolerance"]
+    found["repeatability"]["whole"] = {"tolerance": tolerance, "pairs": 0, "logs": 0}
     write_json(run / "limits.json", found)
     text = html.unescape(shown(run))
     assert Page(text).table("windows of", "all")["all"] == ["6", "0.0800", *4 * "–"]
     assert "hold no two stretches as long as a window" in text
     assert "worse by more than 5 %" not in text
-
-
-def test_standard_errors_of_a_refitted_baseline_are_named(run: Path) -> None:
-    note = "values and standard errors are those after the refit through rollouts"
-    assert note not in shown(run)
-    path = run / "models" / "baseline" / "fit.json"
-    write_json(path, json.loads(path.read_text()) | {"refit": {"iterations": 3}})
-    assert note in shown(run)
-
-
-@pytest.mark.long
-def test_the_file_stands_alone_and_loads_nothing(run: Path) -> None:
-    residuals().to_parquet(run / "residuals.parquet")
-    write_fit_figures(RunFiles(run))
-    path = write_fit_page(RunFiles(run))
-    assert path == run / "report.html"
-    text = path.read_text()
-    scripts = re.findall(r"<script([^>]*)>", text)
-    assert scripts
-    assert all("src" not in attributes for attributes in scripts)
-    assert "<link" not in text
-    assert "&lt;script&gt;" in text
-    assert '<meta name="viewport"' in text
-    page = Page(text)
-    assert all(source.startswith(("data:image/png;base64,", "#")) for source in page.sources)
-    assert sum(source.startswith("data:") for source in page.sources) == 8
-    markup = re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
-    assert not re.search(r"url\(|@import|https?://", markup)
-    assert not list(run.glob("*.partial"))
-    path.unlink()
-    assert write_fit_page(RunFiles(run)).read_text() == text
-
-
-def test_physical_sanity_is_shown_as_the_fit_found_it(run: Path) -> None:
-    assert "Physical sanity" not in html.unescape(shown(run))
-    found = [Finding("plsr", check, check != "damping", f"words on {check}") for check in CHECKS]
-    (run / "sanity.json").write_text(json.dumps(sanity_content({"plsr": found})))
-    page = html.unescape(shown(run))
-    assert "Physical sanity" in page
-    assert "plsr, damping: words on damping" in page
 
 
 def sick(name: str, gyro: float) -> Log:
@@ -314,19 +257,31 @@ def sick(name: str, gyro: float) -> Log:
     return Log(name, t, {**turn, **move, "delta": 0.3 * np.sin(0.21 * t)})
 
 
-def test_findings_above_a_note_stand_in_a_table_and_notes_below(run: Path) -> None:
-    assert 'id="data-doctor"' not in shown(run)
+def test_what_doctor_sanity_refit_and_currents_found_is_shown(run: Path) -> None:
+    """Findings above a note stand in a table, notes below."""
     logs = [sick("first", np.radians(0.5)), sick("second", 0.0)]
     clock = logs[1].t.copy()
     clock[500:] += 7.0
     logs[1] = logs[1].replace(t=clock)
     reports = [inspect(log) for log in logs]
     write_json(run / "doctor.json", inspection(reports, inspect_together(logs)))
-    text = shown(run)
+    checks = [Finding("plsr", check, check != "damping", f"words on {check}") for check in CHECKS]
+    write_json(run / "sanity.json", sanity_content({"plsr": checks}))
+    fit = run / "models" / "baseline" / "fit.json"
+    write_json(fit, json.loads(fit.read_text()) | {"refit": {"iterations": 3}})
+    current = {"current_north": 0.31, "current_east": -0.1, "standard_error": [0.02, 0.015]}
+    fitted = {"zigzag_01": True, "zigzag_02": False}
+    currents = [{"log": name, "fitted": one, **current} for name, one in fitted.items()]
+    write_json(run / "currents.json", currents)
+    text = html.unescape(shown(run))
+    for words in ("Physical sanity", "plsr, damping: words on damping", REFITTED):
+        assert words in text
+    assert "0.31 ± 0.020" in text
+    assert "of other logs" in text
     loud = {one.code for report in reports for one in report.findings if one.level != "note"}
     assert "gaps" in loud
-    page = text.partition('<section id="data-doctor">')[2].partition("</section>")[0]
     assert '<a href="#data-doctor">Data doctor</a>' in text
+    page = part(text, "data-doctor")
     for code in loud:
         assert f'<th class="label"><div>{code.replace("_", " ")}</div></th>' in page
     assert "split the log there (mask kind: gap)" in page
@@ -334,7 +289,6 @@ def test_findings_above_a_note_stand_in_a_table_and_notes_below(run: Path) -> No
 
 
 def test_goodness_of_fit_is_as_the_file_says(run: Path) -> None:
-    assert 'id="goodness-of-fit"' not in shown(run)
     target = autoregressive(0.9, 3, 800, seed=0).T
     noise = 0.01 * np.random.default_rng(0).normal(size=target.shape)
     models = [
@@ -345,9 +299,9 @@ def test_goodness_of_fit_is_as_the_file_says(run: Path) -> None:
     write_json(run / "goodness.json", content("made", {"train": rows, "test": rows}, 0.1))
     found = goodness(RunFiles(run))
     assert found is not None
-    parts = [part for part in found.shown if isinstance(part, Section)]
+    parts = [one for one in found.shown if isinstance(one, Section)]
     units = {"surge u′": "m/s²", "sway v′": "m/s²", "yaw r′": "deg/s²"}
-    assert [part.title for part in parts] == [f"{k} [{u}], test data" for k, u in units.items()]
+    assert [one.title for one in parts] == [f"{k} [{u}], test data" for k, u in units.items()]
     fits, residuals, sentences = parts[2].shown
     assert isinstance(fits, Table)
     assert isinstance(residuals, Table)
@@ -369,48 +323,36 @@ def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> 
         path.unlink()
     write_json(folder / "metrics.json", metrics(("external",), ("zero", "baseline", "plsr")))
     text = shown(folder)
-    page = Page(text)
-    assert page.table("model", "plsr (selected)")["plsr (selected)"][0] == "0.40"
-    for absent in (
-        "Baseline parameters",
-        "Residual heads",
-        "Physical sanity",
-        "simulated plant",
-        "side by side",
-    ):
+    assert Page(text).table("model", "plsr (selected)")["plsr (selected)"][0] == "0.40"
+    for absent in ("Baseline parameters", "Residual heads", "simulated plant", "side by side"):
         assert absent not in text
 
 
-def test_metrics_alone_make_a_report(tmp_path: Path) -> None:
+def test_metrics_alone_make_a_report_and_folders_without_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "metrics.json"
+    for text, error, said in (
+        (None, UsageError, r"no metrics\.json"),
+        ("{", DataError, "not readable as JSON"),
+        ("{}", DataError, "holds no rows"),
+    ):
+        if text is not None:
+            file.write_text(text)
+        with pytest.raises(error, match=said):
+            write_fit_page(RunFiles(tmp_path))
     content = metrics(("validation",), ("plsr",))
-    content["rows"] = [
-        {key: value for key, value in line.items() if key != "manoeuvre"}
-        for line in content["rows"]
-        if line["manoeuvre"] == "all"
-    ]
-    write_json(tmp_path / "metrics.json", content)
+    rows = [line for line in content["rows"] if line["manoeuvre"] == "all"]
+    content["rows"] = [{key: line[key] for key in line if key != "manoeuvre"} for line in rows]
+    write_json(file, content)
     text = shown(tmp_path)
     Page(text)
     assert "These data are not unseen: read with care." in text
     assert "Provenance" not in text
 
 
-def test_folders_that_cannot_be_read_are_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"no metrics\.json"):
-        write_fit_page(RunFiles(tmp_path))
-    (tmp_path / "metrics.json").write_text("{")
-    with pytest.raises(DataError, match="not readable as JSON"):
-        write_fit_page(RunFiles(tmp_path))
-    (tmp_path / "metrics.json").write_text("{}")
-    with pytest.raises(DataError, match="holds no rows"):
-        write_fit_page(RunFiles(tmp_path))
-
-
 @pytest.mark.parametrize(
     ("value", "text"),
     [
         (0.031849, "0.0318"),
-        (12.34, "12.3"),
         (1234.0, "1234"),
         (0.0, "0"),
         (-0.5, "−0.500"),
@@ -419,14 +361,13 @@ def test_folders_that_cannot_be_read_are_refused_by_name(tmp_path: Path) -> None
         (float("nan"), "–"),
     ],
 )
-def test_rounding(value: float | None, text: str) -> None:
+def test_numbers_have_three_digits(value: float | None, text: str) -> None:
     assert number(value) == text
 
 
 @pytest.mark.parametrize(
     ("axis", "term", "unit"),
     [
-        ("u_dot", "u", "1/s"),
         ("u_dot", "u|u|", "1/m"),
         ("u_dot", "1", "m/s²"),
         ("u_dot", "tau_x", "m/(s²·N)"),

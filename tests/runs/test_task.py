@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -36,7 +36,9 @@ class SampleTask(ComputingTask):
         failure = "a flight did not end" if self.fault == "fails a check" else ""
         figures = {"speed": MainFigure(1.5, "m/s"), "lost": MainFigure(float("nan"), "s")}
 
-        def diverging() -> Path:
+        def wild() -> Path:
+            if self.fault == "is withheld":
+                raise WithheldError("model wild is withheld: worse than zero")
             raise ExportError("model wild: diverges")
 
         def model() -> Path:
@@ -45,17 +47,10 @@ class SampleTask(ComputingTask):
             folder.write(folder.exports / "model.txt", "exported")
             return folder.exports / "model.txt"
 
-        def worse() -> Path:
-            raise WithheldError("model wild is withheld: worse than zero")
-
-        first = {"is not exported": {"wild": diverging}, "is withheld": {"wild": worse}}
-        return Outcome(
-            ["It works."],
-            figures,
-            "a table",
-            failure,
-            {**first.get(self.fault, {}), "model": model},
-        )
+        exports: dict[str, Callable[[], Path]] = {"model": model}
+        if self.fault in ("is not exported", "is withheld"):
+            exports = {"wild": wild, **exports}
+        return Outcome(["It works."], figures, "a table", failure, exports)
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
@@ -64,8 +59,12 @@ class SampleTask(ComputingTask):
 
 
 def test_a_run_leaves_report_summary_and_mark(tmp_path: Path) -> None:
-    finished = SampleTask(name="first", threads=1).run(out=tmp_path / "run")
+    before = torch.get_num_threads()
+    task = SampleTask(name="first", threads=before + 1)
+    finished = task.run(out=tmp_path / "run")
+    assert torch.get_num_threads() == before, "threads are those of the task and put back"
     folder = RunFolder.open(tmp_path / "run")
+    assert json.loads((folder.path / "found.json").read_text())["threads"] == before + 1
     assert finished.folder.path == folder.path
     assert [file.read_text() for file in finished.exports] == ["exported"]
     assert folder.read_summary() == {
@@ -83,69 +82,55 @@ def test_a_run_leaves_report_summary_and_mark(tmp_path: Path) -> None:
         *("checksums.json", "exports", "exports.json", "found.json", "provenance.json"),
         *("report.html", "resolved.yaml", "summary.json"),
     }
+    for verb in (
+        lambda: task.export_model(ExportRequest(finished.folder, "selected")),
+        lambda: task.evaluate_on(finished.folder, [], None),
+    ):
+        with pytest.raises(UsageError, match="of task 'sample'; it has: report"):
+            verb()
 
 
 def test_the_folder_is_named_after_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert SampleTask(name="mine").run().folder.path == Path("runs") / "mine"
-    with pytest.raises(UsageError, match="exists already"):
-        SampleTask(name="mine").run()
-    SampleTask(name="mine").run(resume=True)
     # without a report a run ends after its results
-    folder = SampleTask(name="mine", seed=8).run(overwrite=True, report=False).folder
+    folder = SampleTask(name="mine", seed=8).run(report=False).folder
+    assert folder.path == Path("runs") / "mine"
     assert folder.finished
     assert not any(path.exists() for path in (folder.report, folder.exports))
-
-
-def test_threads_are_those_of_the_task_and_put_back(tmp_path: Path) -> None:
-    before = torch.get_num_threads()
-    SampleTask(name="two", threads=before + 1).run(out=tmp_path / "run")
-    assert json.loads((tmp_path / "run" / "found.json").read_text())["threads"] == before + 1
-    assert torch.get_num_threads() == before
+    with pytest.raises(UsageError, match="exists already"):
+        SampleTask(name="mine").run()
+    SampleTask(name="mine", seed=8).run(resume=True, report=False)
 
 
 def test_a_run_that_fails_is_not_finished_and_is_run_again(tmp_path: Path) -> None:
+    run = tmp_path / "run"
     with pytest.raises(FitError, match="nothing can be fitted"):
-        SampleTask(name="fails", fault="raises").run(out=tmp_path / "run")
+        SampleTask(name="fails", fault="raises").run(out=run)
     with pytest.raises(UsageError, match="is not finished"):
-        RunFolder.open(tmp_path / "run")
+        RunFolder.open(run)
     # nothing was found, so that a corrected configuration may use the folder
-    assert SampleTask(name="fails").run(out=tmp_path / "run").folder.finished
-
-
-def test_a_result_that_fails_a_check_is_reported_first(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="a flight did not end"):
-        SampleTask(name="checked", fault="fails a check").run(out=tmp_path / "run")
-    assert RunFolder.open(tmp_path / "run").report.is_file()
+        SampleTask(name="fails", fault="fails a check").run(out=run)
+    assert RunFolder.open(run).report.is_file(), "a result that fails a check is reported first"
 
 
-def test_a_run_that_withholds_a_model_is_complete_and_says_so(tmp_path: Path) -> None:
-    finished = SampleTask(name="worse", fault="is withheld").run(out=tmp_path / "run")
+def test_a_run_that_withholds_or_cannot_export_a_model_is_complete_and_says_so(
+    tmp_path: Path,
+) -> None:
+    run = tmp_path / "run"
+    finished = SampleTask(name="wild", fault="is withheld").run(out=run)
     assert [file.name for file in finished.exports] == ["model.txt"]
     said = "Not exported: model wild is withheld: worse than zero."
     assert finished.folder.read_summary()["verdict"] == ["It works.", said]
     assert "model wild is withheld" in finished.folder.report.read_text()
-
-
-def test_an_export_that_fails_is_reported_and_the_run_complete(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"model wild: diverges; the run itself is complete"):
-        SampleTask(name="wild", fault="is not exported").run(out=tmp_path / "run")
-    folder = RunFolder.open(tmp_path / "run")
+        SampleTask(name="wild", fault="is not exported").run(out=run, overwrite=True)
+    folder = RunFolder.open(run)
     assert (folder.exports / "model.txt").is_file()
     page = plain(folder.report)
     assert "Not exported: model wild: diverges." in page
     assert "exports/model.txt" in page.replace("<wbr>", "")
     assert folder.read_summary()["verdict"] == ["It works.", "Not exported: model wild: diverges."]
     # what an earlier run exported is not shown as this one's
-    SampleTask(name="wild").run(out=tmp_path / "run", overwrite=True)
+    SampleTask(name="wild").run(out=run, overwrite=True)
     assert "wild: diverges" not in plain(folder.report)
-
-
-def test_a_verb_that_a_run_does_not_have_names_those_that_it_has(tmp_path: Path) -> None:
-    finished = SampleTask(name="verbs").run(out=tmp_path / "run")
-    for verb in (
-        lambda task: task.export_model(ExportRequest(finished.folder, "selected")),
-        lambda task: task.evaluate_on(finished.folder, [], None),
-    ):
-        with pytest.raises(UsageError, match="of task 'sample'; it has: report"):
-            verb(SampleTask(name="verbs"))

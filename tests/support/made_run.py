@@ -25,12 +25,8 @@ LEVEL = {
     "plsr": (0.0400, 0.0300, 0.0100),
     "truth": (0.0200, 0.0250, 0.0050),
 }
-KINDS = {
-    "zigzag_01": "zigzag",
-    "zigzag_02": "zigzag",
-    "zigzag_03": "zigzag",
-    "turning_01": "turning",
-}
+KINDS = {**{f"zigzag_0{number}": "zigzag" for number in (1, 2, 3)}, "turning_01": "turning"}
+SCALES = {"u": 0.5, "v": 0.25, "r": 0.25}
 RESOLVED = """task: fit
 name: made
 description: made by hand <script>alert(1)</script>
@@ -48,35 +44,18 @@ evaluation:
 
 
 def row(
-    model: str,
-    split: str,
-    protocol: str,
-    manoeuvre: str = "all",
-    *,
-    factor: float = 1.0,
-    diverged: int = 0,
+    model: str, split: str, protocol: str, manoeuvre: str = "all", *, factor: float = 1.0
 ) -> dict[str, Any]:
     """One row of metrics.json."""
     rmse = {name: factor * value for name, value in zip("uvr", LEVEL[model], strict=True)}
-    mean = (rmse["u"] / 0.5 + rmse["v"] / 0.25 + rmse["r"] / 0.25) / 3
-    return {
-        "model": model,
-        "kind": MODELS[model],
-        "split": split,
-        "protocol": protocol,
-        "manoeuvre": manoeuvre,
-        "windows": 6,
-        "n": 600,
-        "diverged": diverged,
-        "rmse": rmse,
-        "mae": rmse,
-        "nrmse": {"u": rmse["u"] / 0.5, "v": rmse["v"] / 0.25, "r": rmse["r"] / 0.25, "mean": mean},
-        "rmse_ci95": {name: [0.9 * value, 1.1 * value] for name, value in rmse.items()},
-        "nrmse_mean_ci95": [0.9 * mean, 1.1 * mean],
-        "position_error_end": 10 * rmse["u"],
-        "heading_error_end": rmse["r"],
-        "selected": model == "plsr",
-    }
+    nrmse = {name: rmse[name] / scale for name, scale in SCALES.items()}
+    mean = sum(nrmse.values()) / 3
+    found = {"model": model, "kind": MODELS[model], "split": split, "protocol": protocol}
+    found |= {"manoeuvre": manoeuvre, "windows": 6, "n": 600, "diverged": 0}
+    found |= {"rmse": rmse, "mae": rmse, "nrmse": nrmse | {"mean": mean}}
+    found |= {"rmse_ci95": {name: [0.9 * value, 1.1 * value] for name, value in rmse.items()}}
+    found |= {"nrmse_mean_ci95": [0.9 * mean, 1.1 * mean], "heading_error_end": rmse["r"]}
+    return found | {"position_error_end": 10 * rmse["u"], "selected": model == "plsr"}
 
 
 def metrics(
@@ -92,15 +71,8 @@ def metrics(
                 for number, kind in enumerate(("turning", "zigzag")):
                     rows.append(row(model, split, protocol, kind, factor=1.1 + 0.1 * number))
     units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
-    scales = {"u": 0.5, "v": 0.25, "r": 0.25}
-    return {
-        "schema": "residnet.metrics/1",
-        "run": "made",
-        "channels": units,
-        "scales": scales,
-        "selected": "plsr",
-        "rows": rows,
-    }
+    about = {"schema": "residnet.metrics/1", "run": "made", "channels": units, "scales": SCALES}
+    return {**about, "selected": "plsr", "rows": rows}
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -144,36 +116,15 @@ def write_rollout(folder: Path, log: str, models: tuple[str, ...], size: float) 
     pd.concat(parts).to_parquet(folder / f"{log}.parquet")
 
 
-def curve() -> list[dict[str, float]]:
-    """A learning curve of two stages."""
-    return [
-        {
-            "epoch": float(e),
-            "stage": float(e > 1),
-            "loss": 1.0 / (1 + e) ** 2,
-            "validation": 0.2 - 0.02 * e,
-        }
-        for e in range(4)
-    ]
-
-
 def residuals() -> pd.DataFrame:
     """Contents of residuals.parquet: `plsr` explains all of it, `mlp` nothing."""
     random = np.random.default_rng(0)
     parts = []
-    for model in ("plsr", "mlp"):
+    for model, share in (("plsr", 1.0), ("mlp", 0.0)):
         for axis in ("u_dot", "v_dot", "r_dot"):
             target = random.normal(0, 0.1, 400)
-            parts.append(
-                pd.DataFrame(
-                    {
-                        "model": model,
-                        "axis": axis,
-                        "target": target,
-                        "predicted": target if model == "plsr" else 0 * target,
-                    }
-                )
-            )
+            about = {"model": model, "axis": axis}
+            parts.append(pd.DataFrame({**about, "target": target, "predicted": share * target}))
     return pd.concat(parts)
 
 
@@ -181,27 +132,14 @@ def made_run(run: Path, *, split: str = "test") -> Path:
     """The whole folder, but for models that can be loaded."""
     write_json(run / "metrics.json", metrics())
     (run / "resolved.yaml").write_text(RESOLVED)
-    provenance = {
-        "residnet": "9.8.7",
-        "git": "abc123",
-        "seed": 5,
-        "inputs": {"logs/a.csv": "f00d"},
-        "packages": {"torch": "2.13.0"},
-        "seconds": 12.3,
-    }
+    provenance = {"residnet": "9.8.7", "git": "abc123", "seed": 5, "seconds": 12.3}
+    provenance |= {"inputs": {"logs/a.csv": "f00d"}, "packages": {"torch": "2.13.0"}}
     write_json(run / "provenance.json", provenance)
-    entry = {
-        "seconds": 60.0,
-        "samples": 600,
-        "usable": 0.975,
-        "learned_from": 0.95,
-        "masked": {"frozen": 0.025},
-        "largest": {"u": 1.5, "v": 0.2, "r": 0.1},
-    }
-    write_json(
-        run / "data_quality.json",
-        [{"log": log, "split": split, "manoeuvre": kind} | entry for log, kind in KINDS.items()],
-    )
+    entry = {"split": split, "seconds": 60.0, "samples": 600, "usable": 0.975}
+    entry |= {"learned_from": 0.95, "masked": {"frozen": 0.025}}
+    entry |= {"largest": {"u": 1.5, "v": 0.2, "r": 0.1}}
+    quality = [{"log": log, "manoeuvre": kind} | entry for log, kind in KINDS.items()]
+    write_json(run / "data_quality.json", quality)
     for number, log in enumerate(KINDS):
         write_rollout(run / "rollouts" / split, log, tuple(MODELS), 0.5 + 0.5 * number)
     coefficients = [
@@ -209,29 +147,29 @@ def made_run(run: Path, *, split: str = "test") -> Path:
         {"axis": "v_dot", "term": "tau_n", "value": 1.0e-5, "standard_error": 5.8e-5},
         {"axis": "r_dot", "term": "v|v|", "value": 0.5, "standard_error": 0.1},
     ]
-    write_json(
-        run / "models" / "baseline" / "fit.json",
-        {"coefficients": coefficients, "samples": 2400, "seconds": 0.01},
-    )
-    write_json(
-        run / "models" / "plsr" / "fit.json",
-        {"order": 7, "terms": 23, "seconds": 0.1, "validation": 0.1},
-    )
-    write_json(
-        run / "models" / "mlp" / "fit.json",
-        {"parameters": 1347, "epochs": 4, "seconds": 23.0, "validation": 0.14, "curve": curve()},
-    )
+    # a learning curve of two stages
+    curve = [
+        {"epoch": e, "stage": float(e > 1), "loss": 1.0 / (1 + e) ** 2, "validation": 0.2 - e / 50}
+        for e in (0.0, 1.0, 2.0, 3.0)
+    ]
+    fits = {
+        "baseline": {"coefficients": coefficients, "samples": 2400, "seconds": 0.01},
+        "plsr": {"order": 7, "terms": 23, "seconds": 0.1, "validation": 0.1},
+        "mlp": {
+            "parameters": 1347,
+            "epochs": 4,
+            "seconds": 23.0,
+            "validation": 0.14,
+            "curve": curve,
+        },
+    }
+    for name, fit in fits.items():
+        write_json(run / "models" / name / "fit.json", fit)
     return run
 
 
 def write_fit_page(run: RunFiles) -> Path:
     """Write `report.html` of a fit or an evaluation with the figures that stand in its folder."""
-    title = str(run.metrics.get("run") or run.path.name)
-    return write_page(
-        run.path,
-        title,
-        run.description,
-        verdict.verdict(run),
-        fit_sections(run),
-        level=verdict.level(run),
-    )
+    title, said = str(run.metrics.get("run") or run.path.name), verdict.verdict(run)
+    level, sections = verdict.level(run), fit_sections(run)
+    return write_page(run.path, title, run.description, said, sections, level=level)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
+import yaml
 
 from residnet.cli import main
 
@@ -70,6 +74,27 @@ def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
     return 0
 
 
+class Said(NamedTuple):
+    """How a command ended, and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+
+Command = Callable[..., Said]
+"""The fixture that carries out a command line."""
+
+
+def write_yaml(path: Path, content: Any) -> Path:
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    return path
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text())
+
+
 SWEEP: dict[str, Any] = {
     "task": "sweep",
     "name": "tiny_sweep",
@@ -98,3 +123,14 @@ SWEEP: dict[str, Any] = {
     "runner": {"kind": "processes", "workers": 1},
 }
 """A sweep over `TINY`, which lies beside it as tiny.yaml."""
+STUDY: dict[str, Any] = {
+    "task": "study",
+    "name": "tiny_study",
+    "base": "tiny.yaml",
+    "common": ["heads={ridge: {kind: ridge}}", "training={}", "ensembles={}", "export.models=[]"],
+    "variants": {"recipe": [], "short": ["heads.ridge.degree=1"]},
+    "reference": "recipe",
+    "model": "ridge",
+    "seeds": [0, 1],
+}
+"""Another recipe and another seed of `TINY`, which lies beside it as tiny.yaml."""

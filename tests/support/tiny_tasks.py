@@ -174,6 +174,22 @@ def autopilot(folder: Path) -> dict[str, Any]:
     }
 
 
+BUOYS = [
+    {"north": 50.0, "east": 30.0, "leave_to": "port", "radius": 10.0},
+    {"north": 100.0, "east": 20.0, "leave_to": "starboard", "radius": 12.0},
+]
+COURSE: dict[str, Any] = {
+    "task": "course",
+    "name": "bend",
+    "autopilot": "autopilot.yaml",
+    "course": {"buoys": BUOYS, "acceptance": 4.0, "lookahead": 10.0, "planning_dt": "0.2 s"},
+    "peers": ["pd"],
+    "dt": "0.2 s",
+    "duration": "42 s",
+}
+"""Two way-points; the config of the autopilot lies beside it."""
+
+
 def imported(folder: Path) -> dict[str, Any]:
     """Tables brought into the canonical form."""
     if not (folder / "logs").is_dir():

@@ -9,9 +9,8 @@ from typing import Any
 import pandas as pd
 import pytest
 import torch
-import yaml
 from read_page import plain
-from tiny import call
+from tiny import call, read_json, write_yaml
 
 from residnet.core.config import load_config
 from residnet.judge.autopilots import cycling, objections
@@ -54,8 +53,7 @@ SMALL: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("conditions")
-    config = folder / "small.yaml"
-    config.write_text(yaml.safe_dump(SMALL))
+    config = write_yaml(folder / "small.yaml", SMALL)
     with pytest.MonkeyPatch.context() as patch:
         assert call(patch, "run", config, "--out", folder / "run") == 0
         for name in ("learned", "network"):
@@ -65,7 +63,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows(run: Path) -> dict[tuple[str, str], dict[str, Any]]:
-    found = json.loads((run / "metrics.json").read_text())["rows"]
+    found = read_json(run / "metrics.json")["rows"]
     return {(row["model"], row["protocol"]): row for row in found}
 
 
@@ -91,45 +89,40 @@ def test_every_controller_and_every_companion_is_judged_on_the_same_flights(run:
     assert found[("learned", "nominal")]["kind"] == "policy"
 
 
-def test_a_row_agrees_with_the_flights_that_it_sums_up(run: Path) -> None:
+def test_rows_and_page_sum_up_the_flights(run: Path) -> None:
     flights = pd.read_parquet(run / "conditions.parquet")
     for (model, test), row in rows(run).items():
         if "cost" in row:
             own = flights[(flights["controller"] == model) & (flights["protocol"] == test)]
             for name in ("cost", "overshoot", "travel"):
                 assert own[name].mean() == pytest.approx(row[name]["mean"])
-
-
-def test_the_page_shows_costs_and_the_start_of_the_learning_curve(run: Path) -> None:
     text = plain(run / "report.html")
     for words in ("Under the stated conditions", "policy, network switched off", "epoch 0 is"):
         assert words in text
-    fit = json.loads((run / "models" / "learned" / "fit.json").read_text())
+    fit = read_json(run / "models" / "learned" / "fit.json")
     assert fit["best_validation"] <= fit["start_validation"]
-    assert json.loads((run / "summary.json").read_text())["finished"]
+    assert read_json(run / "summary.json")["finished"]
 
 
-def test_a_learned_policy_is_exported_with_its_card(run: Path) -> None:
+def exported(run: Path, name: str) -> tuple[Any, dict[str, Any]]:
     extra = {"card.json": ""}
-    module = torch.jit.load(str(run / "exports" / "learned.pt"), _extra_files=extra)
-    card = json.loads(extra["card.json"])
-    assert card["kind"] == "observed"
-    assert card["units"] == 3
+    module = torch.jit.load(str(run / "exports" / f"{name}.pt"), _extra_files=extra)
+    return module, json.loads(extra["card.json"])
+
+
+def test_policies_are_exported_with_their_cards_and_read_back(run: Path) -> None:
+    module, card = exported(run, "learned")
+    assert (card["kind"], card["units"]) == ("observed", 3)
     assert card["conditions"]["delay"] == [0.0, 0.3]
-    state = module.initial_state(torch.tensor([[0.0, 3.2, 0.0]]))
-    assert state.shape == (1, len(card["memory"]))
-
-
-def test_a_network_without_a_law_is_exported_and_read_back(run: Path) -> None:
-    extra = {"card.json": ""}
-    module = torch.jit.load(str(run / "exports" / "network.pt"), _extra_files=extra)
-    card = json.loads(extra["card.json"])
+    measured = torch.tensor([[0.1, 3.2, 0.02]])
+    assert module.initial_state(measured).shape == (1, len(card["memory"]))
+    # a network without a law
+    module, card = exported(run, "network")
     assert card["kind"] == "network"
     assert "constants" not in card
     config = load_config(run / "resolved.yaml", [], AutopilotConfig)
     policy = stored_policy(config, run / "models", "network", 0.1)
     policy.read_from(("psi", "u", "r"))
-    measured = torch.tensor([[0.1, 3.2, 0.02]])
     memory, s = policy.initial_state(measured.double()), module.initial_state(measured)
     for _ in range(5):
         command, s, _ = module.step(measured, torch.tensor([[0.5]]), s)

@@ -4,14 +4,13 @@ known.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from read_page import plain
-from tiny import call
+from tiny import Command, read_json, write_yaml
 
 pytestmark = pytest.mark.long
 
@@ -97,33 +96,28 @@ repeat: []
 """
 
 
-def write(folder: Path, **changes: Any) -> Path:
-    config = yaml.safe_load(CONFIG)
-    config["booklet"] |= changes
-    path = folder / "booklet.yaml"
-    path.write_text(yaml.safe_dump(config))
-    return path
+def write(folder: Path, config: dict[str, Any] | None = None, **booklet: Any) -> Path:
+    content = yaml.safe_load(CONFIG)
+    content["booklet"] |= booklet
+    return write_yaml(folder / "booklet.yaml", content | (config or {}))
 
 
 def test_pages_hold_values_with_intervals_and_limits_beside_measured_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, command: Command
 ) -> None:
     run = tmp_path / "run"
-    assert call(monkeypatch, "run", write(tmp_path), "--out", run) == 0
-    booklet = json.loads((run / "booklet.json").read_text())
+    assert command("run", write(tmp_path), "--out", run).code == 0
+    booklet = read_json(run / "booklet.json")
     pages = {page["name"]: page for page in booklet["pages"]}
     assert booklet["draws"] == 20
     circle, zigzag = pages["circle"]["indices"], pages["ten_ten"]["indices"]
     for found in (*circle.values(), *zigzag.values()):
         low, high = found["interval"]
         assert low <= high
-    assert (
-        circle["advance"]["interval"][0]
-        < circle["advance"]["value"]
-        < circle["advance"]["interval"][1]
-    )
-    assert circle["advance"]["lengths"] == pytest.approx(circle["advance"]["value"] / 6.0)
-    assert circle["advance"]["ship"] == pytest.approx(4.0 * circle["advance"]["value"])
+    advance = circle["advance"]
+    assert advance["interval"][0] < advance["value"] < advance["interval"][1]
+    assert advance["lengths"] == pytest.approx(advance["value"] / 6.0)
+    assert advance["ship"] == pytest.approx(4.0 * advance["value"])
     assert circle["time_90"]["ship"] == pytest.approx(2.0 * circle["time_90"]["value"])
     assert zigzag["initial_turning_distance"]["limit"] == pytest.approx(2.5 * 24.0)
     assert zigzag["first_overshoot"]["kept"] in (True, False)
@@ -131,44 +125,33 @@ def test_pages_hold_values_with_intervals_and_limits_beside_measured_ones(
     assert {page["split"] for page in repeated} == {"validation", "test"}
     assert len(repeated) == 6
     for page in repeated:
-        found = page["indices"]
+        first, yaw = (page["indices"][key] for key in ("first_overshoot", "largest_yaw_rate"))
         # the form of the model is nearly the plant's: what is left is within the turning of one
         # sample and of the gear's response (0.2 s each), which a rate alone leaves out
-        assert (
-            abs(found["first_overshoot"]["difference"])
-            < 0.4 * found["largest_yaw_rate"]["measured"]
-        ), page["name"]
-        assert found["first_overshoot"]["measured"] > 0.02
+        assert abs(first["difference"]) < 0.4 * yaw["measured"], page["name"]
+        assert first["measured"] > 0.02
     text = plain(run / "report.html")
     assert "Manoeuvring booklet" in text
     assert "tactical diameter" in text
     assert len(list((run / "figures").glob("*booklet*.png"))) == 3
 
 
-def test_a_vessel_that_rolls(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = write(tmp_path, **yaml.safe_load(ROLL_BOOKLET))
-    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | yaml.safe_load(ROLL)))
-    assert call(monkeypatch, "run", file, "--out", tmp_path / "run") == 0
-    booklet = json.loads((tmp_path / "run" / "booklet.json").read_text())
-    circle = booklet["pages"][0]["indices"]
-    low, high = circle["largest_roll_angle"]["interval"]
-    assert 0.005 < low <= circle["largest_roll_angle"]["value"] <= high < 0.2
-    text = plain(tmp_path / "run" / "report.html")
-    assert "largest roll angle" in text
-    plan = ("plan-trial", tmp_path / "run", "--time", "60 s", "--out", tmp_path / "plan")
-    assert call(monkeypatch, *plan) == 0
-    assert "they narrow the intervals of predictions" in capsys.readouterr().out
-    tracks = (tmp_path / "plan" / "next_tracks.csv").read_text()
-    assert tracks.count("\n") > 100
+def test_a_vessel_that_rolls_has_roll_angles_and_a_plan(tmp_path: Path, command: Command) -> None:
+    run = tmp_path / "run"
+    file = write(tmp_path, yaml.safe_load(ROLL), **yaml.safe_load(ROLL_BOOKLET))
+    assert command("run", file, "--out", run).code == 0
+    roll = read_json(run / "booklet.json")["pages"][0]["indices"]["largest_roll_angle"]
+    low, high = roll["interval"]
+    assert 0.005 < low <= roll["value"] <= high < 0.2
+    assert "largest roll angle" in plain(run / "report.html")
+    said = command("plan-trial", run, "--time", "60 s", "--out", tmp_path / "plan")
+    assert said.code == 0
+    assert "they narrow the intervals of predictions" in said.out
+    assert (tmp_path / "plan" / "next_tracks.csv").read_text().count("\n") > 100
 
 
-def test_a_manoeuvre_that_does_not_end_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert call(monkeypatch, "run", write(tmp_path, duration="3 s"), "--out", tmp_path / "run") == 1
-    assert (
-        "circle: timed out after 2.8 s before a heading change of 360 deg; give more duration"
-        in capsys.readouterr().err
-    )
+def test_a_manoeuvre_that_does_not_end_is_named(tmp_path: Path, command: Command) -> None:
+    said = command("run", write(tmp_path, duration="3 s"), "--out", tmp_path / "run")
+    assert said.code == 1
+    told = "circle: timed out after 2.8 s before a heading change of 360 deg; give more duration"
+    assert told in said.err

@@ -1,104 +1,80 @@
-"""A run with equations: over a baseline, over none, and with late inputs; in its notes, its report,
-its figures and its exports.
+"""A run with equations: over a baseline, over none, and with late inputs; in its notes, its report
+and its figures.
 """
 
 from __future__ import annotations
 
-import copy
-import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
-import torch
-import yaml
 from read_page import plain
-from tiny import TINY, call
+from tiny import TINY, call, read_json, write_yaml
 
 from residnet.dynamics.store import load_model
 from residnet.report.figure_files import read_figures
 
 pytestmark = pytest.mark.long
 
-FEATURES = ["u", "v", "r", "tau_x", "tau_n"]
+HEAD = {"kind": "symbolic", "features": ["u", "v", "r", "tau_x", "tau_n"]}
+WEAK = {"kind": "weak", "window": "2 s"}
+CONFIG: dict[str, Any] = {
+    **TINY,
+    "name": "equations",
+    "training": {},
+    "ensembles": {},
+    "baselines": {"nothing": {"kind": "still"}},
+    "base_of": {"whole": "nothing"},
+    "heads": {
+        "equation": HEAD,
+        "whole": HEAD | {"estimator": WEAK, "choose": "free_run"},
+        "late": HEAD | {"delay": {"channels": ["tau_x", "tau_n"], "longest": 4}},
+    },
+    "export": {"models": ["late"]},
+}
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("equations")
-    config: dict[str, Any] = copy.deepcopy(TINY)
-    config |= {
-        "name": "equations",
-        "training": {},
-        "ensembles": {},
-        "baselines": {"nothing": {"kind": "still"}},
-        "base_of": {"whole": "nothing"},
-    }
-    config["heads"] = {
-        "equation": {"kind": "symbolic", "features": FEATURES},
-        "whole": {
-            "kind": "symbolic",
-            "features": FEATURES,
-            "estimator": {"kind": "weak", "window": "2 s"},
-            "choose": "free_run",
-        },
-        "late": {
-            "kind": "symbolic",
-            "features": FEATURES,
-            "delay": {"channels": ["tau_x", "tau_n"], "longest": 4},
-        },
-    }
-    config["export"] = {"models": ["whole", "late"]}
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    file = write_yaml(folder / "config.yaml", CONFIG)
     with pytest.MonkeyPatch.context() as patch:
-        assert call(patch, "run", folder / "config.yaml", "--out", folder / "run") == 0
+        assert call(patch, "run", file, "--out", folder / "run") == 0
     return folder / "run"
 
 
-def notes(run: Path, model: str) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((run / "models" / model / "fit.json").read_text())
-    return content
+@pytest.fixture(scope="module")
+def notes(run: Path) -> dict[str, Any]:
+    return {path.parent.name: read_json(path) for path in run.glob("models/*/fit.json")}
 
 
-def test_equations_predict_better_than_the_baseline_and_stand_alone(run: Path) -> None:
-    assert notes(run, "equation")["validation"] < 0.9 * notes(run, "baseline")["validation"]
-    assert notes(run, "whole")["validation"] < 0.5 * notes(run, "nothing")["validation"]
-    assert len(notes(run, "whole")["free_run_choice"]) >= 2
-
-
-def test_notes_hold_the_equations_in_writing(run: Path) -> None:
+def test_equations_predict_and_stand_in_writing(notes: dict[str, Any]) -> None:
+    assert notes["equation"]["validation"] < 0.9 * notes["baseline"]["validation"]
+    assert notes["whole"]["validation"] < 0.5 * notes["nothing"]["validation"]
+    assert len(notes["whole"]["free_run_choice"]) >= 2
     for model in ("equation", "whole", "late"):
-        own = notes(run, model)
+        own = notes[model]
         assert list(own["equations"]) == ["u_dot", "v_dot", "r_dot"]
         for name, equation in own["equations"].items():
             assert equation["text"].startswith(f"{name} = ")
-            assert (
-                equation["c"].count(
-                    f"double {name}(double u, double v, double r, double tau_x, double tau_n)"
-                )
-                == 1
-            )
+            given = "double u, double v, double r, double tau_x, double tau_n"
+            assert equation["c"].count(f"double {name}({given})") == 1
         assert own["parameters"] == len(own["coefficients"]) == sum(own["kept"])
-    assert 0 <= notes(run, "late")["delay"]["steps"] <= 4
-    assert len(notes(run, "late")["delay"]["profile"]) == 5
+    assert 0 <= notes["late"]["delay"]["steps"] <= 4
+    assert len(notes["late"]["delay"]["profile"]) == 5
 
 
-def test_terms_along_a_log_add_up_to_what_the_head_says(run: Path) -> None:
+def test_terms_along_a_log_add_up_to_what_the_head_says(run: Path, notes: dict[str, Any]) -> None:
     table = pd.read_parquet(run / "terms.parquet")
     assert set(table["model"]) == {"equation", "whole", "late"}
-    rollouts = {path.stem for path in (run / "rollouts" / "test").glob("*.parquet")}
-    assert set(table["log"]) <= rollouts
+    assert set(table["log"]) <= {path.stem for path in (run / "rollouts" / "test").iterdir()}
     for model in ("equation", "whole"):
-        coefficients = {
-            (c["axis"], c["term"]): c["value"] for c in notes(run, model)["coefficients"]
-        }
+        coefficients = {(c["axis"], c["term"]) for c in notes[model]["coefficients"]}
         own = table[(table["model"] == model) & (table["term"] != "target")]
-        assert set(zip(own["axis"], own["term"], strict=True)) == set(coefficients)
+        assert set(zip(own["axis"], own["term"], strict=True)) == coefficients
         _, module = load_model(run / "models" / model)
-        stored = module.double().head.coefficients
-        assert int((stored != 0).sum()) == len(coefficients)
+        assert int((module.double().head.coefficients != 0).sum()) == len(coefficients)
         # target and sum of the terms agree as well as the fit says
         for axis in ("u_dot", "r_dot"):
             rows = table[(table["model"] == model) & (table["axis"] == axis)]
@@ -107,34 +83,12 @@ def test_terms_along_a_log_add_up_to_what_the_head_says(run: Path) -> None:
             assert float(left.std()) < float(wide["target"].std())
 
 
-def test_report_and_figures_show_the_equations(run: Path) -> None:
-    titles = [figure.title for figure in read_figures(run / "figures")]
-    assert {f"Equation of {model}, term by term" for model in ("equation", "whole", "late")} <= set(
-        titles
-    )
+def test_report_and_figures_show_the_equations(run: Path, notes: dict[str, Any]) -> None:
+    titles = {figure.title for figure in read_figures(run / "figures")}
+    assert titles >= {f"Equation of {model}, term by term" for model in CONFIG["heads"]}
     text = plain(run / "report.html")
     assert "Equations of equation" in text
     assert "candidate terms differ on these data (condition number" in text
-    seconds = notes(run, "late")["delay"]["seconds"]
+    seconds = notes["late"]["delay"]["seconds"]
     assert f"Delayed inputs act {seconds:g} s after they are given." in text
-    term = notes(run, "whole")["coefficients"][0]["term"]
-    assert term in text
-
-
-def test_the_late_equation_exports_with_its_memory(run: Path) -> None:
-    """The export itself compares the module with the model from a warmed-up memory; here: the
-    memory is that of the delay, and whether it has begun.
-    """
-    extra = {"card.json": ""}
-    module = torch.jit.load(str(run / "exports" / "late.pt"), _extra_files=extra)
-    assert json.loads(extra["card.json"])["memory"] == 1 + 4 * 2
-    spec, model = load_model(run / "models" / "late")
-    random = np.random.default_rng(0)
-    past = torch.from_numpy(random.normal(size=(1, 9, 6)) * 0.1).float()
-    drive = torch.from_numpy(random.uniform(5, 20, size=(1, 9, 2))).float()
-    with torch.no_grad():
-        torch.testing.assert_close(
-            module.warmup(past, drive), model.float().warmup(past, drive), rtol=1e-5, atol=1e-5
-        )
-    assert spec.head is not None
-    assert spec.head.kind == "symbolic"
+    assert notes["whole"]["coefficients"][0]["term"] in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -16,27 +15,26 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-import yaml
-from tiny import TINY, call
+from tiny import TINY, Command, read_json, write_yaml
 
 from residnet.core.config import validate
 from residnet.data.simulated import SimulatedTrials
 from residnet.dynamics.store import load_model
 
-ALONE: dict[str, Any] = {"ensembles": {}, "training": {}, "export": {"models": []}}
+ALONE: dict[str, Any] = {**TINY, "ensembles": {}, "training": {}, "export": {"models": []}}
 
 
 def rows(run: Path) -> list[dict[str, Any]]:
-    content: list[dict[str, Any]] = json.loads((run / "metrics.json").read_text())["rows"]
+    content: list[dict[str, Any]] = read_json(run / "metrics.json")["rows"]
     return content
 
 
 def notes(run: Path, model: str) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((run / "models" / model / "fit.json").read_text())
+    content: dict[str, Any] = read_json(run / "models" / model / "fit.json")
     return content
 
 
-def test_folder_is_complete(tiny_run: Path) -> None:
+def test_the_folder_holds_models_as_plain_numbers_and_what_was_found(tiny_run: Path) -> None:
     made = ("resolved.yaml", "provenance.json", "metrics.json", "report.html", "exports/lstm.pt")
     for name in (*made, "data_quality.json", "residuals.parquet"):
         assert (tiny_run / name).stat().st_size > 0, name
@@ -46,7 +44,7 @@ def test_folder_is_complete(tiny_run: Path) -> None:
     assert kinds == {".json", ".safetensors"}
 
 
-def test_ensemble_averages_accelerations(tiny_run: Path) -> None:
+def test_an_ensemble_averages_accelerations(tiny_run: Path) -> None:
     random = torch.Generator().manual_seed(0)
     y = torch.rand(3, 7, 6, generator=random, dtype=torch.float64)
     w = 20 * torch.rand(3, 7, 2, generator=random, dtype=torch.float64)
@@ -59,7 +57,7 @@ def test_ensemble_averages_accelerations(tiny_run: Path) -> None:
     torch.testing.assert_close(rates["mean"], (rates["ridge"] + rates["lstm"]) / 2)
 
 
-def test_metrics_follow_from_rollouts(tiny_run: Path) -> None:
+def test_metrics_follow_from_the_stored_free_runs(tiny_run: Path) -> None:
     files = (tiny_run / "rollouts" / "test").glob("*.parquet")
     table = pd.concat([pd.read_parquet(path).assign(log=path.stem) for path in files])
     own_rows = [r for r in rows(tiny_run) if (r["split"], r["manoeuvre"]) == ("test", "all")]
@@ -74,27 +72,24 @@ def test_metrics_follow_from_rollouts(tiny_run: Path) -> None:
     error = {r["model"]: r["nrmse"]["mean"] for r in own_rows if r["protocol"] == "manoeuvre"}
     assert error["truth"] < error["ridge"] < error["baseline"] < error["zero"]
     assert sum(row["diverged"] for row in rows(tiny_run)) == 0
-    figures = json.loads((tiny_run / "summary.json").read_text())["figures"]
-    selected = json.loads((tiny_run / "metrics.json").read_text())["selected"]
-    assert figures["nrmse"]["value"] == error[selected]
+    figures = read_json(tiny_run / "summary.json")["figures"]
+    assert figures["nrmse"]["value"] == error[read_json(tiny_run / "metrics.json")["selected"]]
 
 
 def test_goodness_of_every_model_and_axis_agrees_with_the_stored_residuals(tiny_run: Path) -> None:
-    content = json.loads((tiny_run / "goodness.json").read_text())
-    stored = pd.read_parquet(tiny_run / "residuals.parquet")
-    for found in content["splits"].values():
+    for found in read_json(tiny_run / "goodness.json")["splits"].values():
         by = {(row["model"], row["axis"]): row for row in found}
         assert len(by) == len(found) == 3 * 5
         for axis in ("u_dot", "v_dot", "r_dot"):
-            counts = [
-                by[name, axis]["parameters"] for name in ("zero", "baseline", "ridge", "lstm")
-            ]
+            names = ("zero", "baseline", "ridge", "lstm")
+            counts = [by[name, axis]["parameters"] for name in names]
             assert counts[0] == 0
             assert counts == sorted(set(counts))
             assert by["zero", axis]["r2"] <= 1e-9 < by["baseline", axis]["r2"]
             assert by["ridge", axis]["difference"]["to"] == "baseline"
             low, high = by["ridge", axis]["mae_ci95"]
             assert low < by["ridge", axis]["mae"] < high
+    stored = pd.read_parquet(tiny_run / "residuals.parquet")
     for name, part in stored[stored.model == "ridge"].groupby("axis"):
         # only every so manieth sample is stored
         error = float(((part.target - part.predicted) ** 2).mean() ** 0.5)
@@ -102,24 +97,22 @@ def test_goodness_of_every_model_and_axis_agrees_with_the_stored_residuals(tiny_
 
 
 @pytest.mark.long
-def test_the_seed_alone_tells_the_networks(
-    tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_another_seed_changes_the_networks_alone(
+    tiny_config: Path, tiny_run: Path, tmp_path: Path, command: Command
 ) -> None:
-    assert call(monkeypatch, "run", tiny_config, "--out", tmp_path / "again") == 0
-    assert rows(tmp_path / "again") == rows(tiny_run)
-    assert call(monkeypatch, "run", tiny_config, "-s", "seed=1", "--out", tmp_path / "other") == 0
+    assert command("run", tiny_config, "-s", "seed=1", "--out", tmp_path / "other").code == 0
     pairs = zip(rows(tmp_path / "other"), rows(tiny_run), strict=True)
     assert {row["model"] for row, old in pairs if row["rmse"] != old["rmse"]} == {"lstm", "mean"}
 
 
 @pytest.mark.long
-def test_killed_and_resumed(
-    tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_that_was_killed_ends_with_the_same_numbers(
+    tiny_config: Path, tiny_run: Path, tmp_path: Path, command: Command
 ) -> None:
     out = tmp_path / "killed"
-    command = [sys.executable, "-m", "residnet.cli", "run", str(tiny_config), "--out", str(out)]
+    words = [sys.executable, "-m", "residnet.cli", "run", str(tiny_config), "--out", str(out)]
     quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    process = subprocess.Popen(command, **quiet, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    process = subprocess.Popen(words, **quiet, env={**os.environ, "OMP_NUM_THREADS": "1"})
     checkpoint = out / "checkpoints" / "lstm" / "last.ckpt"
     for _ in range(1200):
         if checkpoint.is_file() or process.poll() is not None:
@@ -130,24 +123,23 @@ def test_killed_and_resumed(
     assert checkpoint.is_file()
     epoch = torch.load(checkpoint, weights_only=True)["epoch"]
     assert epoch < 6 or not (out / "metrics.json").is_file()
-    assert call(monkeypatch, "run", tiny_config, "--out", out, "--resume") == 0
+    assert command("run", tiny_config, "--out", out, "--resume").code == 0
     assert rows(out) == rows(tiny_run)
 
 
 @pytest.mark.long
-def test_models_read_back_give_the_same_rows(
-    tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_models_that_are_read_back_are_judged_alike(
+    tiny_config: Path, tiny_run: Path, tmp_path: Path, command: Command
 ) -> None:
     """Killed after the last training: what is judged has been read from the folder."""
     out = tmp_path / "late"
     shutil.copytree(tiny_run / "models", out / "models")
     shutil.copy(tiny_run / "resolved.yaml", out)
-    assert call(monkeypatch, "run", tiny_config, "--out", out, "--resume") == 0
+    assert command("run", tiny_config, "--out", out, "--resume").code == 0
     assert rows(out) == rows(tiny_run)
 
 
-def test_exported_module_runs_without_residnet(tiny_run: Path) -> None:
-    script = """
+ALONE_WITH_TORCH = """
 import json, sys, torch
 sys.modules["residnet"] = None
 files = {"card.json": ""}
@@ -168,38 +160,26 @@ assert (whole - torch.stack(single, 1)).abs().max() < 1e-6
 assert model.initial_state(3).shape == (3, card["memory"])
 assert 0.05 < float(x[0, 3]) < 2.5
 """
-    file = str(tiny_run / "exports" / "lstm.pt")
-    done = subprocess.run([sys.executable, "-c", script, file], capture_output=True, text=True)
+
+
+def test_an_exported_module_runs_without_residnet(tiny_run: Path) -> None:
+    words = [sys.executable, "-c", ALONE_WITH_TORCH, str(tiny_run / "exports" / "lstm.pt")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.long
-def test_free_runs_choose_between_solutions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Models carry the solution whose validation free run is best, and fit.json says what was
-    tried.
-    """
-    config: dict[str, Any] = {
-        **TINY,
-        **ALONE,
-        "baselines": {
-            "poly": {"kind": "regressors", "sets": ["polynomial_2"], "ridge": [1.0e-5, 1.0e-1]},
-            "nomoto": {"kind": "nomoto_sideslip", "drive": "tau_x", "steer": "tau_n"},
-        },
-        "heads": {
-            "plsr": {
-                "kind": "plsr",
-                "choose": "free_run",
-                "terms": ["u", "v", "r", "tau_n", "u|u|", "r|r|"],
-                "features": ["u", "v", "r", "tau_n"],
-            },
-            "ridge": {"kind": "ridge", "choose": "free_run", "penalties": [1.0e-6, 1.0e-2]},
-        },
-    }
-    path, run = tmp_path / "config.yaml", tmp_path / "run"
-    path.write_text(yaml.safe_dump(config))
-    assert call(monkeypatch, "run", path, "--out", run) == 0
+def test_models_carry_the_solution_whose_free_run_is_best(tmp_path: Path, command: Command) -> None:
+    """Of several solutions that validation logs choose between; fit.json says what was tried."""
+    ridge = {"kind": "ridge", "choose": "free_run", "penalties": [1.0e-6, 1.0e-2]}
+    plsr = {"kind": "plsr", "choose": "free_run", "features": ["u", "v", "r", "tau_n"]}
+    plsr["terms"] = ["u", "v", "r", "tau_n", "u|u|", "r|r|"]
+    poly = {"kind": "regressors", "sets": ["polynomial_2"], "ridge": [1.0e-5, 1.0e-1]}
+    nomoto = {"kind": "nomoto_sideslip", "drive": "tau_x", "steer": "tau_n"}
+    config = {**ALONE, "baselines": {"poly": poly, "nomoto": nomoto}}
+    config["heads"] = {"plsr": plsr, "ridge": ridge}
+    run = tmp_path / "run"
+    assert command("run", write_yaml(tmp_path / "c.yaml", config), "--out", run).code == 0
     for name, key, count in (("poly", "ridge", 2), ("plsr", "order", 8), ("ridge", "penalty", 4)):
         tried = notes(run, name)["free_run_choice"]
         assert len(tried) == count
@@ -214,32 +194,26 @@ def test_free_runs_choose_between_solutions(
 
 @pytest.mark.long
 def test_currents_are_found_and_models_fitted_without_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, command: Command
 ) -> None:
-    drifting: dict[str, Any] = {
-        **TINY,
-        **ALONE,
-        "data": {**TINY["data"], "disturbance": {"current_each": [0.1, 0.4]}},
-        "baseline": {"kind": "regressors", "sets": ["fossen"]},
-        "heads": {},
-    }
+    drifting = {**TINY["data"], "disturbance": {"current_each": [0.1, 0.4]}}
+    fossen = {"kind": "regressors", "sets": ["fossen"]}
+    config = {**ALONE, "data": drifting, "baseline": fossen, "heads": {}}
     errors = {}
     for name, current in (("with", {"baseline": "baseline"}), ("without", None)):
-        path = tmp_path / f"{name}.yaml"
-        path.write_text(yaml.safe_dump({**drifting, "current": current}, sort_keys=False))
-        assert call(monkeypatch, "run", path, "--out", tmp_path / name) == 0
+        file = write_yaml(tmp_path / f"{name}.yaml", {**config, "current": current})
+        assert command("run", file, "--out", tmp_path / name).code == 0
         errors[name] = notes(tmp_path / name, "baseline")["validation"]
     # 0.118 in calm water
     assert errors["with"] < 0.15 < 0.5 < errors["without"]
     assert not (tmp_path / "without" / "currents.json").exists()
-    data = validate(drifting["data"], SimulatedTrials, "here")
+    data = validate(drifting, SimulatedTrials, "here")
     kinds = [manoeuvre.kind for manoeuvre in data.draw()]
     names = [f"{kind}_{kinds[: i + 1].count(kind):02d}" for i, kind in enumerate(kinds)]
     known = dict(zip(names, data.disturbance.currents(len(names), data.seed), strict=True))
-    table = json.loads((tmp_path / "with" / "currents.json").read_text())
+    table = read_json(tmp_path / "with" / "currents.json")
     splits = zip(names, data.splits(data.draw()), strict=True)
-    fitted = {row["log"]: row["fitted"] for row in table}
-    assert fitted == {name: split != "test" for name, split in splits}
+    assert {row["log"]: row["fitted"] for row in table} == {n: s != "test" for n, s in splits}
     for row in table:
         found = [row["current_north"], row["current_east"]]
         np.testing.assert_allclose(found, known[row["log"]], atol=0.06)

@@ -4,29 +4,25 @@ feed-forward; a mass of the wrong sign stops it.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-import yaml
-from tiny import call
+from tiny import Command, read_json, write_yaml
 
 from residnet.data.simulated import SimulatedTrials, simulate
 
 pytestmark = pytest.mark.long
 
+ZIGZAGS = {"kind": "zigzag", "count": 8, "start": 3, "heading": ["10 deg"], "drive": [0.1, 0.2]}
 FERRY: dict[str, Any] = {
     "task": "fit",
     "name": "ferry",
     "data": {
         **{"kind": "simulated", "vessel": "milliampere_half"},
         **{"duration": 40, "step": 0.1, "substeps": 1},
-        "trials": [
-            {"kind": "zigzag", "count": 8, "start": 3, "heading": ["10 deg"]}
-            | {"drive": [0.1, 0.2], "steer": [0.03, 0.06]}
-        ],
+        "trials": [ZIGZAGS | {"steer": [0.03, 0.06]}],
         **{"identification": {"zigzag": 6}, "validation": {"zigzag": 1}},
     },
     "prepare": {
@@ -46,37 +42,32 @@ FERRY: dict[str, Any] = {
 }
 
 
-def test_a_whole_fit_and_its_exports(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config, run = tmp_path / "ferry.yaml", tmp_path / "run"
-    config.write_text(yaml.safe_dump(FERRY, sort_keys=False))
-    assert call(monkeypatch, "run", config, "--out", run) == 0
-    content = json.loads((run / "metrics.json").read_text())["rows"]
-    rows = {row["model"]: row for row in content if row["split"] == "test"}
+def test_a_whole_fit_and_its_exports(tmp_path: Path, command: Command) -> None:
+    run = tmp_path / "run"
+    assert command("run", write_yaml(tmp_path / "ferry.yaml", FERRY), "--out", run).code == 0
+    content = read_json(run / "metrics.json")["rows"]
+    error = {row["model"]: row["nrmse"]["mean"] for row in content if row["split"] == "test"}
     # the believed ferry is twice the true one: its residual takes most of the error away
-    assert rows["ridge"]["nrmse"]["mean"] < 0.6 * rows["baseline"]["nrmse"]["mean"]
-    fit = json.loads((run / "models" / "ridge" / "fit.json").read_text())
+    assert error["ridge"] < 0.6 * error["baseline"]
+    fit = read_json(run / "models" / "ridge" / "fit.json")
     assert fit["space"] == "force"
     assert fit["augmented_mass"][0][0] == pytest.approx(0.5 * 2389.657, rel=0.25)
     assert fit["forces_that_never_vary"] == ["tau_y"]
     assert (run / "exports" / "ridge.pt").is_file()
-    assert call(monkeypatch, "export", run, "--model", "ridge", "--format", "feed_forward") == 0
+    feed_forward = ("export", run, "--format", "feed_forward", "--model")
+    assert command(*feed_forward, "ridge").code == 0
     loaded = torch.jit.load(str(run / "exports" / "ridge_feed_forward.pt"))
     nu_dot = torch.tensor([[0.1, 0.0, 0.0], [torch.nan, 0.0, 0.0], [torch.inf, -1e30, 0.0]])
-    nu = torch.tensor([[0.5, 0.0, 0.0]]).expand(3, -1)
-    tau, outside = loaded(nu_dot, nu)
+    tau, outside = loaded(nu_dot, torch.tensor([[0.5, 0.0, 0.0]]).expand(3, -1))
     assert torch.isfinite(tau).all()
     assert outside.tolist()[1:] == [True, True]
     assert 0.5 < float(tau[0, 0]) / (0.1 * 0.5 * 2389.657) < 2.0
-    capsys.readouterr()
-    assert call(monkeypatch, "export", run, "--model", "baseline", "--format", "feed_forward") == 2
-    assert "no residual in force space" in capsys.readouterr().err
+    said = command(*feed_forward, "baseline")
+    assert said.code == 2
+    assert "no residual in force space" in said.err
 
 
-def test_a_mass_of_the_wrong_sign_stops_the_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mass_of_the_wrong_sign_stops_the_fit(tmp_path: Path, command: Command) -> None:
     """Logs of somebody who writes forces with the other sign."""
     trials = SimulatedTrials.model_validate(FERRY["data"])
     for number, log in enumerate(simulate(trials.draw(), trials)):
@@ -87,11 +78,14 @@ def test_a_mass_of_the_wrong_sign_stops_the_fit(
     measured = {"kind": "measured", "reader": {"kind": "canonical"}, "split": split}
     # a strong enough penalty would hide it
     heads = {"ridge": FERRY["heads"]["ridge"] | {"penalties": [1e-6]}}
-    config = tmp_path / "ferry.yaml"
-    config.write_text(yaml.safe_dump(FERRY | {"data": measured, "heads": heads}))
-    assert call(monkeypatch, "run", config, "--out", tmp_path / "run") == 1
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said.startswith(
-        "residnet: head ridge: residual in force space: its mass matrix with the fitted"
-        " accelerations has eigenvalues [-"
+    config = write_yaml(tmp_path / "ferry.yaml", FERRY | {"data": measured, "heads": heads})
+    said = command("run", config, "--out", tmp_path / "run")
+    assert said.code == 1
+    assert (
+        said.err.strip()
+        .splitlines()[-1]
+        .startswith(
+            "residnet: head ridge: residual in force space: its mass matrix with the fitted"
+            " accelerations has eigenvalues [-"
+        )
     )

@@ -13,12 +13,12 @@ import written_logs
 import written_recorders
 import yaml
 from foreign_tables import Style
+from kinds import of_kind
 
 import residnet
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.data.drafting.questions import Question
 from residnet.data.readers import ReaderConfig
 from residnet.data.sources import read_logs
 from residnet.identification.prepared import prepare_logs
@@ -43,8 +43,8 @@ def logs() -> list[Log]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, logs: list[Log]) -> Path:
     folder = tmp_path_factory.mktemp("drafts")
-    style = Style(told=False, units={"psi": "deg", "u": "kn", "v": "kn", "r": "°/min"})
-    foreign_tables.write(logs, folder / "trials", Style(**{**style.__dict__, "signs": ("delta",)}))
+    units = {"psi": "deg", "u": "kn", "v": "kn", "r": "°/min"}
+    foreign_tables.write(logs, folder / "trials", Style(told=False, units=units, signs=("delta",)))
     return folder
 
 
@@ -54,10 +54,13 @@ def lasting(seconds: float) -> Log:
 
 
 def test_free_runs_are_no_longer_than_most_logs() -> None:
-    assert window_length([180.0], 20.0) == 100.0
-    assert window_length([95.0, 95.0, 200.0], 20.0) == 60.0
-    assert window_length([30.0], 20.0) == 20.0
-    assert window_length([], 20.0) == 0.5
+    for lengths, expected in (
+        ([180.0], 100.0),
+        ([95.0, 95.0, 200.0], 60.0),
+        ([30.0], 20.0),
+        ([], 0.5),
+    ):
+        assert window_length(lengths, 20.0) == expected
 
 
 def test_the_length_of_the_test_logs_enters_no_choice() -> None:
@@ -79,8 +82,7 @@ def test_free_runs_are_as_short_as_gaps_ask_for(tmp_path: Path, logs: list[Log])
     log.replace(channels=holes).save(tmp_path / "holes.parquet")
     out = tmp_path / "holes.yaml"
     new_config([tmp_path / "holes.parquet"], out, None, overwrite=False)
-    task = load_task(out)
-    assert isinstance(task, FitConfig)
+    task = of_kind(load_task(out), FitConfig)
     # refuses a log that holds no window
     assert all(prepare_logs(read_logs(task.data), task).values())
 
@@ -98,64 +100,50 @@ def test_a_config_from_logs_alone(folder: Path) -> None:
     assert content["signals"]["inputs"] == ["delta", "n"]
     assert content["recipe"] == "standard"
     assert not {"baseline", "baselines", "heads", "training", "effort"} & set(content)
-    assert {name: len(content["data"]["split"][name]) for name in ("train", "test")} == {
-        "train": 4,
-        "test": 1,
-    }
+    assert [len(content["data"]["split"][name]) for name in ("train", "test")] == [4, 1]
     # whatever was guessed stands above its key
     for line in ("r: {column: yaw rate", "delta: {column: rudder", "time: {column: time"):
         above = text[: text.index(line)].rstrip().splitlines()[-1]
         assert above.strip().startswith("#"), line
-
-
-def test_the_same_from_python(folder: Path) -> None:
+    # the same from Python
     draft = residnet.draft(folder / "trials", name="boat", folder=folder)
-    assert draft.config == yaml.safe_load((folder / "boat.yaml").read_text())
+    assert draft.config == content
     assert "data.split" in dict(draft.guesses)
+    for file, said in (("boat.yaml", "exists; give --overwrite"), ("a.txt", r"name it .*a\.txt\.")):
+        with pytest.raises(UsageError, match=said):
+            new_config([folder / "trials"], folder / file, None, overwrite=False)
 
 
-def test_a_file_is_not_replaced_unasked(folder: Path) -> None:
-    file = folder / "kept.yaml"
-    file.write_text("mine")
-    with pytest.raises(UsageError, match="exists; give --overwrite"):
-        new_config([folder / "trials"], file, None, overwrite=False)
-    with pytest.raises(UsageError, match=r"name it .*boat\.txt\.yaml"):
-        new_config([folder / "trials"], folder / "boat.txt", None, overwrite=False)
-
-
-def test_one_log_is_cut_in_time(folder: Path, logs: list[Log]) -> None:
+def test_one_log_is_cut_in_time(folder: Path) -> None:
     only = sorted((folder / "trials").glob("*.csv"))[0]
     draft = residnet.draft(only, folder=folder)
     assert draft.config["data"]["split"]["test"] == [{"log": only.name, "from": "47.9 s"}]
     assert any("cut in time" in why for _, why in draft.guesses)
 
 
-def test_answers_are_taken(folder: Path, logs: list[Log], tmp_path: Path) -> None:
-    files = foreign_tables.write(logs, tmp_path, Style(units={"r": "°/min"}))
-    for file in files:
+def test_answers_are_taken(logs: list[Log], tmp_path: Path) -> None:
+    for file in foreign_tables.write(logs, tmp_path, Style(units={"r": "°/min"})):
         file.write_text(file.read_text().replace("[°/min]", "[deg/s]"))
-
-    def answer(question: Question) -> str:
-        return question.options[-1]
-
-    draft = residnet.draft(tmp_path, folder=tmp_path, answer=answer)
+    draft = residnet.draft(tmp_path, folder=tmp_path, answer=lambda asked: asked.options[-1])
     assert draft.config["data"]["reader"]["channels"]["r"]["unit"] == "deg/s"
     assert "answered 'deg/s' in place of 'deg/min'" in draft.text
 
 
-def test_what_cannot_be_drafted(folder: Path, logs: list[Log], tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such file or folder"):
-        residnet.draft(tmp_path / "nowhere")
-    with pytest.raises(UsageError, match="holds no log of a format"):
-        residnet.draft(tmp_path)
+def test_what_cannot_be_drafted(logs: list[Log], tmp_path: Path) -> None:
+    foreign_tables.write(logs, tmp_path / "lost", Style(left_out=("psi",)))
+    (tmp_path / "empty").mkdir()
+    for name, said in (
+        ("nowhere", "no such file or folder"),
+        ("empty", "holds no log of a format"),
+        ("lost", "no channel psi"),
+    ):
+        with pytest.raises((UsageError, DataError), match=said):
+            residnet.draft(tmp_path / name)
     still = [log.replace(channels={**log.channels, "n": np.full(len(log), 3.0)}) for log in logs]
     foreign_tables.write(still, tmp_path / "still", Style(left_out=("delta",)))
     draft = residnet.draft(tmp_path / "still", folder=tmp_path)
     assert draft.config["signals"]["inputs"] == []
     assert "no channel of the logs is a rudder" in dict(draft.guesses)["signals.inputs"]
-    foreign_tables.write(logs, tmp_path / "lost", Style(left_out=("psi",)))
-    with pytest.raises((UsageError, DataError), match="no channel psi"):
-        residnet.draft(tmp_path / "lost")
 
 
 WRITERS: dict[str, Callable[[Log, Path], Path]] = {

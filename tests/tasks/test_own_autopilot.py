@@ -1,17 +1,20 @@
-"""From logs of one's own vessel, or K and T, to the config of its autopilot."""
+"""From logs of one's own vessel, or K and T, to the config of its autopilot, and its pace."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from pydantic import ValidationError
 
+from residnet.control.heading.turning import Turning
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import UsageError
-from residnet.tasks.autopilot import AutopilotConfig
+from residnet.tasks.autopilot import AutopilotConfig, least_time
 from residnet.tasks.own_autopilot import draft_autopilot
 
 GAIN, TIME, GEAR, DELAY, NOISE = 0.31, 7.4, 6.0, 0.3, 0.15
@@ -64,9 +67,55 @@ def test_gain_and_time_are_enough(tmp_path: Path) -> None:
     turning = config.steered.turning(config.rudder, config.turning_time)
     # the gear's way to its angle is no part of T
     assert turning.time == pytest.approx(7.4, rel=0.02)
-    with pytest.raises(UsageError, match="exists; give --overwrite"):
-        draft_autopilot(["0.31,7.4"], file)
-    with pytest.raises(UsageError, match="both positive"):
-        draft_autopilot(["0,7.4"], tmp_path / "other.yaml")
-    with pytest.raises(UsageError, match="rudder"):
-        draft_autopilot(["0.31,7.4"], tmp_path / "other.yaml", rudder="15 kg")
+    for given, out, rudder, said in (
+        ("0.31,7.4", "kt", None, "exists; give --overwrite"),
+        ("0,7.4", "other", None, "both positive"),
+        ("0.31,7.4", "other", "15 kg", "rudder"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            draft_autopilot([given], tmp_path / f"{out}.yaml", rudder=rudder)
+
+
+CONFIG: dict[str, Any] = {
+    "task": "autopilot",
+    "name": "slow",
+    "vessel": "nomoto_ship",
+    "rudder": "20 deg",
+    "test": {"duration": "14 s"},
+    "conditions": {"beyond": {"late": {"delay": ["0.6 s", "0.6 s"]}}},
+    "policies": {"learned": {"start": "ptos"}},
+    "peers": {"ptos": {"kind": "ptos"}},
+}
+
+
+def test_the_least_time_is_that_of_two_pulses() -> None:
+    # without damping: half the way at full acceleration, half at full braking
+    turning = Turning(1e4, 1e6, 1.0)
+    acceleration = turning.gain * 0.1 / turning.time
+    two = 2.0 * math.sqrt(math.radians(30.0) / acceleration)
+    assert least_time(turning, 0.1, None) == pytest.approx(two, rel=1e-3)
+    # at once at its speed: the angle over the yaw rate
+    quick = Turning(1.0, 1e-4, 1.0)
+    assert least_time(quick, 0.1, None) == pytest.approx(math.radians(30.0) / 0.1, rel=1e-3)
+    assert least_time(quick, 0.1, 0.05) == pytest.approx(math.radians(30.0) / 0.1 + 4.0, rel=1e-3)
+
+
+def test_times_follow_the_pace_and_delays_do_not() -> None:
+    slow = AutopilotConfig.model_validate(CONFIG | {"pace": 8.0}).paced()
+    assert slow.conditions is not None
+    assert (slow.test.duration, slow.test.dt) == (112.0, 0.16)
+    for conditions in (slow.conditions.stated, slow.conditions.beyond["late"]):
+        assert (conditions.duration, conditions.dt, conditions.hold) == (112.0, 0.16, 40.0)
+        assert conditions.overshoot_weight == 4.0
+    assert slow.conditions.stated.delay == (0.0, 0.4)
+    assert slow.policies["learned"].training.dt == 0.32
+    assert slow.paced() == slow
+
+
+def test_the_pace_of_a_vessel_is_measured_and_belongs_to_conditions() -> None:
+    slow = AutopilotConfig.model_validate(CONFIG | {"pace": "vessel"}).paced()
+    assert slow.test.duration == pytest.approx(14.0 * 8.7, rel=0.05)
+    without = CONFIG | {"pace": 2.0, "conditions": None, "policies": {}, "peers": {}}
+    without |= {"predictive": {"document": {"horizon": 2.0}}}
+    with pytest.raises(ValidationError, match="pace: give 'conditions'"):
+        AutopilotConfig.model_validate(without)

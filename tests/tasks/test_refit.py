@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from read_page import Page, plain
-from tiny import TINY, call
+from tiny import TINY, Command, call, read_json, write_yaml
 
 from residnet.core.config import validate
 from residnet.data.simulated import SimulatedTrials, simulate
 from residnet.runs.folder import require_sealed
+
+pytestmark = pytest.mark.long
 
 DATA: dict[str, Any] = {
     **TINY["data"],
@@ -26,27 +26,23 @@ DATA: dict[str, Any] = {
     ],
     "identification": {"zigzag": 6, "acceleration_deceleration": 3, "three_two_one_one": 3},
 }
+MANOEUVRE = {"protocols": {"manoeuvre": {"kind": "manoeuvre"}}, "selection": "manoeuvre"}
 CONFIG: dict[str, Any] = {
     **{key: TINY[key] for key in ("task", "prepare", "signals")},
     "name": "watched",
     "data": DATA,
     "baseline": {"kind": "regressors", "sets": ["fossen"], "ridge": 1e-6},
     "bands": None,
-    "evaluation": {
-        "protocols": {"manoeuvre": {"kind": "manoeuvre"}},
-        "selection": "manoeuvre",
-        "scales": TINY["evaluation"]["scales"],
-    },
+    "evaluation": {**MANOEUVRE, "scales": TINY["evaluation"]["scales"]},
 }
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("watched")
-    config = folder / "config.yaml"
-    config.write_text(yaml.safe_dump(CONFIG, sort_keys=False))
+    file = write_yaml(folder / "config.yaml", CONFIG)
     with pytest.MonkeyPatch.context() as patch:
-        assert call(patch, "run", config, "--out", folder / "run") == 0
+        assert call(patch, "run", file, "--out", folder / "run") == 0
     return folder / "run"
 
 
@@ -63,53 +59,48 @@ def new_logs(folder: Path, weaker: float) -> list[Any]:
     return words
 
 
-@pytest.mark.long
-def test_a_refit_leaves_the_old_run_alone_and_can_be_exported_and_evaluated(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_refit_leaves_the_old_run_alone_and_can_be_exported(
+    run: Path, tmp_path: Path, command: Command
 ) -> None:
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file()}
     logs, out = new_logs(tmp_path / "logs", 0.2), tmp_path / "refit"
-    given = [*logs, "--model", "baseline", "--window", "5 s", "--refit", out]
-    told = ["--json", tmp_path / "found.json", "--out", tmp_path / "page"]
-    assert call(monkeypatch, "monitor", run, *given, *told) == 1
-    said = capsys.readouterr().out
-    page = Page(plain(tmp_path / "page" / "report.html"))
-    alarms, causes = page.tables
+    given = ["monitor", run, *logs, "--model", "baseline", "--window", "5 s", "--refit", out]
+    said = command(*given, "--json", tmp_path / "found.json", "--out", tmp_path / "page")
+    assert said.code == 1
+    alarms, causes = Page(plain(tmp_path / "page" / "report.html")).tables
     assert [line[1][:5] for line in alarms[1:]].count("after") >= 1
     assert alarms[-1][2] == "gain n_stbd"
     assert [line[1] for line in causes].count("gain n_stbd") == 4
     assert {file: file.read_bytes() for file in run.rglob("*") if file.is_file()} == before
     require_sealed(run)
-    found = json.loads((tmp_path / "found.json").read_text())[-1]["refit"]
+    found = read_json(tmp_path / "found.json")[-1]["refit"]
     (change,) = found["changes"]
     assert change["cause"] == "gain n_stbd"
     assert found["worth_taking"]
-    assert "IS worth taking" in said
-    metrics = json.loads((out / "metrics.json").read_text())
+    assert "IS worth taking" in said.out
+    metrics = read_json(out / "metrics.json")
     assert metrics["selected"] == "baseline_refit"
     assert {row["model"] for row in metrics["rows"]} == {"zero", "baseline", "baseline_refit"}
     errors = {
         row["model"]: row["nrmse"]["mean"]
         for row in metrics["rows"]
-        if row["protocol"] == "manoeuvre" and row["manoeuvre"] == "all"
+        if (row["protocol"], row["manoeuvre"]) == ("manoeuvre", "all")
     }
     assert errors["baseline_refit"] == found["nrmse_new"] < 0.8 * errors["baseline"]
     assert errors["baseline"] == found["nrmse_old"]
     assert (out / "report.html").is_file()
-    assert call(monkeypatch, "export", out, "--model", "baseline_refit") == 0
+    assert command("export", out, "--model", "baseline_refit").code == 0
     # a folder that is there, or the run itself, is not written to
-    capsys.readouterr()
-    assert call(monkeypatch, "monitor", run, *given) == 2
-    assert call(monkeypatch, "monitor", run, *logs, "--refit", run / "refit") == 2
-    assert "give another folder for --refit" in capsys.readouterr().err
+    assert command(*given).code == 2
+    said = command("monitor", run, *logs, "--refit", run / "refit")
+    assert said.code == 2
+    assert "give another folder for --refit" in said.err
 
 
-@pytest.mark.long
-def test_clean_logs_are_not_refitted(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_clean_logs_are_not_refitted(run: Path, tmp_path: Path, command: Command) -> None:
     logs, out = new_logs(tmp_path / "logs", 0.0), tmp_path / "refit"
     given = [*logs, "--model", "baseline", "--window", "5 s", "--refit", out]
-    assert call(monkeypatch, "monitor", run, *given) == 0
-    assert "no model was written" in capsys.readouterr().out
+    said = command("monitor", run, *given)
+    assert said.code == 0
+    assert "no model was written" in said.out
     assert not out.exists()

@@ -2,30 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+import short_configs
 
 from residnet.core.files import config_folder
 from residnet.tasks.registry import load_task
 
-FILE = Path(__file__).parents[2] / "scripts" / "ci" / "short_configs.py"
-
-
-def loaded() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("short_configs", FILE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["short_configs"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-short_configs = loaded()
 CONFIGS = sorted(
     path.relative_to(config_folder()).with_suffix("").as_posix()
     for path in config_folder().rglob("*.yaml")
@@ -49,17 +33,12 @@ def test_the_overrides_of_a_row_are_valid(
     assert load_task(config_folder() / f"{name}.yaml", given).name
 
 
-def test_a_config_whose_data_are_absent_is_skipped(
+def test_what_cannot_run_is_skipped_and_what_fails_has_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
     result = short_configs.carry_out("kvlcc2", tmp_path)
     assert (result.state, result.words) == ("skipped", "no RESIDNET_DATA/kvlcc2")
-
-
-def test_a_run_that_fails_is_said_to_have_failed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     wrong = short_configs.Short(("trials=3",))
     monkeypatch.setitem(short_configs.SHORT, "wam_v_trials", wrong)
     result = short_configs.carry_out("wam_v_trials", tmp_path)

@@ -1,18 +1,16 @@
-"""Task `simulate`: a vessel, a learned model, or both; trials that a fit reads back."""
+"""Task `simulate`: a vessel, a learned model, or both; trials for a fit to read back."""
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from PIL import Image
 from read_page import plain
-from tiny import TINY, call
+from tiny import TINY, Command, call, read_json, write_yaml
 
 from residnet.core.log import Log
 from residnet.data.readers.base import CanonicalConfig
@@ -22,51 +20,48 @@ from residnet.tasks.registry import load_task
 STEP = 0.1
 PATTERN = {"kind": "three_two_one_one", "drive": 0.5, "steer": 0.6, "unit": 2, "duration": 25}
 ZIGZAG = {"kind": "zigzag", "drive": 0.6, "steer": 0.4, "heading": "15 deg", "start": 10}
+CIRCLE = {"kind": "turning_circle", "name": "circle", "drive": 0.6, "steer": 1.0, "start": 10}
 VESSEL: dict[str, Any] = {
     "vessel": "wam_v_cal",
     "duration": 60,
     "step": STEP,
     "substeps": 1,
     "noise": {"u": 0, "v": 0, "r": 0},
-    "manoeuvres": [
-        ZIGZAG | {"reversals": 4},
-        {"kind": "turning_circle", "name": "circle", "drive": 0.6, "steer": 1.0, "start": 10},
-        PATTERN,
-    ],
+    "manoeuvres": [ZIGZAG | {"reversals": 4}, CIRCLE, PATTERN],
     "families": [{"kind": "random_steps", "count": 2}],
 }
 
 
-def flown(
-    folder: Path, content: dict[str, Any], patch: pytest.MonkeyPatch | None = None, code: int = 0
-) -> dict[str, Log]:
-    """The logs of a run in `folder`, by the name of their file within it.
+def of(folder: Path, **content: Any) -> Path:
+    """Write the config beside the folder of its run."""
+    return write_yaml(folder.with_suffix(".yaml"), {"task": "simulate", "name": "ship", **content})
 
-    With a patch, of the command line with its report; without, of Python and without a report.
-    """
-    file = folder.with_suffix(".yaml")
-    task = {"task": "simulate", "name": "ship", **content}
-    file.write_text(yaml.safe_dump(task, sort_keys=False))
-    if patch is None:
-        load_task(file).run(source=file, out=folder, report=False)
-    else:
-        assert call(patch, "run", file, "--out", folder) == code
-    logs = sorted(folder.rglob("*.parquet"))
+
+def logs_of(run: Path) -> dict[str, Log]:
+    """Logs by their folder and name."""
+    files = sorted(run.rglob("*.parquet"))
     return {
-        f"{path.parent.name}/{path.stem}": CanonicalConfig().build().read(path) for path in logs
+        f"{file.parent.name}/{file.stem}": CanonicalConfig().build().read(file) for file in files
     }
 
 
+def flown(folder: Path, **content: Any) -> dict[str, Log]:
+    """The logs of a run without a report."""
+    file = of(folder, **content)
+    load_task(file).run(source=file, out=folder, report=False)
+    return logs_of(folder)
+
+
 def indices(folder: Path) -> dict[tuple[str, str], dict[str, Any]]:
-    content = json.loads((folder / "indices.json").read_text())["rows"]
-    return {(row["craft"], row["log"]): row for row in content}
+    rows = read_json(folder / "indices.json")["rows"]
+    return {(row["craft"], row["log"]): row for row in rows}
 
 
 @pytest.fixture(scope="module")
 def ship(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("programme") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        flown(folder, {"programme": VESSEL}, patch)
+        assert call(patch, "run", of(folder, programme=VESSEL), "--out", folder) == 0
     return folder
 
 
@@ -83,7 +78,7 @@ def test_a_vessel_leaves_logs_indices_and_figures(ship: Path) -> None:
     steer = np.sign(zigzag["cmd_port"] - zigzag["cmd_stbd"])
     assert (np.diff(steer[zigzag.t > 10]) != 0).sum() == 4
     assert zigzag["psi"][-1] >= 0 > zigzag["psi"][-2]
-    content = json.loads((ship / "indices.json").read_text())
+    content = read_json(ship / "indices.json")
     assert (content["schema"], content["length"]) == ("residnet.indices/1", 4.88)
     assert content["units"]["first_overshoot"] == "rad"
     # the peak lies between samples
@@ -112,9 +107,9 @@ def test_a_model_flies_beside_its_vessel_and_alone(tiny_run: Path, tmp_path: Pat
     """
     model: dict[str, Any] = {"run": str(tiny_run), "name": "ridge"}
     programme = VESSEL | {"manoeuvres": [PATTERN], "step": None, "duration": 20, "model": model}
-    both = flown(tmp_path / "both", {"programme": programme})
+    both = flown(tmp_path / "both", programme=programme)
     programme |= {"vessel": None, "model": {**model, "actuators": "wam_v_cal"}}
-    alone = flown(tmp_path / "alone", {"programme": programme})
+    alone = flown(tmp_path / "alone", programme=programme)
     names = {name.removeprefix("logs/") for name in alone}
     assert names == {"three_two_one_one_01", "random_steps_01", "random_steps_02"}
     assert set(both) == {f"{place}/{name}" for place in ("logs", "model_logs") for name in names}
@@ -125,44 +120,45 @@ def test_a_model_flies_beside_its_vessel_and_alone(tiny_run: Path, tmp_path: Pat
         np.testing.assert_array_equal(log["cmd_port"], true["cmd_port"])
         np.testing.assert_allclose(log["n_port"], true["n_port"], atol=1e-9)
         assert 0 < np.abs(log["u"] - true["u"]).max() < 0.5
-    inputs = json.loads((tmp_path / "both" / "provenance.json").read_text())["inputs"]
+    inputs = read_json(tmp_path / "both" / "provenance.json")["inputs"]
     assert {Path(path).name for path in inputs} == {"model.json", "model.safetensors"}
     share = {"drive": "2380 rpm", "limit": "2380 rpm", "rate": "600 rpm/s"}
     sides = {"n_port": share | {"steer": "2380 rpm"}, "n_stbd": share | {"steer": "-2380 rpm"}}
     given = {"model": {"run": str(tiny_run), "inputs": sides}, "duration": 20, "length": 4.88}
     given |= {"noise": VESSEL["noise"], "manoeuvres": [ZIGZAG | {"drive": 0.5, "steer": 0.3}]}
-    log = flown(tmp_path / "given", {"programme": given})["logs/zigzag_01"]
+    log = flown(tmp_path / "given", programme=given)["logs/zigzag_01"]
     assert np.abs(np.diff(log["n_port"])).max() == pytest.approx(10 * STEP, rel=1e-9)
     assert log["cmd_n_port"].max() == pytest.approx(0.8 * 2380 / 60)
 
 
 @pytest.mark.long
-def test_a_manoeuvre_that_never_ends(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_manoeuvre_that_never_ends_is_an_error_where_it_is_listed(
+    tmp_path: Path, command: Command
 ) -> None:
-    """Of those that are listed it is an error, whose log says it too; of those drawn a line."""
+    """Its log says it too; of those that are drawn it is a line."""
     lazy = ZIGZAG | {"steer": 0.0, "heading": "20 deg", "reversals": 2, "duration": 8}
-    programme = VESSEL | {"manoeuvres": [lazy, PATTERN]}
-    logs = flown(tmp_path / "run", {"programme": programme}, monkeypatch, code=1)
-    lines = capsys.readouterr().err.splitlines()
-    [error] = [line for line in lines if line.startswith("residnet:")]
+    run, programme = tmp_path / "run", VESSEL | {"manoeuvres": [lazy, PATTERN]}
+    said = command("run", of(run, programme=programme), "--out", run)
+    assert said.code == 1
+    [error] = [line for line in said.err.splitlines() if line.startswith("residnet:")]
     assert "zigzag_01: timed out after 7.9 s before 2 reversals at 20 deg" in error
     assert "(1 of 4 flights did not end as they should" in error
+    logs = logs_of(run)
     assert logs["logs/zigzag_01"].meta["timed_out"] is True
     assert "timed_out" not in logs["logs/three_two_one_one_01"].meta
-    assert indices(tmp_path / "run")["wam_v_cal", "zigzag_01"]["timed_out"]
+    assert indices(run)["wam_v_cal", "zigzag_01"]["timed_out"]
     family = [{"kind": "turning_circle", "count": 1, "steer": [0.01, 0.02]}]
-    programme |= {"manoeuvres": [], "families": family, "duration": 10}
-    flown(tmp_path / "drawn", {"programme": programme}, monkeypatch)
-    assert "turning_circle_01: timed out" in capsys.readouterr().err
+    drawn = VESSEL | {"manoeuvres": [], "families": family, "duration": 10}
+    said = command("run", of(run, programme=drawn), "--out", tmp_path / "drawn")
+    assert said.code == 0
+    assert "turning_circle_01: timed out" in said.err
 
 
-def test_replay_gives_the_log_again(ship: Path, tmp_path: Path) -> None:
+def test_a_replay_gives_the_log_again(ship: Path, tmp_path: Path) -> None:
     """The same vessel from the recorded start with the recorded commands: the recorded motion."""
     names = ("random_steps_01", "circle")
     replay = [{"kind": "replay", "log": str(ship / "logs" / f"{name}.parquet")} for name in names]
-    programme = VESSEL | {"manoeuvres": replay, "families": []}
-    logs = flown(tmp_path / "run", {"programme": programme})
+    logs = flown(tmp_path / "run", programme=VESSEL | {"manoeuvres": replay, "families": []})
     for name, source in zip(("replay_01", "replay_02"), names, strict=True):
         mine, log = logs[f"logs/{name}"], Log.load(ship / "logs" / f"{source}.parquet")
         assert len(log) - len(mine) in (0, 1)
@@ -171,16 +167,13 @@ def test_replay_gives_the_log_again(ship: Path, tmp_path: Path) -> None:
         assert indices(tmp_path / "run")["wam_v_cal", name]["indices"]["rmse_u"] < 1e-9
 
 
-def test_trials_are_drawn_split_and_read_by_inspect(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_trials_are_drawn_split_and_read_by_inspect(tmp_path: Path, command: Command) -> None:
     trials = [{**TINY["data"]["trials"][0], "drive": [0.4]}, TINY["data"]["trials"][3]]
     counts = {"identification": {"three_two_one_one": 2}, "validation": {"constant": 2}}
     settings = {**TINY["data"], "duration": 12, "trials": trials, **counts}
-    logs = flown(tmp_path / "run", {"data": settings})
+    logs = flown(tmp_path / "run", data=settings)
     data = SimulatedTrials.model_validate(settings)
-    drawn = data.draw()
-    found = zip(simulate(drawn, data), data.splits(drawn), strict=True)
+    found = zip(simulate(data.draw(), data), data.splits(data.draw()), strict=True)
     expected = {f"{split}/{log.name}": log for log, split in found}
     assert logs.keys() == expected.keys()
     for name, log in expected.items():
@@ -189,47 +182,12 @@ def test_trials_are_drawn_split_and_read_by_inspect(
         assert logs[name].channels.keys() == log.channels.keys()
         for channel in log.channels:
             np.testing.assert_array_equal(logs[name][channel], log[channel])
-    provenance = json.loads((tmp_path / "run" / "provenance.json").read_text())
+    provenance = read_json(tmp_path / "run" / "provenance.json")
     assert (provenance["seed"], provenance["inputs"]) == (0, {})
     assert provenance["config"].endswith("run.yaml")
     files = sorted((tmp_path / "run" / "logs").rglob("three_two_one_one_*.parquet"))
     assert len(files) == 3
-    capsys.readouterr()
-    assert call(monkeypatch, "inspect", *files) in (0, 1)
-    text = capsys.readouterr().out
+    said = command("inspect", *files)
+    assert said.code in (0, 1)
     told = "note: 10 channels, 120 samples, manoeuvre three_two_one_one"
-    assert all(f"{path.stem}: {told}" in text for path in files)
-
-
-@pytest.mark.long
-def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(
-    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Baseline and ridge see the same numbers whether they are simulated or read back."""
-    logs = flown(tmp_path / "trials", {"data": TINY["data"]})
-    data = SimulatedTrials.model_validate(TINY["data"])
-    drawn = data.draw()
-    split: dict[str, Any] = {"root": str(tmp_path / "trials" / "logs")}
-    # in the order of the programme: the folds of a cross-validation follow the order of the logs
-    for log, name in zip(simulate(drawn, data), data.splits(drawn), strict=True):
-        split.setdefault(name, []).append(f"{name}/{log.name}.parquet")
-    measured = {"kind": "measured", "reader": {"kind": "canonical"}, "split": split}
-    light: dict[str, Any] = {"heads": {"ridge": {"kind": "ridge"}}, "ensembles": {}, "training": {}}
-    light |= {"export": {"models": []}, "data": measured, "name": "files"}
-    (tmp_path / "files.yaml").write_text(yaml.safe_dump(TINY | light, sort_keys=False))
-    assert call(monkeypatch, "run", tmp_path / "files.yaml", "--out", tmp_path / "files") == 0
-    found = []
-    for run in (tiny_run, tmp_path / "files"):
-        fit = json.loads((run / "models" / "baseline" / "fit.json").read_text())
-        values: dict[tuple[str, ...], float] = {
-            (entry["axis"], entry["term"]): entry["value"] for entry in fit["coefficients"]
-        }
-        for row in json.loads((run / "metrics.json").read_text())["rows"]:
-            if row["model"] in ("zero", "baseline", "ridge"):
-                key = (row["model"], row["split"], row["protocol"], row["manoeuvre"])
-                values[key] = row["nrmse"]["mean"]
-        found.append(values)
-    assert found[1] == pytest.approx(found[0], rel=1e-9)
-    assert len(found[0]) > 40
-    inputs = json.loads((tmp_path / "files" / "provenance.json").read_text())["inputs"]
-    assert len(inputs) == len(logs)
+    assert all(f"{path.stem}: {told}" in said.out for path in files)

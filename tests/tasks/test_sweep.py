@@ -1,4 +1,4 @@
-"""Task `sweep`: every trial is kept, a kill changes nothing, wrong spaces are one line."""
+"""Tasks `sweep` and `study`: every run of many is kept, and a kill changes nothing."""
 
 from __future__ import annotations
 
@@ -14,37 +14,45 @@ from typing import Any
 
 import pytest
 import yaml
-from tiny import SWEEP, TINY, call
+from read_page import plain
+from tiny import STUDY, SWEEP, TINY, Command, read_json, write_yaml
 
+from residnet.core.config import load_config
 from residnet.core.processes import ApartProcesses
+from residnet.core.progress import Progress
+from residnet.tasks import sweep as running
+from residnet.tasks.sweep import SweepConfig, Trials, open_study, watch
 
-pytest.importorskip("optuna")
+optuna = pytest.importorskip("optuna")
 
 WINDOW = "prepare.derivative.window"
+FALLING = "space={heads.ridge.penalty: {low: 1e-6, high: 1.0, log: true}}"
 
 
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(TINY, sort_keys=False))
-    path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(SWEEP, sort_keys=False))
-    return path
-
-
-def _read(out: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((out / "sweep.json").read_text())
-    return content
+    write_yaml(tmp_path / "tiny.yaml", TINY)
+    return write_yaml(tmp_path / "sweep.yaml", SWEEP)
 
 
 def _values(out: Path) -> list[tuple[Any, Any]]:
-    return [(row["values"], row["value"]) for row in _read(out)["trials"]]
+    return [(row["values"], row["value"]) for row in read_json(out / "sweep.json")["trials"]]
+
+
+def _error(run: Path, split: str, protocol: str) -> float:
+    """The error of `ridge` over all manoeuvres."""
+    wanted = ("ridge", split, protocol, "all")
+    (found,) = (
+        row["nrmse"]["mean"]
+        for row in read_json(run / "metrics.json")["rows"]
+        if (row["model"], row["split"], row["protocol"], row["manoeuvre"]) == wanted
+    )
+    return float(found)
 
 
 def test_a_grid_is_searched_whole_and_resumed(
-    sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
-    from residnet.tasks import sweep as running
-
     out = tmp_path / "out"
     real, begun = running.carry_out_trial, []
 
@@ -55,58 +63,44 @@ def test_a_grid_is_searched_whole_and_resumed(
         return real(*words)
 
     monkeypatch.setattr(running, "carry_out_trial", killed)
-    words = ["run", sweep, "--out", out]
     space = {**SWEEP["space"], WINDOW: {"choices": [0.9]}}
-    words += ["-s", f"space={json.dumps(space)}"]
-    assert call(monkeypatch, *words) == 130
-    assert call(monkeypatch, *words, "--resume") == 0
+    words = ["run", sweep, "--out", out, "-s", f"space={json.dumps(space)}"]
+    assert command(*words).code == 130
+    assert command(*words, "--resume").code == 0
     assert begun == [0, 1, 1], "the trial without an end goes on, the finished one is kept"
 
-    content = _read(out)
+    content = read_json(out / "sweep.json")
     assert [row["state"] for row in content["trials"]] == ["finished"] * 2
     drawn = [tuple(row["values"].values()) for row in content["trials"]]
     assert drawn == [(1, 0.9), (2, 0.9)]
     for row in content["trials"]:
         run = out / "trials" / f"{row['number']:05d}"
-        rows = json.loads((run / "metrics.json").read_text())["rows"]
-        (error,) = (
-            one["nrmse"]["mean"]
-            for one in rows
-            if (one["model"], one["split"], one["protocol"], one["manoeuvre"])
-            == ("ridge", "validation", "manoeuvre", "all")
-        )
-        assert row["value"] == error
+        assert row["value"] == _error(run, "validation", "manoeuvre")
         resolved = yaml.safe_load((run / "resolved.yaml").read_text())
         assert resolved["heads"]["ridge"]["degree"] == row["values"]["heads.ridge.degree"]
     best = min(content["trials"], key=lambda row: row["value"])
     assert content["best"] == best["number"]
     written = yaml.safe_load((out / "best.yaml").read_text())
     assert written["heads"]["ridge"]["degree"] == best["values"]["heads.ridge.degree"]
-    assert call(monkeypatch, "check", out / "best.yaml") == 0
+    assert command("check", out / "best.yaml").code == 0
     names = {path.name for path in (out / "figures").glob("*.png")}
     assert {"01_parallel_coordinates.png", "02_course.png"} <= names
     assert "heads.ridge.degree" in (out / "report.html").read_text()
 
 
 def test_values_of_a_random_search_hang_on_its_seed_alone(sweep: Path, tmp_path: Path) -> None:
-    from residnet.core.config import load_config
-    from residnet.tasks.sweep import SweepConfig, Trials, open_study
-
-    space = "space={heads.ridge.penalty: {low: 1e-6, high: 1.0, log: true}}"
     found = []
     for number, seed in enumerate((3, 3, 4)):
         search = f"search={{kind: random, trials: 30, seed: {seed}}}"
-        config = load_config(sweep, [space, search], SweepConfig)
+        config = load_config(sweep, [FALLING, search], SweepConfig)
         (folder := tmp_path / str(number)).mkdir()
         drawn: list[Any] = []
         # what a resumed sweep draws goes on as the undisturbed one does
-        for _ in range(3):
+        for stop in (7, 20, 30):
             trials = Trials(config, open_study(config, folder))
-            while len(drawn) < 30 and (trial := trials.next()):
+            while len(drawn) < stop and (trial := trials.next()):
                 drawn.append(trial.params["heads.ridge.penalty"])
                 trials.study.tell(trial.number, 1.0)
-                if len(drawn) in (7, 20):
-                    break
         assert trials.next() is None
         assert len(drawn) == 30
         assert all(1e-6 <= value <= 1.0 for value in drawn)
@@ -117,32 +111,37 @@ def test_values_of_a_random_search_hang_on_its_seed_alone(sweep: Path, tmp_path:
 
 
 def test_a_poor_trial_is_ended_early(sweep: Path, tmp_path: Path) -> None:
-    import optuna
-
-    from residnet.core.config import load_config
-    from residnet.core.progress import Progress
-    from residnet.tasks.sweep import SweepConfig, Trials, open_study, watch
-
     words = ["pruning={startup: 3}", "search={kind: random, trials: 5}"]
     config = load_config(sweep, words, SweepConfig)
-    study = open_study(config, tmp_path)
-    trials = Trials(config, study)
-    for level in (1.0, 2.0, 3.0):
-        trial = trials.next()
-        assert trial is not None
-        heard: Any = watch(config, tmp_path, trial._trial_id)
+    trials = Trials(config, open_study(config, tmp_path))
+
+    def heard(number: int) -> Any:
+        trial: Any = trials.next()
+        assert trial.number == number
+        return watch(config, tmp_path, trial._trial_id)
+
+    for number, level in enumerate((1.0, 2.0, 3.0)):
+        told = heard(number)
         for epoch in (1, 2):
-            heard(Progress("training ridge", epoch, 2, score=level / epoch))
-        study.tell(trial.number, level)
-    good, poor = trials.next(), trials.next()
-    assert good is not None
-    assert poor is not None
-    heard = watch(config, tmp_path, good._trial_id)
-    heard(Progress("training ridge", 1, 2, score=1.5))
-    heard(Progress("training other", 1, 2, score=9.0))
-    heard = watch(config, tmp_path, poor._trial_id)
+            told(Progress("training ridge", epoch, 2, score=level / epoch))
+        trials.study.tell(number, level)
+    good, poor = heard(3), heard(4)
+    good(Progress("training ridge", 1, 2, score=1.5))
+    good(Progress("training other", 1, 2, score=9.0))
     with pytest.raises(optuna.TrialPruned):
-        heard(Progress("training ridge", 1, 2, score=2.5))
+        poor(Progress("training ridge", 1, 2, score=2.5))
+
+
+def _children(parent: int) -> list[int]:
+    return [int(one) for one in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
+
+
+def _alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
 
 
 @pytest.mark.long
@@ -169,23 +168,9 @@ def test_processes_end_with_a_killed_sweep_and_the_rest_follows(
     assert _values(tmp_path / "out") == _values(tmp_path / "calm")
 
 
-def _children(parent: int) -> list[int]:
-    return [int(one) for one in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
-
-
-def _alive(process: int) -> bool:
-    try:
-        state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
-
-
 def test_a_lost_process_costs_its_own_trial_alone(
-    sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
-    from residnet.tasks import sweep as running
-
     begun: list[int] = []
 
     def lost(*words: Any) -> Any:
@@ -197,11 +182,10 @@ def test_a_lost_process_costs_its_own_trial_alone(
     monkeypatch.setattr(running, "carry_out_trial", lost)
     space = {**SWEEP["space"], WINDOW: {"choices": [0.9, 1.1, 1.3]}}
     words = ["run", sweep, "--out", tmp_path / "out", "-s", f"space={json.dumps(space)}"]
-    assert call(monkeypatch, *words, "-s", "runner.workers=1") == 0
-    rows = _read(tmp_path / "out")["trials"]
+    assert command(*words, "-s", "runner.workers=1").code == 0
+    rows = read_json(tmp_path / "out" / "sweep.json")["trials"]
     assert [begun.count(row["number"]) for row in rows] == [2, 3, *[1] * (len(rows) - 2)]
-    failed = [row["number"] for row in rows if row["state"] == "failed"]
-    assert failed == [1]
+    assert [row["number"] for row in rows if row["state"] == "failed"] == [1]
     assert "lost 3 times" in rows[1]["fault"]
 
 
@@ -213,11 +197,35 @@ def test_a_process_that_is_killed_is_replaced() -> None:
 
 
 @pytest.mark.long
-def test_the_same_sweep_runs_through_ray(
-    sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_same_sweep_runs_through_ray(sweep: Path, tmp_path: Path, command: Command) -> None:
     pytest.importorskip("ray")
     runner = "runner={kind: ray, workers: 2}"
-    assert call(monkeypatch, "run", sweep, "--out", tmp_path / "ray", "-s", runner) == 0
-    assert call(monkeypatch, "run", sweep, "--out", tmp_path / "own") == 0
+    assert command("run", sweep, "--out", tmp_path / "ray", "-s", runner).code == 0
+    assert command("run", sweep, "--out", tmp_path / "own").code == 0
     assert _values(tmp_path / "ray") == _values(tmp_path / "own")
+
+
+@pytest.mark.long
+def test_all_variants_and_seeds_of_a_study_stand_in_one_table(
+    sweep: Path, tmp_path: Path, command: Command
+) -> None:
+    out = tmp_path / "out"
+    file = write_yaml(tmp_path / "study.yaml", STUDY)
+    assert command("run", file, "--out", out).code == 0
+    rows = read_json(out / "study.json")["rows"]
+    assert {(row["variant"], row["protocol"]) for row in rows} == {
+        (v, p) for v in STUDY["variants"] for p in ("manoeuvre", "T10")
+    }
+    for row in rows:
+        runs = [out / "variants" / f"{row['variant']}.{seed}" for seed in (0, 1)]
+        found = [_error(run, "test", row["protocol"]) for run in runs]
+        assert row["nrmse_mean"] == pytest.approx(sum(found) / 2, rel=1e-6)
+    assert "short" in plain(out / "report.html")
+    assert (out / "figures" / "01_study.png").stat().st_size > 1000
+    stamps = {path: path.stat().st_mtime_ns for path in out.glob("variants/*/metrics.json")}
+    assert len(stamps) == 4
+    (out / "variants" / "short.1" / "summary.json").unlink()
+    assert command("run", file, "--out", out, "--resume").code == 0
+    again = {path: path.stat().st_mtime_ns for path in stamps}
+    changed = {path.parent.name for path in again if again[path] != stamps[path]}
+    assert changed == {"short.1"}, "finished runs are kept"
