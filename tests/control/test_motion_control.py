@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from kinds import of_kind
-from scipy.integrate import solve_ivp
 from scipy.signal import step
 
 from residnet.control import (
@@ -148,48 +147,6 @@ def test_pid_by_hand() -> None:
 
 def ferry(name: str) -> HullPlant:
     return of_kind(load_vessel(name).build(), HullPlant)
-
-
-def test_the_exact_model_follows_without_feedback() -> None:
-    """Forces of the true hull's inverse, at once: the only error is their hold over a step."""
-    plant = ferry("milliampere")
-    dt = 0.05
-    config = ReferenceFilterConfig(waypoints=((5.0, -3.0, 0.8),), interval=30.0)
-    guidance = config.build(dt)
-    none = MotionPIDConfig(proportional=(0.0, 0.0, 0.0))
-    controller = none.build(dt, HullFeedForward(plant.hull))
-    x0 = torch.zeros(1, len(plant.state), dtype=torch.float64)
-    # the plain hull: forces act through the body's inputs, as the thrusters would lag
-    wanted = asked(guidance, 600, x0)
-    tau = controller(x0.expand(600, -1), wanted[0], torch.zeros(600, 3, dtype=torch.float64))[0]
-
-    def rate(t: float, y: np.ndarray) -> np.ndarray:
-        held = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
-        held[0, 3:6] = tau[min(int(t / dt + 1e-9), 599)]
-        with torch.no_grad():
-            return plant.rate(torch.from_numpy(y)[None], held)[0].numpy()
-
-    end = solve_ivp(rate, (0.0, 20.0), x0[0].numpy(), max_step=dt, rtol=1e-6).y[:3, -1]
-    np.testing.assert_allclose(end, wanted[0, 400, :3], atol=2e-3)
-
-
-def test_the_closed_loop_scripts() -> None:
-    """A controller has to leave Python: the same commands as TorchScript, after a memory of some
-    steps.
-    """
-    dt = 0.1
-    loop = ClosedLoop(
-        GAINS.build(dt, HullFeedForward(ferry("milliampere").hull)),
-        ReferenceFilterConfig(waypoints=WAYPOINTS).build(dt),
-    )
-    scripted = torch.jit.script(loop)
-    x, w = torch.randn(3, 12, dtype=torch.float64), torch.zeros(3, 5, dtype=torch.float64)
-    memory = again = loop.initial(x)
-    for k in range(4):
-        command, memory = loop(x, w, k, memory)
-        same, again = scripted(x, w, k, again)
-        torch.testing.assert_close(same, command, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(again, memory, rtol=1e-12, atol=1e-12)
 
 
 def test_allocated_to_azimuth_thrusters() -> None:
