@@ -208,39 +208,31 @@ def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) ->
     assert "Not determined by these logs" in titles
 
 
-TWICE = {"ols": {"fit": {"kind": "ols"}, "terms": ["u", "v", "u v", "v u"]}}
-UNDETERMINED: list[tuple[dict[str, Any], tuple[str, ...], dict[str, Any], str]] = [
+REFUSED: list[tuple[dict[str, Any], tuple[str, ...], str]] = [
     (
         {"seconds": 120.0, "v": np.zeros(1200)},
         (),
         {},
         r"model ridge: basis function 'v_dot' is cons",
     ),
-    ({}, (), TWICE, "model ols: basis functions u v, v u are collinear"),
-    ({}, ("validation.segment=1000",), {}, "one run or segment only"),
     (
         {"seconds": 12.0},
-        ("validation.segment=2",),
         {},
         r"samples do not determine|nothing left to f",
     ),
-    ({"tau_x_est": np.full(3000, np.nan)}, (), {}, "holds no number"),
-    ({}, ("channels.actual=[acting_tau, a, b]",), {}, "no channel 'acting_tau'"),
-    ({}, ("data.logs=[none_*.csv]",), {}, "matches no file"),
+    ({"tau_x_est": np.full(3000, np.nan)}, (), "holds no number"),
+    ({}, ("channels.actual=[acting_tau, a, b]",), "no channel 'acting_tau'"),
+    ({}, ("data.logs=[none_*.csv]",), "matches no file"),
 ]
 
 
-@pytest.mark.parametrize(("spoil", "overrides", "models", "said"), UNDETERMINED)
+@pytest.mark.parametrize(("spoil", "overrides", "said"), REFUSED)
 def test_data_that_determine_nothing_are_clear_errors(
-    spoil: dict[str, Any],
-    overrides: tuple[str, ...],
-    models: dict[str, Any],
-    said: str,
-    tmp_path: Path,
+    spoil: dict[str, Any], overrides: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
     log(tmp_path, **spoil)
     with pytest.raises((ConfigError, DataError, FitError, UsageError), match=said):
-        force_study(config(tmp_path, *overrides, **models))
+        force_study(config(tmp_path, *overrides))
 
 
 def test_comparison_of_accelerations_without_segments_has_no_interval() -> None:

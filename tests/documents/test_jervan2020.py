@@ -275,23 +275,6 @@ def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
     assert tau[:, 1:].abs().max() < 1e-9
 
 
-def test_one_segment_nan_and_too_few_samples_are_clear_errors(short: Flown) -> None:
-    wanted = config("operation").models["lag_ridge"].model_copy(update={"lag": False})
-    base = ForceModel(hull("milliampere"))
-    record = record_of(short.first, 20.0, None)
-    spoiled = record.nu.clone()
-    spoiled[5, 1] = torch.nan
-    few = torch.arange(len(record.t)) % 100 == 7
-    cases: list[tuple[dict[str, Any], str]] = [
-        ({"fold": torch.zeros_like(record.fold)}, "one run or segment only"),
-        ({"nu": spoiled}, "not finite at sample 5"),
-        ({"train": few}, "samples do not determine 30"),
-    ]
-    for part, message in cases:
-        with pytest.raises(FitError, match=message):
-            identify(wanted, replace(record, **part), base)
-
-
 def test_a_model_is_identified_again_where_its_residual_has_grown_for_long() -> None:
     def noise(scale: float, seed: int = 0) -> torch.Tensor:
         random = torch.Generator().manual_seed(seed)

@@ -1,5 +1,5 @@
 """A residual in force space through a whole fit: run forward, judged, exported as model and as
-feed-forward; a mass of the wrong sign stops it.
+feed-forward.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ from typing import Any
 import pytest
 import torch
 from tiny import Command, read_json, write_yaml
-
-from residnet.data.simulated import SimulatedTrials, simulate
 
 pytestmark = pytest.mark.long
 
@@ -65,27 +63,3 @@ def test_a_whole_fit_and_its_exports(tmp_path: Path, command: Command) -> None:
     said = command(*feed_forward, "baseline")
     assert said.code == 2
     assert "no residual in force space" in said.err
-
-
-def test_a_mass_of_the_wrong_sign_stops_the_fit(tmp_path: Path, command: Command) -> None:
-    """Logs of somebody who writes forces with the other sign."""
-    trials = SimulatedTrials.model_validate(FERRY["data"])
-    for number, log in enumerate(simulate(trials.draw(), trials)):
-        turned = {name: -log[name] for name in ("tau_x", "tau_y", "tau_n")}
-        log.replace(channels=log.channels | turned).save(tmp_path / f"log_{number}.parquet")
-    parts = {"train": "log_[0-5]", "validation": "log_6", "test": "log_7"}
-    split = {"root": str(tmp_path)} | {key: [f"{log}.parquet"] for key, log in parts.items()}
-    measured = {"kind": "measured", "reader": {"kind": "canonical"}, "split": split}
-    # a strong enough penalty would hide it
-    heads = {"ridge": FERRY["heads"]["ridge"] | {"penalties": [1e-6]}}
-    config = write_yaml(tmp_path / "ferry.yaml", FERRY | {"data": measured, "heads": heads})
-    said = command("run", config, "--out", tmp_path / "run")
-    assert said.code == 1
-    assert (
-        said.err.strip()
-        .splitlines()[-1]
-        .startswith(
-            "residnet: head ridge: residual in force space: its mass matrix with the fitted"
-            " accelerations has eigenvalues [-"
-        )
-    )
