@@ -1,5 +1,5 @@
 """The manoeuvring booklet of a fit, on simulated zigzags of the rudder boat whose own indices are
-known.
+known; and the trials that would narrow it.
 """
 
 from __future__ import annotations
@@ -52,54 +52,12 @@ booklet:
     - {kind: zigzag, name: ten_ten, rudder: 10 deg, heading: 10 deg, drive: 0.8, start: 0 s,
        reversals: 2}
 """
-ROLL = """
-data:
-  kind: simulated
-  vessel: patrol_p06_linear
-  seed: 1
-  trials:
-    - {kind: zigzag, count: 10, heading: [10 deg, 20 deg], drive: [0.6, 0.8], steer: [0.3, 0.4]}
-  duration: 60 s
-  step: 0.25 s
-  noise:
-    u: 0.01
-    v: 0.01
-    r: 0.05 deg/s
-    sensors: {phi: {noise: 0.05 deg}, p: {noise: 0.05 deg/s}}
-  identification: {zigzag: 6}
-  validation: {zigzag: 2}
-prepare:
-  grid: {step: 0.25 s}
-  derivative: {kind: savitzky_golay, window: 1.75 s, order: 2}
-signals: {inputs: [delta, cmd_thrust], velocities: [u, v, r, p]}
-integrator: semi_implicit_euler
-baseline:
-  kind: regressors
-  ridge: 1.0e-4
-  terms: ["1", u, v, r, p, phi, u|u|, u v, u r, v|v|, u|u| delta, cmd_thrust]
-bands: null
-export: {models: []}
-evaluation:
-  protocols: {T10: {kind: windows, length: 10 s}}
-  selection: T10
-  scales: {u: 0.3, v: 0.3, r: 1 deg/s, p: 1 deg/s, phi: 1.5 deg}
-"""
-ROLL_BOOKLET = """
-length: 51.5 m
-scale: 1
-inputs: {cmd_thrust: {drive: 100000}, delta: {steer: 30 deg, rate: 10 deg/s}}
-initial: {u: 7 m/s}
-duration: 300 s
-manoeuvres:
-  - {kind: turning_circle, name: circle, until: 360 deg, rudder: 10 deg, drive: 0.8, start: 0 s}
-repeat: []
-"""
 
 
-def write(folder: Path, config: dict[str, Any] | None = None, **booklet: Any) -> Path:
+def write(folder: Path, **booklet: Any) -> Path:
     content = yaml.safe_load(CONFIG)
     content["booklet"] |= booklet
-    return write_yaml(folder / "booklet.yaml", content | (config or {}))
+    return write_yaml(folder / "booklet.yaml", content)
 
 
 def test_pages_hold_values_with_intervals_and_limits_beside_measured_ones(
@@ -134,16 +92,6 @@ def test_pages_hold_values_with_intervals_and_limits_beside_measured_ones(
     assert "Manoeuvring booklet" in text
     assert "tactical diameter" in text
     assert len(list((run / "figures").glob("*booklet*.png"))) == 3
-
-
-def test_a_vessel_that_rolls_has_roll_angles_and_a_plan(tmp_path: Path, command: Command) -> None:
-    run = tmp_path / "run"
-    file = write(tmp_path, yaml.safe_load(ROLL), **yaml.safe_load(ROLL_BOOKLET))
-    assert command("run", file, "--out", run).code == 0
-    roll = read_json(run / "booklet.json")["pages"][0]["indices"]["largest_roll_angle"]
-    low, high = roll["interval"]
-    assert 0.005 < low <= roll["value"] <= high < 0.2
-    assert "largest roll angle" in plain(run / "report.html")
     said = command("plan-trial", run, "--time", "60 s", "--out", tmp_path / "plan")
     assert said.code == 0
     assert "they narrow the intervals of predictions" in said.out
