@@ -1,13 +1,11 @@
 """Prints the mean length of sentences and the share of those over 35 words, page by page.
 
-python scripts/readability.py [--git REVISION] [PAGE...]   all pages where none is named
+python scripts/readability.py
 """
 
 from __future__ import annotations
 
-import argparse
 import re
-import subprocess
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -30,34 +28,18 @@ def sentences(markdown: str) -> list[int]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("pages", nargs="*", type=Path)
-    parser.add_argument("--git", help="a revision in place of the files as they stand")
-    given = parser.parse_args()
-    pages = given.pages or [
-        ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))
-    ]  # fmt: skip
-    every: list[int] = []
-    for page in pages:
-        name = page.resolve().relative_to(ROOT).as_posix()
-        if given.git:
-            command = ["git", "-C", str(ROOT), "show", f"{given.git}:{name}"]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            counts = sentences(done.stdout)
-        else:
-            counts = sentences(page.read_text(encoding="utf-8"))
-        every += counts
-        if counts:
-            show(name, counts)
-    show("all pages", every)
-
-
-def show(name: str, counts: list[int]) -> None:
-    long = sum(count > LONG for count in counts)
-    print(
-        f"{name:40s} {len(counts):5d} sentences, mean {sum(counts) / len(counts):5.1f} words,"
-        f" {100 * long / len(counts):4.1f} % over {LONG}"
-    )
+    """Print a line for each page, and one for all."""
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    counts = {page.relative_to(ROOT).as_posix(): sentences(page.read_text()) for page in pages}
+    counts["all pages"] = [count for page in counts.values() for count in page]
+    for name, found in counts.items():
+        if found:
+            long = 100 * sum(count > LONG for count in found) / len(found)
+            mean = sum(found) / len(found)
+            print(
+                f"{name:40s} {len(found):5d} sentences, mean {mean:5.1f} words,"
+                f" {long:4.1f} % over {LONG}"
+            )
 
 
 if __name__ == "__main__":

@@ -1,17 +1,16 @@
 """How many planted faults the data doctor finds, and what it says about clean logs.
 
-    python scripts/bench/doctor.py [--vessels N] [--seed S] [--shipped SEEDS] [FAULT...]
-    python scripts/bench/doctor.py --long ROWS [--seed S] [FAULT...]
+    python scripts/bench/doctor.py [FAULT...] [--vessels 10] [--seed 1000]
+    python scripts/bench/doctor.py [FAULT...] --long ROWS [--seed 1000]
 
-The hosts are vessels drawn at random, measured logs where RESIDNET_DATA names them, and with
---shipped the shipped vessels. For each fault and kind of host: logs in which a finding above a note
-names it. Then the clean logs that have a finding above a note. Limits were tuned on seeds below
-1000; report on others.
+The hosts are so many vessels of each kind drawn at random, and measured logs where RESIDNET_DATA
+names them. For each fault and kind of host: logs in which a finding above a note names it. Then the
+clean logs that have a finding above a note. Limits were tuned on seeds below 1000; report on
+others. With --long both ways of looking at one long log of so many rows stand beside each other.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import sys
@@ -20,12 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import bench
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
-
 from large_data import simulate
-from planted import FAULTS, SHIPS, Fault, Ship, Undecidable, clean
+from planted import FAULTS, SHIPS, Fault, Ship, Undecidable
 from random_vessels import KINDS, random_logs, ship_of
 
 from residnet.core.errors import ResidnetError
@@ -33,8 +30,8 @@ from residnet.core.log import Log
 from residnet.data.doctor import Finding, inspect, inspect_together, statistics
 from residnet.data.masks import Mask
 
-_CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-_ROTATED = 3
+_TOGETHER, _MEASURED = 3, 4
+"""Measured logs that are looked at together, and how often."""
 
 
 @dataclass(frozen=True)
@@ -46,65 +43,44 @@ class Host:
     inputs: tuple[str, ...] | None = None
     masks: tuple[Mask, ...] = ()
 
-    def findings(self, logs: Sequence[Log], first_only: bool = False) -> list[Finding]:
-        """Everything that the doctor says of logs, each and together."""
-        members = logs[:1] if first_only else logs
-        found = [f for log in members for f in inspect(log, self.inputs, self.masks).findings]
-        return [*found, *inspect_together(logs, self.inputs).findings]
-
 
 def simulated(seed: int, count: int) -> Iterator[Host]:
-    """Vessels drawn at random."""
+    """Yield vessels drawn at random."""
     for kind in KINDS:
         for logs in random_logs(kind, seed, count):
             yield Host(ship_of(kind, logs[0]), logs)
 
 
-def shipped(seeds: int) -> Iterator[Host]:
-    """The shipped vessels."""
-    for ship in SHIPS:
-        for seed in range(seeds):
-            yield Host(ship, clean(ship, seed))
-
-
-def measured(seed: int) -> Iterator[Host]:
-    """Measured model tankers, three logs at a time."""
+def measured(seed: int) -> list[Host]:
+    """Return measured model tankers, three logs at a time."""
     from residnet.tasks.registry import load_task
 
     folder = os.environ.get("RESIDNET_DATA")
     if not folder:
-        return
+        return []
     random = np.random.default_rng(seed)
-    about = {"lag": (0.7, 1.4), "bias": (0.1, 0.3)}
     hosts = []
     for name in ("esso_osaka", "kvlcc2"):
-        fit: Any = load_task(_CONFIGS / f"{name}.yaml")
+        fit: Any = load_task(bench.CONFIGS / f"{name}.yaml")
         reader = fit.data.reader.build()
         files = sorted((Path(folder) / name).rglob("*.csv"))
         files = [files[i] for i in random.permutation(len(files))]
         arm = (0.6, 1.5) if name == "esso_osaka" else (1.4, 3.5)
         ship = Ship(
-            "tanker", name, "0 s", "0 s", {}, arm=arm, **about, steer=("delta",), actual="delta",
-            demand="delta",
+            "tanker", name, "0 s", "0 s", {}, arm=arm, lag=(0.7, 1.4), bias=(0.1, 0.3),
+            steer=("delta",), actual="delta", demand="delta",
         )  # fmt: skip
-        for start in range(0, len(files) - _ROTATED + 1, _ROTATED):
-            logs = [reader.read(file) for file in files[start : start + _ROTATED]]
+        for start in range(0, len(files) - _TOGETHER + 1, _TOGETHER):
+            logs = [reader.read(file) for file in files[start : start + _TOGETHER]]
             hosts.append(Host(ship, logs, fit.signals.columns, fit.prepare.masks))
-    yield from (hosts[i] for i in random.permutation(len(hosts)))
+    return [hosts[i] for i in random.permutation(len(hosts))][:_MEASURED]
 
 
-def alarms(host: Host) -> list[str]:
-    """What the doctor says above a note of each clean log, one entry for each log."""
-    out = []
-    for log in host.logs:
-        loud = [f for f in inspect(log, host.inputs, host.masks).findings if f.level != "note"]
-        out.append("; ".join(f"{f.code} ({f.effect}): {f.text}" for f in loud))
-    return out
-
-
-def _named(fault: Fault, host: Host, logs: list[Log], verbose: bool) -> bool:
+def named(fault: Fault, host: Host, logs: list[Log]) -> bool:
+    """Return whether the doctor names a fault of the first log, or of all together."""
     try:
-        said = host.findings(logs, first_only=True)
+        said = list(inspect(logs[0], host.inputs, host.masks).findings)
+        said += inspect_together(logs, host.inputs).findings
     except ResidnetError as error:
         said = [Finding("fatal", fault.codes[0], str(error))]
     # what the masks of the run leave out is a note
@@ -113,13 +89,7 @@ def _named(fault: Fault, host: Host, logs: list[Log], verbose: bool) -> bool:
         for f in said
         if f.level != "note" or fault.harmless or f.action == "the config masks these samples"
     ]
-    named = any(f.code in fault.codes for f in loud)
-    if not named or verbose:
-        told = [(f.code, f.effect and round(f.effect, 3)) for f in said if f.code in fault.codes]
-        others = sorted({f.code for f in said if f.level != "note"})
-        word = "found" if named else "missed"
-        print(f"{word}: {fault.name}, {logs[0].name}: {told}, else {others}", file=sys.stderr)
-    return named
+    return any(f.code in fault.codes for f in loud)
 
 
 def loud(log: Log, longest: float) -> set[str]:
@@ -158,34 +128,22 @@ def long_logs(rows: int, seed: int, faults: Sequence[Fault]) -> None:
 
 def main() -> None:
     """Print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--vessels", type=int, default=10, help="of each kind, drawn at random")
-    parser.add_argument("--seed", type=int, default=1000)
-    parser.add_argument("--shipped", type=int, default=0, help="seeds of the shipped vessels")
-    parser.add_argument("--measured", type=int, default=4, help="sets of three measured logs")
-    parser.add_argument("--long", type=int, help="rows of long logs")
-    parser.add_argument("--verbose", action="store_true")
-    parser.add_argument("faults", nargs="*")
-    given = parser.parse_args()
+    given = bench.options(__doc__, faults=(), vessels=10, seed=1000, long=0)
+    faults = [f for f in FAULTS if not given.faults or f.name in given.faults]
     if given.long:
-        chosen = [f for f in FAULTS if not given.faults or f.name in given.faults]
-        long_logs(given.long, given.seed, chosen)
+        long_logs(given.long, given.seed, faults)
         return
-    hosts = [
-        *simulated(given.seed, given.vessels),
-        *shipped(given.shipped),
-        *list(measured(given.seed))[: given.measured],
-    ]
+    hosts = [*simulated(given.seed, given.vessels), *measured(given.seed)]
     names = list(dict.fromkeys(host.ship.name for host in hosts))
     table: dict[tuple[str, str], list[bool]] = {}
     checked, loud = 0, 0
-    faults = [f for f in FAULTS if not given.faults or f.name in given.faults]
     for number, host in enumerate(hosts):
-        if not given.faults:
-            for log, text in zip(host.logs, alarms(host), strict=True):
-                checked, loud = checked + 1, loud + bool(text)
-                if text:
-                    print(f"alarm: {log.name}: {text}", file=sys.stderr)
+        for log in host.logs if not given.faults else ():
+            said = inspect(log, host.inputs, host.masks).findings
+            told = [f"{f.code} ({f.effect}): {f.text}" for f in said if f.level != "note"]
+            checked, loud = checked + 1, loud + bool(told)
+            if told:
+                print(f"alarm: {log.name}: {'; '.join(told)}", file=sys.stderr)
         for fault in faults:
             if host.ship.name not in (*fault.ships, *fault.hosts):
                 continue
@@ -196,7 +154,7 @@ def main() -> None:
             except Undecidable:
                 continue
             rest = [log for log in logs[1:] if len(planted) == 1]
-            hit = _named(fault, host, [*planted, *rest], given.verbose)
+            hit = named(fault, host, [*planted, *rest])
             table.setdefault((fault.name, host.ship.name), []).append(hit)
     print(f"{'fault':28s}" + "".join(f"{name:>11s}" for name in names) + "        all")
     every: list[bool] = []

@@ -1,43 +1,28 @@
-"""Feed-forwards exported from random halves of the ferry's course, outside their range.
+"""Feed-forwards of drawn ferries on courses that nothing has seen, beside the believed model.
 
-    python scripts/bench/feed_forward.py [--halves 10] [--seed 0] [--interval 20]
-    python scripts/bench/feed_forward.py --ferries 10
+    python scripts/bench/feed_forward.py [--ferries 10] [--seed 0]
 
-Half of the segments of the course, drawn at random, identify PLSR and ridge regression of the
-residual force (document 002); every other draw also turns the order of the waypoints at random.
-Each model is exported with the range of its half. At 20,000 motions, 5,000 each up to 1.2, 3, 10
-and 100 times that range, the largest ratio of the commanded to the believed force outside the range
-is printed, which may be 1.2, and the largest sway force and yaw moment on straight courses ahead
-and astern.
-
-With `--ferries`, so many ferries are drawn, each with a course of its own: every mass and every
-damping times 0.5 to 1.5, thrusters of 1.5 to 3 rad/s. A study as a user writes it (`fit: {kind:
-plsr}`) identifies the residual. What it exports is flown on two courses that nothing has seen,
-ahead and astern, beside the believed model. Printed are position errors, and why one is withheld.
+So many ferries are drawn, each with a course of its own: every mass and every damping times 0.5 to
+1.5, thrusters of 1.5 to 3 rad/s. A study as a user writes it (`fit: {kind: plsr}`) identifies the
+residual. What it exports is flown on two courses, ahead and astern. Printed are position errors,
+and why one is withheld.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import bench
 import torch
 import yaml
 from torch import Tensor, nn
 
-from residnet.control.motion import Lag
-from residnet.core.config import load_config
 from residnet.documents.jervan2020.ferry import (
-    FerryModelConfig,
     FerryStudyConfig,
-    Flown,
-    identify,
     objections,
-    record_of,
     study,
     written,
 )
@@ -48,86 +33,21 @@ from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 
-VESSEL = Path(__file__).resolve().parents[2] / "configs/vessels/milliampere.yaml"
-CONFIG = Path(__file__).resolve().parents[2] / "configs/studies/jervan2020/operation.yaml"
-FITS = {
-    "plsr": {"kind": "plsr"},
-    "plsr_5": {"kind": "plsr", "order": 5},
-    "ridge": {"kind": "ridge"},
-}
-REACHES = (1.2, 3.0, 10.0, 100.0)
-"""How far off the drawn motions are, in half widths of the range; beyond about 3 they are replaced
-by the nearest value.
-"""
-
-
-def believed() -> ForceModel:
-    """Return the believed hull.
-
-    Raises:
-        TypeError: where the vessel has another kind of hull.
-    """
-    built = load_vessel("milliampere").build()
-    if not isinstance(built, HullPlant):
-        raise TypeError("milliampere has no hull with a mass matrix")
-    return ForceModel(built.hull)
-
-
-def flown(interval: float, random: torch.Generator, *, turned: bool) -> Flown:
-    """Fly the course once with the believed model; `turned`: its waypoints in random order."""
-    over = [f"course.interval={interval}", "~crossing"]
-    config = load_config(CONFIG, over, FerryStudyConfig)
-    if turned:
-        points = config.course.waypoints
-        order = torch.randperm(len(points), generator=random).tolist()
-        course = config.course.model_copy(update={"waypoints": tuple(points[i] for i in order)})
-        config = config.model_copy(update={"course": course})
-    plain = FerryModelConfig.model_validate({"fit": {"kind": "plsr", "order": 3}})
-    return study(config.model_copy(update={"models": {"plain": plain}}))
-
-
-def judge(found: Flown, interval: float, random: torch.Generator) -> list[str]:
-    """Return a line for each model that a random half identifies."""
-    record, base, lines = record_of(found.first, interval, None), believed(), []
-    folds = torch.unique(record.fold)
-    half = folds[torch.randperm(len(folds), generator=random)[: len(folds) // 2]]
-    record = replace(record, train=torch.isin(record.fold, half))
-    motion = torch.cat((record.nu_dot, record.nu), dim=-1)[record.train]
-    low, high = motion.amin(0), motion.amax(0)
-    middle, width = (low + high) / 2, (high - low) / 2
-    for name, fit in FITS.items():
-        model = identify(FerryModelConfig.model_validate({"fit": fit}), record, base)
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "feed_forward.pt"
-            ranges = list(zip(low.tolist(), high.tolist(), strict=True))
-            force = RequiredForce(*model.force.parts(), mirrored=True)
-            exported = ExportedForce(name, force, ranges, model.fit.notes.get("lag"))
-            TorchScriptExporter().export(exported, file)
-            exported = torch.jit.load(str(file))
-        far = torch.tensor(REACHES, dtype=torch.float64).repeat_interleave(5000).unsqueeze(-1)
-        away = far * (2 * torch.rand(len(far), 6, generator=random, dtype=torch.float64) - 1)
-        x = middle + width * away
-        tau, outside = exported(x[:, :3], x[:, 3:])
-        with torch.no_grad():
-            known = base(x[:, :3], x[:, 3:])
-        ratio = (tau.abs() / (known.abs() + 1e-9))[outside].amax(0)
-        straight = torch.zeros(81, 6, dtype=torch.float64)
-        straight[:, 3] = torch.linspace(-2, 2, 81)
-        across, _ = exported(straight[:, :3], straight[:, 3:])
-        text = " / ".join(f"{float(value):.3f}" for value in ratio)
-        lines.append(
-            f"{name:7s} {int(outside.sum())} of {len(x)} outside; largest ratio {text};"
-            f" straight {float(across[:, 1:].abs().max()):.1e} N, N m"
-        )
-    return lines
+VESSEL = bench.CONFIGS / "vessels" / "milliampere.yaml"
+CONFIG = bench.CONFIGS / "studies" / "jervan2020" / "operation.yaml"
 
 
 class AsExported(nn.Module):
-    """An exported file in the place of the model that a course is flown with."""
+    """What is exported of a model, in the place of the model that a course is flown with."""
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, model: Any, ranges: list[list[float]]) -> None:
         super().__init__()
-        self.exported = torch.jit.load(str(file))
+        force = RequiredForce(*model.force.parts(), mirrored=True)
+        limits = [(low, high) for low, high in ranges]
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "feed_forward.pt"
+            TorchScriptExporter().export(ExportedForce("plsr", force, limits, None), file)
+            self.exported = torch.jit.load(str(file))
 
     def at_heading(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
         """Return the force [..., 3] at nu_dot and nu [..., 3], at any heading."""
@@ -190,45 +110,27 @@ def judge_ferry(number: int, random: torch.Generator, folder: Path) -> str:
     results, _ = written(config, found, RunFolder(folder / f"run_{number}"))
     against = objections("plsr", results)
     model = found.whole.get("plsr", found.models["plsr"])
-    file, base_force = folder / "feed_forward.pt", believed()
-    force = RequiredForce(*model.force.parts(), mirrored=True)
-    ranges = [(low, high) for low, high in results["models"]["plsr"]["exported"]["range"]]
-    TorchScriptExporter().export(ExportedForce("plsr", force, ranges, None), file)
-    lag: Lag | None = model.lag
+    required = AsExported(model, results["models"]["plsr"]["exported"]["range"])
+    hull = load_vessel("milliampere").build()
+    assert isinstance(hull, HullPlant)
     ferry, told = config.ferry(str(true)), []
     for kind in ("ahead", "astern"):
         path = config.course.model_validate(drawn_course(random, kind=kind, count=6))
-        feeds: list[Any] = [(base_force, None), (AsExported(file), lag)]
+        feeds: list[Any] = [(ForceModel(hull.hull), None), (required, model.lag)]
         known, own = (flight.tracking.row()["position_mae"] for flight in ferry.fly(path, feeds))
         told.append(f"{kind} {known:.4f} -> {own:.4f} m ({own / known:.2f})")
-    chosen = f"order {model.fit.notes.get('order')}, {'with' if lag else 'without'} lag"
+    chosen = f"order {model.fit.notes.get('order')}, {'with' if model.lag else 'without'} lag"
     state = f"withheld: {'; '.join(against)}" if against else "exported"
     return f"ferry {number:2d}  {chosen}; {', '.join(told)}; {state}"
 
 
 def main() -> None:
-    """Print a line for each half and model, or for each ferry."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--halves", type=int, default=10, help="random halves")
-    parser.add_argument("--seed", type=int, default=0, help="of all draws")
-    parser.add_argument("--interval", type=float, default=20.0, help="seconds for each waypoint")
-    parser.add_argument("--ferries", type=int, default=0, help="drawn ferries instead")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    random = torch.Generator().manual_seed(options.seed)
-    if options.ferries:
-        with tempfile.TemporaryDirectory() as folder:
-            for number in range(options.ferries):
-                print(judge_ferry(number, random, Path(folder)), flush=True)
-        return
-    found = flown(options.interval, random, turned=False)
-    for number in range(options.halves):
-        if number and number % 2 == 0:
-            found = flown(options.interval, random, turned=True)
-        for line in judge(found, options.interval, random):
-            print(f"half {number:2d}  {line}", flush=True)
+    """Print a line for each ferry."""
+    given = bench.options(__doc__, ferries=10, seed=0)
+    random = torch.Generator().manual_seed(given.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(given.ferries):
+            print(judge_ferry(number, random, Path(folder)), flush=True)
 
 
 if __name__ == "__main__":

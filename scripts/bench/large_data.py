@@ -1,48 +1,47 @@
 """Memory and time of fits on many samples: logs of a simulated boat, fitted by heads of each kind.
 
-    python scripts/bench/large_data.py [--samples 1000000 10000000] [--logs 1000] [--folder DIR]
+    python scripts/bench/large_data.py [--samples 1000000 10000000] [--heads plsr ridge mlp]
         [--in-memory]
-    python scripts/bench/large_data.py --inspected 250 1000 4000
+    python scripts/bench/large_data.py --inspected 1000
     python scripts/bench/large_data.py --rows 1000000
 
-The logs (10 Hz, twin propellers, random steps of both, sensor noise) are written as canonical
-Parquet files; four logs of 10,000 samples for validation and test stand beside them. Each head is
-fitted by a run of its own, in a process of its own: PLSR, ridge, and an MLP for 100 steps of
-training. Printed are the largest resident memory of the process (VmHWM), its time from start to
-end, and the samples a second, each for every number of samples. With --in-memory each fit is made
-a second time with all arrays in memory, as those of few samples are, and the rates are compared.
+The logs (1,000, 10 Hz, twin propellers, random steps of both, sensor noise) are written as
+canonical Parquet files; four logs of 10,000 samples for validation and test stand beside them. Each
+head is fitted by a run of its own, in a process of its own: PLSR, ridge, and an MLP for 100 steps
+of training. With --in-memory each fit is made a second time with all arrays in memory, as those of
+few samples are, and the rates are compared.
 
 With --inspected so many logs of 600 rows are written as csv and looked at together by `residnet
-inspect`; with --rows a csv of so many rows by `inspect` and by `new`. Printed are processor time,
-start-up included, and the largest resident memory.
+inspect`; with --rows a csv of so many rows by `inspect` and by `new`, and it is imported in this
+process beside pandas.read_csv. Processor times include the start.
 """
 
 from __future__ import annotations
 
-import argparse
 import platform
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
+from typing import Any
 
+import bench
 import numpy as np
 import pandas as pd
 import torch
 import yaml
 
 import residnet
+from residnet.core.config import validate
 from residnet.core.log import Log
+from residnet.data.readers import ReaderConfig
 
-STEP = 0.1
-HEADS = {
-    "plsr": ({"kind": "plsr", "choose": "one_step"}, {}),
-    "ridge": ({"kind": "ridge", "choose": "one_step"}, {}),
-    "mlp": (
-        {"kind": "mlp", "hidden": [32, 32]},
-        {"steps": 100, "one_step": {"epochs": 1, "window": "2 s"}, "multi_step": []},
-    ),
+STEP, LOGS = 0.1, 1000
+_STEPS = {"steps": 100, "one_step": {"epochs": 1, "window": "2 s"}, "multi_step": []}
+HEADS: dict[str, dict[str, Any]] = {
+    "plsr": {"heads": {"plsr": {"kind": "plsr", "choose": "one_step"}}},
+    "ridge": {"heads": {"ridge": {"kind": "ridge", "choose": "one_step"}}},
+    "mlp": {"heads": {"mlp": {"kind": "mlp", "hidden": [32, 32]}}, "training": {"mlp": _STEPS}},
 }
 _IN_MEMORY = """
 import runpy, torch
@@ -52,6 +51,7 @@ paged.rows = lambda count, *shape, dtype=torch.float64: torch.zeros(count, *shap
 paged.row_pieces = lambda count: iter([slice(0, count)])
 runpy.run_module("residnet", run_name="__main__")
 """
+"""Runs residnet with all arrays in memory, and none gone through in pieces."""
 
 
 def simulate(count: int, length: int, seed: int) -> list[Log]:
@@ -93,10 +93,10 @@ def simulate(count: int, length: int, seed: int) -> list[Log]:
     ]
 
 
-def write_logs(folder: Path, samples: int, count: int) -> None:
-    """Write so many training logs, and two each for validation and test."""
+def write_logs(folder: Path, samples: int) -> None:
+    """Write the training logs, and two each for validation and test."""
     for split, logs, length, seed in (
-        ("train", count, samples // count, 1),
+        ("train", LOGS, samples // LOGS, 1),
         ("validation", 2, 10_000, 2),
         ("test", 2, 10_000, 3),
     ):
@@ -108,7 +108,6 @@ def write_logs(folder: Path, samples: int, count: int) -> None:
 
 def config(folder: Path, head: str) -> Path:
     """Write the config of a fit of one head and return its file."""
-    settings, training = HEADS[head]
     content = {
         "task": "fit",
         "name": f"large_{head}",
@@ -127,7 +126,7 @@ def config(folder: Path, head: str) -> Path:
         "signals": {"inputs": ["n_port", "n_stbd"]},
         "baseline": {"kind": "regressors", "sets": ["linear"], "drive": ["n_port"],
                      "steer": ["n_stbd"]},
-        "heads": {head: settings},
+        **HEADS[head],
         "evaluation": {
             "splits": ["validation", "test"],
             "protocols": {"T30": {"kind": "windows", "length": "30 s"}},
@@ -135,52 +134,35 @@ def config(folder: Path, head: str) -> Path:
             "scales": {"u": 0.5, "v": 0.1, "r": 0.3},
         },
     }  # fmt: skip
-    if training:
-        content["training"] = {head: training}
     file = folder / f"{head}.yaml"
     file.write_text(yaml.safe_dump(content))
     return file
 
 
-def carried_out(file: Path, out: Path, in_memory: bool = False) -> tuple[float, float]:
-    """Run a config; return the seconds and the largest resident memory in bytes.
-
-    With `in_memory` no array goes to a file, and none is gone through in pieces.
-
-    Raises:
-        RuntimeError: where the run fails, with the end of what it said.
-    """
-    started = time.perf_counter()
-    module = ["-c", _IN_MEMORY] if in_memory else ["-m", "residnet"]
-    argument = [*module, "run", str(file), "--out", str(out), "--workers", "1"]
-    _, peak = _called(argument, out.with_suffix(".log"))
-    return time.perf_counter() - started, peak
-
-
 _ALONE = """
-import os, subprocess, sys
+import os, subprocess, sys, time
+started = time.monotonic()
 with open(sys.argv[1], "w") as stream:
     process = subprocess.Popen(sys.argv[2:], stdout=stream, stderr=subprocess.STDOUT)
     _, status, usage = os.wait4(process.pid, 0)
-code = os.waitstatus_to_exitcode(status)
-print(code, usage.ru_utime + usage.ru_stime, 1024 * usage.ru_maxrss)
+code, processor = os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
+print(code, processor, time.monotonic() - started, 1024 * usage.ru_maxrss)
 """
 """Carries out a command from a small process: one that this large one starts has its peak too."""
 
 
-def _called(argument: list[str], said: Path, most: int = 0) -> tuple[float, float]:
-    """Run Python with arguments; return its processor time in s and its largest memory in bytes.
-
-    What it says goes to a file.
+def called(*words: object, said: Path, most: int = 0) -> tuple[float, float, float]:
+    """Run Python; return s of the processor and of the clock, and the largest memory in bytes.
 
     Raises:
         RuntimeError: where it ends with a code above `most`, with the end of what it said.
     """
-    call = [sys.executable, "-c", _ALONE, str(said), sys.executable, *argument]
-    code, seconds, peak = subprocess.run(call, capture_output=True, check=True).stdout.split()
+    call = [sys.executable, "-c", _ALONE, str(said), sys.executable, *map(str, words)]
+    code, *found = subprocess.run(call, capture_output=True, check=True).stdout.split()
     if not 0 <= int(code) <= most:
         raise RuntimeError("\n".join(said.read_text().splitlines()[-12:]))
-    return float(seconds), float(peak)
+    processor, clock, peak = map(float, found)
+    return processor, clock, peak
 
 
 def write_csv(folder: Path, logs: list[Log]) -> None:
@@ -195,10 +177,10 @@ def write_csv(folder: Path, logs: list[Log]) -> None:
 def looked_at(folder: Path, commands: tuple[str, ...], count: int, what: str) -> None:
     """Print what commands need for a folder of tables."""
     for command in commands:
-        further = ["--defaults", "--out", str(folder / "drafted.yaml")] if command == "new" else []
-        argument = ["-m", "residnet", command, str(folder), "--quiet", *further]
+        further = ["--defaults", "--out", folder / "drafted.yaml"] if command == "new" else []
+        words = ("-m", "residnet", command, folder, "--quiet", *further)
         # a fault that is found is no failure
-        seconds, peak = _called(argument, folder.with_suffix(".log"), most=1)
+        seconds, _, peak = called(*words, said=folder.with_suffix(".log"), most=1)
         each = f"{1e3 * seconds / count:.1f} ms a log, " if what == "logs" else ""
         print(
             f"{command} on {count} {what}: {seconds:.1f} s of processor time, {each}"
@@ -207,38 +189,47 @@ def looked_at(folder: Path, commands: tuple[str, ...], count: int, what: str) ->
         )
 
 
-def main() -> int:
+def imported(file: Path) -> None:
+    """Print the time of an import to a canonical log beside pandas.read_csv of the same file."""
+    names = [name for name in pd.read_csv(file, nrows=0).columns if name != "t [s]"]
+    channels = {n.split()[0]: {"column": n, "unit": n.split("[")[1][:-1]} for n in names}
+    content = {"kind": "csv", "time": {"column": "t [s]", "unit": "s"}, "channels": channels}
+    reader = validate(content, ReaderConfig, "bench").build()
+    plain = bench.least(lambda: pd.read_csv(file), 3)
+    ours = bench.least(lambda: reader.read(file), 3)
+    print(f"pandas.read_csv {plain:.2f} s, import {ours:.2f} s, ratio {ours / plain:.2f}")
+
+
+def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--samples", type=int, nargs="+", default=[1_000_000, 10_000_000])
-    parser.add_argument("--logs", type=int, default=1000)
-    parser.add_argument("--heads", nargs="+", default=list(HEADS), choices=list(HEADS))
-    parser.add_argument("--in-memory", action="store_true", help="compare with arrays in memory")
-    parser.add_argument("--folder", type=Path, help="keeps the logs; a temporary one otherwise")
-    parser.add_argument("--inspected", type=int, nargs="+", default=[], help="logs of 600 rows")
-    parser.add_argument("--rows", type=int, nargs="+", default=[], help="of one table")
-    given = parser.parse_args()
+    given = bench.options(
+        __doc__, samples=[1_000_000, 10_000_000], heads=HEADS, in_memory=False,
+        inspected=0, rows=0,
+    )  # fmt: skip
     print(f"residnet {residnet.__version__}, torch {torch.__version__}, {platform.machine()}")
     with tempfile.TemporaryDirectory() as name:
-        for count in given.inspected:
-            write_csv(Path(name) / f"logs_{count}", simulate(count, 600, 5))
-            looked_at(Path(name) / f"logs_{count}", ("inspect",), count, "logs")
-        for rows in given.rows:
-            write_csv(Path(name) / f"rows_{rows}", simulate(1, rows, 6))
-            looked_at(Path(name) / f"rows_{rows}", ("inspect", "new"), rows, "rows")
-    if given.inspected or given.rows:
-        return 0
+        folder = Path(name)
+        if given.inspected:
+            write_csv(folder / "logs", simulate(given.inspected, 600, 5))
+            looked_at(folder / "logs", ("inspect",), given.inspected, "logs")
+            return
+        if given.rows:
+            write_csv(folder / "rows", simulate(1, given.rows, 6))
+            imported(next((folder / "rows").iterdir()))
+            looked_at(folder / "rows", ("inspect", "new"), given.rows, "rows")
+            return
     print(f"{'samples':>11}{'head':>8}{'peak GB':>9}{'seconds':>9}{'samples/s':>11}")
     for samples in given.samples:
         with tempfile.TemporaryDirectory() as name:
-            folder = Path(given.folder or name) / str(samples)
-            if not folder.is_dir():
-                write_logs(folder, samples, given.logs)
+            folder = Path(name) / "logs"
+            write_logs(folder, samples)
             for head in given.heads:
-                out, rates = Path(name) / f"run_{head}", []
+                rates = []
                 for in_memory in (False, True)[: 1 + given.in_memory]:
-                    place = out.with_name(f"{out.name}_in_memory") if in_memory else out
-                    seconds, peak = carried_out(config(folder, head), place, in_memory)
+                    out = Path(name) / f"run_{head}_{in_memory}"
+                    way = ["-c", _IN_MEMORY] if in_memory else ["-m", "residnet"]
+                    words = (*way, "run", config(folder, head), "--out", out, "--workers", 1)
+                    _, seconds, peak = called(*words, said=out.with_suffix(".log"))
                     rates.append(samples / seconds)
                     print(
                         f"{samples:11}{head:>8}{peak / 1e9:9.2f}{seconds:9.1f}{rates[-1]:11.0f}",
@@ -246,11 +237,9 @@ def main() -> int:
                         flush=True,
                     )
                 if given.in_memory:
-                    print(
-                        f"{'':11}{head:>8} rate from files / in memory: {rates[0] / rates[1]:.2f}"
-                    )
-    return 0
+                    ratio = rates[0] / rates[1]
+                    print(f"{'':11}{head:>8} rate from files / in memory: {ratio:.2f}")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

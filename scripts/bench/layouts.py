@@ -1,6 +1,6 @@
 """Random layouts of recorders' tables: is what `residnet new` drafts right, marked, or refused?
 
-    python scripts/bench/layouts.py [--count 20] [--seed 0] [--keep FOLDER]
+    python scripts/bench/layouts.py [--count 20] [--seed 0]
 
 Logs of a simulated boat are written as tables whose language, units, times, positions, delimiter,
 decimals, encoding, lines above the names and kinds of rudder and throttle are drawn at random. Each
@@ -10,17 +10,17 @@ not marked as a guess makes the script fail; so does an error that is not one li
 
 from __future__ import annotations
 
-import argparse
 import csv
 import math
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace as Layout
 from typing import Any
 
+import bench
 import numpy as np
 import pandas as pd
 
@@ -83,107 +83,84 @@ CLOCKS: dict[str, Callable[[pd.Timestamp], str]] = {
 Column = tuple[str, str, list[Any]]
 
 
-@dataclass(frozen=True)
-class Layout:
-    """How tables are written: each field is a name from the lists above or as it says."""
-
-    language: str
-    delimiter: str
-    decimal: str
-    encoding: str
-    above: str
-    units: str
-    clock: str
-    place: str
-    slow: bool
-    motion: bool
-    wrapped: bool
-    rudder: str
-    drive: str
-    ended: bool
-    form: str
-
-
 def drawn(rng: np.random.Generator) -> Layout:
-    """A layout at random."""
+    """Return how tables are written, at random; each value is a name from above or tells itself."""
 
     def one(*options: str) -> str:
         return str(rng.choice(options))
 
-    language = one(*LANGUAGES)
-    delimiter = one(",", ";", "\t", "|")
+    language, delimiter = one(*LANGUAGES), one(",", ";", "\t", "|")
     comma = delimiter != "," and language != "English" and rng.random() < 0.8
-    western = language != "Japanese"
     return Layout(
-        language,
-        delimiter,
-        "," if comma else ".",
-        one("utf-8", "utf-8-sig", "cp1252" if western else "cp932"),
-        one(*ABOVE),
-        one("[]", "()", "second line", "none"),
-        one("s", "ms", *CLOCKS),
-        one("metres", "degrees", "utm"),
-        bool(rng.random() < 0.3),
-        bool(rng.random() < 0.6),
-        bool(rng.random() < 0.7),
-        one("angle", "to port", "pulses", "per cent", "shares"),
-        one("revolutions", "pulses", "per cent"),
-        bool(rng.random() < 0.3),
-        one("csv", "csv", "csv", "xlsx"),
+        language=language,
+        delimiter=delimiter,
+        decimal="," if comma else ".",
+        encoding=one("utf-8", "utf-8-sig", "cp932" if language == "Japanese" else "cp1252"),
+        above=one(*ABOVE),
+        units=one("[]", "()", "second line", "none"),
+        clock=one("s", "ms", *CLOCKS),
+        place=one("metres", "degrees", "utm"),
+        slow=bool(rng.random() < 0.3),
+        motion=bool(rng.random() < 0.6),
+        wrapped=bool(rng.random() < 0.7),
+        rudder=one("angle", "to port", "pulses", "per cent", "shares"),
+        drive=one("revolutions", "pulses", "per cent"),
+        ended=bool(rng.random() < 0.3),
+        form=one("csv", "csv", "csv", "xlsx"),
     )
 
 
 def columns_of(log: Log, layout: Layout, rng: np.random.Generator) -> list[Column]:
     """Names, units and cells of a log as a layout has them."""
     names = dict(zip(KEYS, LANGUAGES[layout.language].split("|"), strict=True))
+    out: list[Column] = []
+
+    def add(key: str, unit: str, values: Any) -> None:
+        out.append((names[key], unit, list(values)))
+
+    def unit_of(key: str) -> tuple[str, float]:
+        return UNITS[key][int(rng.integers(len(UNITS[key])))]
+
     t = log.t - log.t[0]
     start = pd.Timestamp("2025-06-17 11:58:20")
-    out: list[Column] = []
     if layout.clock in ("s", "ms"):
-        out.append((names["t"], layout.clock, list(t * (1000.0 if layout.clock == "ms" else 1.0))))
+        add("t", layout.clock, t * (1000.0 if layout.clock == "ms" else 1.0))
     else:
-        write = CLOCKS[layout.clock]
-        out.append((names["t"], "", [write(start + pd.Timedelta(seconds=s)) for s in t]))
+        add("t", "", (CLOCKS[layout.clock](start + pd.Timedelta(seconds=s)) for s in t))
     x, y = log["x"], log["y"]
     if layout.slow:
         held = (np.arange(t.size) // 5) * 5
         x, y = x[held], y[held]
     if layout.place == "degrees":
-        latitude = 54.3 + x / 111_320.0
-        longitude = 10.15 + y / (111_320.0 * math.cos(math.radians(54.3)))
-        out += [(names["lat"], "deg", list(latitude)), (names["lon"], "deg", list(longitude))]
+        add("lat", "deg", 54.3 + x / 111_320.0)
+        add("lon", "deg", 10.15 + y / (111_320.0 * math.cos(math.radians(54.3))))
     else:
         far = (6_800_123.0, 431_222.0) if layout.place == "utm" else (0.0, 0.0)
-        out += [(names["x"], "m", list(x + far[0])), (names["y"], "m", list(y + far[1]))]
+        add("x", "m", x + far[0])
+        add("y", "m", y + far[1])
     for key in ("psi", *(("u", "v", "r") if layout.motion else ())):
-        values = (
-            np.remainder(log[key], 2 * math.pi) if key == "psi" and layout.wrapped else log[key]
-        )
-        unit, factor = UNITS[key][int(rng.integers(len(UNITS[key])))]
-        out.append((names[key], unit, list(values * factor)))
+        turned = key == "psi" and layout.wrapped
+        unit, factor = unit_of(key)
+        add(key, unit, (np.remainder(log[key], 2 * math.pi) if turned else log[key]) * factor)
     share = log["delta"] / math.radians(35.0)
-    unit, factor = UNITS["delta"][int(rng.integers(len(UNITS["delta"])))]
-    kinds = {
+    unit, factor = unit_of("delta")
+    rudders = {
         "angle": (unit, log["delta"] * factor),
         "to port": (unit, -log["delta"] * factor),
         "pulses": ("us", np.round(1500.0 + 500.0 * share)),
         "per cent": ("%", 100.0 * share),
         "shares": ("", share),
     }
-    out.append((names["delta"], *_cells(kinds[layout.rudder])))
-    unit, factor = UNITS["n"][int(rng.integers(len(UNITS["n"])))]
-    most = float(np.abs(log["n"]).max())
+    add("delta", *rudders[layout.rudder])
+    share = log["n"] / float(np.abs(log["n"]).max())
+    unit, factor = unit_of("n")
     drives = {
         "revolutions": ("n", unit, log["n"] * factor),
-        "pulses": ("throttle", "us", np.round(1500.0 + 500.0 * log["n"] / most)),
-        "per cent": ("throttle", "%", 100.0 * log["n"] / most),
+        "pulses": ("throttle", "us", np.round(1500.0 + 500.0 * share)),
+        "per cent": ("throttle", "%", 100.0 * share),
     }
-    key, unit, values = drives[layout.drive]
-    return [*out, (names[key], unit, list(values))]
-
-
-def _cells(kind: tuple[str, np.ndarray]) -> tuple[str, list[Any]]:
-    return kind[0], list(kind[1])
+    add(*drives[layout.drive])
+    return out
 
 
 def write(log: Log, layout: Layout, rng: np.random.Generator, path: Path) -> None:
@@ -261,13 +238,7 @@ def judged(files: Sequence[Path], logs: Sequence[Log], layout: Layout) -> tuple[
 
 def main() -> int:
     """Draw layouts; return 1 where one is wrong without a mark."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--keep", type=Path, help="folder for the tables; a temporary one otherwise"
-    )
-    given = parser.parse_args()
+    given = bench.options(__doc__, count=20, seed=0)
     sensors = {**TRIALS["noise"]["sensors"], "delta": {"noise": "0.1 deg"}}
     settings = {**TRIALS, "step": "0.2 s", "noise": {**TRIALS["noise"], "sensors": sensors}}
     config = validate(settings, SimulatedTrials, "bench")
@@ -276,8 +247,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         for seed in range(given.seed, given.seed + given.count):
             layout = drawn(np.random.default_rng(seed))
-            folder = (given.keep or Path(temporary)) / str(seed)
-            folder.mkdir(parents=True, exist_ok=True)
+            folder = Path(temporary) / str(seed)
+            folder.mkdir()
             files = [folder / f"log_{i}.{layout.form}" for i in range(len(logs))]
             for file, log in zip(files, logs, strict=True):
                 write(log, layout, np.random.default_rng(seed), file)

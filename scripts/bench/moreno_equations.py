@@ -7,27 +7,26 @@ its motor nor the logs, so that the first table runs them at voltages from 1 to 
 steady: speed and rate of turn at 0, 10 and 20 deg of rudder to either side, in ship's lengths of
 4.389 m. The second runs them along the random manoeuvres of the model tanker Esso Osaka with the
 propeller's revolutions as voltage, by the factor of least error among seven before the runs
-diverge; it needs esso_osaka/ in the folder that RESIDNET_DATA names.
+diverge; it needs ${RESIDNET_DATA}/esso_osaka.
 """
 
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
+import bench
 import numpy as np
-import pandas as pd
 import torch
 from torch import Tensor
 
 from residnet.baselines.given import EquationsConfig
-from residnet.core.config import load_mapping
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
+from residnet.tasks.registry import load_task
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs/studies/moreno2019/moreno2019.yaml"
+CONFIG = bench.CONFIGS / "studies" / "moreno2019" / "moreno2019.yaml"
 LENGTH = 4.389
 INPUTS = ("volts", "delta")
 EQUATIONS = EquationsConfig(
@@ -83,20 +82,13 @@ def steady() -> None:
         print(f"{volts:5g}  {np.hypot(*end[0, :2].tolist()):9.2f} | {''.join(cells)}")
 
 
-def tanker(root: Path) -> None:
+def tanker() -> None:
     """Print how much of each record of the tanker passes before the equations diverge."""
-    split = load_mapping(CONFIG)["data"]["split"]
     records: list[tuple[str, Tensor]] = []
-    for part in ("train", "validation", "test"):
-        for name in split[part]:
-            table = pd.read_csv(root / "esso_osaka" / name)
-            t = table["t [s]"].to_numpy()
-            grid = np.arange(t[0], t[-1], 0.2)
-            columns = ("u_velo [m/s]", "vm_velo [m/s]", "r_angvelo [rad/s]", "n_prop [rps]")
-            values = [
-                np.interp(grid, t, table[column].to_numpy())
-                for column in (*columns, "delta_rudder [rad]")
-            ]
+    for part, logs in load_task(CONFIG).logs().items():
+        for log in logs:
+            grid = np.arange(log.t[0], log.t[-1], 0.2)
+            values = [np.interp(grid, log.t, log[name]) for name in ("u", "v", "r", "n", "delta")]
             records.append((part, torch.from_numpy(np.stack(values, axis=1))))
     # all records with all factors in one batch, short ones padded
     longest = max(len(values) for _, values in records)
@@ -126,9 +118,9 @@ def tanker(root: Path) -> None:
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
+    bench.options(__doc__)
     steady()
-    if folder := os.environ.get("RESIDNET_DATA"):
-        tanker(Path(folder))
+    if "RESIDNET_DATA" in os.environ:
+        tanker()
     else:
         print("tanker: not run, RESIDNET_DATA names no folder")

@@ -6,11 +6,13 @@ coverage map with contexts of the whole suite:
 
     pytest -n 2 -m "not long and not exporters" --cov=src/residnet --cov-context=test --cov-report=
     python scripts/bench/mutants.py --count 120 --seed 1 [--seconds 120] [--out FILE]
+
+`--map` is the coverage map, `--seconds` the processor time that a mutant has, `--junit` a file with
+the durations of the tests as pytest writes them, and `--out` takes a line of JSON for each mutant.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import json
 import os
@@ -20,11 +22,19 @@ import shutil
 import sys
 import tempfile
 import time
+import xml.etree.ElementTree as tree
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+import bench
+import lightning  # noqa: F401 (loaded once, in the parent)
+import pandas  # noqa: F401
+import pytest
+import scipy.stats  # noqa: F401
+from coverage import CoverageData
+
+ROOT = bench.ROOT
 SWAPS: dict[type[ast.AST], type[ast.AST]] = {
     **{ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult},
     **{ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt},
@@ -98,28 +108,21 @@ def draw(count: int, seed: int) -> list[Mutant]:
     return [mutant(*found) for found in random.Random(seed).sample(everywhere, count)]
 
 
-def reaching(mutants: list[Mutant], map_file: Path, durations: dict[str, float]) -> list[list[str]]:
-    """Return the tests that reach each fault, quickest first; of a line that only an import
+def reaching(drawn: list[Mutant], map_file: str, durations: dict[str, float]) -> list[list[str]]:
+    """Return the tests that reach each fault, quickest first.
 
-    reaches, those that reach any line of its file.
+    Of a line that only an import reaches, they are those that reach any line of its file.
     """
-    from coverage import CoverageData
-
-    data = CoverageData(str(map_file))
+    data = CoverageData(map_file)
     data.read()
     measured = {name.split("/src/residnet/")[-1]: name for name in data.measured_files()}
     found = []
-    for one in mutants:
+    for one in drawn:
         name = measured.get(one.file.removeprefix("src/residnet/"))
         lines = data.contexts_by_lineno(name) if name else {}
-        tests = {
-            context
-            for number in range(one.first, one.last + 1)
-            for context in lines.get(number, ())
-            if context
-        }
-        if not tests:
-            tests = {context for contexts in lines.values() for context in contexts if context}
+        own = [lines.get(number, []) for number in range(one.first, one.last + 1)]
+        tests = {context for contexts in own for context in contexts if context}
+        tests = tests or {context for contexts in lines.values() for context in contexts if context}
         ids = {test.rsplit("|", 1)[0] for test in tests}
         found.append(sorted(ids, key=lambda test: (durations.get(test, 1.0), test)))
     return found
@@ -143,8 +146,6 @@ def judged(one: Mutant, tests: list[str], scratch: Path, seconds: int) -> str:
         silent = os.open(os.devnull, os.O_WRONLY)
         os.dup2(silent, 1)
         os.dup2(silent, 2)
-        import pytest
-
         os._exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests[:400]])))
     _, status = os.waitpid(child, 0)
     file.write_text(whole)
@@ -155,29 +156,16 @@ def judged(one: Mutant, tests: list[str], scratch: Path, seconds: int) -> str:
 
 def main() -> None:
     """Draw, run and count."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=120)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--seconds", type=int, default=120, help="of processor time for a mutant")
-    parser.add_argument("--map", type=Path, default=ROOT / ".coverage")
-    parser.add_argument("--junit", type=Path, help="durations of the tests, as pytest writes them")
-    parser.add_argument("--out", type=Path, help="a line of JSON for each mutant")
-    given = parser.parse_args()
+    given = bench.options(
+        __doc__, count=120, seed=1, seconds=120, map=str(ROOT / ".coverage"), junit=None, out=None
+    )
     durations = {}
     if given.junit:
-        import xml.etree.ElementTree as tree
-
         for case in tree.parse(given.junit).iter("testcase"):
             module = case.get("classname", "").replace(".", "/") + ".py"
             durations[f"{module}::{case.get('name')}"] = float(case.get("time", 1.0))
     mutants = draw(given.count, given.seed)
     tests = reaching(mutants, given.map, durations)
-    # the libraries are loaded once, in the parent
-    import lightning  # noqa: F401
-    import pandas  # noqa: F401
-    import pytest  # noqa: F401
-    import scipy.stats  # noqa: F401
-
     counts: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder) / "copy"
@@ -187,13 +175,11 @@ def main() -> None:
             started = time.monotonic()
             state = judged(one, reached, scratch, given.seconds)
             counts[state] = counts.get(state, 0) + 1
-            row = {
-                **{"file": one.file, "line": one.first, "what": one.what, "state": state},
-                **{"tests": len(reached), "seconds": round(time.monotonic() - started, 1)},
-            }
+            row = {"file": one.file, "line": one.first, "what": one.what, "state": state}
+            row |= {"tests": len(reached), "seconds": round(time.monotonic() - started, 1)}
             print(number, json.dumps(row), flush=True)
             if given.out:
-                with given.out.open("a") as stream:
+                with Path(given.out).open("a") as stream:
                     stream.write(json.dumps(row) + "\n")
     print(", ".join(f"{state} {count}" for state, count in sorted(counts.items())))
 

@@ -11,22 +11,19 @@ planned trials, and at the first refit's parameters for three at random.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+import bench
 import numpy as np
 import torch
-from scattered import scattered
 from torch import Tensor
 
-from residnet.core.config import validate
 from residnet.core.errors import ResidnetError
 from residnet.data.prepare import Prepared, samples
-from residnet.data.simulated import SimulatedTrials, simulate
+from residnet.data.simulated import simulate
 from residnet.data.windows import WindowStore
 from residnet.dynamics.actuated import InputShare
 from residnet.identification.fit import fit
@@ -37,30 +34,12 @@ from residnet.identification.settings import FitSettings
 from residnet.physics.vessel import load_vessel
 from residnet.training.left_out import LeftOpen, left_open
 
-VESSELS: dict[str, dict[str, Any]] = {
-    "wam_v_cal": {
-        "signals": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
-        "commands": {"n_port": "cmd_port", "n_stbd": "cmd_stbd"},
-        "terms": ["u", "v", "r", "u|u|", "r|r|", "u v", "u r", "v r", "tau_x", "tau_n"],
-    },
-    "example_rudder_boat": {
-        "signals": {"inputs": ["n", "delta"]},
-        "commands": {"n": "cmd_n", "delta": "cmd_delta"},
-        "terms": [
-            "u",
-            "v",
-            "r",
-            "u|u|",
-            "r|r|",
-            "u v",
-            "u r",
-            "v r",
-            "n|n|",
-            "|n| u",
-            "u|u| delta",
-        ],
-    },
+_HULL = ("u", "v", "r", "u|u|", "r|r|", "u v", "u r", "v r")
+TERMS = {
+    "wam_v_cal": (*_HULL, "tau_x", "tau_n"),
+    "example_rudder_boat": (*_HULL, "n|n|", "|n| u", "u|u| delta"),
 }
+COMMANDS = {"n_port": "cmd_port", "n_stbd": "cmd_stbd", "n": "cmd_n", "delta": "cmd_delta"}
 STEP, SECONDS, PICKED = 0.1, 60.0, 3
 BOOKLET = (
     "turn_starboard_drive_100",
@@ -71,53 +50,6 @@ BOOKLET = (
 """Candidates that stand for the manoeuvres of a booklet."""
 
 
-def trials(vessel: str, seed: int) -> SimulatedTrials:
-    """Return the programme of the first zigzags; its sea and sensors are those of all trials."""
-    return validate(
-        {
-            "vessel": vessel,
-            "duration": SECONDS,
-            "step": STEP,
-            "substeps": 2,
-            "seed": seed,
-            "noise": {"u": 0.02, "v": 0.02, "r": 0.003},
-            "disturbance": {"force_x": 10, "force_y": 10, "force_n": 10},
-            "trials": [
-                {"kind": "zigzag", "count": 7, "heading": ["10 deg"], "drive": [0.3, 0.7]},
-            ],
-            "identification": {},
-            "validation": {},
-        },
-        SimulatedTrials,
-        "bench",
-    )
-
-
-def settings_of(vessel: str) -> FitSettings:
-    """Return the settings of a fit of one refitted baseline."""
-    known = VESSELS[vessel]
-    return validate(
-        {
-            "prepare": {
-                "grid": {"step": STEP},
-                "derivative": {"kind": "savitzky_golay", "window": 1.1, "order": 2},
-                "hold": "mean",
-            },
-            "signals": known["signals"],
-            "baseline": {"kind": "regressors", "terms": known["terms"]},
-            "refit": {"baseline": {"horizon": 10.0, "every": 10.0, "prior": 0.0}},
-            "bands": None,
-            "evaluation": {
-                "protocols": {"T20": {"kind": "windows", "length": 20.0}},
-                "selection": "T20",
-                "scales": {"u": 0.3, "v": 0.1, "r": 0.1},
-            },
-        },
-        FitSettings,
-        "bench",
-    )
-
-
 def shares_of(vessel: str, flown: str) -> dict[str, InputShare]:
     """Return how a vessel's commands follow drive and steer, as its booklet would say."""
     plant = load_vessel(flown).build()
@@ -126,8 +58,8 @@ def shares_of(vessel: str, flown: str) -> dict[str, InputShare]:
     # a plant has an order of its own, such as the rudder before the propeller
     found = dict(zip(plant.inputs, zip(drive, steer, strict=True), strict=False))
     out = {}
-    for name, command in VESSELS[vessel]["commands"].items():
-        d, s = found[command]
+    for name in bench.SIGNALS[vessel]["inputs"]:
+        d, s = found[COMMANDS[name]]
         out[name] = InputShare(drive=d, steer=s, limit=max(abs(d), abs(s)))
     return out
 
@@ -147,11 +79,21 @@ def left(fitted: FittedModel, settings: FitSettings, logs: Sequence[Prepared]) -
 def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]:
     """Return predicted and achieved shrinkage of the planned trials, and those of random ones."""
     random = np.random.default_rng([seed, 5])
-    settings = settings_of(vessel)
+    settings = bench.settings(
+        vessel,
+        baseline={"kind": "regressors", "terms": TERMS[vessel]},
+        refit={"baseline": {"horizon": 10.0, "every": 10.0, "prior": 0.0}},
+        bands=None,
+    )
     scales = settings.evaluation.scales.array()
     limits = TrialLimits(time=SECONDS, count=PICKED)
     with tempfile.TemporaryDirectory() as folder:
-        programme = trials(str(scattered(vessel, random, Path(folder))), seed)
+        programme = bench.programme(
+            bench.scattered(vessel, random, Path(folder)),
+            seed,
+            [{"kind": "zigzag", "count": 7, "heading": ["10 deg"], "drive": [0.3, 0.7]}],
+            disturbance={"force_x": 10, "force_y": 10, "force_n": 10},
+        )
         first = simulate(programme.draw(), programme)
         others = sorted(candidates(limits), key=lambda one: one.kind)
         later = simulate(others, programme.model_copy(update={"seed": seed + 1}))
@@ -161,11 +103,19 @@ def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]
     fitted = fit(prepared, settings)["baseline"]
     open_ = left(fitted, settings, prepared["train"])
     low, high = np.array(fitted.spec.low), np.array(fitted.spec.high)
-    wide = velocity_limit(low, high, 10.0 * settings.evaluation.divergence)
+    most = 10.0 * settings.evaluation.divergence
+    wide = velocity_limit(low, high, most, fitted.spec.signals.live)
     refit = settings.refit["baseline"]
     aim = Aim([one for one in others if one.name.startswith(BOOKLET)], SECONDS, {})
     found = plan(fitted, open_, refit, scales, shares, wide, limits, aim)
-    goal = booklet(prepared["later"], others, fitted, refit.horizon, scales)
+    runs = [
+        (torch.from_numpy(log.y), torch.from_numpy(log.w[:-1]))
+        for log, one in zip(prepared["later"], others, strict=True)
+        if one.name.startswith(BOOKLET)
+    ]
+    steps = round(refit.horizon / STEP)
+    # squared sensitivities [P, P] of velocities over the booklet's manoeuvres
+    goal = moments(fitted.model.double(), runs, steps, torch.from_numpy(scales)).sum(dim=0)
     before = spread(open_.covariance, goal)
 
     def shrinks(covariance: Tensor) -> float:
@@ -187,36 +137,12 @@ def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]
     return predicted, shrinks(again.covariance), np.array(at_random)
 
 
-def booklet(
-    logs: Sequence[Prepared],
-    flown: Sequence[Any],
-    fitted: FittedModel,
-    horizon: float,
-    scales: np.ndarray,
-) -> Tensor:
-    """Return the squared sensitivities [P, P] of velocities over a booklet's manoeuvres."""
-    runs = [
-        (torch.from_numpy(log.y), torch.from_numpy(log.w[:-1]))
-        for log, one in zip(logs, flown, strict=True)
-        if one.name.startswith(BOOKLET)
-    ]
-    steps = round(horizon / STEP)
-    return moments(fitted.model.double(), runs, steps, torch.from_numpy(scales)).sum(dim=0)
-
-
 def main() -> None:
     """Run the draws, and print a line for each."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--draws", type=int, default=4)
-    parser.add_argument("--random", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    torch.set_num_threads(1)
+    given = bench.options(__doc__, draws=4, random=50, seed=0)
     for number in range(given.draws):
         started = time.process_time()
-        vessel = list(VESSELS)[number % len(VESSELS)]
+        vessel = list(TERMS)[number % len(TERMS)]
         try:
             predicted, achieved, at_random = drawn(vessel, 100 * given.seed + number, given.random)
         except ResidnetError as error:

@@ -1,6 +1,6 @@
 """The central claim of document 001 in kind: one random manoeuvre against one zigzag to learn from.
 
-    python scripts/bench/random_manoeuvres.py [--vessels NAME ...] [--seeds N] [--seed S]
+    python scripts/bench/random_manoeuvres.py [--vessels NAME ...] [--seeds 3] [--seed 1]
 
 For each vessel and seed, two logs of 150 s train and one more is for validation: random steps of
 rudder and propeller; the same 20/20 zigzag each time, first to port or first to starboard; or three
@@ -11,12 +11,9 @@ along manoeuvres that none has seen, over what `zero` misses.
 
 from __future__ import annotations
 
-import argparse
-import os
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
+import bench
 import numpy as np
 import pandas as pd
 
@@ -107,12 +104,8 @@ def case(vessel: str, seed: int) -> dict[tuple[str, str, str], float]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     vessels = ["wam_v_cal", "example_rudder_boat", "mariner"]
-    parser.add_argument("--vessels", nargs="+", default=vessels)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
+    given = bench.options(__doc__, vessels=vessels, seeds=3, seed=1)
     found = [case(vessel, given.seed + k) for vessel in given.vessels for k in range(given.seeds)]
     print(f"{'learned from':14}{'model':8}{'judged on':16}error / zero's (least, most)")
     for key in found[0]:

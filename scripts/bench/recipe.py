@@ -1,90 +1,52 @@
 """The mean of the standard recipe beside its members, the selected model, and a plain network.
 
-    python scripts/bench/recipe.py [--logs boats|shipped|measured] [--count N]
+    python scripts/bench/recipe.py [--logs boats|shipped|measured] [--count 8]
         [--seed S | --numbered N] [--minutes M ...] [--vessels NAME ...] [--effort E]
-        [--without PART ...] [--network] [--peer] [--records FILE] [--keep FOLDER]
+        [--without PART ...] [--network] [--peer] [--weights]
 
 Nothing is said to `residnet.fit` but the logs: M minutes for training and validation (three to
-one), as long for the test, which takes part in no choice.
+one), as long for the test, which takes part in no choice. Logs are of small boats that follow paths
+in gusts, of shipped vessels (zigzags, random steps and 3-2-1-1, with random forces), or stretches
+of those below RESIDNET_DATA: of a model tanker (wind not given) and a 7 m tanker model; with
+--numbered N they are drawn as commit b1b99e7 did, from its Nth on.
 
-    boats     small boats (one propeller and a rudder, or two propellers) that follow paths, with
-              noise and gusts
-    shipped   shipped vessels: zigzags, random steps and 3-2-1-1, with noise and random forces
-    measured  random stretches of the logs below RESIDNET_DATA: a model tanker (wind not given) and
-              a 7 m tanker model
-
-Means of fewer members need no fit of their own and stand beside the recipe's. `--without` fits once
-more for each part of the training that is named, with the same seeds: `mirror` (no mirrored
-windows), `members` (one network in place of several).
-
-`--network` lets networks alone take part where logs are short, as they do of long ones.
-
-`--keep` writes a file for each draw with what every member missed in the free runs of the test logs
-and of the validation logs, the latter by a fit that did not see them too. Any weights of a mean can
-be judged by it.
-
-`--peer` adds what an hour of PyTorch gives: a GRU that reads two seconds of the past, and another
-that runs freely from what the first one leaves, the best of its validations kept; it is judged over
-the same windows. A line for each fit; at the end geometric means over the draws.
+Means of fewer members need no fit of their own. `--without` fits once more for each part of the
+training: `mirror` (no mirrored windows), `members` (one network in place of several). `--network`
+lets networks alone take part where logs are short. `--weights` weighs the members by their errors
+on the validation log, in a fit that did not see it. `--peer` adds a GRU that reads two seconds of
+the past, and another that runs freely from what the first one leaves, the best of its validations
+kept. A line for each fit; at the end geometric means over the draws.
 """
 
 from __future__ import annotations
 
-import argparse
 import copy
-import json
 import os
-import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from argparse import Namespace
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import bench
 import numpy as np
 import torch
+from random_vessels import KINDS, small_boat_logs
+from scipy.optimize import nnls
 from torch import Tensor, nn
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
-
-from random_vessels import KINDS, small_boat_logs
-
 import residnet
-from residnet.core.config import validate
+from residnet.core.config import load_mapping
 from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
 from residnet.data.prepare import Prepared
-from residnet.data.simulated import SimulatedTrials, simulate
+from residnet.data.simulated import simulate
 from residnet.identification import fit, settings
-from residnet.identification.identified import candidates
-from residnet.judge.freerun import Errors, Prediction, free_run
-from residnet.judge.protocol import Window, all_windows
+from residnet.judge.freerun import Errors
+from residnet.judge.protocol import Window
 
-CHANNELS = {
-    "esso_osaka": {
-        "x": ("x_position_mid [m]", "m"),
-        "y": ("y_position_mid [m]", "m"),
-        "psi": ("psi_hat [rad]", "rad"),
-        "u": ("u_velo [m/s]", "m/s"),
-        "v": ("vm_velo [m/s]", "m/s"),
-        "r": ("r_angvelo [rad/s]", "rad/s"),
-        "n": ("n_prop [rps]", "rps"),
-        "delta": ("delta_rudder [rad]", "rad"),
-    },
-    "kvlcc2": {
-        "x": ("x", "m"),
-        "y": ("y", "m"),
-        "psi": ("psi", "rad"),
-        "u": ("u", "m/s"),
-        "v": ("v", "m/s"),
-        "r": ("r", "rad/s"),
-        "n": ("rev", "1/s"),
-        "delta": {"column": "delta", "unit": "rad", "sign": -1},
-    },
-}
-TIME = {"esso_osaka": ("t [s]", "s"), "kvlcc2": "t"}
 SHIPPED: dict[str, dict[str, Any]] = {
     "wam_v_cal": {"step": 0.1, "push": (20.0, 20.0, 20.0), "unit": 3.0},
     "patrol_mss": {"step": 0.1, "push": None, "unit": 3.0},
@@ -100,9 +62,8 @@ Splits = dict[str, list[Log]]
 
 def split(logs: list[Log]) -> Splits:
     """Divide logs into training, validation and test."""
-    parts = (slice(None, TRAINING), slice(TRAINING, STRETCHES), slice(STRETCHES, None))
-    names = ("train", "validation", "test")
-    return {name: logs[part] for name, part in zip(names, parts, strict=True)}
+    fitted = {"train": logs[:TRAINING], "validation": logs[TRAINING:STRETCHES]}
+    return {**fitted, "test": logs[STRETCHES:]}
 
 
 def of_boats(name: str, seconds: float, seed: int, _: np.random.Generator) -> list[Log]:
@@ -118,23 +79,19 @@ def of_shipped(name: str, seconds: float, _: int, random: np.random.Generator) -
     family = {"start": min(unit, 0.1 * seconds), "drive": [0.4, 0.9]}
     push = known["push"] and (random.uniform(0.1, 1.0) * np.array(known["push"])).tolist()
     forces = zip(("force_x", "force_y", "force_n"), push, strict=True) if push else ()
-    content = {
-        "vessel": name,
-        "duration": seconds,
-        "step": known["step"],
-        "substeps": 2,
-        "seed": int(random.integers(2**31)),
-        "noise": {"u": noise, "v": noise, "r": f"{random.uniform(0.05, 0.5)} deg/s"},
-        "disturbance": dict(forces),
-        "trials": [
+    config = bench.programme(
+        name,
+        int(random.integers(2**31)),
+        [
             {"kind": "zigzag", "count": 4, "heading": ["10 deg", "20 deg"], **family},
             {"kind": "random_steps", "count": 2, "band": [0.05 / unit, 0.5 / unit], **family},
             {"kind": "three_two_one_one", "count": 2, "unit": [0.7 * unit, 2.0 * unit], **family},
         ],
-        "identification": {},
-        "validation": {},
-    }
-    config = validate(content, SimulatedTrials, "bench")
+        duration=seconds,
+        step=known["step"],
+        noise={"u": noise, "v": noise, "r": f"{random.uniform(0.05, 0.5)} deg/s"},
+        disturbance=dict(forces),
+    )
     logs = simulate(config.draw(), config)
     return [logs[i] for i in random.permutation(len(logs))]
 
@@ -144,31 +101,41 @@ def of_measured(name: str, seconds: float, _: int, random: np.random.Generator) 
     folder = Path(os.environ["RESIDNET_DATA"]) / name
     files = sorted(path for path in folder.rglob("*.csv") if "cut" not in path.name)
     chosen = random.permutation(np.array(files, dtype=object)).tolist()[: 2 * STRETCHES]
+    reader = load_mapping(bench.CONFIGS / f"{name}.yaml")["data"]["reader"]
+    channels = {key: one for key, one in reader["channels"].items() if not key.startswith("wind")}
     out = []
-    for log in residnet.read_logs(chosen, channels=CHANNELS[name], time=TIME[name]):
+    for log in residnet.read_logs(chosen, channels=channels, time=reader["time"]):
         room = max(float(log.t[-1] - log.t[0]) - seconds, 0.0)
         begin = log.t[0] + random.uniform(0.0, room)
         rows = (log.t >= begin) & (log.t <= begin + seconds)
-        channels = {channel: values[rows] for channel, values in log.channels.items()}
-        out.append(log.replace(t=log.t[rows], channels=channels))
+        kept = {channel: values[rows] for channel, values in log.channels.items()}
+        out.append(log.replace(t=log.t[rows], channels=kept))
     return out
 
 
 SOURCES = {
     "boats": (of_boats, list(KINDS)),
     "shipped": (of_shipped, list(SHIPPED)),
-    "measured": (of_measured, list(CHANNELS)),
+    "measured": (of_measured, ["esso_osaka", "kvlcc2"]),
 }
 
 
-class Network(nn.Module):
-    """A GRU in free run, started by another one that reads the past."""
+class Peer(nn.Module):
+    """A GRU in free run, started by another one that reads the past, trained on one data set."""
 
-    def __init__(self, inputs: int, size: int = 32) -> None:
+    def __init__(self, data: residnet.Data, size: int = 32) -> None:
         super().__init__()
-        self.reader = nn.GRU(3 + inputs, size, batch_first=True)
-        self.cell = nn.GRUCell(3 + inputs, size)
+        self.data = data
+        self.past = max(round(PAST / data.prepare.grid.step), 1)
+        joined = np.concatenate([self.rows(log) for log in data.logs("train")])
+        self.mean = np.nanmean(joined, 0)
+        # an input that hardly moves in training may move in the test
+        self.spread = np.maximum(np.nanstd(joined, 0), 0.05 * np.abs(self.mean)) + 1e-9
+        torch.manual_seed(0)
+        self.reader = nn.GRU(joined.shape[1], size, batch_first=True)
+        self.cell = nn.GRUCell(joined.shape[1], size)
         self.out = nn.Linear(size, 3)
+        self.fit(min(max(w.stop - w.start for w in self.windows("train")), 200))
 
     def forward(self, past: Tensor, start: Tensor, ahead: Tensor) -> Tensor:
         """Velocities [B, T, 3] from past [B, P, 3 + m], velocities [B, 3] and inputs [B, T, m]."""
@@ -179,22 +146,6 @@ class Network(nn.Module):
             nu = nu + 0.1 * self.out(h)
             out.append(nu)
         return torch.stack(out, 1)
-
-
-class Peer:
-    """The network with its scales, trained on one data set."""
-
-    def __init__(self, data: residnet.Data, steps: int = 600) -> None:
-        self.data = data
-        self.past = max(round(PAST / data.prepare.grid.step), 1)
-        joined = np.concatenate([self.rows(log) for log in data.logs("train")])
-        self.mean = np.nanmean(joined, 0)
-        # an input that hardly moves in training may move in the test
-        self.spread = np.maximum(np.nanstd(joined, 0), 0.05 * np.abs(self.mean)) + 1e-9
-        torch.manual_seed(0)
-        self.net = Network(joined.shape[1] - 3)
-        length = max(w.stop - w.start for w in self.windows("train"))
-        self.train(min(length, 200), steps)
 
     @staticmethod
     def rows(log: Prepared) -> np.ndarray:
@@ -212,31 +163,31 @@ class Peer:
         logs = enumerate(self.data.logs(split))
         return [w for i, log in logs for w in protocol.windows(log, i, step)]
 
-    def train(self, length: int, steps: int) -> None:
+    def fit(self, length: int, steps: int = 600) -> None:
         """Free runs of some length from anywhere; the best of the validations is kept."""
         logs = [self.scaled(log) for log in self.data.logs("train")]
         starts = [
             (i, k) for i, log in enumerate(logs) for k in range(self.past, len(log) - length - 1)
         ]
-        optimiser = torch.optim.Adam(self.net.parameters(), 3e-3)
+        optimiser = torch.optim.Adam(self.parameters(), 3e-3)
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-        random, best = np.random.default_rng(0), (np.inf, copy.deepcopy(self.net.state_dict()))
+        random, best = np.random.default_rng(0), (np.inf, copy.deepcopy(self.state_dict()))
         for number in range(steps):
             picked = [starts[i] for i in random.integers(len(starts), size=64)]
             past = torch.stack([logs[i][k - self.past : k] for i, k in picked])
             ahead = torch.stack([logs[i][k : k + length + 1] for i, k in picked])
-            nu = self.net(past, ahead[:, 0, :3], ahead[:, :-1, 3:])
+            nu = self(past, ahead[:, 0, :3], ahead[:, :-1, 3:])
             loss = (nu - ahead[:, 1:, :3]).square().mean()
             optimiser.zero_grad()
             loss.backward()
-            nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
+            nn.utils.clip_grad_norm_(self.parameters(), 1.0)
             optimiser.step()
             falling.step()
             if number % 25 == 24:
                 error = self.error("validation")
                 if error < best[0]:
-                    best = (error, copy.deepcopy(self.net.state_dict()))
-        self.net.load_state_dict(best[1])
+                    best = (error, copy.deepcopy(self.state_dict()))
+        self.load_state_dict(best[1])
 
     @torch.no_grad()
     def error(self, split: str) -> float:
@@ -246,32 +197,24 @@ class Peer:
             z = self.scaled(logs[window.log])
             begin = max(window.start - self.past, 0)
             past = z[begin : window.start] if window.start > begin else z[:1]
-            nu = self.net(
-                past[None], z[None, window.start, :3], z[None, window.start : window.stop - 1, 3:]
-            )[0].numpy()
+            ahead = z[None, window.start : window.stop - 1, 3:]
+            nu = self(past[None], z[None, window.start, :3], ahead)[0].numpy()
             truth = logs[window.log].y[window.start + 1 : window.stop, VELOCITIES]
             apart = nu * self.spread[:3] + self.mean[:3] - truth
             out.append(float((np.sqrt(np.mean(apart**2, 0)) / scales).mean()))
         return float(np.mean(out))
 
 
-PARTS: dict[str, Callable[[dict[str, Any]], None]] = {
-    "mirror": lambda plan: _each(plan["training"], mirror=False),
-    "members": lambda plan: _each(plan["heads"], members=1),
-    "network": lambda plan: _alone(plan),
-}
-
-
-def _alone(plan: dict[str, Any]) -> None:
-    for key in ("heads", "training"):
-        plan[key].setdefault("network", plan[key]["hull_network"])
-    plan["base_of"]["network"] = "zero"
-    plan["means"] = {"mean": ("hull", *plan["heads"])}
-
-
-def _each(parts: dict[str, dict[str, Any]], **changes: Any) -> None:
-    for name in parts:
-        parts[name] = {**parts[name], **changes}
+def change(plan: dict[str, Any], part: str) -> None:
+    """Let networks alone take part in the plan of the recipe, or leave out a part of training."""
+    if part == "network":
+        for key in ("heads", "training"):
+            plan[key].setdefault("network", plan[key]["hull_network"])
+        plan["base_of"]["network"] = "zero"
+        plan["means"] = {"mean": ("hull", *plan["heads"])}
+        return
+    key, changed = {"mirror": ("training", False), "members": ("heads", 1)}[part]
+    plan[key] = {name: {**given, part: changed} for name, given in plan[key].items()}
 
 
 def fitted(splits: Splits, effort: float, parts: Sequence[str]) -> Any:
@@ -281,119 +224,111 @@ def fitted(splits: Splits, effort: float, parts: Sequence[str]) -> Any:
     def changed(facts: Any, effort: float) -> dict[str, Any]:
         plan = whole(facts, effort)
         for part in parts:
-            PARTS[part](plan)
+            change(plan, part)
         return plan
 
     with mock.patch.object(settings, "portfolio", changed):
         return residnet.fit(splits, effort=effort, bands=None)
 
 
-def subsets(models: Any) -> dict[str, float]:
-    """Return the test error of the mean of each set of members, by their names."""
-    evaluation = models.data.evaluation
-    found = models.runs["test"].evaluation
-    run = next(run for run in found.runs if run.protocol == evaluation.selection)
-    members = models["mean"].fitted.notes["members"] if "mean" in models else ["hull"]
-    out = {}
-    for count in range(1, len(members) + 1):
-        for names in combinations(members, count):
-            together = zip(*(run.predictions[name] for name in names), strict=True)
-            states = [np.mean([one.states for one in group], axis=0) for group in together]
-            predictions = [Prediction(one, diverged=False) for one in states]
-            errors = Errors.of(run.windows, predictions, found.logs)
-            out[" + ".join(names)] = float((errors.rmse / evaluation.scales.array()).mean())
-    return out
+class Missed:
+    """What the members of a mean miss in the free runs over a split, in shares of the scales.
 
-
-def missed(models: Any, split: str, *, dense: bool) -> dict[str, np.ndarray]:
-    """Return the errors of models [N, n] in the free runs over a split, one window after another.
-
-    Errors are shares of the scales, NaN where they do not count. `window` numbers the windows,
-    which overlap where they are `dense`.
+    Attributes:
+        each: errors [K, N, n] of the K members, the samples of all windows one after the other; NaN
+            where they do not count.
+        begins: first sample of each window.
     """
-    data, found = models.data, models.identified
-    config, step, logs = data.evaluation, data.prepare.grid.step, data.logs(split)
-    protocol = config.protocols[config.selection]
-    windows = all_windows(protocol, logs, step, split, dense=dense)
-    judged = [replace(one, members=()) for one in candidates(found.values()) if one.name != "mean"]
-    out = {}
-    for name, predictions in free_run(judged, windows, logs, step, found.limit).items():
-        errors = Errors.of(windows, predictions, logs)
-        counted = np.where(errors.scored, errors.velocities, np.nan)
-        out[name] = (counted / config.scales.array())[:, errors.live.axes].astype(np.float32)
-    out["window"] = np.repeat(np.arange(len(windows)), errors.counts)
+
+    def __init__(self, models: residnet.Models, names: Sequence[str], split: str) -> None:
+        evaluation, found = models.data.evaluation, models.runs[split].evaluation
+        run = next(run for run in found.runs if run.protocol == evaluation.selection)
+        errors = [Errors.of(run.windows, run.predictions[name], found.logs) for name in names]
+        every = [np.where(one.scored, one.velocities, np.nan) for one in errors]
+        axes = list(errors[0].live.axes)
+        self.each = (np.stack(every) / evaluation.scales.array())[..., axes]
+        self.begins = errors[0].begins
+
+    def error(self, weights: np.ndarray) -> float:
+        """Return the mean NRMSE over windows and axes of a mean with weights [K]."""
+        together = np.tensordot(weights, self.each, 1)
+        known = np.isfinite(together)
+        squares = np.add.reduceat(np.where(known, together, 0.0) ** 2, self.begins)
+        return float(np.sqrt(squares / np.add.reduceat(known.astype(float), self.begins)).mean())
+
+    def weights(self) -> dict[str, np.ndarray]:
+        """Return weights [K] that follow from these errors."""
+        every = self.each.reshape(len(self.each), -1).T
+        every = every[np.isfinite(every).all(axis=1)]
+        # that they add up to one weighs more than all errors
+        sure = 1e3 * float(np.linalg.norm(every))
+        rows = np.vstack((every, np.full(every.shape[1], sure)))
+        found = {
+            "weighed by inverse squares": 1.0 / (every**2).mean(axis=0),
+            "weighed by least squares": nnls(rows, np.append(np.zeros(len(every)), sure))[0],
+        }
+        return {name: weights / weights.sum() for name, weights in found.items()}
+
+
+def means(models: residnet.Models, first: residnet.Models | None) -> dict[str, float]:
+    """Return the test errors of the means of fewer members, and of weighed ones."""
+    names = models["mean"].fitted.notes["members"] if "mean" in models else ["hull"]
+    test, out = Missed(models, names, "test"), {}
+    for count in range(1, len(names) + 1):
+        for some in combinations(names, count):
+            out[" + ".join(some)] = test.error(np.array([(n in some) / count for n in names]))
+    if first is not None:
+        learned = Missed(first, names, "validation").weights()
+        out |= {name: test.error(weights) for name, weights in learned.items()}
     return out
 
 
-def keep(models: Any, splits: Splits, effort: float, parts: Sequence[str], file: Path) -> None:
-    """Write what the members of a fit missed, and what they miss of logs that they did not see."""
-    whole = {"test": missed(models, "test", dense=False)}
-    whole["validation"] = missed(models, "validation", dense=True)
-    if models.identified.seen:
-        with mock.patch.object(fit, "final_fit", return_value=False):
-            first = fitted(splits, effort, parts)
-        whole["seen"] = whole["validation"]
-        whole["validation"] = missed(first, "validation", dense=True)
-        whole["first"] = missed(first, "test", dense=False)
-    arrays = {f"{part}.{name}": one for part, found in whole.items() for name, one in found.items()}
-    file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(file, **arrays)
-
-
-def judged(
-    splits: Splits,
-    effort: float,
-    peer: bool,
-    without: Sequence[str],
-    network: bool,
-    kept: Path | None,
-) -> dict[str, Any]:
+def judged(splits: Splits, given: Namespace) -> dict[str, Any]:
     """Fit, and return the test errors by the protocol that chooses."""
     began = time.process_time()
-    parts = ["network"] if network else []
-    models = fitted(splits, effort, parts)
-    seconds = time.process_time() - began
-    if kept is not None:
-        keep(models, splits, effort, parts, kept)
-    rows = residnet.metrics(models, split="test")
-    rows = rows[rows.protocol == models.data.evaluation.selection].set_index("model")
+    parts = ["network"] if given.network else []
+    models = fitted(splits, given.effort, parts)
+    seconds, first = time.process_time() - began, None
+    if given.weights:
+        with mock.patch.object(fit, "final_fit", return_value=False):
+            first = fitted(splits, given.effort, parts)
+
+    def table(of: residnet.Models) -> Any:
+        rows = residnet.metrics(of, split="test")
+        return rows[rows.protocol == of.data.evaluation.selection].set_index("model")
+
+    rows = table(models)
     errors = {name: float(row.nrmse_mean) for name, row in rows.iterrows()}
     errors["selected"] = errors[models.selected]
-    for part in without:
-        other = residnet.metrics(fitted(splits, effort, [*parts, part]), split="test")
-        other = other[other.protocol == models.data.evaluation.selection].set_index("model")
+    for part in given.without:
+        other = table(fitted(splits, given.effort, [*parts, part]))
         errors[f"mean without {part}"] = float(other.nrmse_mean["mean"])
-    return {
-        "selected": models.selected,
-        "seconds": seconds,
-        "test": errors | subsets(models),
-        "diverged": {name: int(row.diverged) for name, row in rows.iterrows()},
-    } | ({"peer": Peer(models.data).error("test")} if peer else {})
+    errors |= means(models, first)
+    if given.peer:
+        errors["GRU"] = Peer(models.data).error("test")
+    lost = {name: int(row.diverged) for name, row in rows.iterrows() if row.diverged}
+    return {"selected": models.selected, "seconds": seconds, "test": errors, "diverged": lost}
 
 
 def line(record: dict[str, Any]) -> str:
-    """One fit in a line: errors of all models, the selected one marked."""
+    """Return one fit in a line: errors of all models, the selected one marked."""
     parts = [
         f"{'*' if name == record['selected'] else ''}{name} {error:.3f}"
-        + (f" ({lost} diverged)" if (lost := record["diverged"].get(name, 0)) else "")
+        + (f" ({record['diverged'][name]} diverged)" if name in record["diverged"] else "")
         for name, error in record["test"].items()
     ]
-    parts += [f"GRU {record['peer']:.3f}"] if "peer" in record else []
     return f"{record['seconds']:.0f} s: " + ", ".join(parts)
 
 
 def summary(records: list[dict[str, Any]]) -> str:
-    """Ratios of errors to that of the mean: geometric means over the draws."""
+    """Return ratios of the mean's errors to those of others: geometric means over the draws."""
     mean = np.array([record["test"]["mean"] for record in records])
     out = [f"{len(records)} fits; mean {mean.mean():.3f}; error of others in that of the mean:"]
-    names = [name for name in records[0]["test"] if name != "mean"]
-    columns = {name: [r["test"].get(name, np.nan) for r in records] for name in names}
-    if "peer" in records[0]:
-        columns["GRU"] = [record["peer"] for record in records]
-    for name, errors in columns.items():
-        ratio = np.log(np.array(errors) / mean)
+    for name in (name for name in records[0]["test"] if name != "mean"):
+        errors = np.array([record["test"].get(name, np.nan) for record in records])
+        ratio = np.log(errors / mean)
         spread = np.nanstd(ratio) / np.sqrt(len(ratio))
-        better = int((mean <= np.array(errors)).sum())
+        better = int((mean <= errors).sum())
         out.append(
             f"  {name:40} {np.exp(np.nanmean(ratio)):.3f} +- {spread:.3f}; the mean is no worse in"
             f" {better}"
@@ -402,42 +337,22 @@ def summary(records: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Run the bench and print its table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--logs", choices=list(SOURCES), default="boats")
-    parser.add_argument("--count", type=int, default=8, help="number of draws")
-    parser.add_argument("--seed", type=int, default=0, help="of all draws")
-    parser.add_argument(
-        "--numbered", type=int, help="the first of draws as commit b1b99e7 numbers them; no --seed"
-    )
-    parser.add_argument("--minutes", type=float, nargs="+", default=[5.0])
-    parser.add_argument("--vessels", nargs="+", help="of the source; all of it otherwise")
-    parser.add_argument("--effort", type=float, default=1.0, help="of the recipe's networks")
-    parser.add_argument("--without", nargs="+", default=[], choices=list(PARTS)[:-1])
-    parser.add_argument("--network", action="store_true", help="networks alone take part")
-    parser.add_argument("--peer", action="store_true", help="train a plain GRU beside")
-    parser.add_argument("--records", type=Path, help="file for one line of JSON for each fit")
-    parser.add_argument("--keep", type=Path, help="folder for the members' errors of each fit")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
+    """Print a line for each draw, and the table."""
+    given = bench.options(
+        __doc__, logs="boats", count=8, seed=0, numbered=-1, minutes=[5.0], vessels=[], effort=1.0,
+        without=[], network=False, peer=False, weights=False,
+    )  # fmt: skip
     source, names = SOURCES[given.logs]
-    names = given.vessels or names
+    names, first = given.vessels or names, max(given.numbered, 0)
     records = []
     for number in range(given.count):
-        first = given.numbered
-        name = names[(number + (first or 0)) % len(names)]
+        name = names[(number + first) % len(names)]
         minutes = given.minutes[number // len(names) % len(given.minutes)]
-        told = [given.seed, number] if first is None else [first + number, 17]
+        told = [given.seed, number] if given.numbered < 0 else [first + number, 17]
         random = np.random.default_rng(told)
         logs = source(name, 60.0 * minutes / STRETCHES, given.seed + number // 2, random)
-        kept = given.keep and given.keep / f"{name}_{minutes:g}_{given.seed}_{number}.npz"
-        records.append(
-            judged(split(logs), given.effort, given.peer, given.without, given.network, kept)
-        )
+        records.append(judged(split(logs), given))
         print(f"{name}, {minutes:g} min, draw {number}, {line(records[-1])}", flush=True)
-        if given.records is not None:
-            with given.records.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(records[-1]) + "\n")
     print(summary(records))
 
 

@@ -1,69 +1,106 @@
-"""Time free runs and their gradients: against their matrix products, and as compiled C.
+"""Time free runs, their gradients, an epoch of training and a refit, side by side with others.
 
 - `rollout`: an LSTM on a linear baseline, 200 steps by RK4 at batch 1,024 in single precision,
-  compiled as free runs of that length are, and as it is, against the matrix products of its
-  network alone, which no implementation can do without.
-- `ahead`: free runs of 64 rows, and the gradient of 64 windows of 40 steps, by networks of 24 units
-  on a linear baseline: what no state decides found for many steps at once, against step by step.
-- `compiled`: free runs of 1, 64 and 1,024 rows, and the gradient of 64 windows of 40 steps, by
-  LSTMs on a linear baseline: as compiled C against TorchScript with what it finds ahead.
-- `device`: free runs and gradients of 40 steps as compiled C on one core beside TorchScript on a
-  GPU, by the number of rows, and from how many on the GPU pays. Left out where there is none.
+  compiled and as it is, against the matrix products of its network alone.
+- `ahead`: free runs of 64 rows, and their gradient over 40 steps, by networks of 24 units on a
+  linear baseline: what no state decides found for many steps at once, against step by step.
+- `compiled`: free runs and gradients of 40 steps of 1, 64 and 1,024 rows by LSTMs on a linear
+  baseline: as compiled C against TorchScript with what it finds ahead.
+- `device`: the same as compiled C on one core beside TorchScript on a GPU, by the number of rows.
+  Left out where there is none.
+- `epoch`: 25 teacher-forced batches of 64 windows of 100 samples for an LSTM, with gradients and
+  optimiser, against a DataLoader that collates windows and a cell that is stepped.
+- `refit`: ten terms in each of three axes, refitted to 12 logs of 100 s at 10 Hz of a boat with
+  quadratic damping, through free runs of 20 s that start every 10 s. scipy minimises the same
+  errors with the same prior from the same start, by differences of free runs. A first refit may
+  compile the free run.
 
 Times are CPU seconds of this process, the least of `--repeats`, so that a busy machine matters
 little; one thread, with the memory settings of a run (`keep_freed_memory`). Those of `device` are
-by the clock, since a GPU does not count in the former.
+by the clock, since a GPU does not count in the former; those of `refit` count the compiler.
 
-    python scripts/bench/rollout.py [--parts rollout ahead compiled device] [--repeats 5]
+    python scripts/bench/rollout.py [--parts rollout ahead compiled device epoch refit]
+        [--repeats 5]
 """
 
 from __future__ import annotations
 
-import argparse
 import copy
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from itertools import islice
 
+import bench
+import large_data
+import numpy as np
 import torch
-from torch import Tensor
+from bench import least
+from scipy.optimize import least_squares
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, TensorDataset
 
-from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
+from residnet.core.columns import velocities_on
 from residnet.core.processes import keep_freed_memory
+from residnet.data.prepare import PrepareConfig, prepare, samples
+from residnet.data.windows import WindowBatches, WindowStore
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import MANY, FreeRun, Playback, Rollout, Source, scripted
+from residnet.heads.base import ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig
 from residnet.physics.signals import SignalsConfig
+from residnet.training.refit import RefitConfig, level_of, place, problem_of, refit
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
-_BATCH, _STEPS = 1_024, 200
-
-
-def least(
-    work: Callable[[], object], repeats: int, clock: Callable[[], float] = time.process_time
-) -> float:
-    """Return the least time of some work in s, after one call that warms up."""
-    work()
-    found = []
-    for _ in range(repeats):
-        begun = clock()
-        work()
-        found.append(clock() - begun)
-    return min(found)
+_BATCH, _STEPS, _SLOPE = 1_024, 200, 40
+_WINDOW, _WINDOWS, _BATCHES = 100, 64, 25
+_INPUTS = ("n_port", "n_stbd")
+_TERMS = (
+    *("u", "v", "r", "u|u|", "v|v|", "r|r|", "u r", "u v"),
+    *("n_port|n_port|", "n_stbd|n_stbd|"),
+)
+Clock = Callable[[], float]
+Way = Callable[[Rollout, tuple[Tensor, ...]], FreeRun]
+_SCALES = torch.tensor([0.5, 0.1, 0.3], dtype=torch.float64)
 
 
 def model_of(head: MlpConfig | LstmConfig) -> HybridDynamics:
-    """Return a head on a linear baseline."""
+    """Return a head on a linear baseline, without positions."""
     torch.manual_seed(0)
     signals = SignalsConfig(inputs=("tau_x", "tau_n")).build()
     baseline = RegressorBaseline([NAMES] * 3, signals.names)
     baseline.theta.data.copy_(-0.5 * torch.eye(3, 5))
     built = head.build(NAMES)
-    return HybridDynamics(signals, baseline, built, 0.05).to(torch.float32).eval()
+    model = HybridDynamics(signals, baseline, built, 0.05).to(torch.float32).eval()
+    model.positions = False
+    model.requires_grad_(False).head.requires_grad_(True)
+    return model
+
+
+def timed(
+    run: FreeRun, given: tuple[Tensor, ...], repeats: int, clock: Clock = time.process_time
+) -> tuple[float, float]:
+    """Return the least times of a free run in us a step, and of a gradient of 40 steps in ms."""
+    x0, w, memory = given
+
+    def gradient() -> None:
+        run(x0, w[:, :_SLOPE], memory)[0].square().mean().backward()
+
+    with torch.no_grad():
+        free = least(partial(run, *given), repeats, clock)
+    return 1e6 * free / w.shape[1], 1e3 * least(gradient, repeats, clock)
+
+
+def _products(f: Tensor, h: Tensor, a: Tensor, b: Tensor, o: Tensor) -> None:
+    for _ in range(_STEPS):
+        f @ a
+        h @ b
+        h @ o
 
 
 def rollouts(repeats: int) -> None:
@@ -71,21 +108,10 @@ def rollouts(repeats: int) -> None:
     x0, w = torch.zeros(_BATCH, 6), torch.randn(_BATCH, _STEPS, 2)
     for hidden in (100, 24):
         model = model_of(LstmConfig(hidden_size=hidden))
-        model.positions = False
-        f, h = torch.randn(_BATCH, 5), torch.randn(_BATCH, hidden)
-        w_input, w_hidden = torch.randn(5, 4 * hidden), torch.randn(hidden, 4 * hidden)
-        out = torch.randn(hidden, 3)
-
-        def products(
-            f: Tensor = f, h: Tensor = h, a: Tensor = w_input, b: Tensor = w_hidden, o: Tensor = out
-        ) -> None:
-            for _ in range(_STEPS):
-                f @ a
-                h @ b
-                h @ o
-
+        sizes = ((_BATCH, 5), (_BATCH, hidden), (5, 4 * hidden), (hidden, 4 * hidden), (hidden, 3))
+        factors = [torch.randn(size) for size in sizes]
         with torch.no_grad():
-            bound = least(products, repeats)
+            bound = least(partial(_products, *factors), repeats)
             for how, run in (
                 ("compiled", scripted(Rollout(model), _STEPS)),
                 ("not compiled", Rollout(model)),
@@ -109,61 +135,59 @@ class StepByStep(Source):
 
 def ahead(repeats: int) -> None:
     """Print what it saves to find ahead what no state decides."""
-    rows, steps, window = 64, 200, 40
     inputs = ("tau_x", "tau_n")
-    x0, w = torch.zeros(rows, 6), torch.randn(rows, steps, 2)
     for name, head in (
         ("MLP", MlpConfig(hidden=(24, 24))),
         ("LSTM", LstmConfig(hidden_size=24)),
         ("LSTM of inputs", LstmConfig(hidden_size=24, memory=inputs, readout=32)),
     ):
         model = model_of(head)
-        model.positions = False
-        found = []
-        for source in (StepByStep(), Playback()):
-            run = scripted(Rollout(model, source), MANY)
-            memory = model.initial_state(rows)
-
-            def gradient(run: FreeRun = run, memory: Tensor = memory) -> None:
-                run(x0, w[:, :window], memory)[0].square().mean().backward()
-
-            model.requires_grad_(False)
-            free = least(partial(run, x0, w, memory), repeats)
-            model.head.requires_grad_(True)
-            found.append((1e6 * free / steps, 1e3 * least(gradient, repeats)))
-        (before, slope_before), (after, slope) = found
+        given = (torch.zeros(64, 6), torch.randn(64, _STEPS, 2), model.initial_state(64))
+        (before, slope_before), (after, slope) = (
+            timed(scripted(Rollout(model, source), MANY), given, repeats)
+            for source in (StepByStep(), Playback())
+        )
         print(
-            f"{name}, {rows} rows: {before:.0f} us a step, found ahead {after:.0f} us"
-            f" ({before / after:.1f} times less); gradient of {window} steps {slope_before:.1f} ms,"
+            f"{name}, 64 rows: {before:.0f} us a step, found ahead {after:.0f} us"
+            f" ({before / after:.1f} times less); gradient of {_SLOPE} steps {slope_before:.1f} ms,"
             f" found ahead {slope:.1f} ms ({slope_before / slope:.1f} times less)"
         )
 
 
+WAYS: dict[str, Way] = {
+    "TorchScript": lambda roll, given: scripted(roll, MANY),
+    "C": lambda roll, given: CompiledRollout(roll, *(one[:64] for one in given)),
+}
+
+
+def by_rows(
+    rows: tuple[int, ...],
+    steps: int,
+    ways: dict[str, str],
+    repeats: int,
+    clock: Clock = time.process_time,
+) -> None:
+    """Print free runs and gradients in several ways, each on its device."""
+    for hidden in (24, 100):
+        model = model_of(LstmConfig(hidden_size=hidden))
+        for count in rows:
+            told = []
+            for name, device in ways.items():
+                there = copy.deepcopy(model).to(device)
+                given = (torch.randn(count, 6), torch.randn(count, steps, 2))
+                x0, w, memory = (one.to(device) for one in (*given, model.initial_state(count)))
+                run = WAYS[name](Rollout(there), (x0, w, memory))
+                free, slope = timed(run, (x0, w, memory), repeats, clock)
+                told.append(
+                    f"{name} on {device} {free:.1f} us a step, {1e-3 * free * steps:.1f} ms for"
+                    f" {steps}, gradient of {_SLOPE} steps {slope:.1f} ms"
+                )
+            print(f"LSTM of {hidden}, {count} rows: {'; '.join(told)}", flush=True)
+
+
 def compiled_runs(repeats: int) -> None:
     """Print what free runs and their gradient cost as compiled C."""
-    steps, window = 200, 40
-    for hidden in (24, 100):
-        model = model_of(LstmConfig(hidden_size=hidden)).requires_grad_(False)
-        model.positions = False
-        x0, w = torch.randn(_BATCH, 6), torch.randn(_BATCH, steps, 2)
-        memory, told = model.initial_state(_BATCH), []
-        with torch.no_grad():
-            runs = (scripted(Rollout(model), MANY), CompiledRollout(Rollout(model), x0, w, memory))
-            for rows in (1, 64, _BATCH):
-                given = (x0[:rows], w[:rows], memory[:rows])
-                each = [1e6 * least(partial(run, *given), repeats) / steps for run in runs]
-                told.append(f"{rows} rows {each[0]:.0f} us a step, in C {each[1]:.1f} us")
-        model.head.requires_grad_(True)
-        given = (x0[:64], w[:64, :window], memory[:64])
-        found = []
-        for run in (scripted(Rollout(model), MANY), CompiledRollout(Rollout(model), *given)):
-
-            def gradient(run: FreeRun = run, given: tuple[Tensor, ...] = given) -> None:
-                run(*given)[0].square().mean().backward()
-
-            found.append(1e3 * least(gradient, repeats))
-        told.append(f"gradient of {window} steps {found[0]:.1f} ms, in C {found[1]:.1f} ms")
-        print(f"compiled, LSTM of {hidden}: {'; '.join(told)}")
+    by_rows((1, 64, _BATCH), _STEPS, {"TorchScript": "cpu", "C": "cpu"}, repeats)
 
 
 def on_gpu(repeats: int) -> None:
@@ -171,65 +195,130 @@ def on_gpu(repeats: int) -> None:
     if not torch.cuda.is_available():
         print("device: no GPU on this machine")
         return
-    steps, rows = 40, (64, 256, 1_024, 4_096, 16_384, 65_536)
-    print(f"device: one core beside {torch.cuda.get_device_name(0)}, {steps} steps")
 
     def clock() -> float:
         torch.cuda.synchronize()
         return time.perf_counter()
 
+    print(torch.cuda.get_device_name(0))
+    rows = (64, 256, 1_024, 4_096, 16_384, 65_536)
+    by_rows(rows, _SLOPE, {"C": "cpu", "TorchScript": "cuda"}, repeats, clock)
+
+
+def _epoch(
+    batches: Callable[[], Iterable[Sequence[Tensor]]],
+    predict: Callable[[Tensor], Tensor],
+    optimiser: torch.optim.Optimizer,
+) -> None:
+    for seen, truth in batches():
+        loss = (truth - predict(seen)).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+
+
+def epochs(repeats: int) -> None:
+    """Print how much faster an epoch is than by data loader and loop."""
+    random = np.random.default_rng(0)
+    data = [
+        torch.from_numpy(random.normal(size=(50_000, width)).astype(np.float32)) for width in (5, 3)
+    ]
+    starts = WindowBatches(torch.arange(len(data[0]) - _WINDOW), _WINDOWS, _BATCHES)
+    unfolded = (part.unfold(0, _WINDOW, 1).transpose(1, 2) for part in data)
+    loader = DataLoader(TensorDataset(*unfolded), batch_size=_WINDOWS, shuffle=True)
+
+    def windows() -> Iterator[list[Tensor]]:
+        for first in starts.epoch(0, 0):
+            rows = (first[:, None] + torch.arange(_WINDOW)).reshape(-1)
+            yield [part.index_select(0, rows).unflatten(0, (_WINDOWS, _WINDOW)) for part in data]
+
+    def stepped(cell: nn.LSTMCell, out: nn.Linear, seen: Tensor) -> Tensor:
+        state, found = None, []
+        for k in range(_WINDOW):
+            state = cell(seen[:, k], state)
+            found.append(out(state[0]))
+        return torch.stack(found, dim=1)
+
     for hidden in (24, 100):
-        model = model_of(LstmConfig(hidden_size=hidden)).requires_grad_(False)
-        model.positions = False
-        model.head.requires_grad_(True)
-        pays: dict[str, int] = {}
-        for count in rows:
-            found: dict[str, dict[str, float]] = {}
-            for device in ("cpu", "cuda"):
-                there = copy.deepcopy(model).to(device)
-                given = tuple(
-                    one.to(device)
-                    for one in (
-                        torch.randn(count, 6),
-                        torch.randn(count, steps, 2),
-                        model.initial_state(count),
-                    )
-                )
-                runner = Rollout(there)
-                run: FreeRun = (
-                    CompiledRollout(runner, *(one[:64] for one in given))
-                    if device == "cpu"
-                    else scripted(runner, MANY)
-                )
-
-                def gradient(run: FreeRun = run, given: tuple[Tensor, ...] = given) -> None:
-                    run(*given)[0].square().mean().backward()
-
-                with torch.no_grad():
-                    free = least(partial(run, *given), repeats, clock)
-                found[device] = {"free run": free, "gradient": least(gradient, repeats, clock)}
-            told = []
-            for what, core in found["cpu"].items():
-                gpu = found["cuda"][what]
-                told.append(f"{what} {1e3 * core:.1f} ms, on the GPU {1e3 * gpu:.1f} ms")
-                if gpu < core:
-                    pays.setdefault(what, count)
-            print(f"device, LSTM of {hidden}, {count} rows: {'; '.join(told)}")
-        for what in ("free run", "gradient"):
-            at = f"from {pays[what]} rows" if what in pays else f"at none of up to {rows[-1]} rows"
-            print(f"device, LSTM of {hidden}: for a {what} the GPU pays {at}")
+        head = LstmConfig(hidden_size=hidden).build(NAMES).to(torch.float32).train()
+        ours = torch.optim.AdamW(head.parameters())
+        cell, out = nn.LSTMCell(5, hidden), nn.Linear(hidden, 3)
+        usual = torch.optim.AdamW([*cell.parameters(), *out.parameters()])
+        own = least(partial(_epoch, windows, head.sequence, ours), repeats)
+        batches = partial(islice, loader, _BATCHES)
+        other = least(partial(_epoch, batches, partial(stepped, cell, out), usual), repeats)
+        print(
+            f"epoch of {_BATCHES} batches, LSTM of {hidden}: {own:.3f} s, by data loader and loop"
+            f" {other:.3f} s: {other / own:.1f} times"
+        )
 
 
-PARTS = {"rollout": rollouts, "ahead": ahead, "compiled": compiled_runs, "device": on_gpu}
+def spent() -> float:
+    """Return the processor time of this process and of the compilers that it has called, s."""
+    return sum(os.times()[:4])
+
+
+def refits(repeats: int) -> None:
+    """Print the times of refits and of scipy's, and the errors that they reach."""
+    settings = {
+        "grid": {"step": f"{large_data.STEP} s", "held": [*_INPUTS]},
+        "derivative": {"kind": "savitzky_golay", "window": "1.1 s", "order": 2},
+    }
+    config, signals = PrepareConfig.model_validate(settings), SignalsConfig(inputs=_INPUTS)
+    flown = large_data.simulate(12, 1_000, 1)
+    logs = [prepare(log, "train", signals.columns, config) for log in flown]
+    built = signals.build()
+    baseline = RegressorBaseline([_TERMS] * 3, built.names)
+    model = HybridDynamics(built, baseline, ZeroHead(built.names), large_data.STEP, "rk4")
+    model.positions = False
+    known = samples(logs, built)
+    RegressorsConfig(terms=_TERMS).fit(baseline, known)
+    store = WindowStore.gather(logs, torch.float64)
+    plan = RefitConfig(horizon=20.0, every=10.0)
+    start = baseline.theta.detach().clone()
+    problem = problem_of(model, baseline, known, store, plan, _SCALES)
+    windows, steps = problem.w.shape[:2]
+    found = []
+    for _ in range(1 + repeats):
+        place(baseline, start.flatten()[problem.active], problem.active)
+        begun = spent()
+        notes = refit(model, known, store, plan, _SCALES).notes
+        found.append(spent() - begun)
+    print(
+        f"refit of {len(problem.active)} parameters, {windows} windows of {steps} steps: first"
+        f" {found[0]:.2f} s, then {min(found[1:]):.2f} s, {notes['iterations']} iterations, cost"
+        f" {notes['cost_before']:.6f} -> {notes['cost_after']:.9f}"
+    )
+    root = np.linalg.cholesky(problem.precision.numpy()).T
+    each = np.sqrt(problem.nu.numel())
+
+    def errors(values: np.ndarray) -> np.ndarray:
+        place(baseline, torch.from_numpy(values), problem.active)
+        flown = Rollout(model)(problem.x0, problem.w, problem.x0[:, :0])[0]
+        error = (velocities_on(flown[:, 1:]) - problem.nu) * problem.weight / each
+        return np.append(error.numpy().ravel(), root @ (values - problem.start.numpy()))
+
+    begun = spent()
+    best = least_squares(errors, problem.start.numpy(), method="lm", x_scale="jac", xtol=1e-4)
+    taken = spent() - begun
+    place(baseline, torch.from_numpy(best.x), problem.active)
+    level = level_of(model, problem)[0]
+    print(f"scipy: {taken:.2f} s, {best.nfev} free runs, cost {level:.9f}")
+
+
+PARTS = {
+    "rollout": rollouts,
+    "ahead": ahead,
+    "compiled": compiled_runs,
+    "device": on_gpu,
+    "epoch": epochs,
+    "refit": refits,
+}
 
 
 def main() -> None:
     """Print the parts that were asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS))
-    parser.add_argument("--repeats", type=int, default=5)
-    given = parser.parse_args()
-    torch.set_num_threads(1)
+    given = bench.options(__doc__, parts=PARTS, repeats=5)
     keep_freed_memory()
     print(f"torch {torch.__version__}, {platform.platform()}, load {os.getloadavg()[0]:.1f}")
     for part in given.parts:

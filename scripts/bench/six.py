@@ -2,20 +2,19 @@
 
 The shipped configs `remus_100` and `bluerov2_heavy` draw ten minutes of noisy trials; their `hull`
 is fitted and refitted as `residnet run` does. True coefficients are those that give the plant's own
-accelerations on its own motion without noise; a line says how much of these the terms leave out. A
-coefficient counts as determined by the trials where its errors over all draws spread by at most
-2.5 % of the truth, so that nothing but a bias takes it 5 % away in more than one of twenty.
+accelerations on its own motion without noise. A coefficient counts as determined by the trials
+where its errors over all draws spread by at most 2.5 % of the truth, so that nothing but a bias
+takes it 5 % away in more than one of twenty.
 
-    python scripts/bench/six.py [--vessels remus_100 bluerov2_heavy] [--seeds 1 2 3] [-s KEY=VALUE]
+    python scripts/bench/six.py [--vessels remus_100 bluerov2_heavy] [--seeds 10] [-s KEY=VALUE]
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
+import bench
 import torch
 
 from residnet.baselines.regressors import RegressorBaseline
@@ -26,14 +25,13 @@ from residnet.identification.fitter import FitStore, Fitter
 from residnet.identification.prepared import prepare_logs
 from residnet.tasks.fit import FitConfig
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 _DETERMINED, _ASKED, _NOTHING = 2.5, 5.0, 1e-9
 
 
 def true_rows(
     flights: Sequence[Flight], config: FitConfig, baseline: RegressorBaseline
-) -> tuple[torch.Tensor, list[float]]:
-    """Return the true coefficients [n, J], and the share of each axis that its terms leave [n]."""
+) -> torch.Tensor:
+    """Return the true coefficients [n, J]."""
     assert isinstance(config.data, SimulatedTrials)
     signals, plant = config.signals, surrounded(config.data.vessel, config.data.disturbance)
     moved = [flight.motion for flight in flights]
@@ -48,23 +46,19 @@ def true_rows(
     with torch.no_grad():
         rates = plant.rate(x, w)
         phi = baseline.library(built(own, built.prepare(seen)))
-    theta, left = torch.zeros_like(baseline.theta), []
+    theta = torch.zeros_like(baseline.theta)
     for axis, name in enumerate(live):
         own_terms, target = baseline.columns(axis), rates[:, plant.state.index(name)]
         if own_terms:
             found = torch.linalg.lstsq(phi[:, own_terms], target[:, None], driver="gelsd").solution
             theta[axis, own_terms] = found[:, 0]
-            miss = target - phi[:, own_terms] @ found[:, 0]
-            left.append(float(miss.norm() / target.norm()))
-        else:
-            left.append(0.0)
-    return theta, left
+    return theta
 
 
 def drawn(vessel: str, seed: int, overrides: Sequence[str]) -> tuple[list[str], torch.Tensor]:
-    """Return the names of the coefficients; refit, truth, standard error of each, [K, 3]."""
+    """Return the names of the coefficients; refit and truth of each, [K, 2]."""
     given = [f"data.seed={seed}", "heads={}", "base_of={}", "training={}", *overrides]
-    config = load_config(CONFIGS / f"{vessel}.yaml", given, FitConfig)
+    config = load_config(bench.CONFIGS / f"{vessel}.yaml", given, FitConfig)
     assert isinstance(config.data, SimulatedTrials)
     manoeuvres = config.data.draw()
     flights = fly_trials(manoeuvres, config.data)
@@ -76,53 +70,42 @@ def drawn(vessel: str, seed: int, overrides: Sequence[str]) -> tuple[list[str], 
     fitted = Fitter(prepared, config, FitStore()).baseline("hull")
     seconds, baseline = time.process_time() - begun, fitted.model.baseline
     assert isinstance(baseline, RegressorBaseline)
-    true, left = true_rows(flights, config, baseline)
+    true = true_rows(flights, config, baseline)
     print(
         f"{vessel}, seed {seed}: free runs {fitted.notes['least_squares']:.4f} ->"
-        f" {fitted.notes['validation']:.4f} by the refit, {seconds:.1f} s; the terms leave out "
-        + ", ".join(f"{a} {100 * b:.2g} %" for a, b in zip(baseline.axes, left, strict=True) if b),
+        f" {fitted.notes['validation']:.4f} by the refit, {seconds:.1f} s",
         flush=True,
     )
     names, found = [], []
     for row in fitted.notes["coefficients"]:
         place = baseline.outputs.index(row["axis"]), baseline.library.terms.index(row["term"])
         names.append(f"{row['axis']:6} {row['term']}")
-        found.append([row["value"], float(true[place]), row["standard_error"]])
+        found.append([row["value"], float(true[place])])
     return names, torch.tensor(found, dtype=torch.float64)
 
 
 def main() -> None:
     """Compare all vessels over all seeds."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--vessels", nargs="+", default=["remus_100", "bluerov2_heavy"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(1, 11)))
-    parser.add_argument("-s", dest="overrides", action="append", default=[])
-    given = parser.parse_args()
-    torch.set_num_threads(1)
+    vessels = ["remus_100", "bluerov2_heavy"]
+    given = bench.options(__doc__, vessels=vessels, seeds=10, s=[])
     for vessel in given.vessels:
-        draws = [drawn(vessel, seed, given.overrides) for seed in given.seeds]
+        draws = [drawn(vessel, 1 + k, given.s) for k in range(given.seeds)]
         names, found = draws[0][0], torch.stack([part for _, part in draws])
         true = found[:, :, 1].mean(0)
         size = torch.where(true.abs() > _NOTHING, true.abs() / 100.0, 1.0)
         off = (found[:, :, 0] - found[:, :, 1]) / size
-        spread, told = off.std(0), found[:, :, 2].mean(0) / size
-        print(
-            f"{vessel}: coefficient, truth; mean error, spread, standard error told,"
-            " in % where the truth is not nothing"
-        )
-        counts = [0, 0, 0]
+        spread, near = off.std(0), (off.abs() <= _ASKED).sum(0)
+        known = (spread <= _DETERMINED) & (true.abs() > _NOTHING)
+        print(f"{vessel}: coefficient, truth; mean error, spread, in % where there is a truth")
         for k, name in enumerate(names):
-            near = int((off[:, k].abs() <= _ASKED).sum())
-            known = bool(spread[k] <= _DETERMINED and true[k].abs() > _NOTHING)
-            if known:
-                counts = [a + b for a, b in zip(counts, (1, len(off), near), strict=True)]
             print(
                 f"  {name:33} {true[k]:10.4g} {off[:, k].mean():+8.1f} {spread[k]:7.1f}"
-                f" {told[k]:7.1f}" + f"  {near} of {len(off)} within 5 %" * known
+                + f"  {near[k]} of {len(off)} within 5 %" * bool(known[k])
             )
+        count, right = int(known.sum()) * len(off), int(near[known].sum())
         print(
-            f"{vessel}: {counts[0]} of {len(names)} are determined; {counts[2]} of {counts[1]}"
-            f" ({counts[2] / max(counts[1], 1):.0%}) of these are within 5 %"
+            f"{vessel}: {int(known.sum())} of {len(names)} are determined; {right} of {count}"
+            f" ({right / max(count, 1):.0%}) of these are within 5 %"
         )
 
 

@@ -10,9 +10,9 @@ document prints curves and no measurements.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
+import bench
 import numpy as np
 import pandas as pd
 import torch
@@ -22,7 +22,7 @@ from residnet.physics.actuators import Thrusters
 from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel
 
-FOLDER = Path(__file__).resolve().parents[2] / "configs" / "studies" / "woo2018" / "thruster_tests"
+FOLDER = bench.CONFIGS / "studies" / "woo2018" / "thruster_tests"
 RPM = to_si("rpm")
 SLOPE = 2800.0
 """Revolutions in rpm per unit of throttle; the document's Figure 4 saturates before full throttle.
@@ -33,24 +33,12 @@ SAMPLE, LENGTH, AT, DELAY = 0.025, 6.0, 1.35, 0.1
 """Sampling period, length, time of the step and dead time of the shaft, in s."""
 
 
-def thrusters() -> Thrusters:
-    """Return the thrusters of wam_v_cal.
-
-    Raises:
-        TypeError: where the vessel has others.
-    """
-    vessel = load_vessel("wam_v_cal")
-    if not isinstance(vessel, FossenConfig):
-        raise TypeError("wam_v_cal is no vessel of kind fossen")
-    unit = vessel.actuators.build()
-    if not isinstance(unit, Thrusters):
-        raise TypeError("wam_v_cal has no differential thrust")
-    return unit
-
-
 def tables() -> dict[str, pd.DataFrame]:
     """Return the tests by name of their file, in the units of a test engineer."""
-    unit, random = thrusters(), np.random.default_rng(2018)
+    vessel, random = load_vessel("wam_v_cal"), np.random.default_rng(2018)
+    assert isinstance(vessel, FossenConfig)
+    unit = vessel.actuators.build()
+    assert isinstance(unit, Thrusters)
     limit, rate = float(unit.n_max[0]) / RPM, unit.servos[0].fastest / RPM
     throttle = np.arange(-100, 101, 5)
     rpm = np.clip(SLOPE / 100 * throttle, -limit, limit) + random.normal(0, 5, throttle.size)
@@ -75,7 +63,8 @@ def tables() -> dict[str, pd.DataFrame]:
 
 def main() -> None:
     """Write the tests into a folder."""
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER
+    given = bench.options(__doc__, folder=(str(FOLDER),))
+    folder = Path(given.folder[0])
     folder.mkdir(parents=True, exist_ok=True)
     for name, table in tables().items():
         table.to_csv(folder / f"{name}.csv", index=False)

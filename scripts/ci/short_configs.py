@@ -1,7 +1,8 @@
 """Run every shipped config in a shortened form, to its report.
 
-Each config under configs/ has a row in `SHORT`: overrides that keep every part of the run but
-lessen the work. A config without a row fails. Configs whose data are absent are skipped visibly.
+What a config's parts say shortens them (`general`): fewer trials, one epoch, a coarser grid. `OWN`
+has what a config needs besides. Every part of a run is kept. Configs whose data are absent are
+skipped visibly; what takes longer than `LIMIT` fails.
 
     python scripts/ci/short_configs.py [NAME...] [--jobs 2] [--out FOLDER]
 """
@@ -12,13 +13,17 @@ import argparse
 import json
 import multiprocessing
 import os
+import re
 import sys
 import tempfile
-import threading
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
+
+from residnet.core.config import load_mapping
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs"
@@ -42,7 +47,7 @@ class Short:
 
 
 # fewer simulated sea trials
-_TRIALS = (
+TRIALS = (
     "data.trials=[{kind: constant, drive: [0.4, 0.9], steer: [-0.4, 0.0, 0.4]},"
     " {kind: zigzag, count: 5, heading: [20 deg]}, {kind: acceleration_deceleration, count: 3},"
     " {kind: three_two_one_one, count: 3}]",
@@ -50,318 +55,173 @@ _TRIALS = (
     "data.validation={zigzag: 1, acceleration_deceleration: 1, three_two_one_one: 1}",
 )
 # and of those under water
-_DIVES = (
+DIVES = (
     "data.trials=[{kind: depth_step, count: 4, depth: [1], drive: [0.1, 0.2], dive: [0.1, 0.2]},"
     " {kind: random_steps, count: 4, drive: [0.1, 0.2], steer_amplitude: [0.0, 0.04],"
     " dive_amplitude: [0.0, 0.1], own_amplitude: [0.01, 0.04]}]",
     "data.identification={depth_step: 3, random_steps: 3}",
     "data.validation={depth_step: 1, random_steps: 1}",
-    "refit={}",
-    "bands=null",
 )
-_ONE_STEP = "{epochs: 1, window: 2 s, batch: 32}"
-_MULTI_STEP = "[{horizon: 2 s, epochs: 1, batch: 32}]"
-
-
-def _trained(*heads: str) -> tuple[str, ...]:
-    """Return overrides for one short epoch of each stage."""
-    return tuple(
-        override
-        for head in heads
-        for override in (
-            f"training.{head}.steps=2",
-            f"training.{head}.one_step={_ONE_STEP}",
-            f"training.{head}.multi_step={_MULTI_STEP}",
-        )
-    )
-
-
-def _policy(name: str) -> tuple[str, ...]:
-    short = ("epochs=1", "steps=1", "batch=16", "validation=16", "hold=0 s", "compiled=false")
-    return tuple(f"policies.{name}.training.{key}" for key in short)
-
-
-def _predictor(name: str) -> tuple[str, ...]:
-    return (f"predictive.{name}.training={{states: 300, epochs: 5, batch: 50}}",)
-
-
-# eight logs of the Esso Osaka model tanker are enough
-_TANKER = (
-    "refit={}",
-    "baselines.physics={kind: regressors, terms: [u, v, r, n]}",
-    "evaluation.splits=[validation, test]",
-    "bands=null",
-    *_trained("mlp", "lstm"),
-)
-_COARSE = (
+EPOCH = {
+    "steps": "2",
+    "one_step": "{epochs: 1, window: 2 s, batch: 32}",
+    "multi_step": "[{horizon: 2 s, epochs: 1, batch: 32}]",
+}
+COARSE = (
     "prepare.grid={step: 0.5 s, held: [n, delta]}",
     "prepare.derivative={kind: savitzky_golay, window: 2.5 s, order: 2}",
     "evaluation.splits=[validation, test]",
-    "bands=null",
 )
-_SWEPT = (
-    "common=["
-    + ", ".join(
-        f"'{override}'"
-        for override in (
-            *_TRIALS,
-            "heads={mlp: {kind: mlp, hidden: [8]}}",
-            "~training.lstm",
-            *_trained("mlp"),
-            "bands=null",
-            "export.models=[]",
-        )
-    )
-    + "]",
-)
-_FERRY = ("course.interval=10 s",)
-_STEP_TEST = ("test.plants=2", "test.dt=0.1 s")
-_STATED = (
+FLIGHTS = (
     "conditions.flights=8",
     "conditions.stated.dt=0.1 s",
     "conditions.stated.duration=6 s",
     "conditions.stated.hold=1 s",
     "conditions.evolution={flights: 2, population: 2, generations: 1}",
 )
-_ONE_POLICY = (
-    *_STATED,
-    *_STEP_TEST,
-    *_policy("policy"),
-    "policies.policy.training.dt=0.1 s",
-    "policies.policy.training.steady={flights: 2}",
-)
-_TORPEDO = (
-    *_STATED,
-    *_STEP_TEST,
-    *_policy("learned"),
-    "policies.learned.training.dt=0.1 s",
-    "policies.learned.training.steady={flights: 2}",
-    "turning_time=8 s",
-    "test.duration=8 s",
-    "test.bias_time=8 s",
-    "~conditions.beyond",
-    "~peers.pd",
-    "~peers.lqr",
-)
-_SLOW = ("conditions.stated.duration=12 s", "test.duration=26 s", "test.bias_time=26 s")
+BEYOND = "conditions.beyond={delay: {dt: 0.1 s, duration: 6 s, hold: 1 s, delay: [0.6 s, 0.6 s]}}"
+POLICY = {
+    **{"epochs": "1", "steps": "1", "batch": "16", "validation": "16", "hold": "0 s"},
+    **{"compiled": "false", "dt": "0.1 s", "steady": "{flights: 2}"},
+}
 
-_CONDITIONS = (
-    *_STATED,
-    "conditions.beyond={delay: {dt: 0.1 s, duration: 6 s, hold: 1 s, delay: [0.6 s, 0.6 s]}}",
-    *_policy("learned"),
-    *_policy("constants"),
-    "policies.learned.training.dt=0.1 s",
-    "policies.learned.training.steady={flights: 2}",
-    "policies.constants.training.dt=0.1 s",
-    "test.dt=0.1 s",
-    "test.plants=2",
-    "test.bias_time=20 s",
-)
 
-SHORT: dict[str, Short] = {
-    "quickstart": Short((*_TRIALS, *_trained("mlp", "lstm"))),
-    "wam_v_s1": Short((*_TRIALS, *_trained("mlp", "lstm"))),
-    "wam_v_s2": Short((*_TRIALS, *_trained("mlp", "lstm"), "bands=null")),
-    "wam_v_s3": Short((*_TRIALS, *_trained("mlp", "lstm"), "bands=null")),
-    "wam_v_equations": Short((*_TRIALS, "bands=null")),
-    "wam_v_trials": Short(_TRIALS),
-    "sweep_quickstart": Short(
-        (
-            *_SWEPT,
-            "space={heads.mlp.hidden: {choices: [[8], [16]]}}",
-            "search.trials=2",
-            "runner.workers=1",
-        )
+def keys(place: str, values: Mapping[str, str]) -> list[str]:
+    """Return overrides of several keys of one place."""
+    return [f"{place}.{key}={value}" for key, value in values.items()]
+
+
+def general(content: Mapping[str, Any]) -> list[str]:
+    """Return the overrides that follow from the parts of a config."""
+    data, out = content.get("data") or {}, []
+    kinds = {one["kind"] for one in data.get("trials", ())}
+    out += DIVES if "depth_step" in kinds else TRIALS if "three_two_one_one" in kinds else ()
+    out += COARSE if data.get("kind") == "measured" else ()
+    out += ["refit={}"] if "refit" in content else []
+    out += ["bands=null"] if "refit" in content or data.get("kind") == "measured" else []
+    for head in content.get("training", ()):
+        out += keys(f"training.{head}", EPOCH)
+    if "conditions" in content:
+        out += [*FLIGHTS, *[BEYOND] * ("beyond" in content["conditions"])]
+    for name, policy in (content.get("policies") or {}).items():
+        quiet = "steady" in policy["training"]  # it is told that no flight tells whether it swings
+        given = {key: one for key, one in POLICY.items() if key != "steady" or not quiet}
+        out += keys(f"policies.{name}.training", given)
+    for name in content.get("predictive", ()):
+        out.append(f"predictive.{name}.training={{states: 300, epochs: 5, batch: 50}}")
+    task = content["task"]
+    out += ["test.plants=2", "test.dt=0.1 s"] if task == "autopilot" else []
+    out += ["test.bias_time=20 s"] if "beyond" in content.get("conditions", ()) else []
+    out += ["course.interval=10 s"] if task == "ferry_study" else []
+    out += ["repeats=1"] if task == "breeding" else []
+    return out
+
+
+def lasting(seconds: int, *policies: str) -> tuple[str, ...]:
+    """Return overrides for flights of a slow vessel."""
+    return (
+        f"conditions.stated.duration={seconds} s",
+        *(f"policies.{name}.training.duration={seconds} s" for name in policies),
+        f"test.duration={2 * seconds + 2} s",
+        f"test.bias_time={2 * seconds + 2} s",
+    )
+
+
+TORPEDO = (
+    *("turning_time=8 s", "test.duration=8 s", "test.bias_time=8 s", "~conditions.beyond"),
+    *("~peers.pd", "~peers.lqr"),
+)
+GENETIC = "heads.genetic.evolution={population: 30, generations: 2}"
+PHYSICS = "baselines.physics={kind: regressors, terms: [u, v, r, n]}"
+HEAD = "heads={mlp: {kind: mlp, hidden: [8]}}"
+STEPS = ("~training.lstm", *keys("training.mlp", EPOCH))
+SWEPT = [*TRIALS, HEAD, *STEPS, "bands=null", "export.models=[]"]
+FEW = "{drives: [0.35, 0.55, 0.7, 1.0], steers: [0.3], zigzag: 40 s, hold: 10 s, courses: [0.0]}"
+HORIZON = "training: {states: 300, epochs: 5}"
+ONE_CELL = ("rows.values=[0.2]", "columns.values=[0.2]", "~published")
+OWN: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("wam_v_s2", "wam_v_s3", "wam_v_equations"), ("bands=null",)),
+    "simulate_wam_v": ("~programme.families",),
+    "sweep_quickstart": (
+        f"common={SWEPT}",
+        "space={heads.mlp.hidden: {choices: [[8], [16]]}}",
+        "search.trials=2",
+        "runner.workers=1",
     ),
-    "simulate_wam_v": Short(("~programme.families",)),
-    "rudder_boat_trials": Short(_TRIALS),
-    "patrol_identified": Short(_trained("mlp")),
-    "patrol_roll": Short((*_TRIALS, "refit={}", "bands=null", *_trained("network"))),
-    "remus_100": Short((*_DIVES, *_trained("mlp", "lstm"))),
-    "bluerov2_heavy": Short((*_DIVES, *_trained("lstm"))),
-    "kvlcc2": Short(
-        (
-            "prepare.grid={step: 0.5 s, held: [n, delta]}",
-            "prepare.derivative={kind: savitzky_golay, window: 2.5 s, order: 2}",
-            "refit.mmg={horizon: 20 s, every: 40 s, prior: 0, robust: 0.3, iterations: 2}",
-            "booklet.draws=20",
-            "bands=null",
-        ),
-        data="kvlcc2",
+    "kvlcc2": (
+        "refit.mmg={horizon: 20 s, every: 40 s, prior: 0, robust: 0.3, iterations: 2}",
+        "booklet.draws=20",
     ),
-    "esso_osaka": Short(_TANKER, data="esso_osaka"),
-    "esso_osaka_standard": Short(
-        (
-            "data.split={root: '${RESIDNET_DATA}/esso_osaka', train:"
-            " [{log: 'zigzag/*13_04_24.csv', from: 0 s, to: 150 s},"
-            " {log: 'zigzag/*13_14_21.csv', from: 0 s, to: 150 s}], validation:"
-            " [{log: 'zigzag/*13_29_19.csv', from: 0 s, to: 150 s}], test:"
-            " [{log: 'zigzag/*13_42_53.csv', from: 0 s, to: 150 s}]}",
-            "evaluation.selection=T10",
-            "evaluation.protocols={T10: {kind: windows, length: 10 s}}",
-            "prepare.grid={step: 1 s, held: [n, delta]}",
-            "prepare.derivative={kind: savitzky_golay, window: 5 s, order: 2}",
-            "effort=0.01",
-            "bands=null",
-        ),
-        data="esso_osaka",
+    **dict.fromkeys(("esso_osaka", "esso_osaka_no_wind"), (PHYSICS,)),
+    "esso_osaka_standard": (
+        "data.split={root: '${RESIDNET_DATA}/esso_osaka', train:"
+        " [{log: 'zigzag/*13_04_24.csv', from: 0 s, to: 150 s},"
+        " {log: 'zigzag/*13_14_21.csv', from: 0 s, to: 150 s}], validation:"
+        " [{log: 'zigzag/*13_29_19.csv', from: 0 s, to: 150 s}], test:"
+        " [{log: 'zigzag/*13_42_53.csv', from: 0 s, to: 150 s}]}",
+        "evaluation.selection=T10",
+        "evaluation.protocols={T10: {kind: windows, length: 10 s}}",
+        "prepare.grid={step: 1 s, held: [n, delta]}",
+        "prepare.derivative={kind: savitzky_golay, window: 5 s, order: 2}",
+        "effort=0.01",
     ),
-    "esso_osaka_no_wind": Short(_TANKER, data="esso_osaka"),
-    "milliampere_raw": Short(data="milliampere"),
-    "autopilot_nomoto": Short((*_ONE_POLICY, *_predictor("document"))),
-    "autopilot_nomoto_rate": Short(_ONE_POLICY),
-    "autopilot_conditions": Short(
-        (
-            *_CONDITIONS,
-            *_policy("network"),
-            "policies.network.training.dt=0.1 s",
-            "policies.network.training.steady={flights: 2}",
-            *_predictor("document"),
-        )
+    **dict.fromkeys(("autopilot_remus", "autopilot_remus_depth"), TORPEDO),
+    "autopilot_conditions_patrol": (*lasting(12, "learned", "constants"), "test.sea_time=10 s"),
+    "autopilot_patrol": (*lasting(12, "policy"), "test.sea_time=10 s"),
+    "autopilot_patrol_learned": (
+        *lasting(12, "on_vessel", "on_model"),
+        "policies.on_model.learned.run={runs}/patrol_identified",
     ),
-    "autopilot_conditions_rate": Short(_CONDITIONS),
-    "autopilot_ship": Short(_CONDITIONS),
-    "autopilot_remus": Short(_TORPEDO),
-    "autopilot_remus_depth": Short(_TORPEDO),
-    "autopilot_conditions_patrol": Short(
-        (
-            *_CONDITIONS,
-            "conditions.stated.duration=12 s",
-            "policies.learned.training.duration=12 s",
-            "policies.constants.training.duration=12 s",
-            "test.sea_time=10 s",
-        )
+    "studies/esso_osaka/ablation": (
+        "variants={recipe: [], no_mirror: ['heads.mlp.mirror=false']}",
+        f"common={[PHYSICS, 'refit={}', HEAD, 'base_of={mlp: hull}', 'ensembles={}', *STEPS]}",
+        "seeds=[0]",
+        "workers=1",
     ),
-    "autopilot_patrol": Short(
-        (
-            *_ONE_POLICY,
-            *_predictor("document"),
-            *_SLOW,
-            "policies.policy.training.duration=12 s",
-            "test.sea_time=10 s",
-        )
+    "studies/gouletas2020/heading_nomoto": (
+        f"predictive={{mlp_printed: {{horizon: 0.01 s, {HORIZON}}},"
+        f" mlp_3s_linear: {{horizon: 3 s, linear: true, {HORIZON}}}}}",
     ),
-    "autopilot_patrol_learned": Short(
-        (
-            *_STATED,
-            *_STEP_TEST,
-            *_SLOW,
-            *_policy("on_vessel"),
-            *_policy("on_model"),
-            "policies.on_vessel.training.duration=12 s",
-            "policies.on_model.training.duration=12 s",
-            "policies.on_vessel.training.steady={flights: 2}",
-            "policies.on_model.training.steady={flights: 2}",
-            "policies.on_model.learned.run={runs}/patrol_identified",
-        ),
-        after="patrol_identified",
+    "studies/gouletas2020/heading_patrol": (
+        f"predictive={{mlp_10s: {{horizon: 10 s, hidden: [30], {HORIZON}}}}}",
+        *("test.dt=0.25 s", "test.duration=30 s"),
     ),
-    "studies/esso_osaka/ablation": Short(
-        (
-            "variants={recipe: [], no_mirror: ['heads.mlp.mirror=false']}",
-            "common=['baselines.physics={kind: regressors, terms: [u, v, r, n]}', 'refit={}',"
-            " 'heads={mlp: {kind: mlp, hidden: [8]}}', 'base_of={mlp: hull}', 'ensembles={}',"
-            " '~training.lstm', 'training.mlp.steps=1', 'training.mlp.multi_step=[{horizon: 2 s,"
-            " epochs: 1, batch: 32}]']",
-            "seeds=[0]",
-            "workers=1",
-        ),
-        data="esso_osaka",
+    "studies/gouletas2020/table_6_3": (
+        *("autopilot={runs}/autopilot_nomoto", "spread.flights=2", "protocols=[enter]"),
+        *("dt=0.1 s", "line_of_sight=[{kind: lookahead, distance: 17 m}]"),
     ),
-    "studies/gouletas2020/heading_nomoto": Short(
-        (
-            "predictive={mlp_printed: {horizon: 0.01 s, training: {states: 300, epochs: 5}},"
-            " mlp_3s_linear: {horizon: 3 s, linear: true, training: {states: 300, epochs: 5}}}",
-            *_STEP_TEST,
-        )
+    "studies/gouletas2020/table_6_8": (
+        *("autopilot={runs}/autopilot_patrol", "protocols=[enter]", "duration=300 s"),
+        "line_of_sight=[{kind: lookahead, distance: 123 m}]",
     ),
-    "studies/gouletas2020/heading_patrol": Short(
-        (
-            "predictive={mlp_10s: {horizon: 10 s, hidden: [30],"
-            " training: {states: 300, epochs: 5}}}",
-            "test.plants=2",
-            "test.dt=0.25 s",
-            "test.duration=30 s",
-        )
+    "studies/halvorsen2019/force_equations": (GENETIC,),
+    "studies/halvorsen2019/jet_equations": (GENETIC,),
+    "studies/halvorsen2019/table_5_2": (
+        *("rows.values=[2]", "columns.values=[5]", "~published", "~published_error"),
     ),
-    "studies/gouletas2020/table_6_3": Short(
-        (
-            "autopilot={runs}/autopilot_nomoto",
-            "spread.flights=2",
-            "protocols=[enter]",
-            "dt=0.1 s",
-            "line_of_sight=[{kind: lookahead, distance: 17 m}]",
-        ),
-        after="autopilot_nomoto",
+    "studies/halvorsen2019/table_5_3": ONE_CELL,
+    "studies/halvorsen2019/table_5_3_small": ONE_CELL,
+    "studies/halvorsen2019/delay": ("rows.values=[none]", "columns.values=[0.0, 0.5]"),
+    "studies/halvorsen2019/standard_model": (
+        "~trials.planing",
+        *(f"trials.{name}.programme={FEW}" for name in ("standard", "calm")),
     ),
-    "studies/gouletas2020/table_6_8": Short(
-        (
-            "autopilot={runs}/autopilot_patrol",
-            "protocols=[enter]",
-            "duration=300 s",
-            "line_of_sight=[{kind: lookahead, distance: 123 m}]",
-        ),
-        after="autopilot_patrol",
+    "studies/jervan2020/measured": ("validation.folds=2",),
+    "studies/moreno2019/moreno2019": (
+        *("heads.gptips.evolution.population=30", "heads.gptips.evolution.generations=2"),
+        "evaluation.splits=[train, validation, test]",
     ),
-    "studies/halvorsen2019/force_equations": Short(
-        ("heads.genetic.evolution={population: 30, generations: 2}",)
+    "studies/woo2018/outside_terms": (
+        "data.trials=[{kind: zigzag, count: 6, heading: [10 deg], steer: [0.15, 0.9],"
+        " drive: [1.0, 1.0]}]",
+        "data.identification={zigzag: 5}",
+        "data.validation={zigzag: 1}",
     ),
-    "studies/halvorsen2019/jet_equations": Short(
-        ("heads.genetic.evolution={population: 30, generations: 2}",)
-    ),
-    "studies/halvorsen2019/noise": Short(("repeats=1",)),
-    "studies/halvorsen2019/table_5_2": Short(
-        ("repeats=1", "rows.values=[2]", "columns.values=[5]", "~published", "~published_error")
-    ),
-    "studies/halvorsen2019/table_5_3": Short(
-        ("repeats=1", "rows.values=[0.2]", "columns.values=[0.2]", "~published")
-    ),
-    "studies/halvorsen2019/table_5_3_small": Short(
-        ("repeats=1", "rows.values=[0.2]", "columns.values=[0.2]", "~published")
-    ),
-    "studies/halvorsen2019/delay": Short(
-        ("repeats=1", "rows.values=[none]", "columns.values=[0.0, 0.5]")
-    ),
-    "studies/halvorsen2019/standard_model": Short(
-        (
-            "~trials.planing",
-            *(
-                f"trials.{name}.programme={{drives: [0.35, 0.55, 0.7, 1.0], steers: [0.3],"
-                " zigzag: 40 s, hold: 10 s, courses: [0.0]}"
-                for name in ("standard", "calm")
-            ),
-        )
-    ),
-    "studies/jervan2020/azimuth": Short(_FERRY),
-    "studies/jervan2020/case": Short(_FERRY),
-    "studies/jervan2020/disturbance": Short(_FERRY),
-    "studies/jervan2020/force_residual": Short(_FERRY),
-    "studies/jervan2020/measured": Short(("validation.folds=2",), data="milliampere"),
-    "studies/jervan2020/noise": Short(_FERRY),
-    "studies/jervan2020/operation": Short(_FERRY),
-    "studies/jervan2020/update": Short(_FERRY),
-    "studies/jervan2020/zigzag": Short(),
-    "studies/moreno2019/moreno2019": Short(
-        (
-            "heads.gptips.evolution.population=30",
-            "heads.gptips.evolution.generations=2",
-            *_COARSE[:2],
-            "bands=null",
-        ),
-        data="esso_osaka",
-    ),
-    "studies/moreno2019/polynomial_wind": Short(("refit={}", *_COARSE), data="esso_osaka"),
-    "studies/woo2018/outside_terms": Short(
-        (
-            "data.trials=[{kind: zigzag, count: 6, heading: [10 deg], steer: [0.15, 0.9],"
-            " drive: [1.0, 1.0]}]",
-            "data.identification={zigzag: 5}",
-            "data.validation={zigzag: 1}",
-            *_trained("mlp", "lstm"),
-        )
-    ),
-    "studies/woo2018/thrusters": Short(),
-    "studies/woo2018/woo2018": Short((*_TRIALS, *_trained("lstm_printed", "lstm_rate", "lstm"))),
+}
+AFTER = {
+    "autopilot_patrol_learned": "patrol_identified",
+    "studies/gouletas2020/table_6_3": "autopilot_nomoto",
+    "studies/gouletas2020/table_6_8": "autopilot_patrol",
 }
 
 
@@ -371,25 +231,24 @@ def shipped() -> list[str]:
     return sorted(path.relative_to(CONFIGS).with_suffix("").as_posix() for path in files)
 
 
-@dataclass(frozen=True)
-class Result:
-    """How the short run of a config ended.
+def short(name: str) -> Short:
+    """Return how a config is shortened."""
+    file = CONFIGS / f"{name}.yaml"
+    content = load_mapping(file)
+    base = file.parent / content["base"] if "base" in content else file
+    needs = re.search(r"\$\{RESIDNET_DATA\}/(\w+)", base.read_text(encoding="utf-8"))
+    overrides = (*general(content), *OWN.get(name, ()))
+    return Short(overrides, needs[1] if needs else "", AFTER.get(name, ""))
 
-    Attributes:
-        name: of the config.
-        state: `ok`, `skipped` or `FAILED`.
-        seconds: that it took.
-        words: why.
-    """
 
-    name: str
+SHORT = {name: short(name) for name in shipped()}
+
+
+class Result(NamedTuple):
+    """How the short run of a config ended: `ok`, `skipped` or `FAILED`, and why."""
+
     state: str
-    seconds: float
     words: str = ""
-
-    def line(self) -> str:
-        """Return a line for the log."""
-        return f"{self.state:8s} {self.seconds:6.1f} s  {self.name}  {self.words}".rstrip()
 
 
 def carry_out(name: str, runs: Path) -> Result:
@@ -397,38 +256,41 @@ def carry_out(name: str, runs: Path) -> Result:
 
     The run is a fork of this process, which has the libraries loaded: ten seconds less each.
     """
-    short = SHORT[name]
-    if short.data and not (Path(os.environ.get("RESIDNET_DATA", "")) / short.data).is_dir():
-        return Result(name, "skipped", 0.0, f"no RESIDNET_DATA/{short.data}")
-    runs.mkdir(parents=True, exist_ok=True)
+    one, started = SHORT[name], time.monotonic()
     folder = runs / name.replace("/", "_")
-    command = ["residnet", "run", str(CONFIGS / f"{name}.yaml"), "--out", str(folder)]
-    for override in short.overrides:
-        command += ["-s", override.replace("{runs}", str(runs))]
+    if one.data and not (Path(os.environ.get("RESIDNET_DATA", "")) / one.data).is_dir():
+        result = Result("skipped", f"no RESIDNET_DATA/{one.data}")
+    else:
+        runs.mkdir(parents=True, exist_ok=True)
+        command = ["residnet", "run", str(CONFIGS / f"{name}.yaml"), "--out", str(folder)]
+        for override in one.overrides:
+            command += ["-s", override.replace("{runs}", str(runs))]
+        result = forked(command, folder)
+    seconds = time.monotonic() - started
+    print(f"{result.state:8s} {seconds:6.1f} s  {name}  {result.words}".rstrip(), flush=True)
+    return result
+
+
+def forked(command: list[str], folder: Path) -> Result:
+    """Carry out a command line in a fork; return how it ended, and why."""
     said = folder.with_suffix(".txt")
-    started = time.monotonic()
-    process = multiprocessing.get_context("fork").Process(target=_command, args=(command, said))
+    process = multiprocessing.get_context("fork").Process(target=spoken, args=(command, said))
     process.start()
     process.join(LIMIT)
-    seconds = time.monotonic() - started
     if process.is_alive():
         process.kill()
-        return Result(name, "FAILED", seconds, f"not done after {LIMIT} s")
+        return Result("FAILED", f"not done after {LIMIT} s")
     if process.exitcode:
         last = (said.read_text().strip().splitlines() or [""])[-1]
-        return Result(name, "FAILED", seconds, f"exit {process.exitcode}: {last}")
+        return Result("FAILED", f"exit {process.exitcode}: {last}")
     summary = json.loads((folder / "summary.json").read_text())
-    for wrong, words in (
-        (not summary["finished"], "summary.json does not say finished"),
-        (not summary["verdict"], "summary.json has no verdict"),
-        (not (folder / "report.html").is_file(), "no report.html"),
-    ):
-        if wrong:
-            return Result(name, "FAILED", seconds, words)
-    return Result(name, "ok", seconds)
+    if not summary["finished"] or not summary["verdict"]:
+        return Result("FAILED", "summary.json does not say finished, or has no verdict")
+    page = (folder / "report.html").is_file()
+    return Result("ok") if page else Result("FAILED", "no report.html")
 
 
-def _command(command: list[str], said: Path) -> None:
+def spoken(command: list[str], said: Path) -> None:
     """Carry out a command line in this process, its output in a file."""
     from residnet.__main__ import main
 
@@ -447,54 +309,31 @@ def _command(command: list[str], said: Path) -> None:
     os._exit(code if isinstance(code, int) else 0)
 
 
-def carry_out_all(names: list[str], runs: Path, jobs: int) -> list[Result]:
-    """Run configs side by side; one that uses another's run waits for it."""
-    results: dict[str, Future[Result]] = {}
-    lock = threading.Lock()
-
-    def run(name: str) -> Result:
-        before = SHORT[name].after
-        result = (
-            Result(name, "FAILED", 0.0, f"{before} failed")
-            if before and results[before].result().state == "FAILED"
-            else carry_out(name, runs)
-        )
-        with lock:
-            print(result.line(), flush=True)
-        return result
-
-    # what others wait for comes first, so that waiting never blocks all jobs
-    wanted = {*names, *(SHORT[name].after for name in names if SHORT[name].after)}
-    order = sorted(wanted, key=lambda name: (bool(SHORT[name].after), name))
-    with ThreadPoolExecutor(jobs) as pool:
-        for name in order:
-            results[name] = pool.submit(run, name)
-    return [result.result() for result in results.values()]
-
-
 def main() -> int:
-    """Run the named configs, or all; return how many failed."""
+    """Run the named configs, or all; return 1 where one failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", help="configs below configs/, without suffix")
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
     parser.add_argument("--out", type=Path, help="folder for the runs; a temporary one otherwise")
     given = parser.parse_args()
-    rowless = sorted(set(shipped()) - set(SHORT))
-    stale = sorted(set(SHORT) - set(shipped()))
-    for name in rowless:
-        print(f"FAILED   configs/{name}.yaml has no row in {Path(__file__).name}")
-    for name in stale:
-        print(f"FAILED   the row '{name}' names no config")
+    if stale := sorted({*OWN, *AFTER} - set(SHORT)):
+        raise SystemExit(f"{Path(__file__).name} names what is no config: {', '.join(stale)}")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     import lightning  # noqa: F401  (every run that trains loads it; forks have it already)
 
     import residnet.tasks.registry  # noqa: F401
 
     started = time.monotonic()
-    with tempfile.TemporaryDirectory() as temporary:
+    wanted = set(given.names or SHORT)
+    wanted |= {SHORT[name].after for name in wanted if SHORT[name].after}
+    results: list[Result] = []
+    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(given.jobs) as pool:
         runs = given.out or Path(temporary)
-        results = carry_out_all(given.names or sorted(set(SHORT) - set(stale)), runs, given.jobs)
-    failed = len(rowless) + len(stale) + sum(result.state == "FAILED" for result in results)
+        # those whose runs others use come first
+        for later in (False, True):
+            names = sorted(name for name in wanted if bool(SHORT[name].after) == later)
+            results += pool.map(lambda name: carry_out(name, runs), names)
+    failed = sum(result.state == "FAILED" for result in results)
     skipped = sum(result.state == "skipped" for result in results)
     print(
         f"{len(results)} configs: {failed} failed, {skipped} skipped for want of data,"

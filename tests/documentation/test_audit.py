@@ -75,7 +75,7 @@ def test_the_command_exists(command: str) -> None:
         assert (ROOT / words[1]).is_file(), command
     elif program == "python":
         source = (ROOT / words[0]).read_text(encoding="utf-8")
-        named = [f'"{word}"' for word in words[1:] if word.startswith("--")]
+        named = [f"{word[2:]}=" for word in words[1:] if word.startswith("--")]
         if "--parts" in words:
             named += [f'"{part}": ' for part in words[words.index("--parts") + 1].split(",")]
         assert [name for name in named if name not in source] == [], command

@@ -22,8 +22,8 @@ def test_every_figure_names_a_source_that_exists() -> None:
         assert file == "stdout" or file.endswith(".json"), where
         assert len(rest) in (1, 2, 3), where
         assert not rest[1:] or re.fullmatch(r"deg|x[0-9.e-]+", rest[1]), where
-    for source in results.SOURCES.values():
-        assert (ROOT / source.command[0]).is_file(), source.command
+    for command in results.SOURCES.values():
+        assert (ROOT / command[0]).is_file(), command
 
 
 def test_figures_are_read_from_runs_and_put_into_pages(tmp_path: Path) -> None:
@@ -42,34 +42,22 @@ def test_figures_are_read_from_runs_and_put_into_pages(tmp_path: Path) -> None:
         results.figure("quickstart metrics.json rows[model=c].value", tmp_path)
 
 
-def test_what_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
-    source = results.SOURCES["tanker"]
-    assert "needs esso_osaka/" in results.why_not(source, 1000)
-    (tmp_path / "esso_osaka").mkdir()
-    assert results.why_not(source, 1000) == ""
-    assert results.why_not(source, 1).startswith("takes 9 minutes")
-
-
 def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    minutes = {"good": 1, "bad": 2, "long": 99, "other": 1}
-    lines = [f"<!--= {name} stdout took\\s(\\d+) -->old<!--/-->" for name in minutes]
+    made = {name: (str(tmp_path / f"{name}.py"), "7") for name in ("good", "bad", "long", "other")}
+    lines = [f"<!--= {name} stdout took\\s(\\d+) -->old<!--/-->" for name in made]
     page, good = tmp_path / "page.md", tmp_path / "good.py"
     page.write_text("\n".join(lines))
     good.write_text("import sys; print('took', sys.argv[1])")
     (tmp_path / "bad.py").write_text("raise SystemExit('no such luck')")
-    made = {
-        name: results.Source((str(tmp_path / f"{name}.py"), "7"), least)
-        for name, least in minutes.items()
-    }
+    (tmp_path / "long.py").write_text("import time; time.sleep(60)")
     monkeypatch.setattr(results, "pages", lambda: [page])
     monkeypatch.setattr(results, "SOURCES", made)
     monkeypatch.setattr(results, "state", lambda: "now")
     monkeypatch.setattr(results, "git", lambda *words: "abc")
     call = ["results.py", "--runs", str(tmp_path / "runs"), "--only", "good,bad,long"]
-    monkeypatch.setattr(sys, "argv", call)
+    monkeypatch.setattr(sys, "argv", [*call, "--minutes", "0.03"])
 
     def said() -> str:
         results.main()
@@ -80,13 +68,14 @@ def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
     for words in (
         "1 figures changed; those that were run are of commit abc.",
         "not run: bad: failed: no such luck",
-        "not run: long: takes 99 minutes",
+        "not run: long: takes longer than 0.03 minutes",
         "not run: other: not asked for",
     ):
         assert words in told
     # what is finished is not run again, unless its command or its source is another one
+    monkeypatch.setattr(sys, "argv", [*call[:-1], "good"])
     assert "running good" not in said()
-    made["good"] = results.Source((str(good), "8"), 1)
+    made["good"] = (str(good), "8")
     said()
     assert next(text for _, text in results.marks(page)) == "8"
     good.write_text("print('took long')")
