@@ -132,6 +132,7 @@ TORPEDO = (
     *("~peers.pd", "~peers.lqr"),
 )
 GENETIC = "heads.genetic.evolution={population: 30, generations: 2}"
+ALL_SPLITS = "evaluation.splits=[train, validation, test]"
 PHYSICS = "baselines.physics={kind: regressors, terms: [u, v, r, n]}"
 HEAD = "heads={mlp: {kind: mlp, hidden: [8]}}"
 STEPS = ("~training.lstm", *keys("training.mlp", EPOCH))
@@ -150,7 +151,7 @@ OWN: dict[str, tuple[str, ...]] = {
     ),
     "kvlcc2": (
         "refit.mmg={horizon: 20 s, every: 40 s, prior: 0, robust: 0.3, iterations: 2}",
-        "booklet.draws=20",
+        *("booklet.draws=20", ALL_SPLITS),
     ),
     **dict.fromkeys(("esso_osaka", "esso_osaka_no_wind"), (PHYSICS,)),
     "esso_osaka_standard": (
@@ -209,7 +210,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "studies/jervan2020/measured": ("validation.folds=2",),
     "studies/moreno2019/moreno2019": (
         *("heads.gptips.evolution.population=30", "heads.gptips.evolution.generations=2"),
-        "evaluation.splits=[train, validation, test]",
+        ALL_SPLITS,
     ),
     "studies/woo2018/outside_terms": (
         "data.trials=[{kind: zigzag, count: 6, heading: [10 deg], steer: [0.15, 0.9],"
