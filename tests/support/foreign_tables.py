@@ -61,7 +61,6 @@ class Style:
         decimal: sign of the decimals.
         dates: format of local dates in place of seconds; empty for seconds.
         encoding: of the text.
-        wrapped: whether the heading lies between 0 and 360 degrees.
         left_out: channels that are not written.
     """
 
@@ -73,7 +72,6 @@ class Style:
     decimal: str = "."
     dates: str = ""
     encoding: str = "utf-8"
-    wrapped: bool = True
     left_out: Sequence[str] = ()
 
 
@@ -92,7 +90,7 @@ def write(logs: Sequence[Log], folder: Path, style: Style) -> list[Path]:
                 continue
             unit = style.units.get(channel, SI.get(channel, "1/s"))
             values = log[channel] * FACTORS[unit] * (-1.0 if channel in style.signs else 1.0)
-            if channel == "psi" and style.wrapped:
+            if channel == "psi":
                 values = np.remainder(values, 2.0 * np.pi * FACTORS[unit])
             table[names[channel] + (f" [{unit}]" if style.told else "")] = values
         file = folder / f"{log.name}.csv"
