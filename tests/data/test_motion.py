@@ -156,14 +156,6 @@ def test_velocities_without_a_pose_make_one_from_the_origin(lacking: tuple[str, 
         np.testing.assert_array_equal(log[name], TRUTH[name])
 
 
-def test_a_fit_is_prepared_from_velocities_alone() -> None:
-    channels = {name: TRUTH[name] for name in ("u", "v", "r", "delta")}
-    config = PrepareConfig(grid=GridConfig(step=0.1))
-    prepared = prepare(TRUTH.replace(channels=channels), "train", ("delta",), config)
-    assert prepared.usable.all()
-    np.testing.assert_array_equal(prepared.y[:, 3], TRUTH["u"])
-
-
 @pytest.mark.parametrize("lost", [("w",), ("p", "q"), ("u", "v", "w", "p", "q", "r")])
 def test_what_was_not_measured_under_water_follows_from_attitude_and_depth(
     lost: tuple[str, ...],

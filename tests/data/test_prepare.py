@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-import torch
 
-from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.prepare import PrepareConfig, Prepared, prepare, samples
@@ -79,16 +77,6 @@ def test_a_channel_that_nothing_uses_changes_nothing(kind: str, step: float) -> 
     assert alone.good.sum() > 100
     for name in ("y", "smooth", "nu_dot", "w", "piece", "usable", "good"):
         np.testing.assert_array_equal(getattr(alone, name), getattr(beside, name))
-
-
-def test_windows_begin_where_told() -> None:
-    logs = [made("start"), made("start", broken=True)]
-    store = WindowStore.gather(logs)
-    rows = store.beginnings(20, 5)
-    assert torch.equal(rows, torch.tensor([5, 65, 96]))
-    assert torch.equal(store.depth[rows], torch.full((3,), 5))
-    with pytest.raises(DataError, match="beginning"):
-        store.beginnings(60, 5)
 
 
 @pytest.mark.parametrize("kind", ["hampel", "outlier"])

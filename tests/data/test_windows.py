@@ -10,6 +10,7 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
+from made_logs import random_runs
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
@@ -19,23 +20,17 @@ from residnet.data.prepare import Prepared
 from residnet.data.windows import WindowBatches, WindowStage, WindowStore
 
 
-def runs(count: int, random: np.random.Generator, mean: float) -> np.ndarray:
-    """[T] bool in runs of random length."""
-    flips = random.random(count) < 1.0 / mean
-    return np.asarray(np.cumsum(flips) % 2 == 0)
-
-
 def broken_log(seed: int, count: int) -> Prepared:
     """Random numbers in stretches; the second stretch follows the first at once, so that only the
     label tells them apart.
     """
     random = np.random.default_rng(seed)
     piece = np.cumsum(random.random(count) < 0.04)
-    piece = np.where(runs(count, random, 25.0), piece, -1)
+    piece = np.where(random_runs(count, random, 25.0), piece, -1)
     y, w = random.normal(size=(count, 6)), random.normal(size=(count, 2))
     y[piece < 0, 3] = np.nan
     y[0] = 1.0
-    usable = runs(count, random, 12.0) & (piece >= 0)
+    usable = random_runs(count, random, 12.0) & (piece >= 0)
     good = usable & (random.random(count) < 0.8)
     log = Log(
         f"log_{seed}", 0.1 * np.arange(count), {name: y[:, i] for i, name in enumerate(STATE)}

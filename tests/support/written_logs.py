@@ -15,7 +15,6 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from scipy.io import savemat
 
-from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers.base import CanonicalConfig, LogReader
@@ -67,30 +66,28 @@ def two_files(log: Log, folder: Path) -> Path:
 def csv(log: Log, folder: Path) -> Path:
     """A table with every digit."""
     path = folder / "trial.csv"
-    pd.DataFrame({"t": log.t, **log.channels}).to_csv(path, index=False, float_format="%.17g")
+    _table(log).to_csv(path, index=False, float_format="%.17g")
     return path
 
 
 def parquet(log: Log, folder: Path) -> Path:
     """A foreign table."""
     path = folder / "trial.parquet"
-    pd.DataFrame({"t": log.t, **log.channels}).to_parquet(path)
+    _table(log).to_parquet(path)
     return path
 
 
 def json_lines(log: Log, folder: Path) -> Path:
     """An object a line."""
     path = folder / "trial.jsonl"
-    pd.DataFrame({"t": log.t, **log.channels}).to_json(
-        path, orient="records", lines=True, double_precision=15
-    )
+    _table(log).to_json(path, orient="records", lines=True, double_precision=15)
     return path
 
 
 def excel(log: Log, folder: Path) -> Path:
     """The first sheet of an Excel file."""
     path = folder / "trial.xlsx"
-    pd.DataFrame({"t": log.t, **log.channels}).to_excel(path, index=False)
+    _table(log).to_excel(path, index=False)
     return path
 
 
@@ -110,9 +107,8 @@ def mat73(log: Log, folder: Path) -> Path:
         group = file.create_group("trial")
         group.attrs["MATLAB_class"] = np.bytes_("struct")
         for name, values in {"t": log.t, **log.channels}.items():
-            group.create_dataset(name, data=values[None, :]).attrs["MATLAB_class"] = np.bytes_(
-                "double"
-            )
+            made = group.create_dataset(name, data=values[None, :])
+            made.attrs["MATLAB_class"] = np.bytes_("double")
     with path.open("r+b") as stream:
         stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
     return path
@@ -131,9 +127,7 @@ def hdf5_table(log: Log, folder: Path) -> Path:
     """One table of named columns."""
     path = folder / "trial.hdf5"
     with h5py.File(path, "w") as file:
-        file.create_dataset(
-            "table", data=pd.DataFrame({"t": log.t, **log.channels}).to_records(index=False)
-        )
+        file.create_dataset("table", data=_table(log).to_records(index=False))
     return path
 
 
@@ -142,44 +136,27 @@ def topics(log: Log, folder: Path) -> Path:
     path = folder / "trial"
     path.mkdir()
     ns = _stamps(log)
-    stamp = {"header_stamp_secs": ns // 10**9, "header_stamp_nsecs": ns % 10**9}
-    late = ns + 7200 * 10**9 + 1_000_000
-    time = [
-        f"{pd.Timestamp(int(s), unit='s'):%Y/%m/%d %H:%M:%S}.{int(rest)}"
-        for s, rest in zip(late // 10**9, late % 10**9, strict=True)
-    ]
-    pose = {
-        f"pose_pose_position_{k}": v
-        for k, v in zip("xyz", (log["y"], log["x"], 0.0 * log["x"]), strict=True)
-    }
-    pose |= {f"pose_pose_orientation_{k}": v for k, v in zip("xyzw", _quaternion(log), strict=True)}
-    twist = {
-        "twist_twist_linear_x": log["u"],
-        "twist_twist_linear_y": -log["v"],
-        "twist_twist_angular_z": -log["r"],
-    }
-    pd.DataFrame({"time": time, **stamp, **pose, **twist}).to_csv(
-        path / "odometry.csv", index=False, float_format="%.17g"
-    )
-    for name in COMMANDS:
-        pd.DataFrame({"time": time, **stamp, "data": log[name]}).to_csv(
-            path / f"{name}.csv", index=False, float_format="%.17g"
-        )
+    late = (ns + 7200 * 10**9 + 1_000_000).tolist()
+    time = [f"{pd.Timestamp(s // 10**9, unit='s'):%Y/%m/%d %H:%M:%S}.{s % 10**9}" for s in late]
+    about = {"time": time, "header_stamp_secs": ns // 10**9, "header_stamp_nsecs": ns % 10**9}
+    place = dict(zip("xyz", (log["y"], log["x"], 0.0 * log["x"]), strict=True))
+    odometry = {f"pose_pose_position_{axis}": values for axis, values in place.items()}
+    for part, values in zip("xyzw", _quaternion(log), strict=True):
+        odometry[f"pose_pose_orientation_{part}"] = values
+    odometry |= {"twist_twist_linear_x": log["u"], "twist_twist_linear_y": -log["v"]}
+    odometry |= {"twist_twist_angular_z": -log["r"]}
+    tables = {"odometry": odometry, **{name: {"data": log[name]} for name in COMMANDS}}
+    for name, columns in tables.items():
+        table = pd.DataFrame({**about, **columns})
+        table.to_csv(path / f"{name}.csv", index=False, float_format="%.17g")
     return path
 
 
 def bag1(log: Log, folder: Path) -> Path:
     """ROS 1 bag."""
-    path = folder / "trial.bag"
-    store = get_typestore(Stores.ROS1_NOETIC)
+    path, store = folder / "trial.bag", get_typestore(Stores.ROS1_NOETIC)
     with Writer1(path) as writer:
-        _messages(
-            log,
-            writer,
-            store,
-            lambda name, kind: writer.add_connection(name, kind, typestore=store),
-            store.serialize_ros1,
-        )
+        _messages(log, writer, store, store.serialize_ros1)
     return path
 
 
@@ -202,53 +179,40 @@ def mcap(log: Log, folder: Path) -> Path:
 def _bag2(log: Log, path: Path, plugin: StoragePlugin) -> Path:
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer2(path, version=9, storage_plugin=plugin) as writer:
-        _messages(
-            log,
-            writer,
-            store,
-            lambda name, kind: writer.add_connection(name, kind, typestore=store),
-            store.serialize_cdr,
-        )
+        _messages(log, writer, store, store.serialize_cdr)
     return path
 
 
-def _messages(
-    log: Log,
-    writer: Any,
-    store: Any,
-    connect: Callable[[str, str], Any],
-    serialize: Callable[[Any, str], Any],
-) -> None:
+def _messages(log: Log, writer: Any, store: Any, serialize: Callable[[Any, str], Any]) -> None:
     """Odometry by REP-103 with header stamps, commands as std_msgs/Float64 at the arrival of the
     odometry.
     """
     odometry, number = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
-    types = store.types
-    pose = connect("/odometry", odometry)
-    commands = {name: connect(f"/{name}", number) for name in COMMANDS}
-    ns = _stamps(log)
+    kinds = {"odometry": odometry, **dict.fromkeys(COMMANDS, number)}
+    to = {n: writer.add_connection(f"/{n}", kind, typestore=store) for n, kind in kinds.items()}
+    types = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
     qx, qy, qz, qw = _quaternion(log)
-    vector, none = types["geometry_msgs/msg/Vector3"], np.zeros(36)
-    header_type = types["std_msgs/msg/Header"]
-    for i, at in enumerate(ns.tolist()):
-        time = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
-        extra = {"seq": i} if "seq" in header_type.__dataclass_fields__ else {}
-        point = types["geometry_msgs/msg/Point"](x=log["y"][i], y=log["x"][i], z=0.0)
-        turned = types["geometry_msgs/msg/Quaternion"](x=qx[i], y=qy[i], z=qz[i], w=qw[i])
-        twist = types["geometry_msgs/msg/Twist"](
-            linear=vector(log["u"][i], -log["v"][i], 0.0), angular=vector(0.0, 0.0, -log["r"][i])
-        )
-        message = types[odometry](
-            header=header_type(stamp=time, frame_id="odom", **extra),
+    vector, none, clock = types["Vector3"], np.zeros(36), store.types["builtin_interfaces/msg/Time"]
+    for i, at in enumerate(_stamps(log).tolist()):
+        time = clock(sec=at // 10**9, nanosec=at % 10**9)
+        extra = {"seq": i} if "seq" in types["Header"].__dataclass_fields__ else {}
+        point = types["Point"](x=log["y"][i], y=log["x"][i], z=0.0)
+        turned = types["Quaternion"](x=qx[i], y=qy[i], z=qz[i], w=qw[i])
+        moved = vector(log["u"][i], -log["v"][i], 0.0), vector(0.0, 0.0, -log["r"][i])
+        message = types["Odometry"](
+            header=types["Header"](stamp=time, frame_id="odom", **extra),
             child_frame_id="base_link",
-            pose=types["geometry_msgs/msg/PoseWithCovariance"](
-                types["geometry_msgs/msg/Pose"](point, turned), none
-            ),
-            twist=types["geometry_msgs/msg/TwistWithCovariance"](twist, none),
+            pose=types["PoseWithCovariance"](types["Pose"](point, turned), none),
+            twist=types["TwistWithCovariance"](types["Twist"](*moved), none),
         )
-        writer.write(pose, at, serialize(message, odometry))
-        for name, connection in commands.items():
-            writer.write(connection, at, serialize(types[number](data=log[name][i]), number))
+        writer.write(to["odometry"], at, serialize(message, odometry))
+        for name in COMMANDS:
+            told = store.types[number](data=log[name][i])
+            writer.write(to[name], at, serialize(told, number))
+
+
+def _table(log: Log) -> pd.DataFrame:
+    return pd.DataFrame({"t": log.t, **log.channels})
 
 
 def _stamps(log: Log) -> np.ndarray:
@@ -270,14 +234,3 @@ def reader_for(path: Path) -> LogReader:
 def recording_for(path: Path) -> Recording:
     """All that a file or folder holds, its clocks settled, before it becomes a log."""
     return align_clocks(AutoConfig().load(path, EVERYTHING), {}, None)
-
-
-def outcome(path: Path) -> str | None:
-    """What reading ends in: None for a log, else the error's text; anything but residnet's own
-    errors passes through.
-    """
-    try:
-        reader_for(path).read(path)
-    except (UsageError, DataError) as error:
-        return str(error)
-    return None
