@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,48 +31,37 @@ def made(noise: float = 0.0, count: int = 600, groups: int = 12, seed: int = 0) 
     rng = np.random.default_rng(seed)
     z = rng.normal(size=(count, 5)) * [0.3, 0.05, 0.05, 3.0, 0.3] + [0.6, 0, 0, 8, 0]
     u, v, r, n, delta = z.T
-    target = np.stack(
-        (
-            (-u + LAGS["K_u"] * n + LAGS["b_u"]) / LAGS["T_u"],
-            (-v - SLIP["K_beta"] * u * r + SLIP["b_beta"] * u) / SLIP["T_beta"],
-            (-r + LAGS["K"] * delta + LAGS["b"]) / LAGS["T"],
-        ),
-        axis=1,
-    )
+    surge = (-u + LAGS["K_u"] * n + LAGS["b_u"]) / LAGS["T_u"]
+    sway = (-v - SLIP["K_beta"] * u * r + SLIP["b_beta"] * u) / SLIP["T_beta"]
+    yaw = (-r + LAGS["K"] * delta + LAGS["b"]) / LAGS["T"]
+    target = np.stack((surge, sway, yaw), axis=1)
     target += noise * rng.normal(size=target.shape) * [0.05, 0.02, 0.02]
     return sampled(z, target, NAMES, groups=groups)
 
 
-def test_parameters_of_known_lags_are_exact() -> None:
-    config = NomotoSideslipConfig()
-    found = {
-        c.term: c.value for c in config.fit(config.build(NAMES), made()) if c.ratio is not None
-    }
-    assert found == pytest.approx(LAGS | SLIP, rel=1e-9)
-    config2 = NomotoConfig()
-    found = {
-        c.term: c.value for c in config2.fit(config2.build(NAMES), made()) if c.ratio is not None
-    }
-    assert found == pytest.approx(LAGS, rel=1e-9)
+def parameters(config: Any, samples: Samples) -> dict[str, Any]:
+    table = config.fit(config.build(samples.names), samples)
+    return {entry.term: entry for entry in table if entry.ratio is not None}
+
+
+@pytest.mark.parametrize(
+    ("config", "truth"), [(NomotoSideslipConfig(), LAGS | SLIP), (NomotoConfig(), LAGS)]
+)
+def test_parameters_of_known_lags_are_exact(config: Any, truth: dict[str, float]) -> None:
+    found = {name: entry.value for name, entry in parameters(config, made()).items()}
+    assert found == pytest.approx(truth, rel=1e-9)
 
 
 def test_errors_of_parameters_are_their_spread() -> None:
     """T, K and b of many repetitions spread as the standard errors of one say: ratios need the
     coefficients' covariance.
     """
-    config = NomotoSideslipConfig()
-    baseline = config.build(NAMES)
     runs = [
-        {
-            c.term: (c.value, c.error)
-            for c in config.fit(baseline, made(1.0, seed=seed, groups=40))
-            if c.ratio is not None
-        }
-        for seed in range(60)
+        parameters(NomotoSideslipConfig(), made(1.0, seed=seed, groups=40)) for seed in range(60)
     ]
     for name in LAGS | SLIP:
-        values = np.array([run[name][0] for run in runs])
-        claimed = np.sqrt(np.mean([run[name][1] ** 2 for run in runs]))
+        values = np.array([run[name].value for run in runs])
+        claimed = np.sqrt(np.mean([run[name].error ** 2 for run in runs]))
         assert 0.7 < claimed / values.std() < 1.4, name
 
 
@@ -116,10 +106,8 @@ def test_a_refit_may_not_move_what_nothing_determines() -> None:
     unexplained.
     """
     baseline = NomotoConfig().build(NAMES)
-    movable = {
-        (int(i) // baseline.library.count, baseline.library.terms[int(i) % baseline.library.count])
-        for i in baseline.free_indices()
-    }
+    terms, size = baseline.library.terms, baseline.library.count
+    movable = {(i // size, terms[i % size]) for i in baseline.free_indices().tolist()}
     assert movable == {(0, "u"), (0, "n"), (0, "1"), (2, "r"), (2, "delta"), (2, "1")}
     assert len(NomotoSideslipConfig().build(NAMES).free_indices()) == 9
 
@@ -145,22 +133,20 @@ def test_parameters_follow_moved_coefficients() -> None:
 
 
 def test_other_channels_and_manoeuvres() -> None:
-    samples = made()
-    renamed = dataclasses.replace(
-        samples, names=("u", "v", "r", "tau_x", "tau_n"), kinds=("turning", "zigzag") * 6
-    )
-    spoiled = renamed.target.clone()
+    names = ("u", "v", "r", "tau_x", "tau_n")
+    samples = dataclasses.replace(made(), names=names, kinds=("turning", "zigzag") * 6)
+    spoiled = samples.target.clone()
     spoiled[samples.group % 2 == 0] = 99.0
     config = NomotoConfig(drive="tau_x", steer="tau_n", manoeuvres=("zigzag",))
-    table = config.fit(config.build(renamed.names), renamed.with_target(spoiled))
-    assert {c.term: c.value for c in table if c.ratio is not None} == pytest.approx(LAGS, rel=1e-9)
+    found = parameters(config, samples.with_target(spoiled))
+    assert {name: entry.value for name, entry in found.items()} == pytest.approx(LAGS, rel=1e-9)
 
 
-def test_errors() -> None:
+def test_what_does_not_settle_or_is_not_there_is_an_error() -> None:
     samples = made()
     unstable = samples.target.clone()
     unstable[:, 2] += samples.column("r")
     with pytest.raises(FitError, match="needs r to settle, but r_dot rises with r"):
-        NomotoConfig().fit(NomotoConfig().build(NAMES), samples.with_target(unstable))
+        parameters(NomotoConfig(), samples.with_target(unstable))
     with pytest.raises(FitError, match="turning"):
-        NomotoConfig(manoeuvres=("turning",)).fit(NomotoConfig().build(NAMES), samples)
+        parameters(NomotoConfig(manoeuvres=("turning",)), samples)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +11,12 @@ import sympy
 import torch
 from made_equations import CHANNELS, draw_ship
 from made_odin import FORCE_TRUTH, MSD_TRUTH, force_logs, msd_log
-from made_samples import NAMES, made, sampled
+from made_samples import sampled
 
-from residnet.baselines.given import StillConfig
-from residnet.core.config import validate
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.heads import HeadConfig
+from residnet.dynamics.store import load_model, save_model
 from residnet.heads.genetic import GeneticConfig
-from residnet.physics.signals import SignalsConfig
 from residnet.physics.terms import TermLibrary, parse_term
 from residnet.regression.expressions import (
     Algebra,
@@ -35,6 +29,8 @@ from residnet.regression.expressions import (
     term,
 )
 from residnet.regression.genetic import breed, limits_of
+from residnet.testing import example_samples
+from residnet.testing.checks import example_model, example_spec
 
 FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
 
@@ -52,7 +48,7 @@ def samples(log: dict[str, np.ndarray]) -> Samples:
 def test_force_equations_of_odin() -> None:
     """Document 000 eqs. (6.6)-(6.8)."""
     head = GeneticConfig.model_validate({"evolution": {"population": 1000}}).build(FORCES)
-    data = samples(force_logs(1)[0])
+    data = samples({name: values[::10] for name, values in force_logs(1)[0].items()})
     head.calibrate(data)
     notes = head.solve(data)
     for axis, truth in FORCE_TRUTH.items():
@@ -61,9 +57,6 @@ def test_force_equations_of_odin() -> None:
         assert notes["equations"][axis]["reached_goal"]
         assert notes["equations"][axis]["error_share"] < 1e-10
     assert set(head.names()) == {term for truth in FORCE_TRUTH.values() for term in truth}
-    with torch.no_grad():
-        out = head.sequence(data.z)
-    torch.testing.assert_close(out, data.target, rtol=1e-9, atol=1e-12)
     parts = head.contributions(data.z, 0)
     assert list(parts) == [name for name in head.names() if name in FORCE_TRUTH["u_dot"]]
     np.testing.assert_allclose(sum(parts.values()), data.target[:, 0], rtol=1e-9, atol=1e-12)
@@ -93,13 +86,8 @@ def test_noise_hides_no_equation_that_a_sparse_search_finds(final: bool) -> None
 @pytest.mark.parametrize("final", [True, False])
 def test_mass_spring_damper(final: bool) -> None:
     """Document 000 eq. (5.13); without a final choice the result may hold terms that do nothing."""
-    evolution = {
-        "population": 500,
-        "operators": ["+", "-", "*", "abs"],
-        "tournament": 3,
-        "depth": 7,
-        "split": "sum",
-    }
+    evolution: dict[str, Any] = {"population": 500, "tournament": 3, "depth": 7, "split": "sum"}
+    evolution |= {"operators": ["+", "-", "*", "abs"]}
     config = GeneticConfig.model_validate(
         {"evolution": evolution} | ({} if final else {"final": None})
     )
@@ -116,39 +104,18 @@ def test_mass_spring_damper(final: bool) -> None:
 
 
 def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:
-    signals = SignalsConfig(inputs=("tau_x", "tau_n"))
+    evolution = {"population": 80, "generations": 3}
     config = GeneticConfig.model_validate(
-        {
-            "evolution": {
-                "population": 80,
-                "generations": 3,
-                "operators": ["+", "*", "abs", "sin", "/", "sqrt"],
-            }
-        }
+        {"evolution": evolution | {"operators": ["+", "*", "abs", "sin", "/", "sqrt"]}}
     )
-    head = config.build(NAMES)
-    head.calibrate(made())
-    head.solve(made())
-    model = HybridDynamics(signals.build(), StillConfig().build(NAMES), head, 0.1, "rk4")
-    spec = ModelSpec(
-        name="m",
-        role="head",
-        signals=signals,
-        baseline=StillConfig(),
-        head=validate(config.model_dump(), HeadConfig, "test"),
-        dt=0.1,
-        integrator="rk4",
-        low=(0,) * 5,
-        high=(1,) * 5,
-    )
+    spec = example_spec(config)
+    model: Any = example_model(spec)
     save_model(tmp_path / "m", spec, model)
-    _, loaded = load_model(tmp_path / "m")
-    again: Any = loaded.head
-    z = made().z[:50]
+    again: Any = load_model(tmp_path / "m")[1]
+    z = example_samples().z[:50]
     with torch.no_grad():
-        assert torch.equal(again.sequence(z), head.sequence(z))
-    assert again.names() == head.names()
-    assert json.loads((tmp_path / "m" / "model.json").read_text())["head"]["kind"] == "genetic"
+        assert torch.equal(again.head.sequence(z), model.head.sequence(z))
+    assert again.head.names() == model.head.names()
 
 
 def expression(algebra: Algebra) -> Sum:
@@ -180,9 +147,8 @@ def test_tables_and_writing_say_the_same() -> None:
     wanted = truth(*z.T)
     for module in (library, torch.jit.script(library)):
         with torch.no_grad():
-            np.testing.assert_allclose(
-                module(torch.from_numpy(z)).numpy() @ weights, wanted, rtol=1e-12
-            )
+            found = module(torch.from_numpy(z)).numpy() @ weights
+        np.testing.assert_allclose(found, wanted, rtol=1e-12)
     read, same = library.read(algebra.channels)
     assert [term(read, p) for p in same] == [term(algebra, p) for p in products]
     value = symbolic_sum(algebra, list(zip(products, weights, strict=True)))

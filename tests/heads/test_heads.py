@@ -19,17 +19,13 @@ from residnet.heads.base import ClosedFormHead, Features, ResidualHead
 from residnet.testing.checks import example_model, example_spec
 
 
-@pytest.fixture(params=kinds(HeadConfig))
-def kind(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
 def config_of(kind: str, **settings: Any) -> Any:
     if kind == "genetic":
         pytest.importorskip("deap", reason="genetic programming needs the extra gp")
     return validate({"kind": kind, **HEADS.get(kind, {}), **settings}, HeadConfig, "here")
 
 
+@pytest.mark.parametrize("kind", kinds(HeadConfig))
 def test_features_choose_what_a_head_sees(kind: str) -> None:
     head: ResidualHead = config_of(kind, features=["u", "v", "r"]).build(NAMES)
     head.calibrate(made())
@@ -45,6 +41,7 @@ def test_features_choose_what_a_head_sees(kind: str) -> None:
         config_of(kind, features=["u", "tau_z"]).build(NAMES)
 
 
+@pytest.mark.parametrize("kind", ["mlp", "kernel", "recurrent", "sklearn"])
 def test_a_model_stored_in_single_precision_keeps_its_answers(kind: str, tmp_path: Path) -> None:
     """Training leaves float32 weights; they come back as they were."""
     spec = example_spec(config_of(kind))

@@ -4,6 +4,7 @@ textbook form.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -43,41 +44,34 @@ def standardised(z: torch.Tensor) -> np.ndarray:
     return (kept - own.mean(0)) / own.std(0)
 
 
-@pytest.mark.parametrize("penalty", [1e-5, 1e-3, 1e-1])
-@pytest.mark.parametrize("sigma", [1.0, 10.0, 100.0])
+@pytest.mark.parametrize(("sigma", "penalty"), [(1.0, 1e-3), (10.0, 1e-5), (100.0, 1e-1)])
 def test_radial_basis_functions_equal_scikit_learn(sigma: float, penalty: float) -> None:
     head, notes = fitted(Rbf(sigma=(sigma,)), (penalty,))
-    truth = KernelRidge(kernel="rbf", gamma=1 / (2 * sigma), alpha=penalty * len(SAMPLES)).fit(
-        standardised(SAMPLES.z), SAMPLES.target.numpy()
-    )
-    np.testing.assert_allclose(
-        answer(head, SAMPLES.z), truth.predict(standardised(SAMPLES.z)), atol=1e-10
-    )
-    np.testing.assert_allclose(answer(head, NEW), truth.predict(standardised(NEW)), atol=1e-10)
-    np.testing.assert_allclose(
-        head.kernel.coefficients, truth.dual_coef_, atol=1e-10 * np.abs(truth.dual_coef_).max()
-    )
+    truth = KernelRidge(kernel="rbf", gamma=1 / (2 * sigma), alpha=penalty * len(SAMPLES))
+    check(head, truth)
+    size = np.abs(truth.dual_coef_).max()
+    np.testing.assert_allclose(head.kernel.coefficients, truth.dual_coef_, atol=1e-10 * size)
     gram = rbf_kernel(standardised(SAMPLES.z), gamma=1 / (2 * sigma))
     freedom = np.trace(gram @ np.linalg.inv(gram + penalty * len(SAMPLES) * np.eye(len(SAMPLES))))
     assert notes["effective_parameters"] == pytest.approx([freedom] * 3, rel=1e-8)
 
 
-@pytest.mark.parametrize("penalty", [1e-5, 1e-3, 1e-1])
 @pytest.mark.parametrize(
-    ("degree", "slope", "constant"), [(1, 1.0, 1.0), (2, 1.0, 1.0), (3, 0.5, 2.0), (2, 0.3, 0.0)]
+    ("degree", "slope", "constant", "penalty"),
+    [(1, 1.0, 1.0, 1e-1), (3, 0.5, 2.0, 1e-3), (2, 0.3, 0.0, 1e-5)],
 )
 def test_polynomials_equal_scikit_learn(
     degree: int, slope: float, constant: float, penalty: float
 ) -> None:
     head, _ = fitted(Polynomial(degree=degree, slope=slope, constant=constant), (penalty,))
-    truth = KernelRidge(
-        kernel="poly", degree=degree, gamma=slope, coef0=constant, alpha=penalty * len(SAMPLES)
-    )
+    settings = {"degree": degree, "gamma": slope, "coef0": constant}
+    check(head, KernelRidge(kernel="poly", alpha=penalty * len(SAMPLES), **settings))
+
+
+def check(head: KernelHead, truth: KernelRidge) -> None:
     truth.fit(standardised(SAMPLES.z), SAMPLES.target.numpy())
-    np.testing.assert_allclose(
-        answer(head, SAMPLES.z), truth.predict(standardised(SAMPLES.z)), atol=1e-10
-    )
-    np.testing.assert_allclose(answer(head, NEW), truth.predict(standardised(NEW)), atol=1e-10)
+    for z in (SAMPLES.z, NEW):
+        np.testing.assert_allclose(answer(head, z), truth.predict(standardised(z)), atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -89,53 +83,34 @@ def test_cross_validation_equals_explicit_refits(kernel: Rbf | Polynomial) -> No
     head, notes = fitted(kernel, penalties, folds=4)
     x, y = standardised(SAMPLES.z), SAMPLES.target.numpy()
     fold = np.unique(SAMPLES.group.numpy(), return_inverse=True)[1] % 4
-    whole = {"rbf": refitted_rbf, "polynomial": refitted_polynomial}[kernel.kind]
     for i, found in enumerate(notes["cross_validated_error"]):
         error = np.zeros((3, 3))
         for f in range(4):
+            own, rest = fold == f, fold != f
             for j, penalty in enumerate(penalties):
-                predicted = whole(
-                    head, kernel, i, x[fold != f], y[fold != f], x[fold == f], penalty * len(x)
-                )
-                error[j] += ((predicted - y[fold == f]) ** 2).sum(0)
+                predict = refitted(head, kernel, i, x[rest], y[rest], penalty * len(x))
+                error[j] += ((predict(x[own]) - y[own]) ** 2).sum(0)
         np.testing.assert_allclose(found, error / len(x), rtol=1e-7)
 
 
-def refitted_rbf(
-    head: KernelHead,
-    kernel: Any,
-    setting: int,
-    x: np.ndarray,
-    y: np.ndarray,
-    new: np.ndarray,
-    alpha: float,
-) -> np.ndarray:
+def refitted(
+    head: KernelHead, kernel: Any, setting: int, x: np.ndarray, y: np.ndarray, alpha: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    if isinstance(kernel, Polynomial):
+        poly = KernelRidge(kernel="poly", degree=kernel.degree, gamma=1, coef0=1, alpha=alpha)
+        return poly.fit(x, y).predict  # type: ignore[no-any-return]
     gamma = 1 / (2 * kernel.sigma[setting])
     if len(SAMPLES) <= kernel.exact:
-        ridge = KernelRidge(kernel="rbf", gamma=gamma, alpha=alpha).fit(x, y)
-        return np.asarray(ridge.predict(new))
+        radial = KernelRidge(kernel="rbf", gamma=gamma, alpha=alpha)
+        return radial.fit(x, y).predict  # type: ignore[no-any-return]
     points = head.kernel.points.numpy()  # type: ignore[operator, union-attr]
     wide, own = rbf_kernel(x, points, gamma), rbf_kernel(points, gamma=gamma)
     # min |y - wide c|^2 + alpha c' own c, stacked: the normal equations would lose half the digits
     values, vectors = np.linalg.eigh(own)
     root = np.sqrt(alpha * values.clip(0))[:, None] * vectors.T
-    coefficients = np.linalg.lstsq(
-        np.concatenate((wide, root)), np.concatenate((y, np.zeros((len(points), 3)))), rcond=None
-    )[0]
-    return rbf_kernel(new, points, gamma) @ coefficients  # type: ignore[no-any-return]
-
-
-def refitted_polynomial(
-    head: KernelHead,
-    kernel: Any,
-    setting: int,
-    x: np.ndarray,
-    y: np.ndarray,
-    new: np.ndarray,
-    alpha: float,
-) -> np.ndarray:
-    truth = KernelRidge(kernel="poly", degree=kernel.degree, gamma=1.0, coef0=1.0, alpha=alpha)
-    return truth.fit(x, y).predict(new)  # type: ignore[no-any-return]
+    target = np.concatenate((y, np.zeros((len(points), 3))))
+    coefficients = np.linalg.lstsq(np.concatenate((wide, root)), target, rcond=None)[0]
+    return lambda new: rbf_kernel(new, points, gamma) @ coefficients  # type: ignore[no-any-return]
 
 
 def test_landmarks_that_are_all_samples_give_the_exact_fit() -> None:
@@ -158,23 +133,20 @@ def test_landmarks_lie_apart_and_are_repeatable() -> None:
 
 
 def test_each_axis_takes_its_own_setting_by_one_step_errors() -> None:
-    target = SAMPLES.target.clone()
-    target[:, 1] = torch.randn(
-        len(SAMPLES), generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
-    head = KernelConfig(
-        kernel=Rbf(sigma=(0.3, 30.0)), penalties=(1e-6, 10.0), choose="one_step"
-    ).build(NAMES)
-    head.calibrate(SAMPLES)
-    (only,) = head.solutions(SAMPLES.with_target(target))
-    assert [only.choice["penalty"][0], only.choice["penalty"][1]] == [1e-6, 10.0]
+    target, sigmas, penalties = SAMPLES.target.clone(), (0.3, 30.0), (1e-6, 10.0)
+    noise = torch.Generator().manual_seed(0)
+    target[:, 1] = torch.randn(len(SAMPLES), generator=noise, dtype=torch.float64)
+    head = KernelConfig(kernel=Rbf(sigma=sigmas), penalties=penalties, choose="one_step")
+    built = head.build(NAMES)
+    built.calibrate(SAMPLES)
+    (only,) = built.solutions(SAMPLES.with_target(target))
+    assert only.choice["penalty"][:2] == [1e-6, 10.0]
     assert only.choice["sigma"][0] == 30.0
-    error = torch.tensor(only.notes["cross_validated_error"])
-    for axis in range(3):
-        i, j = (
-            [0.3, 30.0].index(only.choice["sigma"][axis]),
-            [1e-6, 10.0].index(only.choice["penalty"][axis]),
-        )
+    error = np.array(only.notes["cross_validated_error"])
+    for axis, (sigma, penalty) in enumerate(
+        zip(only.choice["sigma"], only.choice["penalty"], strict=True)
+    ):
+        i, j = sigmas.index(sigma), penalties.index(penalty)
         assert error[i, j, axis] == error[..., axis].min()
 
 

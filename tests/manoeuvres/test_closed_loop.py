@@ -12,6 +12,7 @@ from torch import Tensor
 
 from residnet.control.motion import MotionPIDConfig
 from residnet.core.errors import UsageError
+from residnet.core.log import Log
 from residnet.data.simulated import Craft, Disturbance, Sea, SensorNoise, fly
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
@@ -112,14 +113,6 @@ def test_each_row_stops_on_its_own_and_the_loop_when_all_have() -> None:
     assert (torch.sign(w[2, : k + 1, 0]).diff() != 0).sum() == 4
 
 
-def test_what_is_not_reached_does_not_stop() -> None:
-    t = times(300)
-    _, _, stopped, _ = flown(
-        TurningCircle.source([TurningCircle(drive=1, steer=0.01)], HELM, t), 1, 300
-    )
-    assert stopped.tolist() == [-1]
-
-
 def test_pull_out_ends_when_the_yaw_rate_is_steady() -> None:
     """After the turn r decays with T = 3 s; the running mean with the window's time constant
     follows until both are calm.
@@ -168,8 +161,6 @@ def test_spiral_of_a_linear_vessel_has_no_loop() -> None:
     t = times(6000)
     x, w, stopped, _ = flown(Spiral.source([spiral], HELM, t), 1, 6000, Nomoto(offset=2 * DEG))
     assert int(stopped) > 0
-    from residnet.core.log import Log
-
     end = int(stopped) + 1
     channels = {name: x[0, :end, i].numpy() for i, name in enumerate(STATE)}
     channels |= {name: w[0, :end, i].numpy() for i, name in enumerate(HELM.inputs)}
@@ -195,10 +186,8 @@ def test_excitation_keeps_to_its_band_and_amplitude(
     assert 0.18 < np.abs(drive - 0.5).max() <= 0.2 + 1e-12
     assert 0.55 < np.abs(steer).max() <= 0.6 + 1e-12
     for demand in (drive - drive.mean(), steer):
-        power, frequency = (
-            np.abs(np.fft.rfft(demand * np.hanning(t.numel()))) ** 2,
-            np.fft.rfftfreq(t.numel(), dt),
-        )
+        power = np.abs(np.fft.rfft(demand * np.hanning(t.numel()))) ** 2
+        frequency = np.fft.rfftfreq(t.numel(), dt)
         inside = power[(frequency > 0.018) & (frequency < 0.22)].sum() / power.sum()
         # steps have harmonics and a level of their own besides
         assert inside > (0.99 if kind is MultiSine else 0.5)
@@ -224,12 +213,16 @@ def test_a_demand_does_not_depend_on_how_long_it_is_asked_for() -> None:
         assert torch.equal(short[1], long[1][:300])
 
 
-def test_rudder_angles() -> None:
+def test_rudder_angles_and_vessels_that_cannot() -> None:
     circle = TurningCircle(drive=1, rudder=-15 * DEG)
     assert circle.share(HELM) == pytest.approx(-0.5)
     assert circle.side == -1
     with pytest.raises(UsageError, match="goes to 30 deg"):
         TurningCircle(drive=1, rudder=31 * DEG).share(HELM)
+    gains = (1.0, 1.0, 1.0)
+    control = MotionPIDConfig(proportional=gains, integral=gains, derivative=gains)
+    with pytest.raises(UsageError, match="all three"):
+        FourCorner.source([FourCorner(control=control)], HELM, times(2))
 
 
 @pytest.mark.long
@@ -238,23 +231,16 @@ def test_four_corner_course_of_the_ferry(vessel: str) -> None:
     """Gains from the ferry's own mass; it keeps near the filtered poses and comes back to where it
     began.
     """
-    plant = load_vessel(vessel).build()
-    hull: Any = plant.hull
-    mass, omega = hull.mass.diagonal(), torch.tensor([0.26, 0.26, 0.4], dtype=torch.float64)
-    gains = [
-        tuple((part).tolist())
-        for part in (mass * omega**2, 0.1 * mass * omega**3, 2 * mass * omega)
-    ]
-    control = MotionPIDConfig(proportional=gains[0], integral=gains[1], derivative=gains[2])
+    plant: Any = load_vessel(vessel).build()
+    mass, omega = plant.hull.mass.diagonal(), torch.tensor([0.26, 0.26, 0.4], dtype=torch.float64)
+    proportional, integral, derivative = (
+        tuple(part.tolist()) for part in (mass * omega**2, 0.1 * mass * omega**3, 2 * mass * omega)
+    )
+    control = MotionPIDConfig(proportional=proportional, integral=integral, derivative=derivative)
     course = FourCorner(control=control)
     assert course.lasts(10.0) == 720.0
-    craft = Craft(
-        vessel,
-        RecordedPlantDynamics(plant, 0.2, 2),
-        Helm.from_plant(plant),
-        plant.commands,
-        plant.approach(1),
-    )
+    model, helm = RecordedPlantDynamics(plant, 0.2, 2), Helm.from_plant(plant)
+    craft = Craft(vessel, model, helm, plant.commands, plant.approach(1))
     (flight,) = fly(craft, [course], Sea(plant, Disturbance(), SensorNoise(), 0), 10.0, 0.2)
     motion = flight.motion
     assert len(motion) == 3600
@@ -266,5 +252,3 @@ def test_four_corner_course_of_the_ferry(vessel: str) -> None:
         k = (i + 1) * 300 - 1
         assert math.hypot(motion["x"][k] - north, motion["y"][k] - east) < 1.5
         assert motion["psi"][k] == pytest.approx(heading, abs=8 * DEG)
-    with pytest.raises(UsageError, match="all three"):
-        FourCorner.source([course], HELM, times(2))

@@ -1,5 +1,5 @@
 """Manoeuvring indices against closed forms: circles, a sinusoidal heading, Nomoto's exact zigzag;
-IMO's limits.
+IMO's limits; what was steered, read off a log.
 """
 
 from __future__ import annotations
@@ -17,9 +17,17 @@ from residnet.core.log import Log
 from residnet.manoeuvres import indices
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.closed_loop import Spiral, Stopping, TurningCircle, Zigzag
-from residnet.manoeuvres.indices import IN_LENGTHS, UNITS, Track, first_crossing, turning, zigzag
+from residnet.manoeuvres.indices import (
+    IN_LENGTHS,
+    UNITS,
+    Track,
+    first_crossing,
+    steered_zigzag,
+    turning,
+    zigzag,
+)
 
-DEG = math.pi / 180
+DEG, HALF = math.pi / 180, math.pi / 2
 
 
 def motion(
@@ -38,8 +46,7 @@ def thinned(log: Log, every: int) -> Log:
     )
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize("psi0", [0.0, 2.9])
+@pytest.mark.parametrize(("side", "psi0"), [(1.0, 2.9), (-1.0, 0.0)])
 def test_circle(side: float, psi0: float) -> None:
     """Straight on at 2 m/s, then at once a circle of 1.5 m/s with 5 deg of drift: all in closed
     form.
@@ -54,40 +61,27 @@ def test_circle(side: float, psi0: float) -> None:
     found = turning(thinned(motion(t, psi, r, u, v), 500), start, side, 3 * math.pi, 5.0)
     radius = speed / abs(rate)
 
-    def place(angle: float) -> tuple[float, float]:
-        # the course is drift behind the heading: integrate the velocity direction from -drift to
-        # angle - drift
-        return radius * (math.sin(angle - drift) + math.sin(drift)), radius * (
-            math.cos(drift) - math.cos(angle - drift)
-        )
-
+    # the course is drift behind the heading: integrate the velocity direction from -drift on
+    advance = radius * (math.cos(drift) + math.sin(drift))
+    transfer, diameter = (
+        radius * (math.cos(drift) - math.cos(a - drift)) for a in (HALF, 2 * HALF)
+    )
     assert found["approach_speed"] == pytest.approx(2.0, rel=1e-12)
     assert found["time_90"] == pytest.approx(math.pi / 2 / 0.06, abs=1e-3)
     assert found["time_180"] == pytest.approx(math.pi / 0.06, abs=1e-3)
     # the velocity jumps between two samples, which a spline of the track rounds off
-    assert found["advance"] == pytest.approx(place(math.pi / 2)[0], abs=0.02)
-    assert found["transfer"] == pytest.approx(place(math.pi / 2)[1], abs=0.02)
-    assert found["tactical_diameter"] == pytest.approx(place(math.pi)[1], abs=0.02)
+    assert found["advance"] == pytest.approx(advance, abs=0.02)
+    assert found["transfer"] == pytest.approx(transfer, abs=0.02)
+    assert found["tactical_diameter"] == pytest.approx(diameter, abs=0.02)
     assert found["steady_diameter"] == pytest.approx(2 * radius, rel=1e-9)
     assert found["steady_drift_angle"] == pytest.approx(drift, rel=1e-9)
     assert found["steady_yaw_rate"] == pytest.approx(0.06, rel=1e-9)
     assert found["advance_lengths"] == pytest.approx(found["advance"] / 5.0)
     # half a circle has no steady turn
-    short = turning(
-        thinned(motion(t[:80000], psi[:80000], r[:80000], u[:80000], v[:80000]), 500),
-        start,
-        side,
-        3 * math.pi,
-        None,
-    )
-    assert set(short) == {
-        "approach_speed",
-        "advance",
-        "transfer",
-        "time_90",
-        "tactical_diameter",
-        "time_180",
-    }
+    half = motion(*(part[:80000] for part in (t, psi, r, u, v)))
+    short = turning(thinned(half, 500), start, side, 3 * math.pi, None)
+    steady = ("steady_diameter", "steady_drift_angle", "steady_yaw_rate")
+    assert set(short) == {n for n in found if n not in steady and not n.endswith("_lengths")}
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -107,13 +101,8 @@ def test_sinusoidal_heading(side: float) -> None:
     assert found["period"] == pytest.approx(2 * math.pi / w, abs=1e-4)
     assert found["largest_yaw_rate"] == pytest.approx(a * w, rel=1e-9)
     # the track moves outward as long as the heading is on that side
-    outward, _ = max(
-        (float(value), 0)
-        for value in [
-            np.trapezoid(3 * np.sin(a * np.sin(w * s)), s)
-            for s in [np.linspace(first, math.pi / w, 4000)]
-        ]
-    )
+    outside = np.linspace(first, math.pi / w, 4000)
+    outward = np.trapezoid(3 * np.sin(a * np.sin(w * outside)), outside)
     assert found["overshoot_width"] == pytest.approx(outward, rel=1e-3)
     assert set(found) <= set(UNITS) | {f"{name}_lengths" for name in IN_LENGTHS}
 
@@ -133,7 +122,7 @@ def test_nomoto_zigzag_in_closed_form() -> None:
         r0, psi0, side = rates[-1], headings[-1], sides[-1]
         rest = time * math.log(1 - side * r0 / turn) if side * r0 < 0 else 0.0
         span = brentq(
-            lambda s, r0=r0, psi0=psi0, side=side: side * psi_at(s, r0, psi0, side) - bound,
+            lambda s, known=(r0, psi0, side): known[2] * psi_at(s, *known) - bound,
             rest,
             rest + 400.0,
             xtol=1e-13,
@@ -144,12 +133,10 @@ def test_nomoto_zigzag_in_closed_form() -> None:
         sides.append(-side)
     t = np.arange(0.0, edges[-1], 0.4)
     piece = np.searchsorted(edges, t, side="right") - 1
+    places = zip(t, piece, strict=True)
     psi = np.array(
-        [
-            0.0 if i < 0 else psi_at(s - edges[i], rates[i], headings[i], sides[i])
-            for s, i in zip(t, piece, strict=True)
-        ]
-    )
+        [i >= 0 and psi_at(s - edges[i], rates[i], headings[i], sides[i]) for s, i in places]
+    ).astype(float)
     r = np.gradient(psi, t)
     found = zigzag(motion(t, psi, r, np.full_like(t, 5.0)), start, 1.0, bound, None)
 
@@ -202,56 +189,42 @@ def test_spiral_takes_the_rate_before_each_change() -> None:
 
 
 @pytest.mark.parametrize(
-    ("length", "speed", "first", "second"),
-    [
-        (90.0, 10.0, 10.0, 25.0),
-        (100.0, 10.0, 10.0, 25.0),
-        (200.0, 10.0, 15.0, 32.5),
-        (300.0, 10.0, 20.0, 40.0),
-        (400.0, 10.0, 20.0, 40.0),
-    ],
+    ("length", "first", "second"),
+    [(90.0, 10.0, 25.0), (200.0, 15.0, 32.5), (300.0, 20.0, 40.0), (400.0, 20.0, 40.0)],
 )
-def test_imo_limits_of_the_10_10_zigzag(
-    length: float, speed: float, first: float, second: float
-) -> None:
+def test_imo_limits_of_the_10_10_zigzag(length: float, first: float, second: float) -> None:
     """MSC.137(76): 10 deg below L/V = 10 s, 20 deg from 30 s on, (5 + L/(2V)) deg between; 25, 40
     and (17.5 + 0.75 L/V) deg.
     """
-    limits = indices.zigzag_limits(10.0, length, speed)
+    limits = indices.zigzag_limits(10.0, length, 10.0)
     assert limits["first_overshoot"] == pytest.approx(first * DEG)
     assert limits["second_overshoot"] == pytest.approx(second * DEG)
     assert limits["initial_turning_distance"] == pytest.approx(2.5 * length)
 
 
 def test_which_manoeuvres_imo_limits() -> None:
-    rudder = Helm(
-        lambda d, s: torch.stack((35 * DEG * s, d), dim=-1),
-        ("psi", "r", "u"),
-        ("cmd_delta", "cmd_n"),
-    )
-    twin = Helm(
-        lambda d, s: torch.stack((d + s, d - s), dim=-1),
-        ("psi", "r", "u"),
-        ("cmd_port", "cmd_stbd"),
+    rudder, twin = (
+        Helm(lambda d, s, size=size: torch.stack((size * s, d), dim=-1), ("psi", "r", "u"), inputs)
+        for size, inputs in ((35 * DEG, ("cmd_delta", "cmd_n")), (1.0, ("cmd_port", "cmd_stbd")))
     )
     assert rudder.hard_over == pytest.approx(35 * DEG)
     assert twin.hard_over is None
     ten = Zigzag(drive=1, rudder=10 * DEG, heading=10 * DEG)
     assert ten.share(rudder) == pytest.approx(10 / 35)
-    assert ten.limits(rudder, 100, 8) == indices.zigzag_limits(10.0, 100, 8)
-    assert Zigzag(drive=1, rudder=-20 * DEG, heading=20 * DEG).limits(
-        rudder, 100, 8
-    ) == indices.zigzag_limits(20.0, 1.0, 1.0)
-    assert Zigzag(drive=1, rudder=10 * DEG, heading=20 * DEG).limits(rudder, 100, 8) == {}
-    alone = Zigzag(drive=1, steer=0.5, heading=20 * DEG).limits(twin, 100, 8)
-    assert alone == indices.zigzag_limits(20.0, 1.0, 1.0), "without a rudder the heading tells"
-    assert TurningCircle(drive=1, steer=-1).limits(rudder, 100, 8) == {
-        "advance": 450,
-        "tactical_diameter": 500,
-    }
-    assert TurningCircle(drive=1, steer=0.5).limits(rudder, 100, 8) == {}
-    assert Stopping(drive=1).limits(rudder, 100, 8) == {"track_reach": 1500}
-    assert Stopping(drive=1, astern=-0.5).limits(rudder, 100, 8) == {}
+    tens, twenties = (indices.zigzag_limits(angle, 100, 8) for angle in (10.0, 20.0))
+    over = {"advance": 450, "tactical_diameter": 500}
+    for manoeuvre, limits in (
+        (ten, tens),
+        (Zigzag(drive=1, rudder=-20 * DEG, heading=20 * DEG), twenties),
+        (Zigzag(drive=1, rudder=10 * DEG, heading=20 * DEG), {}),
+        (TurningCircle(drive=1, steer=-1), over),
+        (TurningCircle(drive=1, steer=0.5), {}),
+        (Stopping(drive=1), {"track_reach": 1500}),
+        (Stopping(drive=1, astern=-0.5), {}),
+    ):
+        assert manoeuvre.limits(rudder, 100, 8) == limits
+    alone = Zigzag(drive=1, steer=0.5, heading=20 * DEG)
+    assert alone.limits(twin, 100, 8) == twenties, "without a rudder the heading tells"
 
 
 def test_empty_samples_are_left_out() -> None:
@@ -264,3 +237,69 @@ def test_empty_samples_are_left_out() -> None:
     assert few["period"] == pytest.approx(whole["period"], abs=1e-4)
     with pytest.raises(DataError, match="indices need"):
         Track(log.replace(channels=log.channels | {"r": np.full(t.size, np.nan)}))
+
+
+def steered(angle: float, heading: float, side: float, offset: float = 0.0) -> Log:
+    """Nomoto's ship (K = .15, T = 8 s) steered in a zigzag (deg) from 4 s on, its rudder resting at
+    `offset` before and turning about it by 15 deg/s.
+    """
+    step, speed = 0.1, 15.0 * DEG
+    t = np.arange(0, 120.0, step)
+    psi, r, delta, towards = 0.0, 0.0, offset * DEG, side
+    out = np.zeros((t.size, 2))
+    for k, now in enumerate(t):
+        out[k] = psi, delta
+        if towards * psi >= heading * DEG:
+            towards = -towards
+        wanted = (towards * angle * (now >= 4.0) + offset) * DEG
+        delta += float(np.clip(wanted - delta, -speed * step, speed * step))
+        r += step * (0.15 * (delta - offset * DEG) - r) / 8.0
+        psi += step * r
+    return Log("zz", t + 3.0, {"psi": out[:, 0] + 0.7, "delta": out[:, 1]})
+
+
+@pytest.mark.parametrize(
+    ("angle", "heading", "side", "offset"),
+    [(10, 10, 1, 0), (20, 5, -1, 0.8), (30, 20, 1, -1.0), (5, 1, -1, 0)],
+)
+def test_what_was_steered_is_read_off(
+    angle: float, heading: float, side: float, offset: float
+) -> None:
+    log = steered(angle, heading, side, offset)
+    # noise on the rudder does not make orders
+    noise = 0.01 * DEG * np.random.default_rng(0).standard_normal(len(log))
+    for one in (log, log.replace(channels=log.channels | {"delta": log["delta"] + noise})):
+        found = steered_zigzag(one, "delta")
+        assert found.side == side
+        assert found.angle / DEG == pytest.approx(angle, abs=0.02)
+        assert found.start == pytest.approx(4.0, abs=0.15)
+        # the order falls on the first sample beyond the heading
+        assert found.heading / DEG == pytest.approx(heading, abs=0.4)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_where_the_rudder_left_does_not_hang_on_the_grid(every: int) -> None:
+    """The order of the closed form: the rudder of the made zigzag leaves at the very sample that is
+    the first beyond the heading.
+    """
+    log = steered(20, 10, 1.0)
+    psi, size = log["psi"] - log["psi"][0], np.abs(log["delta"])
+    left = np.isclose(size[:-1], 20 * DEG) & (np.diff(size) < -1e-6)
+    turns = np.flatnonzero(left & (np.arange(len(log) - 1) >= 60))
+    assert len(turns) > 2
+    found = steered_zigzag(thinned(log, every), "delta")
+    assert found.leaves / DEG == pytest.approx(np.abs(psi[turns]).mean() / DEG, abs=0.03)
+    rates = np.abs(np.gradient(psi, log.t))[turns]
+    assert found.turning == pytest.approx(rates.mean(), rel=0.02)
+    assert every > 1 or found.leaves > found.heading
+
+
+def test_other_manoeuvres_are_refused() -> None:
+    t = np.arange(0, 60, 0.1)
+    turn = Log("turn", t, {"psi": 0.05 * t, "delta": np.where(t < 5, 0.0, 0.3)})
+    with pytest.raises(DataError, match="turn: the rudder is reversed"):
+        steered_zigzag(turn, "delta")
+    log = steered(20, 20, 1.0)
+    against = log.replace(channels={"psi": -log["psi"], "delta": log["delta"]})
+    with pytest.raises(DataError, match="sign of delta"):
+        steered_zigzag(against, "delta")

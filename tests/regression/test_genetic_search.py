@@ -47,10 +47,8 @@ def test_fitness_equals_least_squares() -> None:
         x = algebra.values(terms, DATA).T
         best = np.linalg.lstsq(x[TRAIN], NOISY[TRAIN], rcond=None)[0]
         for part, error in ((TRAIN, train), (~TRAIN, validation)):
-            assert error == pytest.approx(
-                np.square(NOISY[part] - x[part] @ best).sum() / np.square(NOISY[part]).sum(),
-                rel=1e-10,
-            )
+            share = np.square(NOISY[part] - x[part] @ best).sum() / np.square(NOISY[part]).sum()
+            assert error == pytest.approx(share, rel=1e-10)
         assert left == terms
     assert fitness.fitted == 4
     fitness.of(sets)
@@ -70,11 +68,8 @@ def test_terms_that_are_not_independent_or_not_finite_take_no_part() -> None:
 
 @pytest.mark.parametrize("split", ["sum", "expand"])
 def test_finds_a_sum_of_products(split: str) -> None:
-    _, found = breed(
-        2 * DATA["a"] - DATA["b"] * DATA["c"] + 0.5 * DATA["c"] * np.abs(DATA["c"]),
-        split=split,
-        population=500,
-    )
+    target = 2 * DATA["a"] - DATA["b"] * DATA["c"] + 0.5 * DATA["c"] * np.abs(DATA["c"])
+    _, found = breed(target, split=split, population=500)
     assert found.reached
     assert max(found.train, found.validation) < 1e-12
     assert found.history[-1].train == found.train
@@ -82,20 +77,11 @@ def test_finds_a_sum_of_products(split: str) -> None:
 
 def test_genes_get_a_coefficient_each() -> None:
     target = 2 * (DATA["a"] + DATA["b"] * DATA["b"]) - 0.3 * DATA["c"]
-    algebra, found = breed(
-        target,
-        split="gene",
-        genes=3,
-        depth=3,
-        first_depth=(0, 2),
-        population=600,
-        generations=40,
-        patience=40,
-    )
+    settings = {"genes": 3, "depth": 3, "first_depth": (0, 2), "generations": 40, "patience": 40}
+    algebra, found = breed(target, split="gene", population=600, **settings)
     assert found.reached
     assert 2 <= len(found.terms) <= 3
-    for product in found.terms:
-        assert len(product) >= 1
+    assert all(len(product) >= 1 for product in found.terms)
     assert algebra.limits.expand is False
 
 
@@ -118,14 +104,14 @@ def test_same_seed_same_result_and_pythons_generator_is_left_alone() -> None:
     random.seed(5)
     wanted = random.random()
     random.seed(5)
-    one, two, other = breed(NOISY, 3)[1], breed(NOISY, 3)[1], breed(NOISY, 4)[1]
+    one, two, other = (breed(NOISY, seed, generations=3)[1] for seed in (3, 3, 4))
     assert one == two
     assert one.history != other.history
     assert random.random() == wanted
 
 
 def test_early_stopping_and_elite() -> None:
-    _, found = breed(NOISY, generations=200, patience=4)
+    _, found = breed(NOISY, population=60, generations=200, patience=4)
     assert len(found.history) - 1 <= found.generation + 4
     assert found.validation == min(g.validation for g in found.history)
     errors = [g.train for g in found.history]

@@ -39,22 +39,16 @@ def planted(
 ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Correlated columns of very different sizes, and a target of four of them."""
     random = np.random.default_rng(seed)
-    x = (
-        random.normal(size=(rows, columns))
-        @ (np.eye(columns) + 0.5 * random.normal(size=(columns, columns)))
-        * 10.0 ** random.uniform(-3, 5, columns)
-    )
+    mix = np.eye(columns) + 0.5 * random.normal(size=(columns, columns))
+    x = random.normal(size=(rows, columns)) @ mix * 10.0 ** random.uniform(-3, 5, columns)
     chosen = random.choice(columns, 4, replace=False)
     values = random.uniform(0.5, 2.0, 4) * random.choice([-1, 1], 4) / x[:, chosen].std(0)
     y = x[:, chosen] @ values
-    return (
-        x,
-        y + noise * y.std() * random.normal(size=rows),
-        {f"c{i}": float(v) for i, v in zip(chosen, values, strict=True)},
-    )
+    truth = {f"c{i}": float(v) for i, v in zip(chosen, values, strict=True)}
+    return x, y + noise * y.std() * random.normal(size=rows), truth
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_planted_equation_is_found_exactly(seed: int) -> None:
     x, y, truth = planted(seed)
     equation = solve(x, y)
@@ -64,17 +58,15 @@ def test_a_planted_equation_is_found_exactly(seed: int) -> None:
     assert not equation.undecided
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_planted_equation_is_found_in_noise_with_honest_errors(seed: int) -> None:
     x, y, truth = planted(seed, rows=2000, noise=0.2)
     equation = solve(x, y)
     assert set(equation.terms) == set(truth)
     assert equation.share == pytest.approx(0.2 / np.sqrt(1.04), rel=0.1)
-    deviation = (
-        np.array([v - truth[t] for t, v in zip(equation.terms, equation.values, strict=True)])
-        / equation.errors
-    )
-    assert np.abs(deviation).max() < 4.0
+    found = dict(zip(equation.terms, equation.values, strict=True))
+    off = np.array([found[term] - truth[term] for term in equation.terms]) / equation.errors
+    assert np.abs(off).max() < 4.0
     # the textbook formula on the columns that were found
     own = x[:, [int(term[1:]) for term in equation.terms]]
     left = y - own @ equation.values
@@ -95,7 +87,7 @@ def test_standard_errors_grow_with_the_correlation_of_the_noise() -> None:
     assert coloured.errors[0] / white.errors[0] == pytest.approx(np.sqrt(19), rel=0.3)
 
 
-@pytest.mark.parametrize("terms", [1, 3, 6])
+@pytest.mark.parametrize("terms", [1, 6])
 def test_forward_regression_is_orthogonal_matching_pursuit_on_orthogonal_columns(
     terms: int,
 ) -> None:
@@ -106,14 +98,11 @@ def test_forward_regression_is_orthogonal_matching_pursuit_on_orthogonal_columns
     search = Search(x, y, 200.0, SearchConfig(max_terms=terms, gamma=0.0))
     chosen = search.best()[1]
     assert set(chosen) == set(np.flatnonzero(other.coef_))
-    np.testing.assert_allclose(
-        np.linalg.lstsq(x[:, sorted(chosen)], y, rcond=None)[0],
-        other.coef_[sorted(chosen)],
-        atol=1e-12,
-    )
+    found = np.linalg.lstsq(x[:, sorted(chosen)], y, rcond=None)[0]
+    np.testing.assert_allclose(found, other.coef_[sorted(chosen)], atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(5))
 def test_the_search_finds_the_best_of_all_subsets(seed: int) -> None:
     random = np.random.default_rng(seed)
     x = random.normal(size=(60, 9)) @ (np.eye(9) + random.normal(size=(9, 9)))

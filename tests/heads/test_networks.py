@@ -1,0 +1,365 @@
+"""Networks: cells against PyTorch and NumPy, members that run by themselves, mirrored heads
+(rho(M z) = M rho(z), to the last bits), and the hyperbolic tangent of large batches.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from made_samples import NAMES, channels, made, sampled
+from torch import Tensor, nn
+
+from residnet.baselines.given import StillConfig
+from residnet.core.config import validate
+from residnet.core.errors import ConfigError
+from residnet.core.samples import Samples
+from residnet.data.windows import WindowStore
+from residnet.dynamics.ensemble import MeanOfTrajectories
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.heads.base import ResidualHead
+from residnet.heads.lstm import LstmConfig, LstmCore, LstmHead
+from residnet.heads.mirror import Tanh, quick_tanh
+from residnet.heads.mlp import MlpConfig
+from residnet.heads.recurrent import RecurrentConfig, RecurrentHead
+from residnet.physics.signals import SignalsConfig
+
+
+def built(**config: object) -> LstmHead:
+    torch.manual_seed(0)
+    head = LstmConfig.model_validate({"kind": "lstm", "hidden_size": 12, **config}).build(NAMES)
+    assert isinstance(head, LstmHead)
+    head.calibrate(made())
+    return head.double().eval()
+
+
+def windows(batch: int = 3, length: int = 25) -> Tensor:
+    return torch.from_numpy(channels(batch * length, seed=9).reshape(batch, length, len(NAMES)))
+
+
+def stepped(head: Any, z: Tensor) -> Tensor:
+    s = torch.zeros(len(z), head.n_state, dtype=z.dtype)
+    out = []
+    for k in range(z.shape[1]):
+        rho, s = head(z[:, k], s)
+        out.append(rho)
+    return torch.stack(out, dim=1)
+
+
+def test_an_lstm_equals_that_of_torch() -> None:
+    core, z = LstmCore(4, 10, softsign=False).double(), torch.randn(5, 30, 4, dtype=torch.float64)
+    other = nn.LSTM(4, 10, batch_first=True).double()
+    with torch.no_grad():
+        core.bias.uniform_(-0.5, 0.5)
+        weights = dict(other.named_parameters())
+        weights["weight_ih_l0"].copy_(core.w_input)
+        weights["weight_hh_l0"].copy_(core.w_hidden)
+        weights["bias_ih_l0"].copy_(core.bias)
+        weights["bias_hh_l0"].zero_()
+        out, (h, c) = other(z)
+        mine, s = core.sequence(z)
+    torch.testing.assert_close(mine, out, rtol=0, atol=1e-12)
+    torch.testing.assert_close(s, torch.cat((h[0], c[0]), dim=1), rtol=0, atol=1e-12)
+
+
+def softsign(x: np.ndarray) -> np.ndarray:
+    return x / (1 + np.abs(x))
+
+
+def logistic(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
+def test_a_softsign_cell_equals_numpy() -> None:
+    """Document 003 eq. (17): softsign in place of tanh, the gates stay logistic."""
+    core, z = LstmCore(3, 6, softsign=True).double(), torch.randn(2, 8, 3, dtype=torch.float64)
+    wi, wh, b = (part.detach().numpy() for part in (core.w_input, core.w_hidden, core.bias))
+    h, c = np.zeros((2, 6)), np.zeros((2, 6))
+    outputs = []
+    for k in range(8):
+        i, f, g, o = np.split(z[:, k].numpy() @ wi.T + h @ wh.T + b, 4, axis=1)
+        c = logistic(f) * c + logistic(i) * softsign(g)
+        h = logistic(o) * softsign(c)
+        outputs.append(h)
+    with torch.no_grad():
+        out, s = core.sequence(z)
+    np.testing.assert_allclose(out, np.stack(outputs, axis=1), atol=1e-13)
+    np.testing.assert_allclose(s, np.concatenate((h, c), axis=1), atol=1e-13)
+
+
+def test_the_documents_network_has_axes_of_their_own() -> None:
+    """4 * 100 * (4 + 100 + 1) + 101 = 42,101 for each of surge, sway, yaw (correction W4)."""
+    config = LstmConfig(hidden_size=100, per_axis=True, features=("u", "v", "r", "tau_n"))
+    head: Any = config.build(NAMES)
+    counts = [sum(p.numel() for p in network.parameters()) for network in head.networks]
+    assert counts == [42_101] * 3
+    assert head.n_state == 600
+    seen = {"u": ("u", "tau_x"), "v": ("v", "r"), "r": ("r", "tau_n", "v")}
+    own, z = built(per_axis=True, axis_features=seen), windows()
+    changed = z.clone()
+    changed[..., 3] += 50.0
+    before, after = own.sequence(z), own.sequence(changed)
+    assert bool((before[..., 0] != after[..., 0]).any())
+    assert torch.equal(before[..., 1:], after[..., 1:])
+
+
+@pytest.mark.parametrize("activation", ["tanh", "softsign"])
+def test_gradients_of_the_sequence_are_those_of_the_steps(activation: str) -> None:
+    head, z = built(activation=activation), windows(2, 10)
+    weights = list(head.parameters())
+    found, wanted = (
+        torch.autograd.grad(out.square().sum(), weights)
+        for out in (head.sequence(z), stepped(head, z))
+    )
+    for a, b in zip(found, wanted, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-12)
+
+
+def test_a_memory_of_chosen_features_ignores_the_others() -> None:
+    head, z = built(memory=(NAMES[-1],), readout=5), windows()
+    other = z.clone()
+    other[:, :, : len(NAMES) - 1] += 0.1
+    assert torch.equal(head.warmup(z), head.warmup(other))
+    assert not torch.equal(head.sequence(z), head.sequence(other))
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"axis_features": {"u": ["u"], "v": ["v"], "r": ["r"]}}, "needs per_axis"),
+        ({"per_axis": True, "axis_features": {"u": ["u"]}}, "all of u, v, r"),
+        ({"memory": [NAMES[-1]]}, "readout"),
+    ],
+)
+def test_wrong_configs(config: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        validate({"kind": "lstm", **config}, LstmConfig, "here")
+
+
+RUDDER = ("u", "v", "r", "n", "delta")
+
+
+def networks(**config: object) -> RecurrentHead:
+    torch.manual_seed(0)
+    head = RecurrentConfig.model_validate({"hidden_size": 5, "step": 0.5, **config}).build(RUDDER)
+    assert isinstance(head, RecurrentHead)
+    return head.double()
+
+
+def mean_of(**config: object) -> MeanOfTrajectories:
+    signals = SignalsConfig(inputs=("n", "delta")).build()
+    baseline = StillConfig().build(signals.names)
+    model = HybridDynamics(signals, baseline, networks(**config), 0.1, "semi_implicit_euler")
+    return MeanOfTrajectories([model], (-1.0,) * 3, (1.0,) * 3).double()
+
+
+def test_a_step_is_that_of_pytorch_and_no_network_sees_another() -> None:
+    """torch.nn.GRUCell with the same weights, network by network."""
+    head = networks(members=3)
+    z, s = torch.randn(6, 5, dtype=torch.float64), torch.rand(6, 5, dtype=torch.float64)
+    found, after = head(z, s)
+    seen = torch.cat((z, torch.zeros(6, 3)), dim=1)
+    # torch orders reset, update, new; ours is update, reset, new
+    order = torch.cat((torch.arange(5, 10), torch.arange(5), torch.arange(10, 15)))
+    for k in range(3):
+        cell, rows = nn.GRUCell(8, 5, dtype=torch.float64), slice(2 * k, 2 * k + 2)
+        with torch.no_grad():
+            cell.weight_ih.copy_(head.w_input[k].T[order])
+            cell.weight_hh.copy_(head.w_hidden[k].T[order])
+            cell.bias_ih.copy_(head.bias[k, 0][order])
+            cell.bias_hh.copy_(torch.cat((torch.zeros(10), head.bias_hidden[k, 0])))
+            h = cell(seen[rows], s[rows])
+            rho = h @ head.w_out[k] + seen[rows] @ head.w_skip[k] + head.bias_out[k]
+        torch.testing.assert_close(after[rows], h)
+        torch.testing.assert_close(found[rows], rho)
+
+
+def test_short_steps_keep_what_a_long_one_does() -> None:
+    """The share of the memory that is kept over five short steps is that of a long one."""
+    head = networks()
+    with torch.no_grad():
+        # gates and new memory that depend on nothing but the biases
+        for weight in (head.w_input, head.w_hidden):
+            weight.zero_()
+    z, s = torch.randn(1, 5, dtype=torch.float64), torch.rand(1, 5, dtype=torch.float64)
+    long = head(z, s)[1]
+    head.set_step(0.1)
+    for _ in range(5):
+        s = head(z, s)[1]
+    torch.testing.assert_close(s, long)
+
+
+def test_the_mean_is_that_of_networks_that_run_by_themselves() -> None:
+    mean = mean_of(members=3)
+    y = 0.1 * torch.randn(2, 8, 6, dtype=torch.float64)
+    w = torch.randn(2, 30, 2, dtype=torch.float64)
+    with torch.no_grad():
+        found = Rollout(mean)(y[:, -1], w[:, 8:], mean.warmup(y[:, :-1], w[:, :7]))[0]
+        single = mean.members[0]
+        part = single.warmup(y[:, :-1].repeat(3, 1, 1), w[:, :7].repeat(3, 1, 1))
+        each = Rollout(single)(y[:, -1].repeat(3, 1), w[:, 8:].repeat(3, 1, 1), part)[0]
+    wanted = each[..., 3:].unflatten(0, (3, 2)).mean(0)
+    torch.testing.assert_close(found[..., 3:], wanted, rtol=0, atol=2e-4)
+
+
+def test_a_measurement_starts_all_members_from_it() -> None:
+    """Whatever they had predicted, a state far from it is where each member goes on."""
+    mean = mean_of(members=2).requires_grad_(False)
+    w, x = torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 6, dtype=torch.float64)
+    s = mean.initial_state(1).double()
+    for _ in range(40):
+        x, s = mean.step(x, w, s)
+    apart = s[:, 4:].reshape(2, -1)[:, :3]
+    assert float((apart[0] - apart[1]).abs().max()) > 1e-3
+    away = x + torch.tensor([0, 0, 0, 0.3, -0.2, 0.1], dtype=torch.float64)
+    _, after = mean.step(away, w, s)
+    alone = mean.members[0].step(away.repeat(2, 1), w.repeat(2, 1), s[:, 4:].reshape(2, -1)[:, 3:])
+    wanted = alone[0][:, 3:] - alone[0][:, 3:].mean(0)
+    # a measurement 150 small velocities away leaves a 20,000th of what lay between the members
+    torch.testing.assert_close(after[:, 4:].reshape(2, -1)[:, :3], wanted, rtol=0, atol=1e-5)
+
+
+def test_a_coarse_store_holds_all_samples_and_the_means_of_inputs() -> None:
+    count, steps = 23, 4
+    label = torch.arange(count, dtype=torch.float64)
+    rows = label[:, None]
+    turning = torch.remainder(0.3 * rows + torch.pi, 2 * torch.pi) - torch.pi
+    w = torch.cat((rows, turning), dim=1)
+    yes = torch.ones(count, dtype=torch.bool)
+    stretch = torch.cat((torch.arange(12), torch.arange(11)))
+    left = torch.cat((12 - torch.arange(12), 11 - torch.arange(11)))
+    store = WindowStore(
+        rows.repeat(1, 6), rows.repeat(1, 6), rows.repeat(1, 3), w, w, yes, yes, left, stretch,
+        (label >= 12).long(),
+    )  # fmt: skip
+    coarse = store.coarse(steps, [1])
+    assert sorted(coarse.y[:, 0].tolist()) == label.tolist()
+    starts = coarse.starts(3)
+    taken = coarse.take(coarse.y, starts, 3)[..., 0]
+    torch.testing.assert_close(taken.diff(dim=1), torch.full((len(starts), 2), 4.0).double())
+    # a window of three long steps keeps to its stretch
+    assert all((row < 12).all() or (row >= 12).all() for row in taken)
+    means = coarse.take(coarse.w, starts, 2)
+    torch.testing.assert_close(means[..., 0], taken[:, :2] + 1.5)
+    expected = 0.3 * (taken[:, :2] + 1.5)
+    torch.testing.assert_close(means[..., 1].cos(), expected.cos())
+
+
+@pytest.mark.parametrize("steps", [7, 40])
+def test_accelerations_along_measurements_are_those_of_steps(steps: int) -> None:
+    single: Any = mean_of(members=2).members[0]
+    z = 0.2 * torch.randn(1, steps, 5, dtype=torch.float64)
+    with torch.no_grad():
+        found = single.one_step(z)
+        x = torch.cat((torch.zeros(1, steps, 3), z[..., :3]), dim=-1).repeat(2, 1, 1)
+        s, out = torch.zeros(2, single.n_state, dtype=torch.float64), []
+        for k in range(steps):
+            out.append(single.acceleration(x[:, k], z[:, k, 3:].repeat(2, 1), s).mean(0))
+            s = single.step(x[:, k], z[:, k, 3:].repeat(2, 1), s)[1]
+    torch.testing.assert_close(found[0], torch.stack(out))
+
+
+def test_what_the_recipe_trains_is_compiled() -> None:
+    """A head that TorchScript refuses would be trained and run several times slower, unsaid."""
+    mean = mean_of(members=2, restoring=True)
+    for model in (mean, mean.members[0]):
+        assert isinstance(torch.jit.script(Rollout(model)), torch.jit.ScriptModule)
+
+
+# channels, where each is found in the mirror, and with which sign
+SCENES = {
+    "wind": (
+        (*RUDDER, "wind_u", "wind_v", "wind_mag"),
+        [0, 1, 2, 3, 4, 5, 6, 7],
+        [1, -1, -1, 1, -1, 1, -1, 1],
+    ),
+    "thrusters": (
+        ("u", "v", "r", "n_port", "n_stbd", "tau_x", "tau_y", "tau_n"),
+        [0, 1, 2, 4, 3, 5, 6, 7],
+        [1, -1, -1, 1, 1, 1, -1, -1],
+    ),
+}
+TURNED = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+MIRRORED: dict[str, Any] = {
+    "mlp": MlpConfig(mirror=True, hidden=(9, 7)),
+    "lstm": LstmConfig(mirror=True, hidden_size=6),
+    "readout": LstmConfig(mirror=True, hidden_size=5, readout=4, memory=("v", "r")),
+    "per axis": LstmConfig(mirror=True, hidden_size=4, per_axis=True, activation="softsign"),
+}
+
+
+def one_sided(names: tuple[str, ...], count: int = 300) -> Samples:
+    """All around starboard turns, so that a head without symmetry would lean to one side."""
+    random = np.random.default_rng(2)
+    z = random.normal(size=(count, len(names))) + 0.7
+    return sampled(z, random.normal(size=(count, 3)) * [0.1, 0.05, 0.2], names)
+
+
+def mirrored(kind: str, names: tuple[str, ...]) -> ResidualHead:
+    torch.manual_seed(4)
+    head: ResidualHead = MIRRORED[kind].build(names)
+    head.calibrate(one_sided(names))
+    with torch.no_grad():
+        for parameter in head.parameters():
+            parameter.add_(0.3 * torch.randn_like(parameter))
+    return head.double().eval()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("kind", MIRRORED)
+def test_the_residual_in_the_mirror_is_the_mirror_of_the_residual(kind: str, scene: str) -> None:
+    names, index, sign = SCENES[scene]
+    head = mirrored(kind, names)
+    # beyond the training range too: the guard must be symmetric
+    z = torch.from_numpy(2.0 * np.random.default_rng(3).normal(size=(3, 20, len(names))))
+    other = z[..., index] * torch.tensor(sign, dtype=z.dtype)
+    with torch.no_grad():
+        here, there = head.sequence(z), head.sequence(other)
+        torch.testing.assert_close(there, here * TURNED, rtol=0, atol=1e-15)
+        step_here, step_there = stepped(head, z), stepped(head, other)
+        torch.testing.assert_close(step_there, step_here * TURNED, rtol=0, atol=1e-15)
+        torch.testing.assert_close(step_here, here, rtol=0, atol=1e-12)
+    smallest = float(here.abs().amax((0, 1)).min())
+    assert smallest > 1e-3, "a head that answers zero is symmetric by nature"
+
+
+def test_scales_are_those_of_both_sides() -> None:
+    head, known = mirrored("mlp", RUDDER), one_sided(RUDDER)
+    inner: Any = head.inner.features  # type: ignore[union-attr]
+    sign = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
+    both = torch.cat((known.z, known.z * sign))
+    torch.testing.assert_close(inner.mean, both.mean(0))
+    torch.testing.assert_close(inner.std, both.std(0, correction=0))
+    torch.testing.assert_close(inner.low[[1, 2, 4]], -inner.high[[1, 2, 4]])
+    target = torch.cat((known.target, known.target * TURNED))
+    torch.testing.assert_close(head.residual_std(), target.std(0, correction=0))
+
+
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+@pytest.mark.parametrize("name", ["trim", "n_port"])
+def test_a_mirror_of_unknown_channels_is_a_configuration_error(kind: str, name: str) -> None:
+    with pytest.raises(ConfigError, match=f"mirror.*{name}.*leave `mirror` out"):
+        MIRRORED[kind].build(("u", "v", "r", name))
+
+
+@pytest.mark.parametrize(("dtype", "within"), [(torch.float32, 3e-7), (torch.float64, 1e-15)])
+def test_the_quick_hyperbolic_tangent_agrees_with_torch(dtype: torch.dtype, within: float) -> None:
+    x = torch.linspace(-30.0, 30.0, 10_001, dtype=dtype).reshape(73, 137)
+    ends = torch.tensor([torch.inf, -torch.inf, torch.nan], dtype=dtype)[:, None].expand(3, 8_192)
+    with torch.no_grad():
+        quick = quick_tanh(x)
+        torch.testing.assert_close(quick, torch.tanh(x), rtol=0.0, atol=within)
+        # few numbers and traces take torch's own
+        assert torch.equal(quick_tanh(x[:2]), torch.tanh(x[:2]))
+        assert not torch.equal(quick, torch.tanh(x))
+        assert torch.equal(torch.jit.script(Tanh())(x), quick)
+        traced = torch.export.export(Tanh(), (x,))
+        assert torch.equal(traced.module()(x), torch.tanh(x))
+        found = quick_tanh(ends.contiguous())
+        torch.testing.assert_close(found, torch.tanh(ends), rtol=0, atol=0, equal_nan=True)
+    x.requires_grad_()
+    slopes = [torch.autograd.grad(f(x).sum(), x)[0] for f in (quick_tanh, torch.tanh)]
+    torch.testing.assert_close(*slopes, rtol=0.0, atol=2.0 * within)
