@@ -528,20 +528,36 @@ class Channels:
         if {"x", "y", "psi"} <= set(self._names):
             self._settle_axes()
             self._settle_frame()
-            for name, place in (("u", 1), ("v", 2), ("r", 3)):
-                moved = [motion[place] for motion in self._motions if motion is not None]
-                if name not in self._names or not moved:
-                    continue
-                size = to_si(self._unit(name, mark=False), CHANNEL_UNITS[name])
-                own = size * float(np.nanstd(self._values(name)))
-                if own < STILL * float(np.std(np.concatenate(moved))):
-                    column = self._names.pop(name)
-                    text = f"'{column}' does not move, while position and heading do; left out:"
-                    self._marks.note(CHANNELS, f"{text} {name} follows from them")
+            for name in [one for one in ("u", "v", "r") if one in self._names]:
+                self._settle_velocity(name)
         elif "psi" in self._names:
             self._psi_unit = self._unit("psi")
         self._settle_wind()
         return {name: self._entry(name) for name in self._names}
+
+    def _settle_velocity(self, name: str) -> None:
+        """Leave out what does not move, or is far larger than the motion and does not follow it."""
+        moved = [motion for motion in self._motions if motion is not None]
+        if not moved:
+            return
+        place = {"u": 1, "v": 2, "r": 3}[name]
+        told = np.concatenate([motion[place] for motion in moved])
+        size = to_si(self._unit(name, mark=False), CHANNEL_UNITS[name])
+        own = size * self._values(name)
+        # a vessel that only drifts has nearly no motion of one of its axes
+        whole = told if name == "r" else np.hypot(*np.concatenate([m[1:3] for m in moved], axis=1))
+        what = ""
+        if float(np.nanstd(own)) < STILL * float(np.std(told)):
+            what = "does not move, while position and heading do"
+        elif (
+            float(np.nanmedian(np.abs(own))) > float(whole.max())
+            and not follows(self._logs, self._motions, name).telling
+        ):
+            what = "is larger than all motion by position and heading, and does not follow it"
+        if what:
+            column = self._names.pop(name)
+            text = f"'{column}' {what}; left out: {name} follows from them"
+            self._marks.note(CHANNELS, text)
 
     @property
     def _posed(self) -> bool:

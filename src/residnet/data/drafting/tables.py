@@ -33,6 +33,7 @@ from residnet.data.drafting.words import (
     input_channel,
     other_dimension,
     plain,
+    si_of,
     state_channel,
     words_of,
     written_unit,
@@ -62,6 +63,7 @@ _FIRST_ROWS = {"parquet": parquet_rows, "json_lines": json_rows}
 _BRACKETS = re.compile(r"[\[(]")
 _QUOTIENT = re.compile(r"(?P<name>.*\S)\s+/\s+(?P<unit>\S.*)")
 _TURNS = re.compile(r"rpm|rev|1/s|hz|turns|u/?min|umdr|drehz|toeren|tours|giri|varv", re.IGNORECASE)
+_DRIVEN = re.compile(r"^(?:(?:cmd_)?n(?=_|$)|thrust)")
 _PULSES = (900.0, 2100.0)
 """Pulses in us that servos and speed controllers take."""
 _PARTS_OF_TIME = (
@@ -305,16 +307,16 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
     # before `heading of the second compass`
     for column in sorted(columns, key=order):
         channel = sided.get(column) or state_channel(about[column]) or input_channel(about[column])
-        si = CHANNEL_UNITS.get(channel or "")
+        si = si_of(channel) if channel else None
         other = other_dimension(column, si) if si else None
         if channel == "n" and other == "m":
             channel = "x"
         elif channel and channel.startswith("thrust") and written_unit(column, "1/s"):
             # a thruster that turns, and no force
             channel = "n" + channel.removeprefix("thrust")
-        elif channel and re.match(r"(cmd_)?n(_|$)", channel) and other in ("-", "%", "us"):
-            # no revolutions: the share of the throttle, or pulses to it
-            channel = re.sub(r"^(cmd_)?n", "throttle", channel)
+        elif channel and _DRIVEN.match(channel) and other in ("-", "%", "us"):
+            # no revolutions and no force: the share of the throttle, or pulses to it
+            channel = _DRIVEN.sub("throttle", channel)
         elif channel in STATE_NAMES and other:
             marks.note(CHANNELS, f"'{column}' is called as {channel} is, but holds {other}")
             continue

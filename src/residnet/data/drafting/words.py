@@ -235,7 +235,8 @@ _ABOUT: dict[str, str] = {
     " прав 우현 sancak | stbd sb stb right rechts derecha derecho droite hoyre",
     "current": "current stromung courant corriente stroming 潮流",
     "depth": "depth tiefe profond profund diepte dybde 水深 수심 derinlik",
-    "voltage": "volt spannung tension battery batterie bateria batteri | amp ampere current_a",
+    "voltage": "volt spannung tension battery batterie bateria batteri | amp ampere current_a batt"
+    " bat bus solar supply",
     "bow": "| bow bug proue proa boeg baug",
     "stern": "| stern heck poupe popa hek akter aft",
     "index": "| index idx id number nr no num count counter flag valid",
@@ -290,6 +291,8 @@ def plain(name: str) -> str:
     text = _IN_BRACKETS.sub(" ", name)
     for sign, word in _SYMBOLS.items():
         text = re.sub(rf"(?<![^\W_]){sign}(?![^\W_\d])", word, text)
+    # StB is one word
+    text = re.sub(r"(?<![^\W_])[A-Z][a-z][A-Z](?![^\W_])", lambda word: word[0].lower(), text)
     text = re.sub(r"([a-z])([A-Z])", r"\1 \2", text)
     text = text.translate(_LETTERS)
     decomposed = unicodedata.normalize("NFKD", text)
