@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from fleets import CONTRADICTIONS, Fleet, drawn
@@ -56,6 +58,39 @@ def test_a_sign_an_offset_and_a_scale_are_told_apart(fleets: list[Fleet]) -> Non
         (one,) = [one for one in found(logs, fleet) if one.text.startswith(log.name)]
         assert one.code == f"contradicts_{cause}"
         assert name in one.text
+
+
+def _exchanged(log: Log) -> dict[str, np.ndarray]:
+    return {"n_port": log["n_stbd"], "n_stbd": log["n_port"]}
+
+
+def _askew(log: Log) -> dict[str, np.ndarray]:
+    """The sensor of the velocities is turned by 20 deg."""
+    turned = (log["u"] + 1j * log["v"]) * np.exp(1j * np.radians(20.0))
+    return {"u": turned.real, "v": turned.imag}
+
+
+@pytest.mark.parametrize(
+    ("change", "cause", "channels"),
+    [
+        (_exchanged, "exchanged", ("x", "y", "psi", "r")),
+        (_askew, "heading", ("psi", "u", "v", "r")),
+    ],
+)
+def test_logs_with_one_fault_do_not_hide_each_other(
+    change: Callable[[Log], dict[str, np.ndarray]], cause: str, channels: tuple[str, ...]
+) -> None:
+    """A third of the logs share it; where none holds velocities, positions tell them."""
+    (fleet,) = drawn("twin", _SEED, 1, fewest=9, most=9)
+    logs = [
+        log.replace(channels={name: log[name] for name in (*channels, *fleet.inputs)})
+        for log in fleet.logs
+    ]
+    assert found(logs, fleet) == []
+    wrong = [log.replace(channels={**log.channels, **change(log)}) for log in logs[:3]]
+    named = found([*wrong, *logs[3:]], fleet)
+    assert sorted(one.text.split(":")[0] for one in named) == [log.name for log in logs[:3]]
+    assert {one.code for one in named} == {f"contradicts_{cause}"}
 
 
 def _hand_on_the_wheel(fleet: Fleet) -> tuple[list[Log], slice]:

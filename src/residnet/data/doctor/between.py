@@ -12,7 +12,7 @@ import numpy as np
 
 from residnet.core.arrays.paged import LARGE
 from residnet.core.log import Log
-from residnet.core.names import VELOCITY
+from residnet.core.names import POSE, VELOCITY
 from residnet.core.stretches import stretches
 from residnet.data.channels import deviation, median, noise_of
 from residnet.data.doctor.clock import EPOCH
@@ -56,9 +56,11 @@ class Together:
     @cached_property
     def fleet(self) -> Fleet | None:
         """The logs, each predicted by a model of the others; None where that cannot be."""
-        moving = any(name in self for name in VELOCITY)
-        several = len(self.logs) > 1
-        return Fleet(self.logs, self.inputs) if several and moving and self.inputs else None
+        if len(self.logs) < 2 or not self.inputs:
+            return None
+        logs = [moved(log) for log in self.logs]
+        moving = any(all(name in log for log in logs) for name in VELOCITY)
+        return Fleet(logs, self.inputs) if moving else None
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
@@ -67,6 +69,19 @@ class Together:
         """Return the splits of logs where these are known and differ."""
         found = [self.splits.get(log.name, "") for log in logs]
         return " and ".join(found) if all(found) and len(set(found)) > 1 else ""
+
+
+def moved(log: Record) -> Record:
+    """Return a log with the velocities that its position and heading tell; others as they are."""
+    if "u" in log or not all(name in log for name in POSE):
+        return log
+    ground = np.gradient(log.smooth("x") + 1j * log.smooth("y"), log.t)
+    ahead = ground * np.exp(-1j * log["psi"])
+    made = {"u": ahead.real, "v": ahead.imag}
+    whole = log.log.replace(
+        channels={**log.log.channels, **made}, units={**log.units, **dict.fromkeys(made, "m/s")}
+    )
+    return Record(whole, log.inputs)
 
 
 @check("between", "copied_part", fix="leave it out, or keep both in one split")
@@ -367,6 +382,8 @@ _ADVICE = {
     "sign": "correct its sign in this log",
     "offset": "take the offset off in this log",
     "late": "shift the clock of the inputs in this log",
+    "exchanged": "exchange both columns in this log",
+    "heading": "correct the heading, or the axes of the velocities, of this log",
     "current": "leave it out, give the current as an input, or let the fit estimate it",
     "vessel": "leave it out, or fit it alone",
 }

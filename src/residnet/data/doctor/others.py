@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from residnet.core.arrays.paged import LARGE
 from residnet.core.layout import SIX
@@ -49,6 +50,9 @@ _USUAL_PARTS = 1.3
 model is right: the mean of the largest of three chi variables over their size."""
 _LEAST_SCATTER = 0.1
 """Scatter of the logarithm of what is left that logs of one vessel have at least."""
+_SPOILT, _ROUNDS = 3.0, 3
+"""What the others leave of a log over what it leaves of itself, in the middle of the logs, from
+which the half that agrees is searched for, and steps of that search."""
 _SUSPECTS, _SUSPICIOUS = 8, 0.5
 """Logs that are left out in turn, so that the time grows with the number of logs only, and how
 much a log must stand apart before it is."""
@@ -436,8 +440,41 @@ class Fleet:
         most = np.sqrt(np.maximum(size, 0.0) / np.maximum(count, 1))
         return float(most.max()), float(moved.max())
 
+    def _misfits(self, core: Sequence[int], own: Mapping[int, np.ndarray]) -> dict[int, float]:
+        """Return what a core leaves of each log, over what its own quarters leave of each other."""
+        models = self._others(core, [i for i in self.told if [i] != core])
+        left = {i: self._left(i, model) for i, model in models.items()}
+        return {i: float((left[i] / own[i]).max()) if i in left else 1.0 for i in self.told}
+
+    def _agreeing(self) -> list[int]:
+        """Return the half of the logs that agree best; all where they predict each other well.
+
+        Several logs with one fault spoil the model of all, so that none stands apart. It is the
+        half with the least sum of misfits, from single logs on (least trimmed squares over logs,
+        Rousseeuw and Van Driessen 2006).
+        """
+        own = {i: np.maximum(self._by_stretches(self.rows[i]), 1e-12) for i in self.told}
+        least, best = math.inf, list(self.told)
+        if np.median([*self._misfits(self.told, own).values()]) < _SPOILT:
+            return best
+        for first in self.told[:: -(-len(self.told) // _SUSPECTS)]:
+            core = [first]
+            for _ in range(_ROUNDS):
+                misfits = self._misfits(core, own)
+                core = sorted(misfits, key=lambda i: misfits[i])[: len(self.told) // 2 + 1]
+            total = sum(misfits[i] for i in core)
+            if total < least:
+                least, best = total, sorted(core)
+        return best
+
     def _separate(self) -> None:
         """Take the logs apart that contradict the others, one after the other, the worst first."""
+        self._settle(self._agreeing())
+        while rest := [i for i in self.told if i not in self.core]:
+            agreed = [i for i, score in self.scores(self.core, rest).items() if score.size <= 1.0]
+            if not agreed:
+                break
+            self._settle(sorted((*self.core, *agreed)))
         while len(self.core) > max(1, len(self.told) // 2):
             first = self.scores(self.core, self.core)
             # a wrong log spoils the models of all others: the likeliest are left out in turn
@@ -545,9 +582,9 @@ class Cause:
     """One change under which the others' model explains a log.
 
     Attributes:
-        kind: dead, scale, sign, offset, late, current or vessel.
+        kind: dead, scale, sign, offset, late, exchanged, heading, current or vessel.
         channel: concerned; empty where there is none.
-        size: factor, offset (SI), delay in s, or speed of the current in m/s.
+        size: factor, offset (SI), delay in s, angle in rad, or speed of the current in m/s.
         surprise: of the log, so changed; the least is the likeliest.
         text: in words.
     """
@@ -621,8 +658,14 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
             surprise, size = min(found)
             text = _in_words(kind, name, log.units[name], size)
             out.append(Cause(kind, name, size, surprise, text))
-    if "psi" in log and {"u", "v"} <= set(fleet.moving):
-        out += _current(fleet, model, log)
+    for port in (one for one in fleet.driving if one.endswith("_port")):
+        if (stbd := port.removesuffix("port") + "stbd") in fleet.driving:
+            surprise = model.surprise(fleet.of(changed(log, {port: log[stbd], stbd: log[port]})))
+            text = f"{port} and {stbd} would have to be exchanged"
+            out.append(Cause("exchanged", port, 0.0, surprise, text))
+    if {"u", "v"} <= set(fleet.moving):
+        out.append(_heading_off(fleet, model, log))
+        out += _current(fleet, model, log) if "psi" in log else []
     out.append(_vessel(fleet, model, i, unsure))
     return sorted(out, key=lambda one: one.surprise)
 
@@ -638,6 +681,25 @@ def _freed(fleet: Fleet, model: Model, i: int, name: str, step: float) -> float:
     free = rest.shape[1] - 1
     # one of so many velocities was given away at each block
     return float((rest**2).sum(1).mean()) * (rest.shape[1] / free if free else 1.0)
+
+
+def _heading_off(fleet: Fleet, model: Model, log: Record) -> Cause:
+    """Return the angle by which ahead is another way than the velocities have it."""
+
+    def surprise(angle: float) -> float:
+        turned = (log["u"] + 1j * log["v"]) * np.exp(1j * angle)
+        return model.surprise(fleet.of(changed(log, {"u": turned.real, "v": turned.imag})))
+
+    step = math.radians(10.0)
+    near = min((step * k for k in range(-17, 19) if k), key=surprise)
+    found = minimize_scalar(surprise, bounds=(near - step, near + step), options={"maxiter": 12})
+    angle = float(found.x)
+    way = "larger" if angle < 0.0 else "smaller"
+    text = (
+        f"psi would have to be {way} by {abs(math.degrees(angle)):.3g} deg, or u and v turned by"
+        " as much"
+    )
+    return Cause("heading", "psi", angle, float(found.fun), text)
 
 
 def _current(fleet: Fleet, model: Model, log: Record) -> list[Cause]:
