@@ -64,6 +64,10 @@ def _exchanged(log: Log) -> dict[str, np.ndarray]:
     return {"n_port": log["n_stbd"], "n_stbd": log["n_port"]}
 
 
+def _reversed(log: Log) -> dict[str, np.ndarray]:
+    return {"delta": -log["delta"]}
+
+
 def _askew(log: Log) -> dict[str, np.ndarray]:
     """The sensor of the velocities is turned by 20 deg."""
     turned = (log["u"] + 1j * log["v"]) * np.exp(1j * np.radians(20.0))
@@ -71,19 +75,23 @@ def _askew(log: Log) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("change", "cause", "channels"),
+    ("kind", "change", "cause", "states"),
     [
-        (_exchanged, "exchanged", ("x", "y", "psi", "r")),
-        (_askew, "heading", ("psi", "u", "v", "r")),
+        ("twin", _exchanged, "exchanged", ("x", "y", "psi", "r")),
+        ("boat", _reversed, "sign", ("psi", "u", "v", "r")),
+        ("boat", _askew, "heading", ("psi", "u", "v", "r")),
     ],
 )
 def test_logs_with_one_fault_do_not_hide_each_other(
-    change: Callable[[Log], dict[str, np.ndarray]], cause: str, channels: tuple[str, ...]
+    kind: str,
+    change: Callable[[Log], dict[str, np.ndarray]],
+    cause: str,
+    states: tuple[str, ...],
 ) -> None:
     """A third of the logs share it; where none holds velocities, positions tell them."""
-    (fleet,) = drawn("twin", _SEED, 1, fewest=9, most=9)
+    (fleet,) = drawn(kind, 14, 1, fewest=9, most=9)
     logs = [
-        log.replace(channels={name: log[name] for name in (*channels, *fleet.inputs)})
+        log.replace(channels={name: log[name] for name in (*states, *fleet.inputs)})
         for log in fleet.logs
     ]
     assert found(logs, fleet) == []

@@ -50,9 +50,8 @@ _USUAL_PARTS = 1.3
 model is right: the mean of the largest of three chi variables over their size."""
 _LEAST_SCATTER = 0.1
 """Scatter of the logarithm of what is left that logs of one vessel have at least."""
-_SPOILT, _ROUNDS = 3.0, 3
-"""What the others leave of a log over what it leaves of itself, in the middle of the logs, from
-which the half that agrees is searched for, and steps of that search."""
+_ROUNDS = 3
+"""Steps of the search for the half of the logs that agrees best."""
 _SUSPECTS, _SUSPICIOUS = 8, 0.5
 """Logs that are left out in turn, so that the time grows with the number of logs only, and how
 much a log must stand apart before it is."""
@@ -447,7 +446,7 @@ class Fleet:
         return {i: float((left[i] / own[i]).max()) if i in left else 1.0 for i in self.told}
 
     def _agreeing(self) -> list[int]:
-        """Return the half of the logs that agree best; all where they predict each other well.
+        """Return the half of the logs that agree best.
 
         Several logs with one fault spoil the model of all, so that none stands apart. It is the
         half with the least sum of misfits, from single logs on (least trimmed squares over logs,
@@ -455,8 +454,6 @@ class Fleet:
         """
         own = {i: np.maximum(self._by_stretches(self.rows[i]), 1e-12) for i in self.told}
         least, best = math.inf, list(self.told)
-        if np.median([*self._misfits(self.told, own).values()]) < _SPOILT:
-            return best
         for first in self.told[:: -(-len(self.told) // _SUSPECTS)]:
             core = [first]
             for _ in range(_ROUNDS):
@@ -649,13 +646,20 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
             sizes["late"] = [step * fleet.seconds for step in _STEPS]
             sizes["offset"] = [step * spread for step in _STEPS]
         for kind, tried in sizes.items():
-            found = []
-            for size in tried:
+
+            def surprise_of(size: float, kind: str = kind, name: str = name) -> float:
                 values = _with_change(kind, log[name], log.t, size)
                 surprise = model.surprise(fleet.of(changed(log, {name: values})))
                 # what is predicted has another density where it is scaled
-                found.append((surprise - (0.0 if drives else 2.0 * math.log(abs(size))), size))
-            surprise, size = min(found)
+                return surprise - (0.0 if name in fleet.driving else 2.0 * math.log(abs(size)))
+
+            surprise, size = min((surprise_of(size), size) for size in tried)
+            if drives and kind != "sign":
+                tried = sorted(tried)
+                at = tried.index(size)
+                ends = tried[max(at - 1, 0)], tried[min(at + 1, len(tried) - 1)]
+                near = minimize_scalar(surprise_of, bounds=ends, options={"maxiter": 8})
+                surprise, size = min((surprise, size), (float(near.fun), float(near.x)))
             text = _in_words(kind, name, log.units[name], size)
             out.append(Cause(kind, name, size, surprise, text))
     for port in (one for one in fleet.driving if one.endswith("_port")):
