@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (884, 128),
     "control": (3179, 362),
     "core": (1615, 245),
-    "data": (9657, 840),
+    "data": (9725, 847),
     "documents": (2462, 227),
     "dynamics": (2289, 284),
     "export": (1504, 172),
