@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -29,49 +30,28 @@ def log() -> Log:
     )
 
 
-def test_round_trip(log: Log, tmp_path: Path) -> None:
-    path = tmp_path / "log.parquet"
-    log.save(path)
-    again = Log.load(path)
-    assert (again.name, again.manoeuvre, again.units, again.meta) == (
-        log.name,
-        log.manoeuvre,
-        log.units,
-        log.meta,
-    )
-    assert again.t.tobytes() == log.t.tobytes()
-    assert list(again.channels) == list(log.channels)
-    for name, values in log.channels.items():
-        assert again[name].dtype == np.float64
-        assert again[name].tobytes() == values.tobytes()
-    assert list(again.masks) == list(log.masks)
-    for reason, mask in log.masks.items():
-        assert again.masks[reason].dtype == np.bool_
-        np.testing.assert_array_equal(again.masks[reason], mask)
-
-
-def test_round_trip_of_a_bare_log(tmp_path: Path) -> None:
-    path = tmp_path / "log.parquet"
-    Log("empty", np.zeros(0), {}).save(path)
-    again = Log.load(path)
-    assert len(again) == 0
-    assert (again.name, again.manoeuvre, again.channels, again.masks, again.meta) == (
-        "empty",
-        "unknown",
-        {},
-        {},
-        {},
-    )
-
-
-def test_units_are_filled_in(log: Log) -> None:
-    assert log.units == {"fuel": "kg", "u": "m/s", "psi": "rad"}
-    assert Log("x", np.zeros(1), {"odd": np.zeros(1)}).units == {"odd": "-"}
+def test_what_is_written_comes_back_bit_by_bit(log: Log, tmp_path: Path) -> None:
+    for one in (log, Log("empty", np.zeros(0), {}, meta={"vessel": None})):
+        one.save(tmp_path / "log.parquet")
+        again = Log.load(tmp_path / "log.parquet")
+        for part in ("name", "manoeuvre", "units", "meta"):
+            assert getattr(again, part) == getattr(one, part)
+        assert again.t.tobytes() == one.t.tobytes()
+        assert list(again.channels) == list(one.channels)
+        for name, values in one.channels.items():
+            assert again[name].dtype == np.float64
+            assert again[name].tobytes() == values.tobytes()
+        assert list(again.masks) == list(one.masks)
+        for reason, mask in one.masks.items():
+            assert again.masks[reason].dtype == np.bool_
+            np.testing.assert_array_equal(again.masks[reason], mask)
 
 
 def test_usable_is_what_no_mask_excludes(log: Log) -> None:
     assert np.flatnonzero(~log.usable).tolist() == [0, 1, 2, 3, 4, 40]
     assert Log("x", np.zeros(3), {}).usable.all()
+    assert log.units == {"fuel": "kg", "u": "m/s", "psi": "rad"}
+    assert Log("x", np.zeros(1), {"odd": np.zeros(1)}).units == {"odd": "-"}
 
 
 def test_access(log: Log) -> None:
@@ -80,66 +60,41 @@ def test_access(log: Log) -> None:
     )
     assert log.stack([]).shape == (50, 0)
     assert log.replace(name="other").name == "other"
-    with pytest.raises(
-        UsageError, match=r"log zigzag-20: no channel 'fuels'; did you mean 'fuel'\?$"
-    ):
+    with pytest.raises(UsageError, match=r"log zigzag-20: no channel 'fuels'; did you mean 'fuel'"):
         log["fuels"]
-
-
-def test_channels_have_the_clocks_length() -> None:
     with pytest.raises(DataError, match="log x: channel u has 2 samples, time has 3"):
         Log("x", np.arange(3.0), {"u": np.zeros(2)})
 
 
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"nope\.parquet: no such file$"):
-        Log.load(tmp_path / "nope.parquet")
-
-
 @pytest.mark.parametrize(
-    "content",
+    ("content", "told"),
     [
-        pytest.param(b"", id="empty"),
-        pytest.param(b"t,u\n0,1\n", id="csv"),
-        pytest.param(
-            b"PAR1" + bytes(40) + b"PAR1",
-            id="damaged footer",
-        ),
+        (None, "no such file$"),
+        (b"", "not a Parquet file"),
+        (b"t,u\n0,1\n", "not a Parquet file"),
+        (b"PAR1" + bytes(40) + b"PAR1", "not a Parquet file"),
+        ("cut short", "not a Parquet file"),
+        ({}, f"not a residnet log \\({SCHEMA}\\)"),
+        ({"other": "{}"}, "not a residnet log"),
+        ({"residnet": '{"schema": "residnet.log/0"}'}, "not a residnet log"),
     ],
+    ids=str,
 )
-def test_not_parquet(tmp_path: Path, content: bytes) -> None:
+def test_other_files_are_refused_by_name(log: Log, tmp_path: Path, content: Any, told: str) -> None:
     path = tmp_path / "log.parquet"
-    path.write_bytes(content)
-    with pytest.raises(UsageError, match=r"log\.parquet: not a Parquet file") as caught:
+    if isinstance(content, dict):
+        pq.write_table(pa.table({"t": [0.0, 1.0]}).replace_schema_metadata(content), path)
+    elif content == "cut short":
+        log.save(path)
+        path.write_bytes(path.read_bytes()[:-20])
+    elif content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UsageError, match=rf"log\.parquet: {told}") as caught:
         Log.load(path)
     assert "\n" not in str(caught.value)
-
-
-def test_cut_short(log: Log, tmp_path: Path) -> None:
-    path = tmp_path / "log.parquet"
-    log.save(path)
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(UsageError, match="not a Parquet file"):
-        Log.load(path)
-
-
-@pytest.mark.parametrize(
-    "metadata", [None, {"other": "{}"}, {"residnet": '{"schema": "residnet.log/0"}'}]
-)
-def test_foreign_parquet(tmp_path: Path, metadata: dict[str, str] | None) -> None:
-    path = tmp_path / "log.parquet"
-    pq.write_table(pa.table({"t": [0.0, 1.0]}).replace_schema_metadata(metadata), path)
-    with pytest.raises(UsageError, match=f"not a residnet log \\({SCHEMA}\\)"):
-        Log.load(path)
 
 
 def test_a_log_is_shown_in_one_line() -> None:
     log = Log("run 1", 0.1 * np.arange(901), {"u": np.zeros(901), "psi": np.zeros(901)})
     assert repr(log) == "Log('run 1', unknown, 901 samples over 90.0 s: u [m/s], psi [rad])"
     assert "0 samples over 0.0 s" in repr(Log("none", np.zeros(0), {}))
-
-
-def test_a_log_of_a_model_alone_names_no_vessel(tmp_path: Path) -> None:
-    log = Log("flown", np.arange(3.0), {"u": np.zeros(3)}, meta={"vessel": None, "findings": []})
-    log.save(tmp_path / "flown.parquet")
-    assert Log.load(tmp_path / "flown.parquet").meta["vessel"] is None

@@ -52,15 +52,12 @@ def test_parts_are_found_by_name() -> None:
     assert validate({"kind": "pulse"}, ManoeuvreConfig, "here").kind == "pulse"
     assert load_vessel("sample_ferry").build().commands == 2
     assert exporter("numbers").suffix == ".csv"
-    assert isinstance(validate({"kind": "plsr"}, HeadConfig, "here"), PlsrConfig)
-
-
-@pytest.mark.usefixtures("installed")
-def test_errors_know_the_keys_of_third_party_kinds() -> None:
-    with pytest.raises(ConfigError, match="time_konstant: unknown key; did you mean 'time_const"):
-        validate({"kind": "slow_water", "time_konstant": 3}, HeadConfig, "here")
-    with pytest.raises(ConfigError, match="'slow_watr'; did you mean 'slow_water'"):
-        validate({"kind": "slow_watr"}, HeadConfig, "here")
+    for given, told in (
+        ({"kind": "slow_water", "time_konstant": 3}, "unknown key; did you mean 'time_const"),
+        ({"kind": "slow_watr"}, "'slow_watr'; did you mean 'slow_water'"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            validate(given, HeadConfig, "here")
 
 
 @pytest.mark.usefixtures("installed")
@@ -83,14 +80,17 @@ def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> N
     ],
 )
 def test_faults_of_kinds(installed: Path, target: str, fault: str) -> None:
-    declare(installed / "site", "residnet.heads", odd=target)
-    assert fault in dict(registry.listed(HeadConfig))["odd"]
-
-
-def test_no_package_takes_a_name_away(installed: Path) -> None:
-    declare(installed / "site", "residnet.heads", plsr="residnet_sample.slow_water:SlowWaterConfig")
+    declare(
+        installed / "site",
+        "residnet.heads",
+        odd=target,
+        plsr="residnet_sample.slow_water:SlowWaterConfig",
+    )
+    listed = dict(registry.listed(HeadConfig))
+    assert fault in listed["odd"]
+    # no package takes a name away
     assert isinstance(validate({"kind": "plsr"}, HeadConfig, "here"), PlsrConfig)
-    assert "residnet has a kind of that name" in dict(registry.listed(HeadConfig))["plsr"]
+    assert "residnet has a kind of that name" in listed["plsr"]
 
 
 def test_faults_of_formats_and_vessels(installed: Path) -> None:
