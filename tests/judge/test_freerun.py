@@ -1,40 +1,116 @@
-"""Free runs: what a window starts from, what it is given, what is stored where it diverges; poses
-from velocities.
-"""
+"""Free runs: which windows, what each starts from and is given, what stands where it diverges."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from made_logs import made, prepared, random_states
+from made_logs import made, prepared, random_runs, random_states
 
-from residnet.baselines.given import StillConfig
 from residnet.baselines.regressors import RegressorBaseline
+from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.prepare import Prepared
-from residnet.dynamics.base import Dynamics, Integrator
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.judge import freerun
 from residnet.judge.freerun import Candidate, Prediction, free_run, integrate
-from residnet.judge.protocol import Window
+from residnet.judge.protocol import WholeManoeuvre, Window, Windows, all_windows
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
 STEP = 0.1
+
+
+def test_windows_are_the_first_that_fit_back_to_back() -> None:
+    """The protocol of the data README, sample by sample: usable at its start, without a break."""
+    rng = np.random.default_rng(1)
+    found = 0
+    for _ in range(200):
+        count = int(rng.integers(1, 300))
+        breaks = np.cumsum(rng.random(count) < 0.02)
+        hole = random_runs(count, rng, mean=40.0) & (rng.random() < 0.5)
+        piece = np.where(hole, -1, breaks + 1000 * np.cumsum(np.diff(hole, prepend=False)))
+        usable = ~(random_runs(count, rng, mean=15.0) & (rng.random(count) < 0.7))
+        log = made(random_states(count, rng), STEP, usable=usable, piece=piece)
+        windows = Windows(length=2.0, first=0.5, history=1.0).windows(log, 7, STEP)
+        expected, start = [], 5
+        while start + 20 < count:
+            inside = piece[start : start + 21]
+            if log.usable[start] and (inside == inside[0]).all():
+                expected.append(start)
+                start += 19
+            start += 1
+        assert [w.start for w in windows] == expected
+        for w in windows:
+            assert (w.log, w.stop) == (7, w.start + 21)
+            np.testing.assert_array_equal(w.nu, log.y[w.start, 3:])
+        found += len(windows)
+    assert found > 200
+
+
+def test_history_does_not_reach_across_a_break() -> None:
+    """What warms up a memory must be an uninterrupted past."""
+    piece = np.repeat([0, -1, 1], 100)
+    log = made(np.zeros((300, 6)), STEP, piece=piece)
+    windows = Windows(length=4.0, first=5.0, history=6.0).windows(log, 0, STEP)
+    assert [(w.past, w.start) for w in windows] == [(0, 50), (200, 200), (200, 240)]
+    touching = made(np.zeros((200, 6)), STEP, piece=np.repeat([0, 1], 100))
+    windows = Windows(length=4.0, first=9.0, history=6.0).windows(touching, 0, STEP)
+    assert [(w.past, w.start) for w in windows] == [(100, 100), (100, 140)]
+
+
+def test_whole_manoeuvres() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        count = int(rng.integers(1, 400))
+        piece = np.where(
+            random_runs(count, rng, mean=60.0), np.cumsum(rng.random(count) < 0.01), -1
+        )
+        piece = np.where(piece >= 0, np.cumsum(np.diff(piece, prepend=-2) != 0), -1)
+        log = made(random_states(count, rng), STEP, piece=piece)
+        expected = []
+        for number in np.unique(piece[piece >= 0]):
+            rows = np.flatnonzero(piece == number)
+            assert (np.diff(rows) == 1).all()
+            if len(rows) > 30:
+                expected.append((int(rows[0]) + 4, int(rows[-1]) + 1, int(rows[0])))
+        windows = WholeManoeuvre(initial=0.4, shortest=3.0).windows(log, 3, STEP)
+        assert [(w.start, w.stop, w.past) for w in windows] == expected
+        for w in windows:
+            np.testing.assert_allclose(w.nu, log.y[w.past : w.start, 3:].mean(0))
+
+
+def test_a_stretch_without_a_sample_to_score_is_no_window() -> None:
+    """Its error would be the mean of nothing, and metrics.json holds no NaN."""
+    usable, piece = np.ones(200, dtype=bool), np.repeat([0, 1], 100)
+    usable[4:100] = False
+    windows = WholeManoeuvre(initial=0.4, shortest=3.0).windows(
+        made(np.zeros((200, 6)), STEP, usable=usable, piece=piece), 0, STEP
+    )
+    assert [w.start for w in windows] == [104]
+
+
+def test_no_window_at_all_says_how_long_the_logs_are() -> None:
+    logs = [made(np.zeros((n, 6)), STEP, name=f"of {n}") for n in (50, 80)]
+    told = r"protocol T30: none of 2 'test' logs.*of 80, lasts 8\.0 s"
+    with pytest.raises(DataError, match=told):
+        all_windows(Windows(length=30.0), logs, STEP, "T30")
+    found = all_windows(Windows(length=2.0, first=0.0), logs, STEP, "T2")
+    assert [w.log for w in found] == [0, 0, 1, 1, 1]
+
+
 SIGNALS = SignalsConfig(inputs=("tau_x", "tau_n"))
 
 
 def window(
-    log: int,
-    start: int,
-    stop: int,
-    past: int | None = None,
-    nu: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    log: int, start: int, stop: int, past: int | None = None, nu: Any = (1.0, 0, 0)
 ) -> Window:
     return Window(log, start, stop, start if past is None else past, np.array(nu))
 
@@ -58,12 +134,11 @@ def ran(
     return free_run([Candidate("m", "head", model)], windows, logs, STEP, limits, dtype)["m"]
 
 
-@pytest.mark.parametrize("rate", [0.05, -0.2])
-def test_integrate_gives_a_circle(rate: float) -> None:
+def test_integrate_gives_a_circle() -> None:
     """Constant u, v, r: a circle of radius U / |r|; the trapezoidal rule on the chord is off by (r
     dt)^2 / 12 of the arc only.
     """
-    count, u, v = 400, 2.0, 0.3
+    count, u, v, rate = 400, 2.0, 0.3, -0.2
     nu = np.tile([u, v, rate], (count, 1))
     pose = integrate(np.array([5.0, -3.0, 0.4]), nu, STEP)
     t = STEP * np.arange(count)
@@ -73,16 +148,9 @@ def test_integrate_gives_a_circle(rate: float) -> None:
     np.testing.assert_allclose(pose[:, 2], psi, atol=1e-12)
     allowed = (rate * STEP) ** 2 / 12 * np.hypot(u, v) * t[-1] + 1e-12
     assert np.hypot(pose[:, 0] - north, pose[:, 1] - east).max() <= allowed
-
-
-def test_integrate_straight_and_accelerating() -> None:
-    t = STEP * np.arange(50)
-    nu = np.stack((0.5 * t, 0 * t, 0 * t), axis=1)
-    pose = integrate(np.array([0.0, 0.0, np.pi / 2]), nu, STEP)
-    np.testing.assert_allclose(
-        pose, np.stack((0 * t, 0.25 * t**2, np.full_like(t, np.pi / 2)), axis=1), atol=1e-12
-    )
-    assert integrate(np.array([1.0, 2.0, 3.0]), np.ones((1, 3)), STEP).tolist() == [[1.0, 2.0, 3.0]]
+    # rates between samples are their means
+    faster = integrate(np.zeros(3), np.stack((0.5 * t, 0 * t, 0 * t), axis=1), STEP)
+    np.testing.assert_allclose(faster[:, 0], 0.25 * t**2, atol=1e-9)
 
 
 @pytest.mark.parametrize(("dtype", "near"), [(torch.float64, 1e-6), (torch.float32, 1e-5)])
@@ -121,31 +189,42 @@ def test_inputs_are_held_from_their_own_sample() -> None:
     np.testing.assert_allclose(p.states[:, 3], expected, atol=1e-12)
 
 
-def zero() -> HybridDynamics:
-    signals = SIGNALS.build()
-    return HybridDynamics(signals, StillConfig().build(signals.names), ZeroHead(), STEP)
-
-
-@pytest.mark.parametrize(("growth", "limit"), [(1.0, 50.0), (800.0, 1e300), (3.0, 1e3)])
+@pytest.mark.parametrize(("growth", "limit"), [(1.0, 50.0), (800.0, 1e300)])
 def test_a_diverged_window_holds_the_prediction_of_zero(growth: float, limit: float) -> None:
     theta = np.zeros((3, 6))
     theta[0, 0] = growth
     logs = [made(random_states(80, np.random.default_rng(3)), STEP)]
     windows = [window(0, 0, 80, nu=(1.0, 0.2, -0.05)), window(0, 10, 40, nu=(0.0, 0.3, 0.1))]
-    runs = free_run(
-        [Candidate("m", "head", hybrid(theta)), Candidate("zero", "zero", zero())],
-        windows,
-        logs,
-        STEP,
-        np.full(3, limit),
-    )
-    assert [p.diverged for p in runs["m"]] == [True, False]
-    assert [p.diverged for p in runs["zero"]] == [False, False]
-    for p, z in zip(runs["m"], runs["zero"], strict=True):
+    runs, zero = (ran(hybrid(one), windows, logs, limit) for one in (theta, 0.0 * theta))
+    assert [p.diverged for p in runs] == [True, False]
+    assert [p.diverged for p in zero] == [False, False]
+    for p, z in zip(runs, zero, strict=True):
         # the second starts at rest, where growth has nothing to work on: it equals zero without
         # diverging
         np.testing.assert_allclose(p.states, z.states, atol=1e-12)
         assert np.isfinite(p.states).all()
+
+
+def test_a_mean_is_that_of_the_trajectories_of_its_members() -> None:
+    """Run by itself and beside them; where one ran away, the mean of what it really did."""
+    theta = np.zeros((2, 3, 6))
+    theta[0, 0, 0], theta[1, 0, 0], theta[1, 0, 5] = -1.0, 0.9, 0.2
+    models = [hybrid(one).double() for one in theta]
+    mean = MeanOfTrajectories(models, (-1e6,) * 3, (1e6,) * 3)
+    logs = [made(random_states(40, np.random.default_rng(3)), STEP)]
+    windows = [window(0, 0, 40, nu=(5.0, 0.2, 0.1)), window(0, 10, 20, nu=(1.0, 0.3, 0.1))]
+    candidates = [Candidate(name, "head", model) for name, model in zip("ab", models, strict=True)]
+    candidates.append(Candidate("mean", "ensemble", mean, members=("a", "b")))
+    found = free_run(candidates, windows, logs, STEP, np.full(3, 100.0))
+    assert [[p.diverged for p in found[name]] for name in ("a", "b", "mean")] == [
+        [False, False],
+        [True, False],
+        [False, False],
+    ]
+    both = np.mean([found[name][1].states[:, 3:] for name in "ab"], axis=0)
+    np.testing.assert_allclose(found["mean"][1].states[:, 3:], both, atol=1e-9)
+    for one, other in zip(found["mean"], ran(mean, windows, logs, 100.0), strict=True):
+        np.testing.assert_allclose(one.states, other.states, atol=1e-9)
 
 
 def test_a_window_beyond_short_training_logs_is_no_divergence() -> None:
@@ -193,18 +272,16 @@ def test_a_memory_is_warmed_up_by_the_measured_past() -> None:
                 x, s = model.step(x, torch.from_numpy(log.w[None, k]), s)
 
 
-@pytest.mark.parametrize(("vessel", "start"), [("wam_v_cal", 0.0), ("patrol_p06", 7.0)])
-def test_the_plant_itself_predicts_its_own_noise_free_trial(vessel: str, start: float) -> None:
+def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
     """The candidate `truth`: what the measured state lacks (actuators, phi and p of a vessel that
     rolls) from the log, commands as inputs, no more known.
     """
-    plant, count = load_vessel(vessel).build(), 200
+    plant, count = load_vessel("patrol_p06").build(), 200
     model = PlantDynamics(plant, STEP, 2)
     w = torch.zeros(1, count, len(plant.inputs), dtype=torch.float64)
-    swing = torch.sin(torch.arange(count) * 0.1)
-    w[0, :, 0] = 0.1 * torch.sign(swing) if start else 20 + 10 * swing
-    w[0, :, 1] = 1e5 if start else 15.0
-    x, states = plant.approach(1) if start else torch.zeros(1, 8, dtype=torch.float64), []
+    w[0, :, 0] = 0.1 * torch.sign(torch.sin(torch.arange(count) * 0.1))
+    w[0, :, 1] = 1e5
+    x, states = plant.approach(1), []
     with torch.no_grad():
         for k in range(count):
             states.append(x[0])
@@ -215,13 +292,13 @@ def test_the_plant_itself_predicts_its_own_noise_free_trial(vessel: str, start: 
     motion, whole = log.stack(("x", "y", "psi", "u", "v", "r")), np.ones(count, dtype=bool)
     trial = prepared(log, motion, np.zeros((count, 2)), whole, np.zeros(count, dtype=int))
     truth = Candidate("truth", "truth", model, plant.state, plant.inputs[:2], len(plant.inputs) - 2)
-    windows = [window(0, s, s + 60, nu=tuple(motion[s, 3:])) for s in (0, 70, 130)]
+    windows = [window(0, s, s + 60, nu=motion[s, 3:]) for s in (0, 70, 130)]
     found = free_run([truth], windows, [trial], STEP, np.full(3, 1e6))["truth"]
     for one, p in zip(windows, found, strict=True):
         seen = motion[one.start : one.stop]
         np.testing.assert_allclose(p.states[:, 3:], seen[:, 3:], atol=1e-12)
-        np.testing.assert_allclose(p.states[:, :3], seen[:, :3], atol=2e-3 * max(start, 1.0))
-    assert not start or np.abs(log["phi"]).max() > 0.01
+        np.testing.assert_allclose(p.states[:, :3], seen[:, :3], atol=2e-2)
+    assert np.abs(log["phi"]).max() > 0.01
 
 
 @pytest.mark.parametrize("remembers", [False, True])
@@ -249,20 +326,3 @@ def test_windows_run_together_as_they_run_alone(
             assert one.states.shape == (length, 6)
             np.testing.assert_allclose(one.states, other, rtol=1e-9, atol=1e-9)
     assert model.positions, "the judged model itself is left as it is"
-
-
-@pytest.mark.parametrize("integrator", ["rk4", "semi_implicit_euler"])
-def test_velocities_and_heading_do_without_positions(integrator: Integrator) -> None:
-    random = np.random.default_rng(5)
-    model = hybrid(np.concatenate((-np.eye(3), 0.1 * random.normal(size=(3, 3))), axis=1))
-    model = HybridDynamics(model.signals, model.baseline, model.head, STEP, integrator)
-    x0, w = (
-        torch.from_numpy(random.normal(size=(4, 6))),
-        torch.from_numpy(random.normal(size=(4, 30, 2))),
-    )
-    with torch.no_grad():
-        whole = Rollout(model)(x0, w, x0[:, :0])[0]
-        model.positions = False
-        part = Rollout(model)(x0, w, x0[:, :0])[0]
-    torch.testing.assert_close(part[..., 2:], whole[..., 2:], rtol=0, atol=1e-13)
-    assert torch.equal(part[..., :2], x0[:, None, :2].expand(-1, 31, -1))

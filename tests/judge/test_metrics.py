@@ -1,19 +1,31 @@
-"""Metrics and limits of hand-made predictions against numbers by hand and plain loops."""
+"""Errors of free runs by hand and by loops, and their intervals against all resamples."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_logs import made, random_states
+from scipy import stats
 
 from residnet.baselines.given import StillConfig
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ZeroHead
 from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction
-from residnet.judge.metrics import Judged, find, metrics_content, metrics_table, new_trials
+from residnet.judge.metrics import (
+    Judged,
+    blocks,
+    difference,
+    find,
+    intervals,
+    metrics_content,
+    metrics_table,
+    new_trials,
+    tail,
+)
 from residnet.judge.protocol import Window, Windows
 from residnet.judge.selection import blocks_of, shares
 from residnet.physics.signals import SignalsConfig
@@ -51,14 +63,7 @@ def test_by_hand() -> None:
     assert errors.ends()["position"].tolist() == [5.0]
     assert errors.ends()["heading"].tolist() == pytest.approx([0.5])
     assert errors.samples.tolist() == [3]
-    (row,) = [
-        r
-        for r in Judged(run, [candidate("mine")], [log], SCALES).rows({})
-        if r["manoeuvre"] == "all"
-    ]
-    nrmse = np.array([np.sqrt(0.25 / 3) / 0.5, np.sqrt(0.02 / 3) / 0.25, np.sqrt(0.03 / 4) / 0.1])
-    assert [row["nrmse"][c] for c in "uvr"] == pytest.approx(nrmse.tolist())
-    assert row["nrmse"]["mean"] == pytest.approx(nrmse.mean())
+    row = find(Judged(run, [candidate("mine")], [log], SCALES).rows({}), model="mine")
     labels = [
         row[key] for key in ("model", "kind", "split", "protocol", "windows", "n", "diverged")
     ]
@@ -85,13 +90,8 @@ def test_rows_equal_a_loop_over_windows() -> None:
     table = Judged(run, [candidate("a"), candidate("b")], logs, SCALES).rows(
         {"manoeuvring": ["zigzag", "turning"], "absent": ["3211"]}
     )
-    assert {row["manoeuvre"] for row in table} == {
-        "all",
-        "zigzag",
-        "constant",
-        "turning",
-        "manoeuvring",
-    }
+    shown = {"all", "zigzag", "constant", "turning", "manoeuvring"}
+    assert {row["manoeuvre"] for row in table} == shown
     members = {"all": {"zigzag", "constant", "turning"}, "manoeuvring": {"zigzag", "turning"}}
     for row in table:
         wanted = members.get(row["manoeuvre"], {row["manoeuvre"]})
@@ -101,13 +101,8 @@ def test_rows_equal_a_loop_over_windows() -> None:
             w, p = run.windows[i], run.predictions[row["model"]][i]
             error = p.states - logs[w.log].y[w.start : w.stop]
             good = logs[w.log].usable[w.start : w.stop]
-            rmse.append(
-                [
-                    np.sqrt((error[good, 3] ** 2).mean()),
-                    np.sqrt((error[good, 4] ** 2).mean()),
-                    np.sqrt((error[:, 5] ** 2).mean()),
-                ]
-            )
+            parts = (error[good, 3], error[good, 4], error[:, 5])
+            rmse.append([np.sqrt((part**2).mean()) for part in parts])
             position.append(np.hypot(*error[-1, :2]))
             heading.append(abs(np.remainder(error[-1, 2] + np.pi, 2.0 * np.pi) - np.pi))
             count += int(good.sum())
@@ -125,15 +120,11 @@ def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
     row = find(Judged(run, [candidate("a")], logs, SCALES).rows({}), model="a")
     # four logs of three windows: whole logs are too few, runs of two and one make eight
     assert row["ci95_blocks"] == {"of": "windows", "count": 8}
-    for c in "uvr":
-        low, high = row["rmse_ci95"][c]
-        assert low < row["rmse"][c] < high
-    low, high = row["nrmse_mean_ci95"]
-    assert low < row["nrmse"]["mean"] < high
+    spans = [(row["rmse_ci95"][c], row["rmse"][c]) for c in "uvr"]
+    for (low, high), mean in (*spans, (row["nrmse_mean_ci95"], row["nrmse"]["mean"])):
+        assert low < mean < high
     alone = FreeRun("T3", "test", run.windows[:1], {"a": run.predictions["a"][:1]})
-    (single,) = [
-        r for r in Judged(alone, [candidate("a")], logs, SCALES).rows({}) if r["manoeuvre"] == "all"
-    ]
+    single = find(Judged(alone, [candidate("a")], logs, SCALES).rows({}), model="a")
     assert single["rmse_ci95"] == {"u": None, "v": None, "r": None}
     assert single["nrmse_mean_ci95"] is single["ci95_blocks"] is None
 
@@ -145,68 +136,19 @@ def test_differences_are_paired_by_window_and_kind() -> None:
         for name in "ab"
     }
     compared = candidate("a", "b")
-    table = Judged(run, [compared, candidate("b")], logs, SCALES).rows({})
-    for row in table:
+    for row in Judged(run, [compared, candidate("b")], logs, SCALES).rows({}):
         chosen = [row["manoeuvre"] in ("all", logs[w.log].log.manoeuvre) for w in run.windows]
         if row["model"] == "b":
             assert row["difference"] is None
             continue
-        found = row["difference"]
+        found, one, other = row["difference"], errors["a"][chosen], errors["b"][chosen]
         assert found["to"] == "b"
-        assert found["nrmse_mean"] == pytest.approx(
-            float((errors["a"] - errors["b"])[chosen].mean())
-        )
-        assert found["nrmse_mean"] == pytest.approx(
-            row["nrmse"]["mean"]
-            - find(table, model="b", manoeuvre=row["manoeuvre"])["nrmse"]["mean"]
-        )
-        assert found["ratio"] == pytest.approx(
-            errors["a"][chosen].mean() / errors["b"][chosen].mean()
-        )
+        assert found["nrmse_mean"] == pytest.approx(float((one - other).mean()))
+        assert found["ratio"] == pytest.approx(one.mean() / other.mean())
         # only all kinds together make blocks enough
         assert (found["ci95"] is None) == (row["manoeuvre"] != "all")
     lost = Judged(run, [replace(compared, reference="absent")], logs, SCALES).rows({})
     assert {row["difference"] for row in lost} == {None}
-
-
-def test_find_wants_exactly_one() -> None:
-    run, logs = made_run()
-    table = Judged(run, [candidate("a"), candidate("b")], logs, SCALES).rows({})
-    assert find(table, model="b", split="test", protocol="T3", manoeuvre="zigzag")["windows"] == 6
-    with pytest.raises(KeyError, match="0 rows"):
-        find(table, model="c")
-    with pytest.raises(KeyError, match="2 rows"):
-        find(table, split="test")
-
-
-@pytest.mark.parametrize("logs", [3, 4, 6])
-def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest(logs: int) -> None:
-    random, held, windows = np.random.default_rng(3), [], 3
-    numbers = np.repeat(np.arange(logs), windows)
-    for _ in range(400):
-        # a log has its size in common, half of it for all columns
-        sizes = 0.4 * random.normal(size=(2, logs, 1)) + 0.4 * random.normal(size=(2, logs, 6))
-        seen, new = np.exp(
-            sizes.repeat(windows, axis=1) + 0.1 * random.normal(size=(2, 3 * logs, 6))
-        )
-        spans = np.array(new_trials(seen, numbers))
-        own = np.log(seen.reshape(logs, windows, 6).mean(1)).std(0)
-        surest = int(own.argmin())
-        low, high = spans[surest]
-        held.append(low <= new.mean(0)[surest] <= high)
-        np.testing.assert_allclose(np.sqrt(spans.prod(1)), seen.mean(0))
-    assert 0.92 <= np.mean(held) <= 0.99
-
-
-def test_what_ran_away_or_is_exact_leaves_the_intervals_of_others() -> None:
-    values = np.exp(np.random.default_rng(4).normal(size=(12, 4)))
-    numbers = np.repeat(np.arange(4), 3)
-    plain = new_trials(values[:, :2], numbers)
-    values[:, 2], values[5, 3] = 0.0, np.inf
-    spans = new_trials(values, numbers)
-    assert spans[:2] == plain
-    assert spans[2] == [0.0, 0.0]
-    assert new_trials(values[:6], numbers[:6]) == [None] * 4
 
 
 def test_a_table_has_one_column_per_number_and_the_file_marks_the_selected_model() -> None:
@@ -219,6 +161,10 @@ def test_a_table_has_one_column_per_number_and_the_file_marks_the_selected_model
     assert table["note"][0] == f"{rows[0]['diverged']}/12 diverged"
     assert "selected" not in table
     assert table.notna().to_numpy().all()
+    assert find(rows, model="b", split="test", protocol="T3", manoeuvre="zigzag")["windows"] == 6
+    for wanted, told in (({"model": "c"}, "0 rows"), ({"split": "test"}, "2 rows")):
+        with pytest.raises(KeyError, match=told):
+            find(rows, **wanted)
     content = metrics_content("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", "c", rows)
     assert content["schema"] == "residnet.metrics/1"
     assert (content["selected"], content["selected_ensemble"]) == ("b", "c")
@@ -254,23 +200,15 @@ def nine(wind: list[float] | None = None) -> tuple[FreeRun, list[Prepared]]:
     by twice that.
     """
     logs = [made(straight(k + 1.0), 0.1, w=np.zeros((21, 1)), name=f"log{k}") for k in range(9)]
-    if wind is not None:
-        logs = [
-            replace(
-                p,
-                log=p.log.replace(channels={**p.log.channels, "wind_speed": np.full(21, wind[k])}),
-            )
-            for k, p in enumerate(logs)
-        ]
+    for speed, one in zip(wind or (), logs, strict=False):
+        one.log.channels["wind_speed"] = np.full(21, speed)
     windows = [window(k, 0, 21) for k in range(9)]
 
     def off(factor: float) -> list[Prediction]:
-        out = []
-        for k, p in enumerate(logs):
-            states = p.y.copy()
-            states[:, 3] += factor * 0.01 * (k + 1)
-            out.append(Prediction(states, False))
-        return out
+        return [
+            Prediction(p.y + factor * 0.01 * (k + 1) * np.eye(6)[3], False)
+            for k, p in enumerate(logs)
+        ]
 
     return FreeRun("T2", "test", windows, {"a": off(1), "b": off(2)}), logs
 
@@ -278,13 +216,11 @@ def nine(wind: list[float] | None = None) -> tuple[FreeRun, list[Prepared]]:
 def test_bands_are_thirds_of_the_windows() -> None:
     run, logs = nine(wind=[3.0, 1.0, 2.0] * 3)
     found = Judged(run, [candidate("a", "b"), candidate("b")], logs, SCALES).bands()
+    speeds, winds = ((1, 3), (4, 6), (7, 9)), ((1, 1), (2, 2), (3, 3))
     assert [(band["by"], band["low"], band["high"], band["windows"]) for band in found] == [
-        ("speed", 1.0, 3.0, 3),
-        ("speed", 4.0, 6.0, 3),
-        ("speed", 7.0, 9.0, 3),
-        ("wind", 1.0, 1.0, 3),
-        ("wind", 2.0, 2.0, 3),
-        ("wind", 3.0, 3.0, 3),
+        (by, low, high, 3)
+        for by, ends in (("speed", speeds), ("wind", winds))
+        for low, high in ends
     ]
     # u alone is off: nrmse of a window is a third of its error over the scale
     levels = [
@@ -302,13 +238,10 @@ def test_bands_are_thirds_of_the_windows() -> None:
 
 def test_bands_without_windows_enough_or_without_wind_are_left_out() -> None:
     run, logs = nine()
-    assert {band["by"] for band in Judged(run, [candidate("a")], logs, SCALES).bands()} == {"speed"}
     few = FreeRun("T2", "test", run.windows[:8], {"a": run.predictions["a"][:8]})
     # 8 windows: thirds of 3, 2 and 3
-    assert [band["low"] for band in Judged(few, [candidate("a")], logs, SCALES).bands()] == [
-        1.0,
-        6.0,
-    ]
+    found = Judged(few, [candidate("a")], logs, SCALES).bands()
+    assert [(band["by"], band["low"]) for band in found] == [("speed", 1.0), ("speed", 6.0)]
     # one speed: no breakdown at all
     still = [made(straight(1.0), 0.1) for _ in range(9)]
     assert Judged(run, [candidate("a")], still, SCALES).bands() == []
@@ -344,7 +277,7 @@ def logs() -> list[Prepared]:
     ]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def run(logs: list[Prepared]) -> FreeRun:
     """The error of zero is 0.1 throughout; the model's grows with time and passes it at 12 s."""
     protocol = Windows(length=20.0, first=0.0, history=0.0)
@@ -370,9 +303,6 @@ def test_errors_of_the_pose_are_told_after_the_times_that_matter(
         prediction.states[20, :2] += np.array([3.0, 4.0])
         prediction.states[20, 2] += np.radians(200.0)
     entries = Judged(run, CANDIDATES, logs, SCALES).horizons(STEP)
-    for prediction in run.predictions["mlp"]:
-        prediction.states[20, :2] -= np.array([3.0, 4.0])
-        prediction.states[20, 2] -= np.radians(200.0)
     assert [entry["seconds"] for entry in entries] == [10.0, 20.0]
     first = entries[0]
     assert (first["windows"], first["logs"]) == (12, 6)
@@ -390,12 +320,9 @@ def test_errors_of_the_pose_are_told_after_the_times_that_matter(
 
 
 def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[Prepared]) -> None:
-    pairs = list(zip(run.windows, run.predictions["mlp"], strict=True))
-    for window, prediction in pairs:
+    for window, prediction in zip(run.windows, run.predictions["mlp"], strict=True):
         prediction.states[20, 2] += 0.5 * (window.log + 1)
     entries = Judged(run, CANDIDATES, logs, SCALES).horizons(STEP)
-    for window, prediction in pairs:
-        prediction.states[20, 2] -= 0.5 * (window.log + 1)
     assert entries[0]["models"]["mlp"]["intervals"]["heading"][1] == pytest.approx(np.pi)
 
 
@@ -433,3 +360,111 @@ def test_shares_of_blocks_sum_to_the_mean_error(
     own = shares(part, "mlp", logs, SCALES, labels, blocks)
     expected = Judged(part, [CANDIDATES[2]], logs, SCALES).nrmse["mlp"].mean()
     assert own.sum() == pytest.approx(expected)
+
+
+def test_a_block_is_a_log_from_five_logs_on() -> None:
+    numbers = np.array([7, 7, 2, 3, 3, 3, 9, 4])
+    found = blocks(numbers)
+    assert found is not None
+    assert (found.of, found.count) == ("logs", 5)
+    same = found.labels[:, None] == found.labels[None, :]
+    assert (same == (numbers[:, None] == numbers[None, :])).all()
+
+
+def test_few_logs_are_cut_into_runs_that_stay_within_a_log() -> None:
+    # 12 + 5 + 1 windows: runs of 3 make 4 + 2 + 1 = 7 blocks, runs of 2 make 6 + 3 + 1 = 10
+    logs = [0] * 12 + [1] * 5 + [2]
+    found = blocks(logs)
+    assert found is not None
+    assert (found.of, found.count) == ("windows", 10)
+    for block in range(found.count):
+        members = np.flatnonzero(found.labels == block)
+        assert len({logs[i] for i in members}) == 1
+        assert (np.diff(members) == 1).all()
+        assert 1 <= len(members) <= 2
+
+
+@pytest.mark.parametrize("logs", [[0] * 40, [0, 0, 0, 1, 1, 1, 1, 1, 1], [0, 1, 2, 3]])
+def test_too_little_gives_no_interval(logs: list[int]) -> None:
+    assert blocks(logs) is None
+    assert intervals(np.ones((len(logs), 2)), None) == [None, None]
+    found = difference(np.arange(len(logs)) + 2.0, np.ones(len(logs)), "base", None)
+    assert found["ci95"] is None
+    assert found["excludes_zero"] is False
+    assert found["nrmse_mean"] == pytest.approx(np.mean(np.arange(len(logs)) + 1.0))
+
+
+def test_equals_the_enumeration_of_all_resamples() -> None:
+    logs = [0, 0, 0, 1, 2, 2, 3, 3, 3, 3, 4, 5]
+    values = np.random.default_rng(3).normal(1.0, 0.5, len(logs))
+    sums = np.array([values[np.array(logs) == k].sum() for k in range(6)])
+    sizes = np.array([logs.count(k) for k in range(6)])
+    picks = np.array(list(itertools.product(range(6), repeat=6)))
+    means = sums[picks].sum(1) / sizes[picks].sum(1)
+    (interval,) = intervals(values[:, None], blocks(logs))
+    assert interval is not None
+    expected = np.quantile(means, [tail(6), 1 - tail(6)])
+    assert interval == pytest.approx(expected.tolist(), abs=0.06 * (expected[1] - expected[0]))
+
+
+def test_levels_widen_as_student_s_t() -> None:
+    assert tail(10**6) == pytest.approx(0.025, rel=1e-4)
+    # t of 4 and 7 degrees of freedom from tables
+    for count, t in ((5, 2.7764), (8, 2.3646)):
+        assert tail(count) == pytest.approx(stats.norm.sf(t * np.sqrt(count / (count - 1))), 1e-3)
+
+
+def test_pairing_finds_what_the_errors_of_each_model_hide() -> None:
+    # windows differ a hundred times more than models do
+    hard = np.random.default_rng(5).uniform(0.1, 1.0, 24)
+    drawn = blocks(np.arange(24) // 3)
+    found, other = (difference(*two, "base", drawn) for two in ((hard - 0.01, hard), (hard, hard)))
+    assert found["excludes_zero"] is True
+    assert found["ci95"] == pytest.approx([-0.01, -0.01])
+    assert found["ratio"] == pytest.approx(1.0 - 0.01 / hard.mean())
+    first, second = intervals(np.stack((hard - 0.01, hard), axis=1), drawn)
+    assert first is not None
+    assert second is not None
+    assert first[1] > second[0]
+    itself = {"ci95": [0.0, 0.0], "excludes_zero": False, "ratio": 1.0, "worse": False}
+    assert other == {"to": "base", "nrmse_mean": 0.0} | itself
+    above = difference(hard + 0.01, hard, "base", drawn)
+    assert above["excludes_zero"] is True
+
+
+@pytest.mark.parametrize(("factor", "worse"), [(1.04, False), (1.06, True), (0.5, False)])
+def test_worse_is_more_than_five_percent(factor: float, worse: bool) -> None:
+    base = np.array([0.1, 0.2, 0.4])
+    found = difference(factor * base, base, "base", None)
+    assert found["ratio"] == pytest.approx(factor)
+    assert found["worse"] is worse
+    assert difference(base, 0 * base, "base", None)["ratio"] is None
+
+
+@pytest.mark.parametrize("logs", [3, 6])
+def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest(logs: int) -> None:
+    random, held, windows = np.random.default_rng(3), [], 3
+    numbers = np.repeat(np.arange(logs), windows)
+    for _ in range(400):
+        # a log has its size in common, half of it for all columns
+        sizes = 0.4 * random.normal(size=(2, logs, 1)) + 0.4 * random.normal(size=(2, logs, 6))
+        seen, new = np.exp(
+            sizes.repeat(windows, axis=1) + 0.1 * random.normal(size=(2, 3 * logs, 6))
+        )
+        spans = np.array(new_trials(seen, numbers))
+        surest = int(np.log(seen.reshape(logs, windows, 6).mean(1)).std(0).argmin())
+        low, high = spans[surest]
+        held.append(low <= new.mean(0)[surest] <= high)
+        np.testing.assert_allclose(np.sqrt(spans.prod(1)), seen.mean(0))
+    assert 0.92 <= np.mean(held) <= 0.99
+
+
+def test_what_ran_away_or_is_exact_leaves_the_intervals_of_others() -> None:
+    values = np.exp(np.random.default_rng(4).normal(size=(12, 4)))
+    numbers = np.repeat(np.arange(4), 3)
+    plain = new_trials(values[:, :2], numbers)
+    values[:, 2], values[5, 3] = 0.0, np.inf
+    spans = new_trials(values, numbers)
+    assert spans[:2] == plain
+    assert spans[2] == [0.0, 0.0]
+    assert new_trials(values[:6], numbers[:6]) == [None] * 4
