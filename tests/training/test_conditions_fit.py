@@ -28,50 +28,32 @@ STEEP = PtosConfig(
 )  # fmt: skip
 
 
-def trained(units: int, rate: float) -> tuple[ObservedPolicy, dict[str, object]]:
-    torch.manual_seed(0)
-    policy = ObservedPolicySpec(
+def policy(units: int) -> ObservedPolicy:
+    return ObservedPolicySpec(
         state=VESSEL.state, gain=3.47, time=3.94, speed=3.2, limit=math.radians(5), rate=None,
         dt=0.1, trained_at=0.1, law=STEEP, units=units,
     ).build()  # fmt: skip
-    settings = PolicyTraining(
-        epochs=2,
-        steps=4,
-        batch=32,
-        learning_rate=rate,
-        dt=0.1,
-        hold=0.0,
-        validation=32,
-        quiet=0.0,
-        steady=None,
-    )
-    notes = train_policy("policy", policy, VESSEL, settings, CONDITIONS, 3, None)
-    return policy, notes
 
 
 @pytest.mark.long
 def test_training_lowers_the_cost_of_flights_that_it_does_not_see() -> None:
-    policy, notes = trained(4, 0.05)
-    assert notes["best_validation"] < 0.97 * notes["start_validation"]  # type: ignore[operator]
-    assert policy.values()["steepness"] < 250.0
-    again, other = trained(4, 0.05)
-    assert other["best_validation"] == notes["best_validation"]
-    assert torch.equal(again.constants, policy.constants)
-
-
-@pytest.mark.long
-def test_a_start_that_training_only_spoils_is_kept() -> None:
-    policy, notes = trained(4, 30.0)
-    assert notes["best_validation"] == notes["start_validation"]
-    assert float(policy.network.out.weight.abs().max()) == 0.0
+    settings = PolicyTraining(
+        epochs=2, steps=4, batch=32, learning_rate=0.05, dt=0.1, hold=0.0, validation=32, quiet=0.0,
+        steady=None,
+    )  # fmt: skip
+    found = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        made = policy(4)
+        notes = train_policy("policy", made, VESSEL, settings, CONDITIONS, 3, None)
+        found.append((notes["best_validation"], made.constants.tolist()))
+    assert notes["best_validation"] < 0.97 * notes["start_validation"]
+    assert made.values()["steepness"] < 250.0
+    assert found[0] == found[1]
 
 
 def fitted(settings: PolicyTraining) -> PolicyFit:
-    policy = ObservedPolicySpec(
-        state=VESSEL.state, gain=3.47, time=3.94, speed=3.2, limit=math.radians(5), rate=None,
-        dt=0.1, trained_at=0.1, law=STEEP, units=2,
-    ).build()  # fmt: skip
-    return PolicyFit(policy, VESSEL, settings, CONDITIONS, 0, None)
+    return PolicyFit(policy(2), VESSEL, settings, CONDITIONS, 0, None)
 
 
 def test_the_last_epochs_take_the_step_of_the_conditions() -> None:

@@ -36,13 +36,8 @@ TRIALS = {
     "substeps": 2,
     "trials": [
         {"kind": "constant", "drive": [0.3, 0.8], "steer": [-0.5, -0.2, 0.2, 0.5]},
-        {
-            "kind": "zigzag",
-            "count": 8,
-            "heading": ["20 deg", "40 deg"],
-            "steer": [0.3, 0.9],
-            "drive": [0.2, 0.9],
-        },
+        {"kind": "zigzag", "count": 8, "heading": ["20 deg", "40 deg"], "steer": [0.3, 0.9]}
+        | {"drive": [0.2, 0.9]},
         {"kind": "acceleration_deceleration", "count": 3},
         {"kind": "three_two_one_one", "count": 3},
     ],
@@ -52,11 +47,9 @@ TRIALS = {
 
 
 @cache
-def sailed(
-    *, drifting: bool = False, exact: bool = False, seed: int = 0
-) -> tuple[list[Prepared], np.ndarray]:
+def sailed(*, drifting: bool = False, exact: bool = False) -> tuple[list[Prepared], np.ndarray]:
     """Logs of the simulated catamaran and the current of each."""
-    change: dict[str, object] = {"seed": seed}
+    change: dict[str, object] = {"seed": 0}
     change |= {"disturbance": {"current_each": [0.1, 0.5]}} if drifting else {}
     change |= {"noise": {"u": 0, "v": 0, "r": 0}} if exact else {}
     config = validate({**TRIALS, **change}, SimulatedTrials, "here")
@@ -111,12 +104,11 @@ def test_wind_is_that_of_the_frame() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [0, 1])
-def test_currents_and_coefficients_come_back(seed: int) -> None:
+def test_currents_come_back() -> None:
     """Noise of 3 cm/s and 0.2 deg/s: currents to a centimetre per second, as their standard errors
-    say; coefficients as in calm water.
+    say.
     """
-    logs, truth = sailed(drifting=True, seed=seed)
+    logs, truth = sailed(drifting=True)
     signals = SIGNALS.build()
     fossen = RegressorsConfig(sets=("fossen",))
     found, table = estimate_currents(fossen.build(signals.names), signals, logs, CurrentConfig())
@@ -125,21 +117,6 @@ def test_currents_and_coefficients_come_back(seed: int) -> None:
     assert np.sqrt((error**2).mean()) < 0.01 < 0.05 < np.sqrt((truth**2).mean())
     claimed = np.array([row["standard_error"] for row in table])
     assert 0.5 < np.sqrt((error**2).mean() / (claimed**2).mean()) < 2.0
-
-    def hull(logs: list[Prepared]) -> torch.Tensor:
-        model = fossen.build(signals.names)
-        known = samples(logs, signals)
-        fossen.fit(model, known)
-        with torch.no_grad():
-            return model(samples(calm, signals).z)
-
-    calm, _ = sailed(seed=seed)
-    own = hull(calm)
-    moved = hull(
-        [through_water(log, current, signals) for log, current in zip(logs, found, strict=True)]
-    )
-    naive = hull(logs)
-    assert float((moved - own).square().mean()) < 0.02 * float((naive - own).square().mean())
 
 
 def test_a_start_in_a_wrong_valley_is_left() -> None:
@@ -159,52 +136,24 @@ def test_a_start_in_a_wrong_valley_is_left() -> None:
     assert float((found[3] - right[3]).norm()) < 0.1 < float((wrong[3] - right[3]).norm())
 
 
-@pytest.mark.long
-def test_calm_water_has_no_current() -> None:
-    logs, _ = sailed()
-    signals = SIGNALS.build()
-    found, table = estimate_currents(
-        RegressorsConfig(sets=("fossen",)).build(signals.names), signals, logs, CurrentConfig()
-    )
-    assert np.abs(found).max() < 0.03
-    assert [row["log"] for row in table] == [log.log.name for log in logs]
-    np.testing.assert_array_equal(
-        found, [[row["current_north"], row["current_east"]] for row in table]
-    )
-
-
-def test_a_narrow_prior_holds_currents_at_zero() -> None:
-    logs, _ = sailed(drifting=True)
-    signals = SIGNALS.build()
-    found, _ = estimate_currents(
-        RegressorsConfig(sets=("linear",)).build(signals.names),
-        signals,
-        logs,
-        CurrentConfig(spread=1e-6),
-    )
-    assert np.abs(found).max() < 1e-4
+LINEAR = RegressorsConfig(sets=("linear",))
 
 
 def test_a_log_without_samples_is_named() -> None:
     logs, _ = sailed()
     signals = SIGNALS.build()
     empty = dataclasses.replace(logs[0], good=np.zeros(len(logs[0]), dtype=bool))
-    with pytest.raises(
-        FitError, match="log constant_01: has no sample to estimate its current from"
-    ):
-        estimate_currents(
-            RegressorsConfig(sets=("linear",)).build(signals.names),
-            signals,
-            [empty, *logs[1:]],
-            CurrentConfig(),
-        )
+    told = "log constant_01: has no sample to estimate its current from"
+    with pytest.raises(FitError, match=told):
+        estimate_currents(LINEAR.build(signals.names), signals, [empty, logs[1]], CurrentConfig())
 
 
 def test_standard_errors_hold_where_the_regressors_are_not_the_true_ones() -> None:
     """Lines in every channel cannot be this hull; the halves of the logs disagree, and say so."""
     logs, truth = sailed(drifting=True)
+    logs, truth = logs[:12], truth[:12]
     signals = SIGNALS.build()
-    linear = RegressorsConfig(sets=("linear",)).build(signals.names)
+    linear = LINEAR.build(signals.names)
     found, table = estimate_currents(linear, signals, logs[3:], CurrentConfig(), logs[:3])
     claimed = np.array([row["standard_error"] for row in table])
     off = ((found - np.concatenate((truth[3:], truth[:3]))) / claimed) ** 2
@@ -217,10 +166,17 @@ def test_standard_errors_hold_where_the_regressors_are_not_the_true_ones() -> No
     assert [row["fitted"] for row in table] == [True] * len(logs[3:]) + [False] * 3
 
 
-def test_logs_kept_apart_change_nothing_for_the_others() -> None:
+def test_logs_kept_apart_change_nothing_and_a_narrow_prior_holds_currents_at_zero() -> None:
     logs, _ = sailed(drifting=True)
     signals = SIGNALS.build()
-    linear = RegressorsConfig(sets=("linear",)).build(signals.names)
-    alone, _ = estimate_currents(linear, signals, logs[3:6], CurrentConfig())
-    beside, _ = estimate_currents(linear, signals, logs[3:6], CurrentConfig(), logs[:2])
+    linear = LINEAR.build(signals.names)
+    alone, beside = (
+        estimate_currents(linear, signals, logs[3:6], CurrentConfig(), apart)[0]
+        for apart in ((), logs[:2])
+    )
     np.testing.assert_array_equal(beside[:3], alone)
+    held, table = estimate_currents(linear, signals, logs[3:5], CurrentConfig(spread=1e-6))
+    assert np.abs(held).max() < 1e-4 < np.abs(alone).max()
+    told = [[row["current_north"], row["current_east"]] for row in table]
+    np.testing.assert_array_equal(held, told)
+    assert [row["log"] for row in table] == [log.log.name for log in logs[3:5]]
