@@ -24,7 +24,6 @@ DEAR = (
     "export/test_formats.py",
     "control/test_courses.py",
     "training/test_current.py",
-    "export/test_band.py",
     "tasks/test_simulate.py",
     "heads/test_symbolic.py",
 )

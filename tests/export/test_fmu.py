@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import fmpy
@@ -18,18 +17,11 @@ from fmpy.validation import validate_fmu
 
 from residnet.dynamics.c_code import compiler
 from residnet.dynamics.rollout import Rollout
-from residnet.export import exporter, fmu, vessel
+from residnet.export import exporter, fmu
 from residnet.export.vessel import ExportedVessel
 
-pytestmark = pytest.mark.exporters
+pytestmark = [pytest.mark.exporters, pytest.mark.usefixtures("short_parity")]
 INPUTS = {"n_port": 20.0, "n_stbd": 25.0, "wind_speed": 3.0, "wind_dir": 1.0}
-
-
-@pytest.fixture(autouse=True)
-def short_parity() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vessel, "PARITY_STEPS", 60)
-        yield
 
 
 @pytest.mark.parametrize("name", ["fmu", "fmu2"])

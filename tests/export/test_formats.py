@@ -1,4 +1,4 @@
-"""Every export format with every kind of model: one contract, whatever the format.
+"""Every export format with every kind of model, its band and its refusals: one contract.
 
 The exporter itself compares good and bad inputs with the model before it writes; here the file is
 loaded back as a user would.
@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import copy
 import ctypes
+import functools
 import json
 import subprocess
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,27 +23,34 @@ import pytest
 import torch
 from exported_models import HIGH, LOW, VARIANTS, AsTensors, built, spec_of
 
-from residnet.core.errors import ExportError, WithheldError
+from residnet.core.errors import ExportError, ResidnetError, WithheldError
 from residnet.dynamics.c_code import compiler
 from residnet.dynamics.ensemble import mean_of
+from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.lowering import lowered
+from residnet.dynamics.store import BandTable, ModelSpec
+from residnet.export import FORMATS as REGISTERED
 from residnet.export import base, exporter, torchscript, vessel
 from residnet.export.base import Loaded, RoundingError, released
 from residnet.export.c import STRICT, CasadiModel, CFunction, CompiledModel, c_files, compile_shared
 from residnet.export.onnx_file import OnnxModel, _arctangent
 from residnet.export.torchscript import AotiModel, ScriptedModel
-from residnet.export.vessel import ExportedVessel
+from residnet.export.vessel import ExportedModel, ExportedVessel
+from residnet.heads.symbolic import DelayConfig, SymbolicConfig, SymbolicHead
+from residnet.physics.signals import SignalsConfig
 from residnet.testing import check_bad_inputs
+from residnet.testing.checks import (
+    ROLLING,
+    SIGNALS,
+    SUBMERGED,
+    example_model,
+    example_models,
+    example_samples,
+    example_spec,
+)
 
-STEPS = 60
+pytestmark = pytest.mark.usefixtures("short_parity")
 ROW = {"model": "mine", "split": "test", "protocol": "T30", "nrmse": {"mean": 0.1}}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def short_parity() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vessel, "PARITY_STEPS", STEPS)
-        yield
 
 
 def exported(variant: str) -> ExportedVessel:
@@ -79,25 +88,23 @@ def test_a_file_keeps_the_contract(name: str, variant: str, tmp_path: Path) -> N
     card = exporter(name).export(made, file)
     parities = card["parity"].values() if name == "c" else [card["parity"]]
     for parity in parities:
-        assert parity["steps"] == STEPS
+        assert parity["steps"] == 60
         assert max(parity["share_of_range"].values()) <= 1e-5
     assert card["format"] == name
-    check_bad_inputs(
-        AsTensors(LOADED[name](file, made), made), made.spec, copy.deepcopy(made.model), cases=60
-    )
-    stored = file.with_suffix(".card.json")
+    loaded = AsTensors(LOADED[name](file, made), made)
+    check_bad_inputs(loaded, made.spec, copy.deepcopy(made.model), cases=60)
     if name == "onnx":
         held = onnxruntime.InferenceSession(str(file)).get_modelmeta().custom_metadata_map["card"]
     else:
-        held = stored.read_text()
+        held = file.with_suffix(".card.json").read_text()
     assert json.loads(held) == json.loads(json.dumps(card))
 
 
 @pytest.mark.parametrize(
     "variant",
     [
-        name if i % 3 == 0 else pytest.param(name, marks=pytest.mark.long)
-        for i, name in enumerate(VARIANTS)
+        name if name in ("lstm_mirror", "symbolic") else pytest.param(name, marks=pytest.mark.long)
+        for name in VARIANTS
     ],
 )
 def test_torchscript_is_the_model(variant: str, tmp_path: Path) -> None:
@@ -113,10 +120,8 @@ def test_torchscript_is_the_model(variant: str, tmp_path: Path) -> None:
     check_bad_inputs(module, made.spec, made.at(torch.float32), cases=100)
     random, model = np.random.default_rng(1), made.at(torch.float32)
     x = random.normal(size=(3, 6)) * [50, 50, 3, 0.5, 0.1, 0.1] + [0, 0, 0, 1, 0, 0]
-    x0, w = (
-        torch.from_numpy(x).float(),
-        torch.from_numpy(random.uniform(LOW[3:], HIGH[3:], size=(3, 30, 4))).float(),
-    )
+    inputs = random.uniform(LOW[3:], HIGH[3:], size=(3, 30, 4))
+    x0, w = (torch.from_numpy(part).float() for part in (x, inputs))
     past = torch.cat((x0[:, None, :3].expand(-1, 8, -1), torch.full((3, 8, 3), 0.2)), dim=-1)
     with torch.no_grad():
         s = model.warmup(past, w[:, :8])
@@ -143,19 +148,22 @@ def test_the_card_says_what_a_controller_needs() -> None:
     units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
     assert card["schema"] == "residnet.card/1"
     assert card["states"] == [{"name": name, "unit": unit} for name, unit in units.items()]
-    assert [(e["name"], e["unit"], e["role"]) for e in card["inputs"]] == [
-        ("n_port", "1/s", "command"),
-        ("n_stbd", "1/s", "command"),
-        ("wind_speed", "m/s", "exogenous"),
-        ("wind_dir", "rad", "exogenous"),
+    names = ("u", "v", "r", "n_port", "n_stbd", "wind_speed", "wind_dir")
+    about = zip(names[3:], ("1/s", "1/s", "m/s", "rad"), strict=True)
+    roles = (*["command"] * 2, *["exogenous"] * 2)
+    assert card["inputs"] == [
+        {"name": name, "unit": unit, "role": role}
+        for (name, unit), role in zip(about, roles, strict=True)
     ]
     assert (card["dt"], card["integrator"], card["model"]) == (0.1, "rk4", "mine")
-    names = ("u", "v", "r", "n_port", "n_stbd", "wind_speed", "wind_dir")
     ranges = zip(names, zip(LOW, HIGH, strict=True), strict=True)
     assert card["training_range"] == {name: list(limits) for name, limits in ranges}
     assert card["metrics"] == [ROW]
     assert (card["memory"], card["members"], card["band"]) == (made.model.n_state, [], None)
     assert (card["head"]["kind"], card["baseline"]["kind"]) == ("lstm", "regressors")
+    mean = ExportedVessel(*built("mean")).card()
+    told = [(member["name"], member["head"]["kind"]) for member in mean["members"]]
+    assert told[:2] == [("member_0", "plsr"), ("member_1", "lstm")]
 
 
 def test_outside_flags_each_channel_beyond_its_range() -> None:
@@ -164,28 +172,15 @@ def test_outside_flags_each_channel_beyond_its_range() -> None:
     low, high = torch.tensor(LOW), torch.tensor(HIGH)
     middle = 0.5 * (low + high)
     # rows: the middle, both corners, then each channel just below and just above its range
-    seen = [middle, low, high]
-    for i in range(len(LOW)):
-        for edge, step in ((low, -1e-3), (high, 1e-3)):
-            row = middle.clone()
-            row[i] = edge[i] + step
-            seen.append(row)
-    rows = torch.stack(seen)
+    own = torch.eye(len(LOW))
+    below, above = (
+        middle + own * (edge + step - middle) for edge, step in ((low, -1e-3), (high, 1e-3))
+    )
+    rows = torch.cat((torch.stack((middle, low, high)), below, above))
     # position and heading have no training range
     x = torch.cat((torch.full((len(rows), 3), 6e3), rows[:, :3]), dim=1)
     _, _, outside = module.step(x, rows[:, 3:], module.initial_state(len(rows)))
     assert outside.tolist() == [False] * 3 + [True] * (2 * len(LOW))
-
-
-def test_an_ensemble_exports_and_names_its_members(tmp_path: Path) -> None:
-    parts = dict(zip(("one", "two"), (built("mlp"), built("lstm")), strict=True))
-    members = tuple(part.model_copy(update={"name": name}) for name, (part, _) in parts.items())
-    spec = spec_of(None, role="ensemble", baseline={"kind": "still"})
-    spec = spec.model_copy(update={"members": members})
-    made = ExportedVessel(spec, mean_of([model for _, model in parts.values()]))
-    card = exporter("torchscript").export(made, tmp_path / "mean.pt")
-    told = [(member["name"], member["head"]["kind"]) for member in card["members"]]
-    assert told == [("one", "mlp"), ("two", "lstm")]
 
 
 @pytest.mark.exporters
@@ -200,9 +195,8 @@ def test_a_compiled_package_takes_rows_of_a_transposed_array(tmp_path: Path) -> 
         np.testing.assert_array_equal(loaded.step(x, row, s)[0], loaded.step(x, row.copy(), s)[0])
 
 
-@pytest.mark.parametrize("variant", ["plsr", "lstm"])
-def test_casadi_has_exact_derivatives(variant: str, tmp_path: Path) -> None:
-    made = exported(variant)
+def test_casadi_has_exact_derivatives(tmp_path: Path) -> None:
+    made = exported("lstm")
     card = exporter("casadi").export(made, tmp_path / "boat.casadi")
     assert max(card["parity"]["share_of_range"].values()) <= 1e-12
     model = made.at(torch.float64)
@@ -261,9 +255,8 @@ def test_what_single_precision_does_not_determine_is_written_in_double(
     """Large coefficients that cancel make a model round; here no difference at all is let pass."""
     monkeypatch.setattr(base, "SINGLE", -1.0)
     made, file = exported("plsr"), tmp_path / f"boat.{name}"
-    monkeypatch.setattr(
-        "residnet.export.onnx_file._TOLERANCE", {torch.float32: -1.0, torch.float64: 1e-7}
-    )
+    allowed = {torch.float32: -1.0, torch.float64: 1e-7}
+    monkeypatch.setattr("residnet.export.onnx_file._TOLERANCE", allowed)
     card = exporter(name).export(made, file)
     assert card["dtype"] == "float64"
     loaded = (
@@ -343,9 +336,8 @@ def test_a_changed_weight_and_a_wrong_rollout_are_found() -> None:
     other = exported("lstm")
     with torch.no_grad():
         other.model.head.networks[0].readout[0].bias[2] += 1e-3  # type: ignore[union-attr, index]
-    with pytest.raises(
-        ExportError, match=r"model mine: the module differs .* allowed 1e-05"
-    ) as said:
+    told = r"model mine: the module differs .* allowed 1e-05"
+    with pytest.raises(ExportError, match=told) as said:
         other.check(ScriptedModel(module, torch.float32), "the module", torch.float32)
     assert "\n" not in str(said.value)
 
@@ -366,9 +358,7 @@ def test_a_file_that_differs_from_its_model_does_not_stand(
     wrong = torch.jit.script(exported("mlp_mirror").module(torch.float32))
     save = torch.jit.save
     monkeypatch.setattr(
-        torchscript.torch.jit,
-        "save",
-        lambda module, path, _extra_files: save(wrong, path, _extra_files=_extra_files),
+        torchscript.torch.jit, "save", lambda _, *to, **extra: save(wrong, *to, **extra)
     )
     with pytest.raises(ExportError, match="model mine"):
         exporter("torchscript").export(exported("mlp"), tmp_path / "mine.pt")
@@ -397,3 +387,188 @@ def test_tracks_whose_inputs_jump_find_rounding_that_grows() -> None:
     made.require_tracks(Exact(), "the file", torch.float32, 1e-5)
     with pytest.raises(RoundingError, match="the file differs from the model"):
         made.require_tracks(Rounding(), "the file", torch.float32, 1e-5)
+
+
+TABLE = BandTable(
+    level=0.9,
+    steps=(1, 10, 30),
+    u=(0.1, 0.2, 0.4),
+    v=(0.1, 0.1, 0.1),
+    r=(0.01, 0.02, 0.02),
+    heading=(0.001, 0.1, 0.3),
+    position=(0.01, 1.0, 5.0),
+    logs=12,
+    cautions=("It is a test.",),
+)
+ROLLS = TABLE.model_copy(update={"p": (0.01, 0.03, 0.03), "phi": (0.001, 0.02, 0.05)})
+DEEP = {"w": (0.1, 0.2, 0.3), "q": (0.01, 0.02, 0.03), "z": (0.1, 0.3, 0.9), "theta": ROLLS.phi}
+
+
+@pytest.mark.parametrize(
+    ("table", "signals"),
+    [(TABLE, SIGNALS), (ROLLS.model_copy(update=DEEP), SUBMERGED), (None, ROLLING)],
+)
+def test_half_widths_are_those_of_the_table_in_torchscript_and_in_c(
+    tmp_path: Path, table: BandTable | None, signals: SignalsConfig
+) -> None:
+    spec = example_spec(None, signals).model_copy(update={"band": table})
+    exported, file = ExportedVessel(spec, example_model(spec)), tmp_path / "boat.c"
+    card = exporter("torchscript").export(exported, tmp_path / "model.pt")
+    loaded = torch.jit.load(str(tmp_path / "model.pt"))
+    exporter("c").export(exported, file)
+    library = ctypes.CDLL(str(compile_shared([file], tmp_path / "boat.so", ["-DEXAMPLE_DOUBLE"])))
+    half = np.zeros(len(signals.live.layout.banded))
+    for k in (-3, 0, 1, 7, 10, 20, 29, 30, 60):
+        library.example_band(k, half.ctypes.data_as(ctypes.c_void_p))
+        assert half.tolist() == pytest.approx(loaded.band(k).tolist(), rel=1e-6)
+    assert loaded.band(0).tolist() == [0.0] * len(half)
+    if table is None:
+        assert card["band"] is None
+        assert torch.isinf(loaded.band(7)).all()
+        return
+    first, middle, last = torch.tensor(table.columns).T
+    wanted = {1: first, 10: middle, 20: 0.5 * (middle + last), 30: last, 60: 2.0 * last}
+    for k, row in wanted.items():
+        torch.testing.assert_close(loaded.band(k), row)
+    assert card["band"]["horizon"] == pytest.approx(30 * spec.dt)
+    assert card["band"]["cautions"] == ["It is a test."]
+    assert ("phi" in card["band"]) == signals.live.rolls
+    with pytest.raises(ValueError, match="one half width for each of steps"):
+        BandTable.model_validate(TABLE.model_dump() | {"u": (0.1,)})
+
+
+RATIO = SymbolicConfig(
+    terms=("u n_port^-1", "v", "n_port"), delay=DelayConfig(channels=("n_port",), longest=4)
+)
+
+
+def scripted(spec: ModelSpec, model: HybridDynamics) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return torch.jit.script(ExportedModel(model.float().eval(), spec).eval())
+
+
+@functools.cache
+def delayed() -> tuple[ModelSpec, HybridDynamics]:
+    """A term that divides by revolutions of some steps ago."""
+    spec, known = example_spec(RATIO), example_samples()
+    model = spec.build().eval()
+    spec.baseline.fit(model.baseline, known)
+    turning = known.z[known.z[:, 3] > 1.0]
+    head = model.head
+    assert isinstance(head, SymbolicHead)
+    head.calibrate(known)
+    head.features.low[3] = turning[:, 3].min()
+    head.line.steps.fill_(3.0)
+    head.coefficients.fill_(0.01)
+    return spec, model
+
+
+def ensemble() -> tuple[ModelSpec, HybridDynamics]:
+    pairs = [*example_models()[1:], delayed()]
+    spec = pairs[0][0].model_copy(
+        update={"role": "ensemble", "head": None, "members": tuple(spec for spec, _ in pairs)}
+    )
+    return spec, mean_of([model for _, model in pairs])
+
+
+@pytest.mark.parametrize("make", [delayed, ensemble])
+def test_delays_and_ensembles(make: Any) -> None:
+    spec, model = make()
+    module = scripted(spec, model)
+    check_bad_inputs(module, spec, model, cases=100)
+    # a memory or an input of another batch is refused
+    x, w, s = torch.zeros(3, 6), torch.ones(3, 2), module.initial_state(3)
+    for name, call, given in (
+        ("s", "step", (x, w, s[:1])),
+        ("w", "step", (x, w[:1], s)),
+        ("x", "step", (x[:1, :5], w, s)),
+        ("s", "rollout", (x, w[:, None], s[:2])),
+        ("w_history", "warmup", (x[:, None], w[:, None].expand(-1, 2, -1))),
+    ):
+        with pytest.raises(torch.jit.Error, match=f"{name} has the shape .*, expected"):
+            getattr(module, call)(*given)
+    assert module.step(x.double(), w.double(), s.double())[0].dtype == torch.float32
+
+
+def test_a_delay_line_begins_with_its_first_sample() -> None:
+    """A ratio of zeros would be no number."""
+    _, model = delayed()
+    head = model.head.double()
+    z = example_samples().z[200:206][None]
+    z[..., 3] = torch.linspace(5.0, 6.0, 6)
+    first, memory = head(z[:, 0], torch.zeros(1, head.n_state, dtype=torch.float64))
+    settled = head.warmup(z[:, :1].expand(-1, 9, -1))
+    assert torch.isfinite(first).all()
+    torch.testing.assert_close(memory, settled)
+    again, memory = head(z[:, 1], memory)
+    torch.testing.assert_close(memory, head.warmup(z[:, :2]))
+    torch.testing.assert_close(torch.stack((first, again), dim=1), head.sequence(z[:, :2]))
+    for _ in range(5):
+        _, memory = head(z[:, 5], memory)
+    torch.testing.assert_close(memory, head.warmup(z[:, 5:]))
+
+
+FORMATS = REGISTERED.names()
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_number_that_is_not_finite_is_refused(name: str, tmp_path: Path) -> None:
+    spec, model = built("plsr")
+    with torch.no_grad():
+        model.baseline.theta[0, 1] = torch.nan  # type: ignore[index, operator]
+    file = tmp_path / f"boat{exporter(name).suffix}"
+    with pytest.raises(ResidnetError) as caught:
+        exporter(name).export(ExportedVessel(spec, model), file)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.exporters
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "aoti"])
+@pytest.mark.parametrize("variant", [*VARIANTS, "none"])
+def test_a_format_writes_a_model_or_says_why_not(name: str, variant: str, tmp_path: Path) -> None:
+    spec = spec_of(None)
+    spec, model = (spec, spec.build()) if variant == "none" else built(variant)
+    file, said = tmp_path / f"boat{exporter(name).suffix}", ""
+    try:
+        exporter(name).export(ExportedVessel(spec, model), file)
+    except ResidnetError as error:
+        said = str(error).splitlines()[-1]
+        assert spec.name in said
+    assert file.is_file() == (not said)
+    assert bool(list(tmp_path.iterdir())) == (not said)
+
+
+@pytest.fixture
+def a_sine(short_parity: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sweep each input once, instead of for as long as a memory drifts."""
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 350)
+
+
+def swept(spec: ModelSpec, model: HybridDynamics) -> float:
+    """Return the share of the training range that the inputs of the free run sweep at most."""
+    _, w, _ = ExportedVessel(spec, model).free_run(torch.float64)
+    n = spec.signals.live.size
+    low, high = torch.tensor(spec.low[n:]), torch.tensor(spec.high[n:])
+    return float(((w[0].amax(dim=0) - w[0].amin(dim=0)) / (high - low)).max())
+
+
+@pytest.mark.usefixtures("a_sine")
+def test_inputs_that_ask_for_too_much_together_sweep_less() -> None:
+    """Inputs were logged one at a time; together they leave the states that logs hold."""
+    spec, model = built("plsr")
+    assert swept(spec, model) == pytest.approx(0.8, abs=0.01)
+    n = spec.signals.live.size
+    low, high = ((*b[:n], *(3.0 * value for value in b[n:])) for b in (spec.low, spec.high))
+    wide = spec.model_copy(update={"low": low, "high": high})
+    assert swept(wide, model) in (pytest.approx(0.4, abs=0.01), pytest.approx(0.2, abs=0.01))
+
+
+@pytest.mark.usefixtures("a_sine")
+def test_a_model_that_diverges_under_any_sweep_is_refused() -> None:
+    spec, model = built("plsr")
+    with torch.no_grad():
+        model.baseline.theta[0].abs_()  # type: ignore[index, operator]
+    with pytest.raises(ExportError, match=r"diverges .* accepted .* choose another model"):
+        swept(spec, model)

@@ -1,7 +1,8 @@
-"""Exported policies, alone and along a course: answers, flags and recovery, in every format."""
+"""Exported policies, alone and along a course, and what controllers run: answers and flags."""
 
 from __future__ import annotations
 
+import ctypes
 import json
 import math
 from collections.abc import Callable
@@ -11,9 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from bad_measurements import check_bad_measurements
-from exported_policies import DEG, DT, GAIN, LIMIT, SETTINGS, SPEED, TIME, observed
-from s_functions import SFunction
+from exported_models import built
+from exported_policies import DEG, DT, LIMIT, SETTINGS, SPEED, observed
 from torch import Tensor
 
 from residnet.control.courses.course_plan import Course
@@ -21,10 +21,35 @@ from residnet.control.guidance import CourseGuidance, DriftEstimate
 from residnet.control.heading.controllers import DepthPolicySpec, NetworkPolicySpec
 from residnet.control.heading.policies import FIXED
 from residnet.core.errors import UsageError
+from residnet.dynamics.rollout import Rollout
 from residnet.export import exporter, policy
-from residnet.export.base import Loaded
-from residnet.export.c import CompiledModel, compile_shared
+from residnet.export.base import Exported
+from residnet.export.c import compile_shared
 from residnet.export.policy import COURSE, ExportedController, ExportedCoursePolicy, ExportedHeading
+from residnet.export.vessel import ExportedVessel
+from residnet.testing.checks import damage, require, require_finite
+
+SIMSTRUCT = Path(__file__).parents[1] / "support" / "simstruct"
+
+
+class SFunction:
+    """An exported S-function under a harness that does what Simulink documents."""
+
+    def __init__(self, exported: Exported, folder: Path) -> None:
+        card = exporter("simulink").export(exported, folder / "Boat 2_sfun.c")
+        assert card["format"] == "simulink"
+        sources = [folder / "boat_2_sfun.c", folder / "boat_2_sfun_model.c"]
+        library = compile_shared(sources, folder / "boat.so", [f"-I{SIMSTRUCT}"])
+        self.library = ctypes.CDLL(str(library))
+        self.library.fly.restype = ctypes.c_double
+
+    def fly(self, given: np.ndarray, outputs: int, start: Any = ()) -> tuple[float, np.ndarray]:
+        """Return its sample time and its outputs [T, outputs] at inputs [T, n]."""
+        begin, rows = (np.ascontiguousarray(part, dtype=float) for part in (start, given))
+        out = np.zeros((len(rows), outputs))
+        at = [ctypes.c_void_p(part.ctypes.data) for part in (begin, rows, out)]
+        return self.library.fly(at[0], begin.size, len(rows), at[1], at[2]), out
+
 
 FAR = 12_000.0
 """Metres from the origin of the chart, where single precision resolves a millimetre."""
@@ -60,6 +85,49 @@ def along() -> ExportedCoursePolicy:
     return ExportedCoursePolicy(
         "along", observed(10 * DEG)[1], guidance, course, safe="hold", about=about, metrics=[]
     )
+
+
+def check_bad_measurements(
+    step: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]],
+    initial_state: Callable[[Tensor], Tensor],
+    low: Tensor,
+    high: Tensor,
+    memory: tuple[Tensor, Tensor],
+    limit: float,
+) -> None:
+    """Check that an exported controller commands finite angles and flags what is wrong.
+
+    Among good measurements, from `low` to `high` [k], stand bad ones, bad memories, and memories
+    whose entries lie within their ranges [n] but do not belong together.
+    """
+    cases, random = 200, torch.Generator().manual_seed(0)
+    least, most = memory
+
+    def between(a: Tensor, b: Tensor) -> Tensor:
+        return a + torch.rand(cases, a.numel(), generator=random) * (b - a)
+
+    s = initial_state(damage(between(low, high), high, 0.2, random))
+    require_finite(s, "the memory at a bad measurement is not finite")
+    for k in range(30):
+        y, given = between(low, high), s
+        if k % 5 == 1:
+            y = damage(y, high, 0.3, random)
+        if k % 5 == 3:
+            given = damage(s, most, 0.2, random)
+        if k == 20:
+            given = between(least, most)
+        command, s, fault = step(y, given)
+        who = f"exported controller, step {k}"
+        require_finite(command, f"{who}: a command is not finite")
+        require_finite(s, f"{who}: a memory is not finite")
+        require(bool((command.abs() <= 1.001 * limit).all()), f"{who}: a command exceeds its limit")
+        good = ((y >= low) & (y <= high)).all(dim=-1)
+        good &= ((given >= least) & (given <= most)).all(dim=-1)
+        require(bool((fault | good).all()), f"{who}: a bad sample raises no flag")
+        if k < 20:
+            require(not bool((fault & good).any()), f"{who}: a good sample raises a flag")
+        kept = ((s >= least) & (s <= most)).all()
+        require(bool(kept), f"{who}: leaves a memory that it would not accept")
 
 
 KINDS = [heading, depth, network, along]
@@ -101,90 +169,27 @@ def test_torchscript_answers_as_the_policy_and_is_safe(
         module.step(torch.zeros(3, 2), *[torch.zeros(3, 1)] * (given > 0), torch.zeros(3, 1))
 
 
-@pytest.mark.parametrize("place", range(6))
-@pytest.mark.parametrize("value", [math.nan, math.inf, -1e9])
-def test_a_wrong_measurement_holds_the_command_and_the_memory(place: int, value: float) -> None:
+def test_a_wrong_measurement_holds_the_command_and_the_memory() -> None:
     module = along().controller(torch.float64)
     y = torch.tensor([[FAR, FAR, 0.05, SPEED, 0.01, 0.02]], dtype=torch.float64)
     command, s, _, arrived = module.step(y, module.initial_state(y))
     assert not bool(arrived)
-    wrong = y.clone()
-    wrong[0, place] = value
-    held, after, fault, _ = module.step(wrong, s)
-    assert bool(fault)
-    assert float(held) == float(command)
-    assert torch.equal(after, s)
-    assert not bool(module.step(y, after)[2])
-
-
-class Eager(Loaded):
-    """The policy itself."""
-
-    def __init__(self, exported: ExportedController) -> None:
-        self.module: Any = exported.controller(torch.float64)
-
-    def step(self, *given: np.ndarray) -> tuple[Any, ...]:
-        rows = (torch.from_numpy(np.asarray(part, dtype=np.float64))[None] for part in given)
-        return tuple(part[0].numpy() for part in self.module.step(*rows))
-
-    def memory(self, *past: np.ndarray) -> np.ndarray:
-        found: np.ndarray = self.module.initial_state(torch.from_numpy(past[0])[None])[0].numpy()
-        return found
-
-
-def flown(loaded: Loaded) -> np.ndarray:
-    """Return the track [T, 4] of a vessel in a current, whose commands come late, with noise."""
-    random, late = np.random.default_rng(3), 10
-    x, y, psi, r = FAR, FAR + 2.0, 0.05, 0.0
-    waiting, track = [0.0] * late, []
-    s: Any = None
-    for _ in range(400):
-        noise = random.normal(size=4) * [0.1, 0.1, 0.1 * DEG, 0.1 * DEG]
-        seen = np.array([x + noise[0], y + noise[1], psi + noise[2], SPEED, 0.0, r + noise[3]])
-        s = loaded.memory(seen) if s is None else s
-        command, s, fault, arrived = loaded.step(seen, s)
-        assert not bool(fault)
-        assert not bool(arrived)
-        waiting.append(float(command[0]))
-        delta = waiting.pop(0)
-        r += DT * (GAIN * delta - r) / TIME
-        psi += DT * r
-        x += DT * (SPEED * math.cos(psi) + 0.1)
-        y += DT * (SPEED * math.sin(psi) - 0.2)
-        track.append((x, y, psi, delta))
-    return np.array(track)
-
-
-@pytest.mark.long
-def test_a_course_as_c_is_followed_as_in_python(tmp_path: Path) -> None:
-    exported = along()
-    card = exporter("c").export(exported, tmp_path / "along.c")
-    assert card["dtype"] == "float64"
-    assert "int along_step(const along_real *y" in (tmp_path / "along.h").read_text()
-    library = compile_shared([tmp_path / "along.c"], tmp_path / "along.so")
-    theirs = flown(CompiledModel(library, exported, torch.float64))
-    np.testing.assert_allclose(theirs, flown(Eager(exported)), rtol=0, atol=1e-4)
-
-
-@pytest.mark.long
-def test_a_heading_policy_is_written_as_c(tmp_path: Path) -> None:
-    """With its queue of pending commands and the memory of its network."""
-    for exported in (heading(), network()):
-        card = exporter("c").export(exported, tmp_path / "pilot.c")
-        assert all(part["share_of_limit"] <= 1e-4 for part in card["parity"].values())
-        stored = json.loads((tmp_path / "pilot.card.json").read_text())
-        assert stored == json.loads(json.dumps(card))
-        header = (tmp_path / "pilot.h").read_text()
-        assert "int pilot_step(const pilot_real *y" in header
-        assert "PILOT_SIZE_S" in header
+    wrong = torch.stack([torch.eye(6, dtype=torch.float64)] * 3) > 0
+    values = torch.tensor([math.nan, math.inf, -1e9], dtype=torch.float64)[:, None, None]
+    seen = torch.where(wrong, values, y).reshape(-1, 6)
+    held, after, fault, _ = module.step(seen, s.expand(len(seen), -1))
+    assert fault.all()
+    assert (held == command).all()
+    assert (after == s).all()
+    assert not bool(module.step(y, after[:1])[2])
 
 
 def test_an_s_function_answers_as_the_policy(tmp_path: Path) -> None:
     exported = heading()
     made = SFunction(exported, tmp_path)
     random = np.random.default_rng(0)
-    y = np.stack((0.2 * random.normal(size=200), np.full(200, 3.2), 0.02 * random.normal(size=200)))
-    rows = np.concatenate((y, np.full((1, 200), 0.3))).T
+    rows = np.tile([0.0, 3.2, 0.0, 0.3], (200, 1))
+    rows[:, :3:2] = random.normal(size=(200, 2)) * [0.2, 0.02]
     rows[100, 0] = np.nan
     dt, out = made.fly(rows, 2)
     assert dt == DT
@@ -200,18 +205,19 @@ def test_an_s_function_answers_as_the_policy(tmp_path: Path) -> None:
 
 @pytest.mark.exporters
 @pytest.mark.parametrize("make", KINDS)
-@pytest.mark.parametrize("name", ["onnx", "casadi", "aoti"])
+@pytest.mark.parametrize("name", ["onnx", "casadi", "aoti", "c"])
+@pytest.mark.usefixtures("short_parity")
 def test_every_format_serves_every_policy(
-    name: str,
-    make: Callable[[], ExportedController],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, make: Callable[[], ExportedController], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(policy, "PARITY_STEPS", 200)
     file = tmp_path / f"p{exporter(name).suffix}"
     card = exporter(name).export(make(), file)
     assert file.is_file()
-    assert card["parity"]["share_of_limit"] <= 1e-4
+    parity = card["parity"]
+    parities = [parity] if "share_of_limit" in parity else parity.values()
+    assert all(part["share_of_limit"] <= 1e-4 for part in parities)
+    if name == "c":
+        assert "int p_step(const p_real *y" in file.with_suffix(".h").read_text()
 
 
 @pytest.mark.parametrize("name", ["fmu", "parameters", "feed_forward"])
@@ -219,43 +225,6 @@ def test_what_is_made_of_vessels_alone_refuses_policies(name: str, tmp_path: Pat
     with pytest.raises(UsageError, match="policy pilot: "):
         exporter(name).export(heading(), tmp_path / "p")
     assert not list(tmp_path.iterdir())
-
-
-def closed(rate: float | None, seconds: float, gap: tuple[float, float]) -> tuple[Any, ...]:
-    """Headings, commands and flags of a loop with delay, noise and half a degree of bias."""
-    random, module = (
-        torch.Generator().manual_seed(2),
-        policy.for_export(observed(rate)[1], "amidships"),
-    )
-    psi = r = 0.0
-    late, decay = [0.0] * 10, math.exp(-DT / TIME)
-    s = module.initial_state(torch.tensor([[0.0, SPEED, 0.0]]))
-    track = []
-    for k in range(round(seconds / DT)):
-        noise = (0.1 * DEG * torch.randn(2, generator=random)).tolist()
-        y = torch.tensor([[psi + noise[0], SPEED, r + noise[1]]])
-        if gap[0] <= k * DT < gap[1]:
-            y[0, 0] = torch.nan
-        command, s, fault = module.step(y, torch.tensor([[30 * DEG]]), s)
-        late.append(float(command))
-        steady = GAIN * (late.pop(0) + 0.5 * DEG)
-        psi += steady * DT + (r - steady) * TIME * (1 - decay)
-        r = steady + (r - steady) * decay
-        track.append((psi, float(command), bool(fault)))
-    return tuple(zip(*track, strict=True))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("rate", [None, 10 * DEG])
-def test_it_settles_and_takes_up_the_course_after_a_gap(rate: float | None) -> None:
-    headings, commands, flags = closed(rate, 16.0, (0.0, 0.0))
-    assert not any(flags)
-    assert float((torch.tensor(headings[-300:]) - 30 * DEG).abs().max()) < 1.0 * DEG
-    assert max(map(abs, commands)) <= LIMIT * 1.0001
-    headings, commands, flags = closed(rate, 24.0, (1.5, 3.5))
-    assert list(flags) == [1.5 <= k * DT < 3.5 for k in range(len(flags))]
-    assert all(map(math.isfinite, commands))
-    assert abs(headings[-1] - 30 * DEG) < 1.0 * DEG
 
 
 def test_a_lost_estimate_begins_anew_and_keeps_the_push() -> None:
@@ -266,3 +235,88 @@ def test_a_lost_estimate_begins_anew_and_keeps_the_push() -> None:
     _, after = made(turned, torch.full((1, 1), 2.0, dtype=torch.float64), s)
     assert float(after[0, FIXED.index("push")]) == pytest.approx(0.01)
     assert float(after[0, FIXED.index("heading")]) == pytest.approx(2.0, abs=0.01)
+
+
+@pytest.mark.usefixtures("short_parity")
+def test_a_vessel_moves_as_the_model(tmp_path: Path) -> None:
+    spec, model = built("lstm_mirror")
+    made = SFunction(ExportedVessel(spec, model), tmp_path)
+    x0 = torch.tensor([[0.0, 0, 0, 1, 0, 0]], dtype=torch.float64)
+    w = torch.tensor([20.0, 25.0, 3.0, 1.0], dtype=torch.float64).expand(1, 60, -1)
+    model = model.double()
+    with torch.no_grad():
+        states, _, _ = Rollout(model)(x0, w, model.initial_state(1).double())
+    dt, out = made.fly(w[0].numpy(), 7, x0)
+    assert dt == spec.dt
+    np.testing.assert_allclose(out[:, :6], states[0, :60].numpy(), rtol=1e-9, atol=1e-9)
+    assert not out[:, 6].any()
+    # far outside of what the training data hold
+    _, out = made.fly(1e3 * w[0].numpy(), 7, x0)
+    assert out[1:, 6].all()
+    assert np.isfinite(out).all()
+    assert made.fly(w[0].numpy(), 7)[0] == -1.0
+
+
+ROOT = Path(__file__).parents[2]
+NODE = ROOT / "examples" / "ros2_autopilot" / "src" / "steering_node.c"
+HARNESS = ROOT / "tests" / "support" / "rclc"
+STEPS, ASKED, LAST, AGAIN = 400, 60, 199, 301
+"""A heading is asked for; odometry comes a last time, and again."""
+
+
+@pytest.mark.usefixtures("short_parity")
+@pytest.mark.parametrize("safe", ["amidships", "hold"])
+def test_the_node_answers_as_the_policy(safe: Any, tmp_path: Path) -> None:
+    own = observed(math.radians(10))[1]
+    exported = ExportedHeading("pilot", own, safe=safe, about={}, metrics=[])
+    exporter("c").export(exported, tmp_path / "pilot.c")
+    flags = [
+        f"-I{HARNESS}", f"-I{tmp_path}", "-Dmain=node_main", "-DMODEL=pilot",
+        "-DMODEL_UPPER=PILOT", '-DMODEL_HEADER="pilot.h"', "-DPILOT_DOUBLE",
+    ]  # fmt: skip
+    sources = [NODE, HARNESS / "harness.c", tmp_path / "pilot.c"]
+    library = ctypes.CDLL(str(compile_shared(sources, tmp_path / "node.so", flags)))
+    library.drive.restype = ctypes.c_double
+
+    random = np.random.default_rng(0)
+    psi = 3.0 + np.cumsum(0.01 * random.normal(size=STEPS))
+    r = 0.02 * random.normal(size=STEPS)
+    yaw = 0.5 * math.pi - psi
+    rows = np.zeros((STEPS, 9))
+    # every other step has an odometry, after a first one without
+    rows[1::2, 0] = 1.0
+    rows[LAST + 1 : AGAIN, 0] = 0.0
+    rows[:, 3], rows[:, 4] = np.sin(0.5 * yaw), np.cos(0.5 * yaw)
+    # a heel that leaves the heading as it is: the quaternion of yaw, then roll
+    roll = 0.2
+    rows[:, 1:3] = math.sin(0.5 * roll) * rows[:, 4:2:-1]
+    rows[:, 3:5] *= math.cos(0.5 * roll)
+    rows[:, 5], rows[:, 6] = SPEED, -r
+    rows[ASKED, 7:] = 1.0, -2.5
+    out = np.zeros((STEPS, 2))
+    at = [ctypes.c_void_p(part.ctypes.data) for part in (rows, out)]
+    assert library.drive(at[0], STEPS, at[1]) == pytest.approx(DT)
+
+    module: Any = exported.controller(torch.float64)
+    within = policy.PARITY_TOLERANCE * LIMIT
+    s, seen, age, asked = None, torch.zeros(1, 3).double(), 0.0, math.nan
+    for k in range(STEPS):
+        if rows[k, 0]:
+            heading = math.remainder(psi[k], 2.0 * math.pi)
+            seen, age = torch.tensor([[heading, SPEED, r[k]]]).double(), 0.0
+            if s is None:
+                s, asked = module.initial_state(seen), heading
+        asked = rows[k, 8] if rows[k, 7] else asked
+        if s is None:
+            assert out[k].tolist() == [0.0, 1.0]
+            continue
+        if age > 1.0:
+            seen = torch.full_like(seen, math.nan)
+        age += DT
+        with torch.no_grad():
+            command, s, fault = module.step(seen, torch.tensor([[asked]]).double(), s)
+        assert out[k, 0] == pytest.approx(float(command), abs=within), k
+        # it is too old after a second
+        assert bool(out[k, 1]) == bool(fault) == (LAST + 50 <= k < AGAIN), k
+    assert np.abs(out[:, 0]).max() == pytest.approx(LIMIT, rel=1e-3)
+    assert abs(out[AGAIN - 1, 0]) == pytest.approx(LIMIT if safe == "hold" else 0.0, abs=1e-6)
