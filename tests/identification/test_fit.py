@@ -1,9 +1,9 @@
-"""A fit in Python: the numbers of the command line, models side by side, and who is compared."""
+"""A fit in Python: its models, side by side, its solutions, and who is compared."""
 
 from __future__ import annotations
 
-import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,131 +11,56 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-import yaml
-from tiny import TINY, call
-from tiny_fit import DATA, logs_of, settings_of
+from tiny import TINY
+from tiny_fit import logs_of, settings_of
 
+from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import DataError, FitError
 from residnet.core.processes import free_cores, spread
 from residnet.core.progress import Progress, listen
+from residnet.data.prepare import channels, samples
+from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.heads.base import ZeroHead
 from residnet.identification import fit as parts
 from residnet.identification.bands import FoldModels
 from residnet.identification.fit import fit
-from residnet.identification.fitter import FitStore, FittedModel, Fitter, references
-from residnet.identification.identified import Identified
+from residnet.identification.fitter import (
+    FitStore,
+    FittedModel,
+    Fitter,
+    choose_solution,
+    references,
+)
+from residnet.identification.identified import (
+    Identified,
+    teacher_forced,
+)
 from residnet.identification.prepared import PreparedSplits
 from residnet.identification.settings import FitSettings
-
-
-class MemoryStore(FitStore):
-    """Keeps models in memory and hands heads back."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.models: dict[str, FittedModel] = {}
-
-    def finished(self, name: str) -> FittedModel | None:
-        return self.models.get(name)
-
-    def keep(self, fitted: FittedModel) -> None:
-        self.models[fitted.name] = fitted
+from residnet.physics.signals import SignalsConfig
+from residnet.regression.estimator import Solution
+from residnet.training.score import Score
 
 
 @pytest.fixture(scope="module")
-def settings() -> FitSettings:
-    return settings_of("heads", "ensembles", "training")
+def logs() -> PreparedSplits:
+    return logs_of(settings_of())
 
 
-@pytest.fixture(scope="module")
-def logs(settings: FitSettings) -> PreparedSplits:
-    return logs_of(settings)
-
-
-@pytest.fixture(scope="module")
-def store() -> MemoryStore:
-    return MemoryStore()
-
-
-@pytest.fixture(scope="module")
-def heard() -> list[Progress]:
-    return []
-
-
-@pytest.fixture(scope="module")
-def identified(
-    settings: FitSettings,
-    logs: PreparedSplits,
-    store: MemoryStore,
-    heard: list[Progress],
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Identified:
-    with pytest.MonkeyPatch.context() as patch, listen(heard.append):
-        patch.chdir(tmp_path_factory.mktemp("here"))
-        found = fit(logs, settings, store=store)
-        assert not list(Path.cwd().iterdir())
-    return found
-
-
-@pytest.mark.long
-def test_python_and_command_line_give_the_same_metrics(
-    identified: Identified,
-    settings: FitSettings,
-    logs: PreparedSplits,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    path = tmp_path / "tiny.yaml"
-    path.write_text(yaml.safe_dump({**TINY, "export": {"models": []}}, sort_keys=False))
-    assert call(monkeypatch, "run", path, "--out", tmp_path / "run") == 0
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    splits = settings.evaluation.splits
-    judged = identified.evaluate({str(split): logs[split] for split in splits}, DATA)
-    rows: list[dict[str, Any]] = [row for part in judged.values() for row in part.rows]
-    chosen = identified.select(judged)
-    assert chosen.selected == metrics["selected"]
-    assert chosen.selected_ensemble == metrics["selected_ensemble"] == "mean"
-    assert chosen.content() == json.loads((tmp_path / "run" / "selection.json").read_text())
-    for row in metrics["rows"]:
-        row.pop("selected")
-    # JSON holds every float exactly
-    assert json.loads(json.dumps(rows)) == metrics["rows"]
-
-
-def test_models_stand_in_order(identified: Identified) -> None:
-    assert list(identified) == ["zero", "baseline", "ridge", "lstm", "mean"]
-    assert [entry.spec.role for entry in identified.values()] == [
-        "zero",
-        "baseline",
-        "head",
-        "head",
-        "ensemble",
-    ]
-    assert identified.limit.shape == (3,)
-    assert np.all(identified.limit > 0)
-
-
-@pytest.mark.long
-def test_finished_heads_are_taken_from_the_store(
-    identified: Identified,
-    settings: FitSettings,
-    logs: PreparedSplits,
-    store: MemoryStore,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+def test_models_stand_in_order(
+    logs: PreparedSplits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    told: list[Progress] = []
-    with listen(told.append):
-        again = fit(logs, settings, store=store)
-    assert again["lstm"].model is identified["lstm"].model
-    assert again["baseline"] is not identified["baseline"]
-    assert not any(event.stage == "training lstm" for event in told)
-    assert any("validation free-run error" in event.message for event in told)
+    heard: list[Progress] = []
+    with listen(heard.append):
+        found = fit(logs, settings_of("heads", "ensembles", "training", bands=None))
     assert not list(tmp_path.iterdir())
-
-
-def test_training_reports_every_epoch(identified: Identified, heard: list[Progress]) -> None:
+    assert list(found) == ["zero", "baseline", "ridge", "lstm", "mean"]
+    roles = [entry.spec.role for entry in found.values()]
+    assert roles == ["zero", "baseline", "head", "head", "ensemble"]
+    assert found.limit.shape == (3,)
+    assert np.all(found.limit > 0)
     epochs = [event.done for event in heard if event.stage == "training lstm"]
     assert epochs == list(range(1, 8))
 
@@ -181,14 +106,11 @@ def beside(**training: Any) -> FitSettings:
     )
 
 
-@pytest.fixture
-def everything_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "_LONG_TRAINING", 1)
-
-
 @pytest.mark.long
-@pytest.mark.usefixtures("everything_long")
-def test_side_by_side_gives_the_same_models(logs: PreparedSplits) -> None:
+def test_side_by_side_gives_the_same_models(
+    logs: PreparedSplits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parts, "_LONG_TRAINING", 1)
     settings = beside()
     alone = fit(logs, settings)
     heard: list[Progress] = []
@@ -201,18 +123,11 @@ def test_side_by_side_gives_the_same_models(logs: PreparedSplits) -> None:
             assert torch.equal(value, other[key]), (name, key)
         notes = {key: value for key, value in model.notes.items() if key != "seconds"}
         assert {key: found[name].notes[key] for key in notes} == notes, name
-    # what the processes report reaches who listens to this one
+    # what the processes report reaches who listens to this one, and so does why one fails
     assert {"training wide", "training narrow"} <= {event.stage for event in heard}
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("everything_long")
-def test_a_part_that_fails_in_its_process_ends_the_fit_with_its_message(
-    logs: PreparedSplits,
-) -> None:
-    settings = beside(multi_step=[{"horizon": 500.0, "epochs": 1, "batch": 16}])
+    failing = beside(multi_step=[{"horizon": 500.0, "epochs": 1, "batch": 16}])
     with spread(2), pytest.raises(DataError, match="no training log holds a window of 500"):
-        fit(logs, settings)
+        fit(logs, failing)
 
 
 def test_what_ends_soon_stays_in_this_process(
@@ -232,15 +147,8 @@ def test_what_ends_soon_stays_in_this_process(
         assert parts.side_by_side(Fitter(logs, gpu, FitStore())) == 1
 
 
-ROLES = {
-    "zero": "zero",
-    "baseline": "baseline",
-    "physics": "baseline",
-    "hull": "baseline",
-    "mlp": "head",
-    "ridge": "head",
-    "mean": "ensemble",
-}
+ROLES = {"zero": "zero", **dict.fromkeys(("baseline", "physics", "hull"), "baseline")}
+ROLES |= {"mlp": "head", "ridge": "head", "mean": "ensemble"}
 NOTES: dict[str, dict[str, Any]] = {
     "baseline": {"validation": 0.5},
     "physics": {"validation": 0.16},
@@ -280,3 +188,125 @@ def test_who_is_compared_with_whom(
         for name, role in roles.items()
     ]
     assert references(cast(list[FittedModel], found)) == expected
+
+
+def model() -> HybridDynamics:
+    signals = SignalsConfig(inputs=("n", "delta")).build()
+    return HybridDynamics(
+        signals, RegressorsConfig(terms=("u",)).build(signals.names), ZeroHead(), 0.1
+    )
+
+
+def at(value: float, *, alone: bool = True) -> Solution:
+    """A solution of coefficients all alike; it has neighbours one apart where it is not alone."""
+    return Solution(
+        {"value": value},
+        {"theta": torch.full((3, 1), value, dtype=torch.float64)},
+        neighbours=None
+        if alone
+        else lambda: [at(value - 1.0, alone=False), at(value + 1.0, alone=False)],
+    )
+
+
+def chosen(
+    bench: Callable[[float], Score], *solutions: Solution
+) -> tuple[float, list[dict[str, Any]]]:
+    """The value that is chosen, which the model then has, and what was tried."""
+    own = model()
+    theta: Any = own.baseline.theta
+
+    def score(candidate: HybridDynamics) -> Score:
+        assert candidate is own
+        return bench(float(theta[0, 0]))
+
+    best, notes = choose_solution(own, own.baseline, solutions, score)
+    assert theta.flatten().tolist() == [best.choice["value"]] * 3
+    return best.choice["value"], notes.get("free_run_choice", [])
+
+
+def test_a_single_solution_is_taken_without_a_free_run() -> None:
+    def never(value: float) -> Score:
+        raise AssertionError("nothing to choose")
+
+    assert chosen(never, at(3.0)) == (3.0, [])
+
+
+def test_a_diverging_solution_never_beats_the_best_steady_one() -> None:
+    scores = {5.0: Score(1, 0.1), 2.0: Score(0, 0.9), 1.0: Score(0, 0.8)}
+    best, tried = chosen(scores.__getitem__, at(5.0), at(2.0), at(1.0))
+    assert best == 1.0
+    assert [(one["value"], one["diverged"], one["validation"]) for one in tried] == [
+        (5.0, 1, 0.1), (2.0, 0, 0.9), (1.0, 0, 0.8),
+    ]  # fmt: skip
+
+
+def test_what_lies_around_the_best_is_tried_while_it_gains() -> None:
+    near, wide = at(0.0, alone=False), at(2.0, alone=False)
+    best, tried = chosen(lambda value: Score(0, abs(value - 4.2)), near, wide)
+    assert best == 4.0
+    # each once, up to the first neighbours that do not gain
+    assert [one["value"] for one in tried] == [0.0, 2.0, 1.0, 3.0, 4.0, 5.0]
+
+
+def test_what_stands_alone_does_not_end_the_search() -> None:
+    """No residual at all may beat every shared setting, and yet lose to what lies around the best
+    of them.
+    """
+    best, tried = chosen(
+        lambda value: Score(0, 2.5 if value == 0.0 else abs(value - 7.2)),
+        *(at(4.0, alone=False), at(3.0, alone=False), at(0.0)),
+    )
+    assert tried[2]["validation"] == 2.5 < tried[0]["validation"]
+    assert best == 7.0
+
+
+TERMS = ["u", "v", "r", "tau_x", "tau_n"]
+SETTINGS = settings_of(
+    prepare={**TINY["prepare"], "hold": "mean"},
+    baseline={"kind": "regressors", "terms": TERMS},
+    heads={"ridge": {"kind": "ridge"}},
+)
+
+
+@pytest.fixture(scope="module")
+def forced_logs() -> PreparedSplits:
+    return logs_of(SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def identified(forced_logs: PreparedSplits) -> Identified:
+    return fit(forced_logs, SETTINGS)
+
+
+def test_accelerations_are_those_of_the_models_rate_at_the_sample(
+    forced_logs: PreparedSplits, identified: Identified
+) -> None:
+    log, model = forced_logs["test"][0], identified["ridge"].model.double()
+    # inputs move on within a step: else one rule could not be told from the other
+    assert np.abs(log.w - log.recorded).max() > 1.0
+    at = int(np.flatnonzero(log.good)[50])
+    x, w = torch.from_numpy(log.smooth[at : at + 1]), torch.from_numpy(log.recorded[at : at + 1])
+    z = channels(log, model.signals)[at : at + 1]
+    torch.testing.assert_close(z, model.channels(x, w), rtol=1e-12, atol=1e-12)
+    rate = model.rate(x, model.signals.prepare(w), model.head(z, model.initial_state(1))[0])
+    predicted = teacher_forced(model, log).predicted[at]
+    np.testing.assert_allclose(predicted, rate[0, 3:].detach().numpy(), rtol=1e-9)
+
+
+def test_training_sees_the_channels_of_the_closed_forms(
+    forced_logs: PreparedSplits, identified: Identified
+) -> None:
+    """Where the fit saw other inputs, its residual would correlate with the regressors."""
+    signals = SETTINGS.signals.build()
+    known = samples(forced_logs["train"], signals)
+    store = WindowStore.gather(forced_logs["train"], torch.float64)
+    z = signals(store.smooth, signals.prepare(store.recorded))[store.good]
+    torch.testing.assert_close(z, known.z, rtol=1e-12, atol=1e-12)
+    runs = [
+        (log, teacher_forced(identified["baseline"].model, log)) for log in forced_logs["train"]
+    ]
+    assert torch.equal(torch.cat([run.z[log.good] for log, run in runs]), known.z)
+    left = np.concatenate([(log.nu_dot - run.predicted)[log.good] for log, run in runs])
+    columns = known.z[:, [known.names.index(name) for name in TERMS]].numpy()
+    size = np.linalg.norm(columns, axis=0)[:, None] * np.linalg.norm(left, axis=0)
+    assert (np.abs(columns.T @ left) < 1e-6 * size).all()

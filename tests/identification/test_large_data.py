@@ -6,12 +6,12 @@ import dataclasses
 import mmap
 import time
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
-from tiny_fit import DATA, logs_of, settings_of
+from tiny_fit import DATA, settings_of
 
 from residnet.core.arrays import paged
 from residnet.core.log import Log
@@ -43,6 +43,8 @@ def test_a_fit_from_disk_is_the_fit_from_memory(few: None, monkeypatch: pytest.M
     monkeypatch.undo()
     held = prepare_logs(read, settings)
     assert not any(paged.lies_on_disk(log.y) for logs in held.values() for log in logs)
+    for each in (held, through_currents(held, settings)[0]):
+        assert all(isinstance(members, paged.OneByOne) for members in each.values())
     for name, entry in fit(held, settings).items():
         for key, value in entry.model.state_dict().items():
             torch.testing.assert_close(
@@ -120,22 +122,14 @@ def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    placed: list[tuple[int, ...]] = []
-    empty = paged.empty
-
-    def counted(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
-        placed.append(shape)
-        return empty(shape, dtype)
-
-    monkeypatch.setattr(paged, "empty", counted)
+    placed = Mock(wraps=paged.empty)
+    monkeypatch.setattr(paged, "empty", placed)
     values = torch.arange(3000.0, dtype=torch.float64).reshape(1000, 3)
-    keep = torch.arange(1000) % 4 > 0
-    assert torch.equal(paged.taken(values, keep), values[keep])
-    assert torch.equal(paged.taken(values[:, 0], keep), values[keep][:, 0])
-    assert placed == [(750, 3), (750,)]
-    few_rows = torch.arange(1000) < 100
-    assert torch.equal(paged.taken(values, few_rows), values[few_rows])
-    assert len(placed) == 2
+    many, some = torch.arange(1000) % 4 > 0, torch.arange(1000) < 100
+    assert torch.equal(paged.taken(values, many), values[many])
+    assert torch.equal(paged.taken(values[:, 0], many), values[many][:, 0])
+    assert torch.equal(paged.taken(values, some), values[some])
+    assert [call.args[0] for call in placed.call_args_list] == [(750, 3), (750,)]
 
 
 @LINUX
@@ -156,10 +150,3 @@ def test_a_look_at_each_item_holds_the_pages_of_one(monkeypatch: pytest.MonkeyPa
         item[...] = 0.0
     assert most(items) >= 6 * size
     assert most(paged.OneByOne(items)) < 2.5 * size
-
-
-def test_prepared_logs_are_gone_through_one_by_one() -> None:
-    settings = settings_of()
-    prepared = logs_of(settings)
-    for logs in (prepared, through_currents(prepared, settings)[0]):
-        assert all(isinstance(members, paged.OneByOne) for members in logs.values())

@@ -25,8 +25,6 @@ from residnet.identification.fitter import FitStore, Fitter, burden
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.recipe import PARTS, Facts, portfolio
 from residnet.identification.settings import FitSettings
-from residnet.judge.freerun import Candidate, free_run
-from residnet.judge.protocol import all_windows
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import dissipates
 
@@ -117,23 +115,6 @@ def test_bands_of_short_logs_come_from_fits_without_some_of_them(
 
 
 @pytest.mark.long
-def test_the_mean_is_that_of_the_trajectories_of_its_members(
-    identified: Identified, logs: PreparedSplits
-) -> None:
-    """Free runs of each member by itself, averaged, against those of the one model of them all."""
-    config, step = settings().evaluation, 0.2
-    windows = all_windows(config.protocols["T8"], logs["test"], step, "T8")
-    members = identified["mean"].notes["members"]
-    every = [Candidate(name, "", identified[name].model) for name in [*members, "mean"]]
-    found = free_run(every, windows, logs["test"], step, identified.limit)
-    beside = identified.evaluate({"test": logs["test"]})["test"].runs[0].predictions["mean"]
-    for place, mean in enumerate(found["mean"]):
-        states = [found[name][place].states[:, 3:] for name in members]
-        np.testing.assert_allclose(mean.states[:, 3:], np.mean(states, axis=0), atol=1e-6)
-        np.testing.assert_allclose(mean.states, beside[place].states, atol=1e-6)
-
-
-@pytest.mark.long
 def test_members_that_run_away_or_harm_the_mean_are_left_out(
     identified: Identified, logs: PreparedSplits
 ) -> None:
@@ -191,118 +172,64 @@ def test_what_does_not_go_with_the_recipe(changes: dict[str, Any], said: str) ->
 def test_terms_follow_from_what_moves() -> None:
     names = ("u", "v", "r", "n", "delta", "wind_u", "wind_v", "wind_mag")
     whole = Facts.supposed(names)
-    hull = portfolio(whole)["baselines"]["hull"]["terms"]
-    assert {"u|u|", "n|n|", "|n| u", "n|n| delta", "wind_u wind_mag"} <= set(hull)
-    assert {"u^2 v", "n r", "wind_mag r", "n|n| delta|delta|"} <= set(hull)
-    assert "n^2" not in hull
-    astern = replace(whole, astern=("n",), moving=("n", "delta"))
-    hull = portfolio(astern)["baselines"]["hull"]["terms"]
-    assert "n^2 delta" in hull
-    assert not [term for term in hull if "wind" in term]
-    still = replace(whole, moving=("delta",))
-    assert not [t for t in portfolio(still)["baselines"]["hull"]["terms"] if "n" in t.split()]
+
+    def hull(**change: Any) -> list[str]:
+        return list(portfolio(replace(whole, **change))["baselines"]["hull"]["terms"])
+
+    wanted = {"u|u|", "n|n|", "|n| u", "n|n| delta", "wind_u wind_mag"}
+    assert wanted | {"u^2 v", "n r", "wind_mag r", "n|n| delta|delta|"} <= set(hull())
+    assert "n^2" not in hull()
+    astern = hull(astern=("n",), moving=("n", "delta"))
+    assert "n^2 delta" in astern
+    assert not [term for term in astern if "wind" in term]
+    assert not [term for term in hull(moving=("delta",)) if "n" in term.split()]
 
 
-def short(names: tuple[str, ...]) -> Facts:
-    """What is supposed of nine minutes of logs."""
-    return replace(Facts.supposed(names), samples=5_400)
+NAMES_OF_A_BOAT = ("u", "v", "r", "n", "delta")
 
 
-def test_networks_stand_alone_where_logs_are_long() -> None:
-    names = ("u", "v", "r", "n", "delta")
-    assert portfolio(short(names))["means"] == {"mean": ("hull", "hull_network")}
-    whole = portfolio(Facts.supposed(names))
+def short(names: tuple[str, ...]) -> dict[str, Any]:
+    """The parts for what is supposed of nine minutes of logs."""
+    return portfolio(replace(Facts.supposed(names), samples=5_400))
+
+
+def test_networks_stand_alone_and_horizons_are_long_where_logs_are() -> None:
+    facts = Facts.supposed(NAMES_OF_A_BOAT)
+    assert short(NAMES_OF_A_BOAT)["means"] == {"mean": ("hull", "hull_network")}
+    whole = portfolio(facts)
     assert whole["means"] == {"mean": ("hull", "hull_network", "network")}
     assert whole["base_of"] == {"hull_network": "hull", "network": "zero"}
-
-
-def test_short_logs_give_each_axis_the_terms_that_a_symmetric_vessel_has() -> None:
-    names = ("u", "v", "r", "n", "delta")
-    rows = portfolio(short(names))["baselines"]["hull"]["terms"]
-    assert {"1", "u", "u|u|", "v r", "n", "n|n|", "|n| u"} == set(rows["u"])
-    assert {"u v", "v|r|", "u|u| delta", "n|n| delta", "n|n|", "1"} <= set(rows["v"])
-    assert not {"u", "u|u|", "|n| u", "v r"} & set(rows["r"])
-    paired = SignalsConfig(inputs=("left", "right"), pairs=(("left", "right"),)).build().names
-    rows = portfolio(short(paired))["baselines"]["hull"]["terms"]
-    assert {"left", "right|right|", "|left| u"} <= set(rows["r"])
-    assert "u|u|" not in rows["r"]
-    assert portfolio(short(paired))["training"]["hull_network"]["mirror"]
-
-
-def test_the_models_of_the_recipe_cannot_run_away() -> None:
-    plan = portfolio(Facts.supposed(("u", "v", "r", "n", "delta")))
-    for part in (plan["baseline"], *plan["baselines"].values()):
+    # no model can run away
+    for part in (whole["baseline"], *whole["baselines"].values()):
         assert part["bounded"]
         assert part["dissipative"]
-
-
-def test_horizons_fit_into_the_logs() -> None:
-    facts = replace(Facts.supposed(("u", "v", "r", "n")), length=100.0, stretch=30.0)
-    plan = portfolio(facts)
+    plan = portfolio(replace(facts, length=100.0, stretch=30.0))
     horizons = [s["horizon"] for t in plan["training"].values() for s in t["multi_step"]]
     assert max(*horizons, plan["refit"]["hull"]["horizon"]) <= 18.0
 
 
-@pytest.mark.parametrize(
-    ("term", "axis", "known"),
-    [("u|u|", 0, True), ("v|r|", 1, True), ("|n| r", 2, True), ("u v", 1, False), ("u", 1, False)],
-)
-def test_terms_whose_power_has_one_sign(term: str, axis: int, known: bool) -> None:
-    assert dissipates(term, axis, ("u", "v", "r", "n")) == known
-
-
-def test_terms_that_would_feed_energy_are_left_out(known: Samples) -> None:
-    config = RegressorsConfig(terms=("1", "u", "v", "r", "u|u|", "left"), dissipative=True)
-    # accelerations that grow with the speed, and fall with its square
-    speed = known.z[:, 0]
-    target = torch.stack((0.3 * speed - 0.2 * speed * speed.abs(), -known.z[:, 1], speed), dim=1)
-    baseline = config.build(known.names)
-    table = {(c.axis, c.term): c.value for c in config.fit(baseline, known.with_target(target))}
-    assert ("u_dot", "u") not in table
-    assert ("v_dot", "v") in table
-    assert not baseline.feeding()
-
-
-def test_a_bounded_model_comes_back_from_anywhere(known: Samples) -> None:
-    config = RegressorsConfig(terms=("1", "u", "u|u|", "v", "r", "v|v|"), bounded=True)
-    baseline = config.build(known.names)
-    config.fit(baseline, known)
-    low, high = known.z[:, :3].amin(0), known.z[:, :3].amax(0)
-    far = torch.cat((high + 20.0 * (high - low), known.z[0, 3:]))
-    assert bool((baseline(far) < 0).all())
-    inside = RegressorsConfig(terms=("1", "u", "u|u|", "v", "r", "v|v|")).build(known.names)
-    inside.load_state_dict({"theta": baseline.theta})
-    torch.testing.assert_close(baseline(known.z), inside(known.z))
-
-
-def test_a_bounded_model_holds_inputs_half_a_range_beyond_the_data(known: Samples) -> None:
-    config = RegressorsConfig(terms=("1", "u", "v", "r", "left", "left|left|"), bounded=True)
-    baseline = config.build(known.names)
-    config.fit(baseline, known)
-    place = known.names.index("left")
-    low, high = known.z[:, place].amin(), known.z[:, place].amax()
-
-    def at(value: torch.Tensor) -> torch.Tensor:
-        z = known.z[:1].clone()
-        z[:, place] = value
-        return baseline(z)
-
-    edge = high + 0.5 * (high - low)
-    torch.testing.assert_close(at(high + 10.0 * (high - low)), at(edge))
-    assert not torch.allclose(at(edge), at(high))
+def test_short_logs_give_each_axis_the_terms_that_a_symmetric_vessel_has() -> None:
+    rows = short(NAMES_OF_A_BOAT)["baselines"]["hull"]["terms"]
+    assert {"1", "u", "u|u|", "v r", "n", "n|n|", "|n| u"} == set(rows["u"])
+    assert {"u v", "v|r|", "u|u| delta", "n|n| delta", "n|n|", "1"} <= set(rows["v"])
+    assert not {"u", "u|u|", "|n| u", "v r"} & set(rows["r"])
+    paired = SignalsConfig(inputs=("left", "right"), pairs=(("left", "right"),)).build().names
+    rows = short(paired)["baselines"]["hull"]["terms"]
+    assert {"left", "right|right|", "|left| u"} <= set(rows["r"])
+    assert "u|u|" not in rows["r"]
+    assert short(paired)["training"]["hull_network"]["mirror"]
 
 
 def test_a_mirror_symmetric_model_has_no_asymmetry(known: Samples) -> None:
     baseline = RegressorsConfig(terms=("1", "u", "r", "left", "right")).build(known.names)
     theta = torch.tensor(
-        [[0.1, -0.5, 0.0, 2.0, 2.0], [0.0, 0.0, 0.3, 0.1, -0.1], [0.0, 0.0, -1.0, 0.4, -0.4]],
-        dtype=torch.float64,
-    )
+        [[0.1, -0.5, 0.0, 2.0, 2.0], [0.0, 0.0, 0.3, 0.1, -0.1], [0.0, 0.0, -1.0, 0.4, -0.4]]
+    ).double()
     baseline.theta.data.copy_(theta)
-    pull = baseline.asymmetry(known)
-    assert float(theta.flatten() @ pull @ theta.flatten()) == pytest.approx(0.0, abs=1e-9)
-    theta[2, 4] = 0.4
-    assert float(theta.flatten() @ pull @ theta.flatten()) > 0.0
+    pull, flat = baseline.asymmetry(known), theta.flatten()
+    assert float(flat @ pull @ flat) == pytest.approx(0.0, abs=1e-9)
+    flat[-1] = 0.4
+    assert float(flat @ pull @ flat) > 0.0
 
 
 def test_what_was_predicted_wrong_of_the_past_is_told_and_fades() -> None:
@@ -319,18 +246,49 @@ def test_what_was_predicted_wrong_of_the_past_is_told_and_fades() -> None:
     torch.jit.script(missed)
 
 
-def test_a_term_that_turns_the_damping_about_is_left_out(known: Samples) -> None:
+TERMS = ("1", "u", "u|u|", "v", "r", "v|v|", "left", "left|left|")
+
+
+def test_a_bounded_model_comes_back_from_anywhere(known: Samples) -> None:
+    config = RegressorsConfig(terms=TERMS, bounded=True)
+    baseline = config.build(known.names)
+    config.fit(baseline, known)
+    low, high = known.z.amin(0), known.z.amax(0)
+    far = known.z[:1].clone()
+    far[:, :3] = (high + 20.0 * (high - low))[:3]
+    assert bool((baseline(far) < 0).all())
+    inside = RegressorsConfig(terms=TERMS).build(known.names)
+    inside.load_state_dict({"theta": baseline.theta})
+    torch.testing.assert_close(baseline(known.z), inside(known.z))
+
+    def at(beyond: float) -> torch.Tensor:
+        z, place = known.z[:1].clone(), known.names.index("left")
+        z[:, place] = (high + beyond * (high - low))[place]
+        return baseline(z)
+
+    # inputs are held half a range beyond the data
+    torch.testing.assert_close(at(10.0), at(0.5))
+    assert not torch.allclose(at(0.5), at(0.0))
+
+
+def test_terms_that_would_feed_energy_are_left_out(known: Samples) -> None:
     speed, sway, rate = (known.z[:, i] for i in range(3))
+    # accelerations that grow with the speed, and fall with its square
+    surge = 0.3 * speed - 0.2 * speed * speed.abs()
     # fed by u r, and damped by |u| r where nobody has been
-    target = torch.stack((-speed, -sway, 0.4 * speed * rate - 0.1 * rate), dim=1)
-    terms = ("1", "u", "v", "r", "u r", "left")
+    target = torch.stack((surge, -sway, 0.4 * speed * rate - 0.1 * rate), dim=1)
+    terms = ("1", "u", "v", "r", "u|u|", "u r", "left")
     for dissipative in (False, True):
-        baseline = RegressorsConfig(terms=terms, dissipative=dissipative).build(known.names)
         config = RegressorsConfig(terms=terms, dissipative=dissipative)
+        baseline = config.build(known.names)
         table = {(c.axis, c.term) for c in config.fit(baseline, known.with_target(target))}
-        assert (("r_dot", "u r") in table) != dissipative
-        assert ("v_dot", "u r") in table
+        assert {("r_dot", "u r") in table, ("u_dot", "u") in table} == {not dissipative}
+        assert {("v_dot", "u r"), ("v_dot", "v")} <= table
         z = known.z[::20].clone().requires_grad_()
         slope = torch.autograd.grad(baseline(z)[:, 2].sum(), z)[0][:, 2]
         assert (slope.median() > 0.0) != dissipative
     assert not baseline.undamped(known)
+    assert not baseline.feeding()
+    for term, axis, sure in (("u|u|", 0, 1), ("v|r|", 1, 1), ("|n| r", 2, 1), ("u v", 1, 0)):
+        assert dissipates(term, axis, ("u", "v", "r", "n")) == bool(sure)
+    assert not dissipates("u", 1, ("u", "v", "r", "n"))
