@@ -4,24 +4,21 @@ g1_4dof).
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
-from golden_tables import Row, table
+from golden_tables import beside, made_by, name_of, run
 from kinds import of_kind
 
-from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
+from residnet.dynamics.rollout import Source
+from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource, StackedSource
 from residnet.manoeuvres.closed_loop import Zigzag
-from residnet.physics.actuators.rudders import SternRuddersConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
@@ -67,14 +64,10 @@ class Case:
 
 def case_of(path: Path) -> Case:
     """Parameter set, rudder and run that a name stands for."""
-    name = path.name.removesuffix(".csv.gz")
-    parameters, rudder, run = name.split("_", 2)
-    assert parameters in SETS, f"{name}: no parameter set {parameters}"
-    assert rudder in RUDDERS, f"{name}: no rudder {rudder}"
-    for pattern, make in RUNS.items():
-        if match := re.fullmatch(pattern, run):
-            return Case(parameters, rudder, make(*match.groups()))
-    raise AssertionError(f"{name}: no run is written {run}")
+    parameters, rudder, flight = name_of(path).split("_", 2)
+    assert parameters in SETS, f"{path}: no parameter set {parameters}"
+    assert rudder in RUDDERS, f"{path}: no rudder {rudder}"
+    return Case(parameters, rudder, made_by(path, flight, RUNS, "run"))
 
 
 def plant_of(case: Case) -> HullPlant:
@@ -129,52 +122,22 @@ def trajectories(
     parameters: str, rudder: str, folder: Path, seconds: float
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """States [T+1, 9] and rudder commands [T] of every file of one vessel, flown side by side."""
-    files = [
-        path
-        for path in sorted(folder.glob("*.csv.gz"))
-        if (case_of(path).parameters, case_of(path).rudder) == (parameters, rudder)
-    ]
+    files, longest = beside(
+        folder,
+        lambda path: (case_of(path).parameters, case_of(path).rudder) == (parameters, rudder),
+    )
     files.sort(key=lambda path: case_of(path).run.heading is not None)
-    longest = max(float(table(path)["t"].iloc[-1]) for path in files)
     steps = round(min(longest, seconds) / DT) + 1
     t = torch.arange(steps, dtype=torch.float64) * DT
     runs = [case_of(path).run for path in files]
     plant = plant_of(case_of(files[0])).in_calm_water()
-    source = source_of(runs, plant, t)
     x0 = torch.zeros(len(runs), len(plant.state), dtype=torch.float64)
-    x0[:, plant.state.index("u")] = torch.tensor([run.u for run in runs], dtype=torch.float64)
-    x0[:, plant.state.index("phi")] = torch.tensor(np.radians([run.phi for run in runs]))
+    x0[:, plant.state.index("u")] = torch.tensor([one.u for one in runs], dtype=torch.float64)
+    x0[:, plant.state.index("phi")] = torch.tensor(np.radians([one.phi for one in runs]))
     w = torch.zeros(len(runs), steps, len(plant.inputs), dtype=torch.float64)
-    with torch.no_grad():
-        states, inputs, _ = Rollout(RecordedPlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
+    states, inputs = run(RecordedPlantDynamics(plant, DT), x0, w, source_of(runs, plant, t))
     assert plant.state == COLUMNS
     return {path.name: (states[i].numpy(), inputs[i, :, 0].numpy()) for i, path in enumerate(files)}
-
-
-def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
-    """Ten steps from every row of the file at once, with all exogenous inputs at zero: no more than
-    rounding apart.
-    """
-    case = case_of(path)
-    plant = plant_of(case)
-    x = torch.tensor(frame[list(COLUMNS)].to_numpy())
-    command = frame["delta_cmd"].to_numpy().copy()
-    w = torch.zeros(len(frame), EVERY, len(plant.inputs), dtype=torch.float64)
-    w[:, :, 0] = torch.from_numpy(command)[:, None]
-    rudders = load_vessel(SETS[case.parameters]).actuators
-    assert isinstance(rudders, SternRuddersConfig)
-    w[:, :, 1] = case.run.drive * rudders.thrust
-    with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, DT))(x, w, x[:, :0])
-    # a zigzag may turn its rudder between two rows
-    held = command[:-1] == command[1:]
-    reached, truth = states[:-1, -1].numpy()[held], frame[list(COLUMNS)].to_numpy()[1:][held]
-    assert held.mean() > 0.9
-    yield "ten steps", reached, truth, 1e-13 * np.abs(truth).max(0) + 1e-15
-
-
-def described(case: Case) -> Case:
-    return case
 
 
 FURTHER = {

@@ -11,19 +11,19 @@ import re
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
 import torch
-from golden_tables import Row, accelerations, tensor
+from golden_tables import Row, accelerations, beside, name_of, run, tensor
+from kinds import of_kind
 from scipy.signal import square
-from staged_plant import StagedPlantDynamics
 from torch import Tensor
 
-from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.base import Dynamics
 from residnet.physics.actuators.rudders import WaterJetsConfig
-from residnet.physics.plant import HullPlant
+from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.vessel import load_vessel
 
 DT, EVERY, END = 0.01, 10, 300.0
@@ -101,10 +101,9 @@ DESIGNS: dict[str, Callable[[np.ndarray], tuple[np.ndarray, ...]]] = {
 
 def case_of(path: Path) -> tuple[str, str]:
     """Vessel and design of a file: `jet2_multisine` is design jet2."""
-    name = path.name.removesuffix(".csv.gz")
-    match = re.fullmatch(r"((force|jet)A?\d+)(_\w+)?", name)
-    assert match, f"{name}: no run is written so"
-    assert match[1] in DESIGNS, f"{name}: no inputs are called {match[1]}"
+    match = re.fullmatch(r"((force|jet)A?\d+)(_\w+)?", name_of(path))
+    assert match, f"{path}: no run is written so"
+    assert match[1] in DESIGNS, f"{path}: no inputs are called {match[1]}"
     return VESSELS[match[2]], match[1]
 
 
@@ -116,44 +115,55 @@ def commands(path: Path) -> Inputs:
 
 
 def plant_of(path: Path) -> HullPlant:
-    plant = load_vessel(case_of(path)[0]).build()
-    assert isinstance(plant, HullPlant)
-    return plant
+    return of_kind(load_vessel(case_of(path)[0]).build(), HullPlant)
 
 
-def has_jets(plant: HullPlant) -> bool:
-    return plant.actuators.commands == ("cmd_n", "cmd_nozzle")
-
-
-def jets() -> WaterJetsConfig:
-    found = load_vessel("odin_jets").actuators
-    assert isinstance(found, WaterJetsConfig)
-    return found
-
-
-def recorded(frame: pd.DataFrame, plant: HullPlant) -> Tensor:
+def recorded(frame: pd.DataFrame) -> Tensor:
     """Commands [T, c] as the file has them, in SI."""
-    if has_jets(plant):
+    if "rpm" in frame:
         return tensor(frame, "rpm", "nozzle") * torch.tensor([1 / 60, 1.0], dtype=torch.float64)
     return tensor(frame, "tau_x", "tau_y", "tau_z")
+
+
+@final
+class StagedPlantDynamics(Dynamics):
+    """A plant stepped by RK4 under inputs that move during a step, taken at each stage's time.
+
+    Inputs w [B, 3 m] hold those at the start, the middle and the end of the step side by side.
+    """
+
+    def __init__(self, plant: Plant, dt: float) -> None:
+        super().__init__(dt, "rk4")
+        self.plant = plant
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return x_dot [B, nx] of the plant under the inputs p [B, m] of one stage."""
+        return self.plant.rate(x, p)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state after a step; the memory passes through."""
+        start, middle, end = torch.chunk(w, 3, dim=-1)
+        k1 = self.rate(x, start, s)
+        k2 = self.rate(x + 0.5 * self.dt * k1, middle, s)
+        k3 = self.rate(x + 0.5 * self.dt * k2, middle, s)
+        k4 = self.rate(x + self.dt * k3, end, s)
+        return (
+            self.plant.end_step(x + self.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), end, self.dt),
+            s,
+        )
 
 
 @cache
 def trajectories(folder: Path, vessel: str, seconds: float) -> dict[str, np.ndarray]:
     """States [T+1, 6] at the steps of every file of one vessel, flown side by side."""
-    files = [path for path in sorted(folder.glob("*.csv.gz")) if case_of(path)[0] == vessel]
+    files, _ = beside(folder, lambda path: case_of(path)[0] == vessel)
     plant = plant_of(files[0]).in_calm_water()
     t = DT * np.arange(round(min(END, seconds) / DT))
     # the last stage sees the input just before the next step (golden/README.md)
     stages = (t, t + DT / 2, t + DT - 1e-12)
-    w = torch.from_numpy(
-        np.stack(
-            [np.concatenate([commands(path)(stage) for stage in stages], axis=-1) for path in files]
-        )
-    )
+    asked = [np.concatenate([commands(path)(at) for at in stages], axis=-1) for path in files]
     x0 = torch.zeros(len(files), 6, dtype=torch.float64)
-    with torch.no_grad():
-        states, _, _ = Rollout(StagedPlantDynamics(plant, DT))(x0, w, x0[:, :0])
+    states, _ = run(StagedPlantDynamics(plant, DT), x0, torch.from_numpy(np.stack(asked)))
     return {path.name: states[i].numpy() for i, path in enumerate(files)}
 
 
@@ -171,10 +181,11 @@ def allowed(path: Path, name: str, frame: pd.DataFrame, usual: float) -> float:
 
 
 def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
-    plant, command = plant_of(path), recorded(frame, plant_of(path))
+    plant, command, has_jets = plant_of(path), recorded(frame), "rpm" in frame
     asked = torch.from_numpy(commands(path)(frame["t"].to_numpy()))
-    if has_jets(plant):
-        asked[:, 0] = asked[:, 0].clamp(0.0, jets().motor.n_max)
+    jets = of_kind(load_vessel("odin_jets").actuators, WaterJetsConfig)
+    if has_jets:
+        asked[:, 0] = asked[:, 0].clamp(0.0, jets.motor.n_max)
     # times in the file are rounded sums; an input that jumps there may be seen before or after
     away = (asked - command).abs() > 1e-9 * command.abs().amax(0) + 1e-12
     jumps = int(away.any(-1).sum())
@@ -183,10 +194,10 @@ def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
     made = plant.actuators.force(nu[:, :0], command, nu)
     # both parabolas of the jets cancel: exact to the size of their largest part
     size = made.abs()
-    if has_jets(plant):
+    if has_jets:
         u, n = nu[:, 0].abs(), command[:, 0].abs()
         (a, b, c), (d, e, f, whole) = (
-            [abs(p.value) for _, p in part] for part in (jets().speed, jets().revolutions)
+            [abs(p.value) for _, p in part] for part in (jets.speed, jets.revolutions)
         )
         largest = 2 * (a + u * (b + u * c)) * (d + n * (e + n * f)) / whole
         across = largest * torch.sin(command[:, 1]).abs()
@@ -194,10 +205,6 @@ def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
     within = 1e-12 * np.maximum(size.numpy(), np.abs(tau.numpy()))
     yield "forces", made.numpy(), tau.numpy(), within
     yield accelerations(plant.hull, nu, tau, frame)
-
-
-def described(case: tuple[str, str]) -> tuple[str, str]:
-    return case
 
 
 FURTHER = {

@@ -4,7 +4,6 @@ implementation (golden/README.md, g4_wamv).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -14,13 +13,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from golden_tables import Row, accelerations, table, tensor
+from golden_tables import Row, accelerations, beside, made_by, name_of, run, table, tensor
 from kinds import of_kind
 from scipy.linalg import expm
 
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.heads.base import ZeroHead
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
@@ -63,13 +61,9 @@ class Case:
 
 def case_of(path: Path) -> Case:
     """Vessel and manoeuvre that a name stands for."""
-    name = path.name.removesuffix(".csv.gz")
-    head, _, rest = name.partition("_")
-    assert head in VESSELS, f"{name}: no parameter set {head}"
-    for pattern, make in MANOEUVRES.items():
-        if match := re.fullmatch(pattern, rest):
-            return Case(VESSELS[head], make(*match.groups()))
-    raise AssertionError(f"{name}: no manoeuvre is written {rest}")
+    head, _, rest = name_of(path).partition("_")
+    assert head in VESSELS, f"{path}: no parameter set {head}"
+    return Case(VESSELS[head], made_by(path, rest, MANOEUVRES, "manoeuvre"))
 
 
 def is_linear(path: Path) -> bool:
@@ -77,17 +71,12 @@ def is_linear(path: Path) -> bool:
 
 
 @cache
-def trajectories(
-    vessel: str, folder: Path, seconds: float
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def trajectories(vessel: str, folder: Path, seconds: float) -> dict[str, list[np.ndarray]]:
     """States [T+1, 8] and commands [T, 2] of every file of one vessel, flown side by side."""
-    files = [
-        path
-        for path in sorted(folder.glob("*.csv.gz"))
-        if not is_linear(path) and case_of(path).vessel == vessel
-    ]
-    longest = min(max(float(table(path)["t"].iloc[-1]) for path in files), seconds)
-    steps = round(longest / DT) + 1
+    files, longest = beside(
+        folder, lambda path: not is_linear(path) and case_of(path).vessel == vessel
+    )
+    steps = round(min(longest, seconds) / DT) + 1
     t = torch.arange(steps, dtype=torch.float64) * DT
     plant = load_vessel(vessel).build()
     manoeuvres = [case_of(path).manoeuvre for path in files]
@@ -96,10 +85,9 @@ def trajectories(
     )
     x0 = torch.zeros(len(files), len(plant.state), dtype=torch.float64)
     w = torch.zeros(len(files), steps, len(plant.inputs), dtype=torch.float64)
-    with torch.no_grad():
-        states, inputs, _ = Rollout(RecordedPlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
+    states, inputs = run(RecordedPlantDynamics(plant, DT), x0, w, source)
     return {
-        path.name: (states[i].numpy(), inputs[i, :, :2].numpy()) for i, path in enumerate(files)
+        path.name: [states[i].numpy(), inputs[i, :, :2].numpy()] for i, path in enumerate(files)
     }
 
 
@@ -150,16 +138,14 @@ def linear(path: Path) -> dict[str, Any]:
     baseline = RegressorBaseline([terms] * 3, signals.names)
     baseline.theta.data.copy_(torch.from_numpy(np.concatenate((a, b, c[:, None]), axis=1)))
     model = HybridDynamics(signals, baseline, ZeroHead(), dt, "rk4")
-    x0 = torch.zeros(1, 6, dtype=torch.float64)
-    with torch.no_grad():
-        states, _, _ = Rollout(model)(x0, torch.tensor(tau)[None, :-1], x0[:, :0])
+    states, _ = run(model, torch.zeros(1, 6, dtype=torch.float64), torch.tensor(tau)[None, :-1])
     nu = states[0, :, 3:].numpy() @ np.linalg.inv(scale)
     return {"step": dt, **dict(zip(("u", "v_mps", "r_degps"), nu.T, strict=True))}
 
 
 def linear_model(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A [3, 3], B [3, 2], bias [3] of (u, v, r) with r in deg/s and inputs (tau_x, tau_N)."""
-    name = path.name.removesuffix(".csv.gz")
+    name = name_of(path)
     a = np.array([[-1.3191, 0.0, 0.0], [0.0, 0.0161, -0.0052], [0.0, 8.2861, -0.9860]])
     steer = {
         "linear33_34_printed": np.array([0.0002, 0.0307]),
@@ -169,10 +155,6 @@ def linear_model(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     b = np.zeros((3, 2))
     b[0, 0], b[1:, 1] = 0.0028, steer[name]
     return a, b, np.array([0.6836, 0.0068, 1.3276])
-
-
-def described(case: Case) -> Case:
-    return case
 
 
 FURTHER = {

@@ -11,7 +11,6 @@ give these rows.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -21,19 +20,14 @@ from typing import Any
 import numpy as np
 import torch
 from exact_steps import NomotoDynamics
-from golden_tables import table
+from golden_tables import made_by, name_of, run, table
+from kinds import of_kind
 from torch import Tensor
 
-from residnet.control import (
-    BangBangHeading,
-    ClosedLoop,
-    GivenReference,
-    HeadingPD,
-    Policy,
-)
+from residnet.control import BangBangHeading, ClosedLoop, GivenReference, HeadingPD, Policy
 from residnet.documents.gouletas2020.law import DocumentAutopilot, SimulatedPredictor
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import Rollout, Source
+from residnet.dynamics.rollout import Source
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource
 from residnet.manoeuvres.closed_loop import Zigzag
@@ -61,8 +55,7 @@ class Case:
 
 def nomoto(rate: str | None = None) -> SteeringVessel:
     """The vessel of document 004, with a steering gear of `rate` deg/s where there is one."""
-    vessel = load_vessel("nomoto_oceanos")
-    assert isinstance(vessel, NomotoConfig)
+    vessel = of_kind(load_vessel("nomoto_oceanos"), NomotoConfig)
     assert (vessel.K.value, vessel.T.value) == (GAIN, TIME)
     limited = vessel.rudder.model_copy(
         update={"rate": None if rate is None else float(np.radians(float(rate)))}
@@ -72,8 +65,7 @@ def nomoto(rate: str | None = None) -> SteeringVessel:
 
 def patrol(parameters: str) -> Plant:
     """The patrol vessel with a rudder that stands at its command at once."""
-    vessel = load_vessel(PATROL[parameters])
-    assert isinstance(vessel, PatrolConfig)
+    vessel = of_kind(load_vessel(PATROL[parameters]), PatrolConfig)
     immediate = vessel.actuators.model_copy(update={"rate": None})
     return vessel.model_copy(update={"actuators": immediate}).build().in_calm_water()
 
@@ -92,36 +84,32 @@ def approach(tau: float) -> Heading:
     return (lambda t: np.radians(30.0) * (1.0 - np.exp(-t / tau))) if tau else step_to(30.0)
 
 
+def exactly(plant: SteeringVessel, source: Callable[[Tensor], Source]) -> Case:
+    return Case(plant, NomotoDynamics(plant, 0.01), source)
+
+
 def rudder_step(angle: str) -> Case:
     plant = nomoto()
     steer = np.radians(float(angle)) / plant.delta_max
-    return Case(
+    return exactly(
         plant,
-        NomotoDynamics(plant, 0.01),
         lambda t: ScheduleSource(plant.demand(torch.ones_like(t)[None], steer * (t >= 1.0)[None])),
     )
 
 
 def zigzag(angle: str, heading: str, rate: str | None) -> Case:
     plant = nomoto(rate)
-    manoeuvre = Zigzag(
-        drive=1.0,
-        steer=np.radians(float(angle)) / plant.delta_max,
-        start=0.0,
-        heading=float(np.radians(float(heading))),
-    )
-    return Case(
-        plant,
-        NomotoDynamics(plant, 0.01),
-        lambda t: Zigzag.source([manoeuvre], Helm.from_plant(plant), t),
-    )
+    turn = float(np.radians(float(heading)))
+    steer = np.radians(float(angle)) / plant.delta_max
+    manoeuvre = Zigzag(drive=1.0, steer=steer, start=0.0, heading=turn)
+    return exactly(plant, lambda t: Zigzag.source([manoeuvre], Helm.from_plant(plant), t))
 
 
 def document(horizon: str, tau: str) -> Case:
     plant = nomoto()
     predictor = SimulatedPredictor(NomotoDynamics(plant, float(horizon)), plant.state, 1)
     policy = DocumentAutopilot(predictor, limit=LIMIT)
-    return Case(plant, NomotoDynamics(plant, 0.01), partial(follow, policy, approach(float(tau))))
+    return exactly(plant, partial(follow, policy, approach(float(tau))))
 
 
 def tuned(heading: str | None = None) -> Case:
@@ -129,40 +117,32 @@ def tuned(heading: str | None = None) -> Case:
     policy = HeadingPD.placed(
         plant.state, gain=GAIN, time=TIME, frequency=2.0, damping=0.9, limit=LIMIT
     )
-    return Case(
-        plant, NomotoDynamics(plant, 0.01), partial(follow, policy, step_to(float(heading or 30)))
-    )
+    return exactly(plant, partial(follow, policy, step_to(float(heading or 30))))
 
 
 def time_optimal(heading: str | None = None) -> Case:
     plant = nomoto()
     policy = BangBangHeading(plant.state, gain=GAIN, time=TIME, limit=LIMIT)
-    return Case(
-        plant, NomotoDynamics(plant, 0.01), partial(follow, policy, step_to(float(heading or 30)))
-    )
+    return exactly(plant, partial(follow, policy, step_to(float(heading or 30))))
 
 
-def patrol_document(parameters: str, horizon: str, tau: str | None, spacing: float = 0.25) -> Case:
+def patrol_document(spacing: float, parameters: str, horizon: str, tau: str | None) -> Case:
     plant, h = patrol(parameters), float(horizon)
     # whole steps of at most 0.25 s make both the spacing of the rows and the horizon
     dt = min(spacing / np.ceil(spacing / 0.25 - 1e-9), h)
     model = RecordedPlantDynamics(plant, dt)
-    predictor = SimulatedPredictor(
-        model, plant.state, round(h / dt), torch.tensor([THRUST], dtype=torch.float64)
+    thrust = torch.tensor([THRUST], dtype=torch.float64)
+    policy = DocumentAutopilot(
+        SimulatedPredictor(model, plant.state, round(h / dt), thrust), limit=LIMIT
     )
-    return Case(
-        plant,
-        model,
-        partial(follow, DocumentAutopilot(predictor, limit=LIMIT), approach(float(tau or 0))),
-    )
+    return Case(plant, model, partial(follow, policy, approach(float(tau or 0))))
 
 
 def patrol_pd(parameters: str, heading: str) -> Case:
     plant = patrol(parameters)
     policy = HeadingPD(plant.state, kp=6.0, kd=6.0, limit=LIMIT)
-    return Case(
-        plant, RecordedPlantDynamics(plant, 0.05), partial(follow, policy, step_to(float(heading)))
-    )
+    model = RecordedPlantDynamics(plant, 0.05)
+    return Case(plant, model, partial(follow, policy, step_to(float(heading))))
 
 
 NUMBER = r"(\d+(?:\.\d+)?)"
@@ -172,32 +152,25 @@ RUNS: dict[str, Callable[..., Case]] = {
     rf"docctrl_h{NUMBER}_tau{NUMBER}": document,
     rf"pd_tuned_step{NUMBER}?": tuned,
     rf"timeopt_step{NUMBER}?": time_optimal,
-    rf"patrol_(\w+)_docctrl_h{NUMBER}(?:_tau{NUMBER})?": patrol_document,
     rf"patrol_(\w+)_pd_step{NUMBER}": patrol_pd,
 }
 
 
-def case_of(path: Path, **known: float) -> Case:
-    """Set-up that a name stands for; `spacing` of its rows in s where it is known."""
-    name = path.name.removesuffix(".csv.gz")
-    for pattern, make in RUNS.items():
-        if match := re.fullmatch(pattern, name):
-            return (
-                make(*match.groups(), **known) if make is patrol_document else make(*match.groups())
-            )
-    raise AssertionError(f"{name}: no run is written so")
+def case_of(path: Path, spacing: float = 0.25) -> Case:
+    """Set-up that a name stands for; `spacing` of its rows in s."""
+    patrol = rf"patrol_(\w+)_docctrl_h{NUMBER}(?:_tau{NUMBER})?"
+    runs = RUNS | {patrol: partial(patrol_document, spacing)}
+    case: Case = made_by(path, name_of(path), runs, "run")
+    return case
 
 
 def fly(case: Case, steps: int) -> dict[str, np.ndarray]:
     """Channels [T] of a run, with the rudder angle and the command that act from each time on."""
-    plant, dt = case.plant, case.model.dt
-    t = torch.arange(steps, dtype=torch.float64) * dt
-    x0 = plant.approach(1)
-    w = torch.zeros(1, steps, len(plant.inputs), dtype=torch.float64)
+    t = torch.arange(steps, dtype=torch.float64) * case.model.dt
+    w = torch.zeros(1, steps, len(case.plant.inputs), dtype=torch.float64)
     w[:, :, 1:] = THRUST
-    with torch.no_grad():
-        states, inputs, _ = Rollout(case.model, case.source(t))(x0, w, x0[:, :0])
-    out = dict(zip(plant.state, states[0, :-1].T.numpy(), strict=True))
+    states, inputs = run(case.model, case.plant.approach(1), w, case.source(t))
+    out = dict(zip(case.plant.state, states[0, :-1].T.numpy(), strict=True))
     out["delta_cmd"] = inputs[0, :, 0].numpy()
     return {"delta": out["delta_cmd"], **out}
 
@@ -212,7 +185,7 @@ def flown(path: Path, seconds: float) -> dict[str, Any]:
     return {"step": spacing, **{n: found[n][::every] for n in frame.columns.drop("t")}}
 
 
-FURTHER: dict[str, Any] = {}
+FURTHER: dict[str, Any] = {}  # cases hold what flies, and cannot be compared
 UNKNOWN = ("turn_5",)
 
 

@@ -1,10 +1,12 @@
-"""Golden runs as tables and tensors."""
+"""Golden runs as tables and tensors, what their names say, and how residnet flies them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,7 +14,35 @@ import pytest
 import torch
 from torch import Tensor
 
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.rollout import Rollout, Source
 from residnet.physics.plant import Hull
+
+
+def name_of(path: Path) -> str:
+    """What a file's set-up is told by."""
+    return path.name.removesuffix(".csv.gz")
+
+
+def made_by(path: Path, part: str, makers: Mapping[str, Callable[..., Any]], what: str) -> Any:
+    """What the first pattern that matches a part of a name makes of its groups."""
+    for pattern, make in makers.items():
+        if match := re.fullmatch(pattern, part):
+            return make(*match.groups())
+    raise AssertionError(f"{name_of(path)}: no {what} is written {part}")
+
+
+def beside(folder: Path, alike: Callable[[Path], bool]) -> tuple[list[Path], float]:
+    """The files that are flown side by side, and the end of the longest, s."""
+    files = [path for path in sorted(folder.glob("*.csv.gz")) if alike(path)]
+    return files, max(float(table(path)["t"].iloc[-1]) for path in files)
+
+
+def run(model: Dynamics, x0: Tensor, w: Tensor, source: Source | None = None) -> list[Tensor]:
+    """States [B, T + 1, nx] and inputs [B, T, m] of free runs without a memory."""
+    with torch.no_grad():
+        states, inputs, _ = (Rollout(model, source) if source else Rollout(model))(x0, w, x0[:, :0])
+    return [states, inputs]
 
 
 @cache
