@@ -73,10 +73,8 @@ class Dynamics(nn.Module, ABC):
         self.spatial = len(attitude) > 0
         places = torch.arange(width)
         places[list(attitude)] = width + torch.arange(len(attitude))
-        for name, value in (("attitude", torch.tensor(attitude).long()), ("rearranged", places)):
-            self.register_buffer(name, value, persistent=False)
-        self.attitude: Tensor
-        self.rearranged: Tensor
+        self.attitude = nn.Buffer(torch.tensor(attitude).long(), persistent=False)
+        self.rearranged = nn.Buffer(places, persistent=False)
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the derivative of the state [B, nx] at a stage, for models that integrate.

@@ -153,8 +153,7 @@ class MeanOfTrajectories(HybridDynamics):
             initial=1 + self.dof,
         )
         small = [_TOLD * max(b - a, 1e-6) for a, b in zip(low, high, strict=True)]
-        self.register_buffer("small", torch.tensor(small, dtype=torch.float64), persistent=False)
-        self.small: Tensor
+        self.small = nn.Buffer(torch.tensor(small, dtype=torch.float64), persistent=False)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         x = self.alive(x)

@@ -47,8 +47,7 @@ class Missed(nn.Module):
         super().__init__()
         self.dof, self.size = live.size, 1 + 2 * live.size
         self.free = len(live.learned) == live.size
-        self.register_buffer("mask", live.mask(), persistent=False)
-        self.mask: Tensor
+        self.mask = nn.Buffer(live.mask(), persistent=False)
         self.keep = math.exp(-dt / settle)
         self.gain = (1.0 - self.keep) / dt
 
@@ -104,15 +103,9 @@ class HybridDynamics(Dynamics):
         self.whole, self.free = live.whole, len(live.learned) == live.size
         self.rolls, self.level = live.rolls, not live.rolls
         self.turn_about(ATTITUDE if live.spatial else (), len(live.states))
-        for name, value in {
-            "live": live.mask(),
-            "living": live.alive(),
-            "known_rates": live.known_rates(),
-        }.items():
-            self.register_buffer(name, value, persistent=False)
-        self.live: Tensor
-        self.living: Tensor
-        self.known_rates: Tensor
+        self.live = nn.Buffer(live.mask(), persistent=False)
+        self.living = nn.Buffer(live.alive(), persistent=False)
+        self.known_rates = nn.Buffer(live.known_rates(), persistent=False)
         head.set_step(dt)
         self.missed = Missed(head.settle, dt, live) if head.settle > 0.0 else None
         self.width = head.n_state

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
 from residnet.dynamics.base import Dynamics
@@ -142,8 +142,7 @@ class InAmbientCurrent(Dynamics):
         self.n_state = 2 + model.n_state
         places = torch.zeros(2, len(state), dtype=torch.float64)
         places[0, state.index("x")] = places[1, state.index("y")] = 1.0
-        self.register_buffer("places", places, persistent=False)
-        self.places: Tensor
+        self.places = nn.Buffer(places, persistent=False)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         moved, memory = self.model.step(x, w, s[:, 2:])

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.core.columns import actuators, motion
 from residnet.core.errors import ConfigError
@@ -107,11 +107,9 @@ class VariedPlant(Dynamics):
         self.take = [0 if k == first else k + 1 if k < first else k for k in places]
         self.rudder = plant.state.index(axis.gear) if axis.gear in plant.state else -1
         slowed = torch.tensor([1.0 if name in axis.slowed else 0.0 for name in plant.state])
-        self.register_buffer("slowed", slowed, persistent=False)
-        self.slowed: Tensor
+        self.slowed = nn.Buffer(slowed, persistent=False)
         gear = torch.tensor([1.0 if "delta" in name else 0.0 for name in plant.state])
-        self.register_buffer("gear", gear, persistent=False)
-        self.gear: Tensor
+        self.gear = nn.Buffer(gear, persistent=False)
         x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
         w[:, first] = 0.1
         # a rudder with a lag moves within a step
@@ -194,8 +192,7 @@ class VariedModel(Dynamics):
         super().__init__(dt, model.integrator)
         states = live_of(model.signals.names).states
         slowed = torch.tensor([name in axis.slowed for name in states])
-        self.register_buffer("slowed", slowed, persistent=False)
-        self.slowed: Tensor
+        self.slowed = nn.Buffer(slowed, persistent=False)
         if model.n_state > 0 and not math.isclose(model.dt, dt, rel_tol=1e-9):
             raise ConfigError(
                 f"the learned model has a memory and steps of {model.dt:g} s; give the policy's"

@@ -45,8 +45,7 @@ class BelievedForce(nn.Module):
     def __init__(self, baseline: nn.Module, mass: Tensor) -> None:
         super().__init__()
         self.baseline = baseline
-        self.register_buffer("mass", mass.clone())
-        self.mass: Tensor
+        self.mass = nn.Buffer(mass.clone())
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Return the force [B, 3] at nu_dot [B, 3] and nu [B, 3]."""
@@ -79,8 +78,7 @@ class RequiredForce(nn.Module):
     def __init__(self, believed: nn.Module, correction: nn.Module, *, mirrored: bool) -> None:
         super().__init__()
         self.believed, self.correction, self.mirrored = believed, correction, mirrored
-        self.register_buffer("turned", torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-        self.turned: Tensor
+        self.turned = nn.Buffer(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Return the force [B, 3] at nu_dot [B, 3] and nu [B, 3]."""
@@ -119,8 +117,7 @@ class GuardedForce(nn.Module):
         low, high = torch.tensor(ranges, dtype=torch.float64).T
         reach = torch.tensor([widening(*limits) for limits in ranges], dtype=torch.float64)
         self.ranges = Ranges(low, high, reach, torch.float64)
-        self.register_buffer("width", (high - low).clamp(min=1e-9))
-        self.width: Tensor
+        self.width = nn.Buffer((high - low).clamp(min=1e-9))
         self.dof = PLANAR.dof
         self.fade, self.edge, self.effort = FADE, _EDGE, EFFORT
 

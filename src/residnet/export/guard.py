@@ -55,19 +55,10 @@ class Ranges(nn.Module):
 
     def __init__(self, low: Tensor, high: Tensor, reach: Tensor, dtype: torch.dtype) -> None:
         super().__init__()
-        for name, value in {
-            "low": low,
-            "high": high,
-            "least": low - reach,
-            "most": high + reach,
-            "middle": 0.5 * (low + high),
-        }.items():
-            self.register_buffer(name, value.to(dtype))
-        self.low: Tensor
-        self.high: Tensor
-        self.least: Tensor
-        self.most: Tensor
-        self.middle: Tensor
+        self.low, self.high = nn.Buffer(low.to(dtype)), nn.Buffer(high.to(dtype))
+        self.least = nn.Buffer((low - reach).to(dtype))
+        self.most = nn.Buffer((high + reach).to(dtype))
+        self.middle = nn.Buffer((0.5 * (low + high)).to(dtype))
 
     def inside(self, seen: Tensor) -> Tensor:
         """Return which rows [...] of values [..., k] lie in the training range."""
@@ -121,10 +112,8 @@ class GuardedDynamics(Dynamics):
         # finite, so that comparisons alone tell what is no number
         smallest = (first - 1e-3 * first.abs()).clamp(min=-_LARGEST)
         largest = (last + 1e-3 * last.abs()).clamp(max=_LARGEST)
-        self.register_buffer("memory_low", smallest.to(torch.float32))
-        self.register_buffer("memory_high", largest.to(torch.float32))
-        self.memory_low: Tensor
-        self.memory_high: Tensor
+        self.memory_low = nn.Buffer(smallest.to(torch.float32))
+        self.memory_high = nn.Buffer(largest.to(torch.float32))
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return x_dot [B, nx] of the model at a stage; the flag has none."""

@@ -70,14 +70,11 @@ class _Controller(nn.Module):
         super().__init__()
         last = 1.001 * policy.limit
         kept = [*memory, (-last, last)]
-        for name, ranges in (("", limits), ("memory_", kept)):
-            low, high = torch.tensor(ranges, dtype=dtype).T
-            self.register_buffer(f"{name}low", low.clone())
-            self.register_buffer(f"{name}high", high.clone())
-        self.low: Tensor
-        self.high: Tensor
-        self.memory_low: Tensor
-        self.memory_high: Tensor
+        self.low, self.high, self.memory_low, self.memory_high = (
+            nn.Buffer(end.clone())
+            for ranges in (limits, kept)
+            for end in torch.tensor(ranges, dtype=dtype).T
+        )
         self.keep = 1.0 if safe == "hold" else 0.0
         # a large number where the rudder has no rate: infinity times zero would be no number
         self.travel = min(policy.rate * policy.dt, 2.0 * policy.limit)

@@ -68,15 +68,13 @@ class ExportedModel(nn.Module):
         self.states = len(spec.signals.live.states)
         self.n_state = model.n_state
         known = spec.band
-        self.register_buffer("band_steps", torch.tensor([1.0] if known is None else known.steps))
-        self.register_buffer(
-            "band_widths",
-            torch.full((1, len(spec.signals.live.layout.banded)), torch.inf)
-            if known is None
-            else torch.tensor(known.columns).T,
+        steps, widths = (
+            torch.ones(1),
+            torch.full((1, len(spec.signals.live.layout.banded)), torch.inf),
         )
-        self.band_steps: Tensor
-        self.band_widths: Tensor
+        if known is not None:
+            steps, widths = torch.tensor(known.steps), torch.tensor(known.columns).T
+        self.band_steps, self.band_widths = nn.Buffer(steps), nn.Buffer(widths)
 
     @torch.jit.export
     def band(self, k: int) -> Tensor:
