@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import io
 import pickle
@@ -13,46 +12,28 @@ import torch
 from torch import Tensor
 
 from residnet.core.progress import say
-from residnet.dynamics.rollout import WORTH_SCRIPTING, FreeRun, Rollout, scripted
+from residnet.dynamics.rollout import WORTH_COMPILING, FreeRun, Rollout, scripted
 
 if TYPE_CHECKING:
     from residnet.dynamics.compiled import CompiledRollout
 
-_WORTH = 500
-"""Steps from which on a run is compiled: its own alone, so that numbers do not hang on what ran
-before. Writing and compiling a step takes .7 s, once for all models of a structure; a step in torch
-takes .15 to 1.3 ms.
-"""
-
 
 class _Structure(pickle.Pickler):
-    """Writes all of a rollout but the numbers of its parameters and buffers.
-
-    Attributes:
-        apart: whether it holds other numbers, which are not written either.
-    """
+    """Writes all of a rollout but the numbers of its parameters and buffers."""
 
     def __init__(self, out: io.BytesIO, rollout: Rollout) -> None:
         super().__init__(out)
-        self.known = {id(number) for number in _numbers(rollout)}
-        self.apart = False
+        self.known = {id(number) for number in (*rollout.parameters(), *rollout.buffers())}
 
     def persistent_id(self, obj: Any) -> Any:
         """Return what a tensor is known by."""
         if not isinstance(obj, Tensor):
             return None
-        if obj.is_floating_point():
-            self.apart |= id(obj) not in self.known
+        if obj.is_floating_point() and id(obj) in self.known:
             return str(obj.dtype), tuple(obj.shape), obj.requires_grad and torch.is_grad_enabled()
         return str(obj.dtype), obj.tolist()
 
 
-def _numbers(rollout: Rollout) -> list[Tensor]:
-    return [*rollout.parameters(), *rollout.buffers()]
-
-
-_SCRIPTED: dict[bytes, tuple[Rollout, FreeRun]] = {}
-"""Rollouts by structure, with numbers of their own, and as TorchScript."""
 _KNOWN: dict[bytes, CompiledRollout | Literal[False]] = {}
 """Rollouts by structure: compiled, or that they cannot be."""
 
@@ -80,19 +61,15 @@ def compiled(rollout: Rollout, steps: int) -> FreeRun:
 
 def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> FreeRun:
     apart = x0.device.type != "cpu" or rollout.source.counts or not w.numel()
-    if steps < WORTH_SCRIPTING or apart:
+    if steps < WORTH_COMPILING or apart:
         return scripted(rollout, steps)
     out = io.BytesIO()
-    structure = _Structure(out, rollout)
     try:
-        structure.dump((rollout, x0.dtype, torch.is_grad_enabled()))
+        _Structure(out, rollout).dump((rollout, x0.dtype, torch.is_grad_enabled()))
     except Exception:
         # parts of somebody else's that cannot be pickled
         return scripted(rollout, steps)
     key = hashlib.sha256(out.getvalue()).digest()
-    if steps < _WORTH:
-        once = not (torch.is_grad_enabled() or structure.apart)
-        return _scripted_once(key, rollout, steps) if once else scripted(rollout, steps)
     if key not in _KNOWN:
         from residnet.dynamics.c_code import CompilerError
         from residnet.dynamics.compiled import CompiledRollout
@@ -108,21 +85,6 @@ def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> F
                 _tell(str(error))
     known = _KNOWN[key]
     return known.of(rollout) if known else scripted(rollout, steps)
-
-
-def _scripted_once(key: bytes, rollout: Rollout, steps: int) -> FreeRun:
-    """Return the rollout as TorchScript, made once for all that differ in their numbers alone."""
-    if key not in _SCRIPTED:
-        own = copy.deepcopy(rollout).requires_grad_(False)
-        _SCRIPTED[key] = own, scripted(own, steps)
-    own, fly = _SCRIPTED[key]
-
-    def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        for kept, number in zip(_numbers(own), _numbers(rollout), strict=True):
-            kept.copy_(number)
-        return fly(x0, w, s)
-
-    return run
 
 
 @cache
