@@ -115,7 +115,7 @@ def test_sensitivities_are_the_derivatives_of_the_step(integrator: Integrator) -
     baseline: Any = model.baseline
     active = baseline.free_indices()
     s = 0.1 * torch.randn(3, 10, len(active), generator=random, dtype=torch.float64)
-    found = refit.step_sensitivities(model, baseline, x, p, s)
+    found = refit.step_sensitivities(model, x, p, s)
     start, size = baseline.theta.detach().flatten()[active].clone(), 1e-6
     for j in range(0, len(active), 17):
         ends = []
@@ -123,7 +123,7 @@ def test_sensitivities_are_the_derivatives_of_the_step(integrator: Integrator) -
             values, moved = start.clone(), x.clone()
             values[j] += sign * size
             moved[:, 2:] += sign * size * s[:, :, j]
-            refit.place(baseline, values, active)
+            baseline.place(values)
             with torch.no_grad():
                 ends.append(refit._ahead(model, moved, p)[:, 2:])
         wanted = (ends[0] - ends[1]) / (2.0 * size)

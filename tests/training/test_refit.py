@@ -159,14 +159,14 @@ def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
         x, found = problem.x0, torch.zeros(len(problem.x0), 1 + model.dof, count).double()
         for k in range(steps):
             p = model.signals.prepare(problem.w[:, k])
-            found = step_sensitivities(model, model.baseline, x, p, found)
+            found = step_sensitivities(model, x, p, found)
             x, _ = model.step(x, problem.w[:, k], memory)
         torch.testing.assert_close(x, rolled(0, 0.0)[:, -1], rtol=1e-12, atol=1e-12)
         for place in range(count):
             central = (rolled(place, 1e-5) - rolled(place, -1e-5))[:, -1, HEADING:] / 2e-5
             torch.testing.assert_close(found[:, :, place], central, rtol=1e-6, atol=1e-8)
         run = moved(0, 0.0)[:, :-1]
-    whole = sensitivities(model, model.baseline, run, problem.w, to_start=True)
+    whole = sensitivities(model, run, problem.w, to_start=True)
     to_start = torch.cat([part for _, part in whole]).transpose(0, 1).detach()
     with torch.no_grad():
         for place in range(1 + model.dof):
@@ -188,7 +188,7 @@ def test_noisy_starts_teach_no_damping_where_they_are_estimated() -> None:
 def normal_equations(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:
     assert isinstance(model.baseline, RegressorBaseline)
     squares = module.level_of(model, problem)[1]
-    return module.normal_equations(model, problem, model.baseline, LEVEL, squares)
+    return module.normal_equations(model, problem, LEVEL, squares)
 
 
 def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:

@@ -79,6 +79,19 @@ class ParametricBaseline(Baseline, ABC):
     def free_indices(self) -> Tensor:
         """Return the places [P] in theta, flattened, of the parameters that may move."""
 
+    @final
+    def free(self) -> Tensor:
+        """Return the free parameters [P] as they are."""
+        return self.theta.detach().flatten()[self.free_indices()].clone()
+
+    @final
+    def place(self, values: Tensor) -> None:
+        """Set the free parameters to values [P]."""
+        with torch.no_grad():
+            flat = self.theta.detach().clone().flatten()
+            flat[self.free_indices()] = values.to(flat.dtype)
+            self.theta.copy_(flat.reshape(self.theta.shape))
+
     @abstractmethod
     def free_names(self) -> list[tuple[str, str]]:
         """Return (axis, term) of each free parameter, as the table of coefficients has them [P]."""

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from residnet.baselines.base import ParametricBaseline
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.progress import begin
@@ -28,6 +27,7 @@ from residnet.judge.freerun import Candidate, free_run
 from residnet.judge.protocol import Window
 from residnet.regression.estimator import Solution
 from residnet.training.left_out import without_logs
+from residnet.training.refit import parametric
 
 
 def fold_numbers(kinds: Sequence[str], folds: int, seed: int) -> np.ndarray:
@@ -113,9 +113,7 @@ class FoldModels:
             fitted.notes["refit"]["at_rest"],
         )
         for model, theta in zip(out, found, strict=True):
-            assert isinstance(model.baseline, ParametricBaseline)
-            with torch.no_grad():
-                model.baseline.theta.copy_(theta)
+            parametric(model).theta.data.copy_(theta)
         return out
 
     def _head(self, fitted: FittedModel, baseline: HybridDynamics, k: int) -> HybridDynamics:

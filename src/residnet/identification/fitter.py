@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
-from residnet.baselines.base import ParametricBaseline
 from residnet.baselines.given import StillConfig
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
@@ -39,7 +38,7 @@ from residnet.judge.protocol import EvaluationConfig, all_windows
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.sparse import coefficient_row
 from residnet.training.config import TrainingConfig
-from residnet.training.refit import free_run_starts, refit
+from residnet.training.refit import free_run_starts, parametric, refit
 from residnet.training.score import Score, Shown
 
 
@@ -352,16 +351,15 @@ class Fitter:
         config = self.settings.refit[name]
         store = WindowStore.gather(self.train, torch.float64)
         refitted = refit(model, self.samples, store, config, self.scales)
-        assert isinstance(model.baseline, ParametricBaseline)
+        baseline = parametric(model)
         notes["prior"] = config.prior
-        names = model.baseline.free_names()
+        names = baseline.free_names()
         notes["open"] = [
             name for name, lies in zip(names, refitted.open.tolist(), strict=True) if lies
         ]
         notes["feeding"] = [names[i] for i in refitted.notes["at_rest"]]
         notes["refit"] = refitted.notes
-        table = model.baseline.updated_table(table, refitted.errors)
-        return table, refitted.covariance
+        return baseline.updated_table(table, refitted.errors), refitted.covariance
 
     def head(self, name: str, baseline: FittedModel) -> FittedModel:
         """Fit one head on top of a baseline, or take it from the store where it is finished there.

@@ -12,7 +12,6 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.baselines.base import ParametricBaseline
 from residnet.core.config import Config, Metres, MetresPerSecond, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import ALIVE, MOVING, POSITION, SURGE, SWAY, Live
@@ -26,7 +25,7 @@ from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
 from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne
 from residnet.physics.signals import SignalsConfig
 from residnet.training.left_out import LeftOpen
-from residnet.training.refit import RefitConfig, sensitivities
+from residnet.training.refit import RefitConfig, parametric, sensitivities
 
 
 @torch.no_grad()
@@ -44,19 +43,17 @@ def moments(
         horizon: steps of the free runs of a refit.
         scales: of what moves [n].
     """
-    baseline = model.baseline
-    assert isinstance(baseline, ParametricBaseline)
     places = [
         (run, k * horizon) for run, (_, w) in enumerate(runs) for k in range(len(w) // horizon)
     ]
-    size = int(baseline.free_indices().numel())
+    size = len(parametric(model).free_indices())
     out = torch.zeros(len(runs), size, size, dtype=scales.dtype)
     if not places:
         return out
     number = torch.tensor([run for run, _ in places])
     x = torch.stack([runs[run][0][start : start + horizon] for run, start in places])
     w = torch.stack([runs[run][1][start : start + horizon] for run, start in places])
-    for _, s in sensitivities(model, baseline, x, w):
+    for _, s in sensitivities(model, x, w):
         for seen in s[:, :, 1:] / scales[:, None]:
             out.index_add_(0, number, seen.transpose(1, 2) @ seen)
     return out

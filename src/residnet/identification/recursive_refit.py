@@ -36,6 +36,7 @@ from residnet.identification.monitoring import (
     parted,
     weighed,
 )
+from residnet.training.refit import parametric
 
 _MOST = 3
 """Changes that a refit puts into a model at most."""
@@ -127,10 +128,8 @@ def refitted(fitted: FittedModel, found: Refit) -> FittedModel:
 
     Bands that were calibrated for the old model are left out.
     """
-    baseline = found.model.baseline
-    assert isinstance(baseline, ParametricBaseline)
-    values = baseline.theta.detach().flatten()[baseline.free_indices()].tolist()
-    known = dict(zip(baseline.free_names(), values, strict=True))
+    baseline = parametric(found.model)
+    known = dict(zip(baseline.free_names(), baseline.free().tolist(), strict=True))
     notes = dict(fitted.notes)
     notes["coefficients"] = [
         {**row, "value": known[row["axis"], row["term"]]}
@@ -178,8 +177,6 @@ def _direction(
 
     The share of its accelerations that they can follow comes with it.
     """
-    baseline = model.baseline
-    assert isinstance(baseline, ParametricBaseline)
     pieces = [piece for _, part in groups for piece in part]
     x = torch.from_numpy(np.concatenate([piece.y[:-1] for piece in pieces]))
     w = torch.from_numpy(np.concatenate([piece.w for piece in pieces]))
@@ -193,7 +190,7 @@ def _direction(
         changed = ChangedDynamics(brief, [change], len(x), w.shape[1])
         gained = changed.step(x, w, memory)[0] - brief.step(x, w, memory)[0]
         wanted = gained[:, MOVING].flatten() / (brief.dt * change.size)
-        slopes = baseline.sensitivity(model.channels(x, w)).flatten(0, 1)
+        slopes = parametric(model).sensitivity(model.channels(x, w)).flatten(0, 1)
         # axes count alike, though an acceleration in yaw is no acceleration in surge
         weight = gained[:, MOVING].square().mean(0)
         weight = (weight + 1e-4 * weight.max()).rsqrt().repeat(len(x))
@@ -215,15 +212,13 @@ class _Filter:
     def __init__(self, watch: Watch, changes: Sequence[Change]) -> None:
         self.watch, self.changes = watch, changes
         self.model = copy.deepcopy(watch.model)
-        baseline = self.model.baseline
-        assert isinstance(baseline, ParametricBaseline)
-        self.baseline, self.active = baseline, baseline.free_indices()
-        self.start = baseline.theta.detach().flatten()[self.active].clone()
+        self.baseline = parametric(self.model)
+        self.start = self.baseline.free()
         self.steps = np.array([change.size for change in changes])
         names = [change.name for change in watch.causes]
         self.places = [names.index(change.name) for change in changes]
         self.size = np.zeros(len(changes))
-        self.directions = torch.zeros(len(self.active), len(changes), dtype=self.start.dtype)
+        self.directions = torch.zeros(len(self.start), len(changes), dtype=self.start.dtype)
 
     def through(self, groups: Sequence[tuple[int, Sequence[Piece]]]) -> list[Moved]:
         """Take the logs one after the other, twice, and return what has become of the sizes.
@@ -284,11 +279,7 @@ class _Filter:
 
     def _place(self, size: np.ndarray) -> None:
         """Give the model its parameters for changes of some sizes."""
-        values = self.start + self.directions @ torch.from_numpy(size)
-        with torch.no_grad():
-            flat = self.baseline.theta.detach().clone().flatten()
-            flat[self.active] = values.to(flat.dtype)
-            self.baseline.theta.copy_(flat.reshape(self.baseline.theta.shape))
+        self.baseline.place(self.start + self.directions @ torch.from_numpy(size))
 
     def _told(self, part: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray]:
         """Return scores and information about further changes of the sizes, from a few windows.

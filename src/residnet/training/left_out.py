@@ -15,7 +15,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from residnet.baselines.base import ParametricBaseline
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
@@ -24,7 +23,7 @@ from residnet.training.refit import (
     RefitConfig,
     level_of,
     normal_equations,
-    place,
+    parametric,
     problem_of,
     started,
 )
@@ -60,12 +59,10 @@ def left_open(
         scales: of what moves, [n].
         still: numbers of the free parameters that the refit has left at zero.
     """
-    baseline = model.baseline
-    assert isinstance(baseline, ParametricBaseline)
-    problem = problem_of(model, baseline, samples, store, config, scales).at_rest(still)
+    problem = problem_of(model, samples, store, config, scales).at_rest(still)
     problem = started(model, problem)
     level, states = level_of(model, problem)
-    hessian, _ = normal_equations(model, problem, baseline, level, states)
+    hessian, _ = normal_equations(model, problem, level, states)
     covariance = problem.share(level) * problem.inverse(hessian)
     return LeftOpen(covariance, float(level.square() - config.robust**2))
 
@@ -98,13 +95,11 @@ def without_logs(
         One theta for each fold; the refitted one where a fold holds no window, or where no part of
         the step keeps the free runs of the other logs finite and no worse.
     """
-    baseline = model.baseline
-    assert isinstance(baseline, ParametricBaseline)
-    problem = problem_of(model, baseline, samples, store, config, scales).at_rest(still)
+    baseline = parametric(model)
+    problem = problem_of(model, samples, store, config, scales).at_rest(still)
     problem = started(model, problem)
     level, states = level_of(model, problem)
-    fitted = baseline.theta.detach().clone()
-    parameters = fitted.flatten()[problem.active]
+    fitted, parameters = baseline.theta.detach().clone(), baseline.free()
     of_window = fold[problem.log]
     folds = int(fold.max()) + 1
     count = torch.bincount(of_window, minlength=folds).to(parameters.dtype)
@@ -133,23 +128,20 @@ def without_logs(
         step = torch.linalg.lstsq(hessian, slope.unsqueeze(1), driver="gelsd").solution.squeeze(1)
         step[problem.still] = 0.0
         others = _rows(problem, of_window != k)
-        kept = _best_share(model, others, parameters, step)
-        place(baseline, kept, problem.active)
+        baseline.place(_best_share(model, others, parameters, step))
         out.append(baseline.theta.detach().clone())
-        place(baseline, parameters, problem.active)
+        baseline.place(parameters)
     return out
 
 
 def _best_share(model: HybridDynamics, others: Problem, parameters: Tensor, step: Tensor) -> Tensor:
     """Return the parameters after the largest share of the step that the other logs agree to."""
-    baseline = model.baseline
-    assert isinstance(baseline, ParametricBaseline)
-    before, _ = level_of(model, others)
+    baseline, (before, _) = parametric(model), level_of(model, others)
     for halving in range(_HALVINGS):
         trial = parameters + 0.5**halving * step
-        place(baseline, trial, others.active)
+        baseline.place(trial)
         after, _ = level_of(model, others)
-        place(baseline, parameters, others.active)
+        baseline.place(parameters)
         if torch.isfinite(after) and after <= before:
             return trial
     return parameters
@@ -175,14 +167,11 @@ def _part(
     size = int(part.active.numel())
     if len(part.x0) == 0:
         return torch.zeros(size, size, dtype=states.dtype), torch.zeros(size, dtype=states.dtype)
-    baseline = model.baseline
-    assert isinstance(baseline, ParametricBaseline)
-    theta = baseline.theta.detach().flatten()[part.active]
     nothing = replace(
         part,
         precision=torch.zeros_like(part.precision),
         pull=torch.zeros_like(part.pull),
         belief=torch.zeros_like(part.belief),
-        start=theta,
+        start=parametric(model).free(),
     )
-    return normal_equations(model, nothing, baseline, level, states)
+    return normal_equations(model, nothing, level, states)

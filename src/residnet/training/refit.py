@@ -43,13 +43,21 @@ _HEADING_ROW = slice(0, 1)
 _YAW_RATE_ROW = slice(YAW_RATE - HEADING, YAW_RATE - HEADING + 1)
 
 
-def step_sensitivities(
-    model: HybridDynamics,
-    baseline: ParametricBaseline,
-    x: Tensor,
-    p: Tensor,
-    s: Tensor,
-) -> Tensor:
+def parametric(model: HybridDynamics) -> ParametricBaseline:
+    """Return the baseline of a model whose parameters can move.
+
+    Raises:
+        FitError: where they cannot.
+    """
+    if not isinstance(model.baseline, ParametricBaseline):
+        raise FitError(
+            "a refit through rollouts needs a baseline of kind 'regressors', 'linear_steady',"
+            " 'mmg', 'nomoto' or 'nomoto_sideslip'"
+        )
+    return model.baseline
+
+
+def step_sensitivities(model: HybridDynamics, x: Tensor, p: Tensor, s: Tensor) -> Tensor:
     """Return the sensitivities of heading and what moves one step later, [B, 1 + n, Q].
 
     They are the exact derivative of `Dynamics.integrate` with the residual at zero, whatever the
@@ -57,12 +65,12 @@ def step_sensitivities(
 
     Args:
         model: that steps.
-        baseline: its baseline.
         x: states at the step's start [B, 3 + n].
         p: prepared inputs, held over the step [B, k].
         s: sensitivities at the step's start [B, 1 + n, Q], those to the P free parameters last;
             those before them are to what the step itself does not depend on.
     """
+    baseline = parametric(model)
     if model.spatial:
         return _spatial_sensitivities(model, baseline, x, p, s)
     count = int(baseline.free_indices().numel())
@@ -100,12 +108,7 @@ _AT_ONCE = 1_024
 
 
 def sensitivities(
-    model: HybridDynamics,
-    baseline: ParametricBaseline,
-    x: Tensor,
-    w: Tensor,
-    *,
-    to_start: bool = False,
+    model: HybridDynamics, x: Tensor, w: Tensor, *, to_start: bool = False
 ) -> Iterator[tuple[slice, Tensor]]:
     """Yield sensitivities of free runs after some steps, and which: [K, B, 1 + n, P].
 
@@ -114,12 +117,11 @@ def sensitivities(
 
     Args:
         model: that ran.
-        baseline: its baseline.
         x: states at the start of each step [B, T, 3 + n].
         w: inputs of the steps [B, T, m].
     """
     batch, total = w.shape[:2]
-    count, own = int(baseline.free_indices().numel()), 1 + model.dof
+    count, own = len(parametric(model).free_indices()), 1 + model.dof
     start = torch.eye(own, own + count, dtype=x.dtype)
     s = start[:, :own].expand(batch, -1, -1) if to_start else x.new_zeros(batch, own, count)
     length = max(_AT_ONCE // max(batch, 1), 1)
@@ -127,7 +129,7 @@ def sensitivities(
         steps, found = slice(begin, min(begin + length, total)), []
         rows = [part[:, steps].transpose(0, 1).flatten(0, 1) for part in (x, w)]
         p = model.signals.prepare(rows[1])
-        each = step_sensitivities(model, baseline, rows[0], p, start.expand(len(p), -1, -1))
+        each = step_sensitivities(model, rows[0], p, start.expand(len(p), -1, -1))
         for one in each.unflatten(0, (-1, batch)):
             ahead, more = one[..., :own], one[..., own:]
             s = ahead @ s if to_start else torch.baddbmm(more, ahead, s)
@@ -354,14 +356,13 @@ def free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> Tenso
 
 def problem_of(
     model: HybridDynamics,
-    baseline: ParametricBaseline,
     samples: Samples,
     store: WindowStore,
     config: RefitConfig,
     scales: Tensor,
 ) -> Problem:
     """Return the problem that least squares leave to a refit; nothing stays at zero as yet."""
-    steps = round(config.horizon / model.dt)
+    baseline, steps = parametric(model), round(config.horizon / model.dt)
     starts = free_run_starts(store, config, model.dt)
     take = store.take
     nu = velocities_on(take(store.y, starts + 1, steps))
@@ -382,7 +383,7 @@ def problem_of(
         active,
         config.prior * information + own,
         own,
-        baseline.theta.detach().flatten()[active].clone(),
+        baseline.free(),
         config.asymmetric * baseline.asymmetry(samples),
         believed,
         belief,
@@ -501,13 +502,8 @@ def refit(
         FitError: where free runs diverge from the first step on, or from a later one whatever the
             minimum of those before it is.
     """
-    baseline = model.baseline
-    if not isinstance(baseline, ParametricBaseline):
-        raise FitError(
-            "a refit through rollouts needs a baseline of kind 'regressors', 'linear_steady',"
-            " 'mmg', 'nomoto' or 'nomoto_sideslip'"
-        )
-    problem = problem_of(model, baseline, samples, store, config, scales)
+    baseline = parametric(model)
+    problem = problem_of(model, samples, store, config, scales)
     if begin is not None:
         with torch.no_grad():
             baseline.theta.copy_(begin)
@@ -515,11 +511,11 @@ def refit(
     count, begun = 0, problem.w.shape[1]
     turning: list[int] = []
     if not torch.isfinite(level):
-        begun, count = _brought_near(model, problem, baseline, config.iterations)
+        begun, count = _brought_near(model, problem, config.iterations)
         level, _ = level_of(model, problem)
     first = level
     for _round in range(_ROUNDS):
-        problem, found = _with_starts(model, problem, baseline, config.iterations)
+        problem, found = _with_starts(model, problem, config.iterations)
         level, count = found.point.level, count + found.steps
         if feeding := baseline.feeding():
             problem = problem.at_rest(feeding)
@@ -529,8 +525,9 @@ def refit(
             problem = problem.with_only(turning)
         else:
             break
-        place(baseline, _values(baseline, problem), problem.active)
-    hessian, _ = normal_equations(model, problem, baseline, *level_of(model, problem))
+        # those that are to rest at zero
+        baseline.place(baseline.free().masked_fill(problem.still, 0.0))
+    hessian, _ = normal_equations(model, problem, *level_of(model, problem))
     share, inverse = problem.share(level), problem.inverse(hessian)
     notes = {
         "cost_before": float(first),
@@ -546,12 +543,7 @@ def refit(
     return Refitted(share * inverse, notes, left_open)
 
 
-def _brought_near(
-    model: HybridDynamics,
-    problem: Problem,
-    baseline: ParametricBaseline,
-    iterations: int,
-) -> tuple[int, int]:
+def _brought_near(model: HybridDynamics, problem: Problem, iterations: int) -> tuple[int, int]:
     """Move the parameters to where free runs are finite over the whole horizon.
 
     The minimum over a part of the horizon that no free run leaves carries over a longer part.
@@ -578,15 +570,8 @@ def _brought_near(
             )
         known, begun = part, begun or part
         if known < whole:
-            count += _minimised(model, problem.over(known), baseline, iterations).steps
+            count += _minimised(model, problem.over(known), iterations).steps
     return begun, count
-
-
-def _values(baseline: ParametricBaseline, problem: Problem) -> Tensor:
-    """Return the free parameters as they are, those that are to rest at zero."""
-    values = baseline.theta.detach().flatten()[problem.active].clone()
-    values[problem.still] = 0.0
-    return values
 
 
 class _Reached(NamedTuple):
@@ -597,18 +582,17 @@ class _Reached(NamedTuple):
     states: Tensor
 
 
-def _minimised(
-    model: HybridDynamics, problem: Problem, baseline: ParametricBaseline, iterations: int
-) -> Descent[_Reached]:
+def _minimised(model: HybridDynamics, problem: Problem, iterations: int) -> Descent[_Reached]:
     """Move the parameters to the minimum."""
+    baseline = parametric(model)
 
     def reached(values: Tensor) -> _Reached:
-        place(baseline, values, problem.active)
+        baseline.place(values)
         return _Reached(values, *level_of(model, problem))
 
     def near(point: _Reached) -> tuple[float, Callable[[float], tuple[float, _Reached]]]:
-        place(baseline, point.values, problem.active)
-        hessian, gradient = normal_equations(model, problem, baseline, *point[1:])
+        baseline.place(point.values)
+        hessian, gradient = normal_equations(model, problem, *point[1:])
         share = problem.share(point.level)
 
         def trial(damping: float) -> tuple[float, _Reached]:
@@ -618,23 +602,22 @@ def _minimised(
 
         return float(point.level + problem.prior_cost(point.values, share)), trial
 
-    begin = reached(baseline.theta.detach().flatten()[problem.active].clone())
-    found = descend(begin, near, iterations, gain=_GAIN)
-    place(baseline, found.point.values, problem.active)
+    found = descend(reached(baseline.free()), near, iterations, gain=_GAIN)
+    baseline.place(found.point.values)
     return found
 
 
 def _with_starts(
-    model: HybridDynamics, problem: Problem, baseline: ParametricBaseline, iterations: int
+    model: HybridDynamics, problem: Problem, iterations: int
 ) -> tuple[Problem, Descent[_Reached]]:
     """Move the parameters to the minimum, by turns with the starts until these gain no more."""
-    found = _minimised(model, problem, baseline, iterations)
+    found = _minimised(model, problem, iterations)
     steps = found.steps
     for _ in range(iterations if problem.begins else 0):
         moved = started(model, problem)
         if not level_of(model, moved)[0] < (1.0 - _GAIN) * found.point.level:
             break
-        problem, found = moved, _minimised(model, moved, baseline, iterations)
+        problem, found = moved, _minimised(model, moved, iterations)
         steps += found.steps
     return problem, replace(found, steps=steps)
 
@@ -649,8 +632,7 @@ def started(model: HybridDynamics, problem: Problem) -> Problem:
     """
     if problem.begins is None:
         return problem
-    baseline, states = model.baseline, level_of(model, problem)[1]
-    assert isinstance(baseline, ParametricBaseline)
+    states = level_of(model, problem)[1]
     error, seen = velocities_on(states[:, 1:]) - problem.nu, problem.weight > 0.0
     noise = problem.begins.noise.square()
     square = (error.square() * seen).sum((0, 1)) / seen.sum((0, 1)).clamp(min=1)
@@ -661,7 +643,7 @@ def started(model: HybridDynamics, problem: Problem) -> Problem:
     moving = velocities_on(problem.x0)
     hessian = torch.diag(1.0 / noise).repeat(len(states), 1, 1)
     gradient = (moving - problem.begins.measured) / noise
-    for part, found in sensitivities(model, baseline, states[:, :-1], problem.w, to_start=True):
+    for part, found in sensitivities(model, states[:, :-1], problem.w, to_start=True):
         weight = root[:, part].transpose(0, 1)
         slopes = found[:, :, 1:, 1:] * weight.unsqueeze(-1)
         off = error[:, part].transpose(0, 1) * weight
@@ -669,14 +651,6 @@ def started(model: HybridDynamics, problem: Problem) -> Problem:
         gradient += torch.einsum("kbij,kbi->bj", slopes, off)
     x0 = torch.cat((pose(problem.x0), moving - torch.linalg.solve(hessian, gradient)), dim=1)
     return replace(problem, x0=x0)
-
-
-def place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
-    """Set the free parameters to values [P]; their places in theta are `active` [P]."""
-    with torch.no_grad():
-        flat = baseline.theta.detach().clone().flatten()
-        flat[active] = values
-        baseline.theta.copy_(flat.reshape(baseline.theta.shape))
 
 
 def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
@@ -701,11 +675,7 @@ def level_of(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def normal_equations(
-    model: HybridDynamics,
-    problem: Problem,
-    baseline: ParametricBaseline,
-    level: Tensor,
-    states: Tensor,
+    model: HybridDynamics, problem: Problem, level: Tensor, states: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the Gauss-Newton Hessian [P, P] and half the gradient [P] of the robust cost.
 
@@ -720,11 +690,11 @@ def normal_equations(
     window = 0.5 / size / (model.dof * steps * batch)
     root = (window.sqrt()[:, None, None] * problem.weight).transpose(0, 1)
     error = (velocities_on(states[:, 1:]) - problem.nu).transpose(0, 1) * root
-    for part, found in sensitivities(model, baseline, states[:, :-1], problem.w):
+    for part, found in sensitivities(model, states[:, :-1], problem.w):
         flat = (found[:, :, 1:] * root[part].unsqueeze(-1)).flatten(0, 2)
         hessian.addmm_(flat.T, flat)
         gradient.addmv_(flat.T, error[part].flatten())
-    theta = baseline.theta.flatten()[problem.active]
+    theta = parametric(model).free()
     belief = problem.share(level) * problem.belief
     prior = (
         problem.precision @ (theta - problem.start)
