@@ -61,7 +61,7 @@ def test_matrices_of_a_hull_written_out() -> None:
         }  # fmt: skip
         side = m22 * v + 0.5 * (m23 + m32) * r
         coriolis = np.array([[0, 0, -side], [0, 0, m11 * u], [side, -m11 * u, 0]])
-        rows = (damping.X, damping.Y, damping.N)
+        rows = damping.values()
         drag = np.array([sum(p.value * value[t] for t, p in row.items()) for row in rows])
         residual = mass @ out + coriolis @ [u, v, r] + drag - force
         assert np.abs(residual).max() < 1e-10 * np.abs(force).max()

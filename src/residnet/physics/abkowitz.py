@@ -6,10 +6,10 @@ A vessel file holds all coefficients (Abkowitz 1964).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, final
+from typing import Annotated, Literal, final
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config, MetresPerSecond, RevsPerSecond
@@ -65,27 +65,13 @@ class SeriesMass(Config):
     N_rdot: float
 
 
-class Derivatives(Config):
-    """The coefficients of the force on each axis by term, such as `Y: {v: ..., v^2 r: ...}`.
+def _readable(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Return the terms of each axis, after a look at all of them; an empty row where none is."""
+    read_rows(rows, SERIES)
+    return {axis: rows.get(axis, {}) for axis in "XYN"}
 
-    Attributes:
-        X: coefficients of the surge force, in the units of the series.
-        Y: coefficients of the sway force.
-        N: coefficients of the yaw moment.
-    """
 
-    X: dict[str, float] = Field(default_factory=dict)
-    Y: dict[str, float] = Field(default_factory=dict)
-    N: dict[str, float] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _terms(self) -> Derivatives:
-        read_rows(dict(self), SERIES)
-        return self
-
-    def channels(self) -> set[str]:
-        """Return what the terms are made of."""
-        return {f.name for _, _, factors in read_rows(dict(self), SERIES) for f in factors}
+Derivatives = Annotated[dict[Literal["X", "Y", "N"], dict[str, float]], AfterValidator(_readable)]
 
 
 class AbkowitzConfig(VesselFile):
@@ -109,7 +95,8 @@ class AbkowitzConfig(VesselFile):
         delta_sign: -1 where the coefficients' rudder angle is positive to port (Y_delta > 0), +1
             where it is positive to starboard; commands and states here are positive to starboard.
         mass: rigid body and added mass, in the units of the series.
-        coefficients: hydrodynamic derivatives of the forces.
+        coefficients: hydrodynamic derivatives of surge and sway force and yaw moment, in the units
+            of the series, such as `Y: {v: ..., v^2 r: ...}`.
         rudder: limits and lag of the steering gear.
         shaft: limits and lag of the propeller shaft; only where there are terms in dn.
         wind: coefficients of the hull above water.
@@ -131,12 +118,13 @@ class AbkowitzConfig(VesselFile):
 
     @model_validator(mode="after")
     def _consistent(self) -> AbkowitzConfig:
-        if ("dn" in self.coefficients.channels()) != (self.shaft is not None):
+        rows = read_rows(self.coefficients, SERIES)
+        if any(f.name == "dn" for *_, factors in rows for f in factors) != (self.shaft is not None):
             raise ValueError(
                 "terms in dn and the section 'shaft' belong together: the series needs both or"
                 " neither"
             )
-        turning = self.delta_sign * self.coefficients.N.get("delta", 0.0)
+        turning = self.delta_sign * self.coefficients["N"].get("delta", 0.0)
         if turning < 0:
             raise ValueError(
                 "N.delta times delta_sign must be positive: a rudder to starboard turns to"
@@ -192,7 +180,7 @@ class SeriesForces(Actuators):
         self.length, self.speed = config.length.value, config.speed
         self.sign = float(config.delta_sign)
         self.dynamic = 0.5 * config.density * self.length**2
-        rows = [row for _, row in config.coefficients]
+        rows = list(config.coefficients.values())
         self.terms = TermLibrary(sorted({term for row in rows for term in row}), SERIES)
         values = [[row.get(term, 0.0) for row in rows] for term in self.terms.terms]
         self.coefficients = nn.Buffer(torch.tensor(values, dtype=torch.float64), persistent=False)

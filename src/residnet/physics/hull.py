@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal, final
+from typing import Annotated, Any, Literal, final
 
 import torch
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond
@@ -77,50 +77,50 @@ class AddedMass(Config):
     N_rdot: Inertia
 
 
-class TermRows(Config):
-    """The terms of each axis by name, each coefficient in the SI unit that its term asks for."""
-
-    channels: ClassVar[tuple[str, ...]] = VELOCITY
-    mass: ClassVar[int] = 1
-    """Power of mass in the units: 1 for forces, 0 for accelerations."""
-
-    def rows(self) -> list[dict[str, Parameter]]:
-        """Return the terms of each axis."""
-        return [getattr(self, axis) for axis in type(self).model_fields]
-
-    def values(self, factor: float = 1.0) -> list[dict[str, float]]:
-        """Return the coefficients of each axis, times a factor."""
-        return [{term: factor * p.value for term, p in row.items()} for row in self.rows()]
-
-    @model_validator(mode="after")
-    def _units(self) -> TermRows:
-        named = dict(zip(type(self).model_fields, self.rows(), strict=True))
-        for axis, term, factors in read_rows(named, self.channels, functions=False):
-            metres = _METRES[axis] - sum(f.power for f in factors if f.name in ("u", "v", "w"))
-            seconds = -2 + sum(f.power for f in factors if f.name != "phi")
-            unit = named[axis][term].unit
-            if dimension(unit, self.mass) != (metres, seconds):
-                raise ValueError(
-                    f"{axis}.{term}: its unit must be {unit_text(metres, seconds, self.mass)},"
-                    f" given '{unit}'"
-                )
-        return self
+Row = dict[str, Parameter]
+"""The terms of one axis by name, each coefficient in the SI unit that its term asks for."""
 
 
-class Damping(TermRows):
-    """The damping force of each axis as terms of (u, v, r), for example `X: {u: ..., "u|u|": ...}`.
+def _by_axis(axes: str, channels: tuple[str, ...], mass: int = 1) -> AfterValidator:
+    """Return what checks the units of terms, and gives an axis that has none an empty row.
 
-    Positive coefficients brake.
-
-    Attributes:
-        X: coefficients of the surge force, each in the SI unit that its term asks for.
-        Y: coefficients of the sway force.
-        N: coefficients of the yaw moment.
+    Args:
+        axes: their names, in the order of the velocities.
+        channels: that terms are made of.
+        mass: power of mass in the units, 1 for forces and 0 for accelerations.
     """
 
-    X: dict[str, Parameter] = Field(default_factory=dict)
-    Y: dict[str, Parameter] = Field(default_factory=dict)
-    N: dict[str, Parameter] = Field(default_factory=dict)
+    def checked(rows: dict[str, Row]) -> dict[str, Row]:
+        for axis, term, factors in read_rows(rows, channels, functions=False):
+            metres = _METRES[axis] - sum(f.power for f in factors if f.name in ("u", "v", "w"))
+            seconds = -2 + sum(f.power for f in factors if f.name != "phi")
+            unit = rows[axis][term].unit
+            if dimension(unit, mass) != (metres, seconds):
+                raise ValueError(
+                    f"{axis}.{term}: its unit must be {unit_text(metres, seconds, mass)}, given"
+                    f" '{unit}'"
+                )
+        return {axis: rows.get(axis, {}) for axis in axes}
+
+    return AfterValidator(checked)
+
+
+PlanarRows = Annotated[dict[Literal["X", "Y", "N"], Row], _by_axis("XYN", VELOCITY)]
+"""Terms of (u, v, r), for example `X: {u: ..., "u|u|": ...}`."""
+AccelerationRows = Annotated[dict[Literal["u", "v", "r"], Row], _by_axis("uvr", VELOCITY, 0)]
+"""Accelerations as terms of (u, v, r)."""
+ROLLING_CHANNELS = (*ROLLING.velocities, "phi")
+RollingRows = Annotated[dict[Literal["X", "Y", "K", "N"], Row], _by_axis("XYKN", ROLLING_CHANNELS)]
+"""Forces as terms of (u, v, p, r, phi)."""
+SubmergedRows = Annotated[
+    dict[Literal["X", "Y", "Z", "K", "M", "N"], Row], _by_axis("XYZKMN", SUBMERGED.velocities)
+]
+"""Forces as terms of (u, v, w, p, q, r)."""
+
+
+def values(rows: Mapping[Any, Row], factor: float = 1.0) -> list[dict[str, float]]:
+    """Return the coefficients of each axis, times a factor."""
+    return [{term: factor * p.value for term, p in row.items()} for row in rows.values()]
 
 
 class HullVessel(VesselFile, ABC):
@@ -161,12 +161,12 @@ class HullConfig(HullVessel, ABC):
     Attributes:
         scale: what M, C and D are all multiplied by: a true vessel beside the believed one of its
             `base` (document 002 eq. (4.2)).
-        damping: terms of D(nu) nu.
+        damping: terms of D(nu) nu on each axis; positive coefficients brake.
         actuators: what the vessel is driven and steered by.
     """
 
     scale: float = Field(default=1.0, gt=0)
-    damping: Damping
+    damping: PlanarRows
     actuators: ActuatorsConfig
 
     @abstractmethod
@@ -185,7 +185,7 @@ class HullConfig(HullVessel, ABC):
         """
         mass = [[self.scale * value for value in row] for row in self.mass_matrix()]
         (surge, sway), cross = (mass[0][0], mass[1][1]), self.scale * self.coupling()
-        rows = self.damping.values(-self.scale)
+        rows = values(self.damping, -self.scale)
         for row, coriolis in zip(
             rows,
             ({"v r": sway, "r^2": cross}, {"u r": -surge}, {"u v": surge - sway, "u r": -cross}),
@@ -287,22 +287,6 @@ class Gains(Config):
     n: Annotated[Parameter, AfterValidator(of_dimension(-1, -2, 0)), Positive]
 
 
-class AccelerationTerms(TermRows):
-    """The accelerations without force as terms of (u, v, r); terms that brake are negative.
-
-    Attributes:
-        u: terms of the surge acceleration, each in the SI unit that its term asks for.
-        v: terms of the sway acceleration.
-        r: terms of the yaw acceleration.
-    """
-
-    mass = 0
-
-    u: dict[str, Parameter] = Field(default_factory=dict)
-    v: dict[str, Parameter] = Field(default_factory=dict)
-    r: dict[str, Parameter] = Field(default_factory=dict)
-
-
 @final
 class OdinConfig(HullVessel):
     """A 3-DOF vessel known by its accelerations, nu_dot = gain tau + terms of the velocities.
@@ -311,13 +295,13 @@ class OdinConfig(HullVessel):
 
     Attributes:
         gains: acceleration per force.
-        terms: acceleration without force.
+        terms: acceleration without force; terms that brake are negative.
         actuators: what the vessel is driven and steered by.
     """
 
     kind: Literal["odin"]
     gains: Gains
-    terms: AccelerationTerms
+    terms: AccelerationRows
     actuators: ActuatorsConfig
 
     def hull(self) -> Hull:
@@ -325,7 +309,7 @@ class OdinConfig(HullVessel):
         mass = [1.0 / gain.value for gain in (self.gains.x, self.gains.y, self.gains.n)]
         rows = [
             {term: m * value for term, value in row.items()}
-            for m, row in zip(mass, self.terms.values(), strict=True)
+            for m, row in zip(mass, values(self.terms), strict=True)
         ]
         return Hull(
             torch.diag(torch.tensor(mass, dtype=torch.float64)).tolist(), rows, VELOCITY, self.name
@@ -370,26 +354,6 @@ class RollingAddedMass(AddedMass):
     N_pdot: Inertia
 
 
-class HullForces(TermRows):
-    """The forces of the water on the hull as terms of (u, v, p, r, phi).
-
-    Terms that brake are negative.
-
-    Attributes:
-        X: terms of the surge force, each in the SI unit that its term asks for.
-        Y: terms of the sway force.
-        K: terms of the roll moment.
-        N: terms of the yaw moment.
-    """
-
-    channels = (*ROLLING.velocities, "phi")
-
-    X: dict[str, Parameter] = Field(default_factory=dict)
-    Y: dict[str, Parameter] = Field(default_factory=dict)
-    K: dict[str, Parameter] = Field(default_factory=dict)
-    N: dict[str, Parameter] = Field(default_factory=dict)
-
-
 class Hydrostatics(Config):
     """Roll restoring K = -rho g V GM phi.
 
@@ -419,7 +383,7 @@ class PatrolConfig(HullVessel):
         hydrostatics: roll restoring.
         rigid_body: mass, inertia and centre of gravity.
         added_mass: hydrodynamic derivatives of the accelerations.
-        forces: terms of the forces of the water.
+        forces: terms of the forces of the water; those that brake are negative.
     """
 
     kind: Literal["patrol"]
@@ -427,7 +391,7 @@ class PatrolConfig(HullVessel):
     hydrostatics: Hydrostatics
     rigid_body: RollingBody
     added_mass: RollingAddedMass
-    forces: HullForces
+    forces: RollingRows
     actuators: RollingActuatorsConfig
 
     def start(self) -> Mapping[str, float]:
@@ -462,11 +426,11 @@ class PatrolConfig(HullVessel):
             {"u r": down, "phi": -self.hydrostatics.stiffness},
             {"u r": -along},
         )
-        rows = self.forces.values()
+        rows = values(self.forces)
         for row, more in zip(rows, inertia, strict=True):
             for term, value in more.items():
                 row[term] = row.get(term, 0.0) + value
-        return Hull(mass, rows, HullForces.channels, self.name)
+        return Hull(mass, rows, ROLLING_CHANNELS, self.name)
 
 
 class SubmergedBody(RollingBody):
@@ -504,30 +468,6 @@ class SubmergedAddedMass(Config):
     N_rdot: Inertia
 
 
-class SubmergedForces(TermRows):
-    """The forces of the water on the hull as terms of (u, v, w, p, q, r).
-
-    Terms that brake are negative. What inertia does is not among them.
-
-    Attributes:
-        X: terms of the surge force, each in the SI unit that its term asks for.
-        Y: terms of the sway force.
-        Z: terms of the heave force.
-        K: terms of the roll moment.
-        M: terms of the pitch moment.
-        N: terms of the yaw moment.
-    """
-
-    channels = SUBMERGED.velocities
-
-    X: dict[str, Parameter] = Field(default_factory=dict)
-    Y: dict[str, Parameter] = Field(default_factory=dict)
-    Z: dict[str, Parameter] = Field(default_factory=dict)
-    K: dict[str, Parameter] = Field(default_factory=dict)
-    M: dict[str, Parameter] = Field(default_factory=dict)
-    N: dict[str, Parameter] = Field(default_factory=dict)
-
-
 class Buoyancy(Config):
     """The water that the hull displaces.
 
@@ -553,7 +493,8 @@ class SubmergedConfig(HullVessel):
         buoyancy: what carries it.
         rigid_body: mass, inertia and centre of gravity.
         added_mass: hydrodynamic derivatives of the accelerations.
-        forces: terms of the forces of the water.
+        forces: terms of the forces of the water; those that brake are negative, and what inertia
+            does is not among them.
         speed: that trials start from; 0 for at rest.
     """
 
@@ -562,7 +503,7 @@ class SubmergedConfig(HullVessel):
     buoyancy: Buoyancy
     rigid_body: SubmergedBody
     added_mass: SubmergedAddedMass
-    forces: SubmergedForces
+    forces: SubmergedRows
     actuators: SubmergedActuatorsConfig
 
     def start(self) -> Mapping[str, float]:
@@ -586,7 +527,7 @@ class SubmergedConfig(HullVessel):
         )
         for force, moment, arm in ((0, 4, z), (1, 3, -z), (1, 5, x), (2, 4, -x)):
             mass[force, moment] = mass[moment, force] = m * arm
-        rows = self.forces.values()
+        rows = values(self.forces)
 
         def add(axis: int, term: str, value: float) -> None:
             if value:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations, combinations_with_replacement, product
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import torch
 from pydantic import Field
@@ -102,7 +102,7 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
 
 
 def read_rows(
-    rows: Mapping[str, Iterable[str]], names: Sequence[str], *, functions: bool = True
+    rows: Mapping[Any, Iterable[str]], names: Sequence[str], *, functions: bool = True
 ) -> list[tuple[str, str, tuple[Factor, ...]]]:
     """Return (axis, term, its factors) of all terms of all axes, as a config gives them.
 
