@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.documents import published
-from residnet.physics.hull import OdinConfig
+from residnet.physics.hull import OdinConfig, values
 from residnet.regression.equation_rows import correlation_time
 
 _RANK = 1e-6
@@ -232,9 +232,7 @@ def truth(vessel: OdinConfig, mass: float) -> dict[str, float]:
     without added mass and with the Coriolis terms v r and -u r, as in document 000.
     """
     gain = [1.0 / parameter.value for parameter in (vessel.gains.x, vessel.gains.y, vessel.gains.n)]
-    rows = [
-        {term: parameter.value for term, parameter in row.items()} for row in vessel.terms.rows()
-    ]
+    rows = values(vessel.terms)
     places = {"X_u": (0, "u"), "Y_v": (1, "v"), "Y_r": (1, "r"), "N_v": (2, "v"), "N_r": (2, "r")}
     places |= {"X_|u|u": (0, "u|u|"), "Y_|v|v": (1, "v|v|"), "N_|r|r": (2, "r|r|")}
     parameters = dict.fromkeys(NAMES, 0.0) | {
