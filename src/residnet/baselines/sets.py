@@ -118,6 +118,18 @@ def _turning(steer: str, drives: Sequence[str]) -> list[str]:
     ]
 
 
+HULL = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
+"""Coriolis products and quadratic damping."""
+ROLL = ("u p", "p|p|", "u|u| phi", "phi^3")
+WIND = (
+    "wind_u", "wind_v", "wind_u wind_mag", "wind_v wind_mag",
+    "wind_u wind_v", "wind_u wind_v^2 wind_mag^-1", "wind_v wind_u^2 wind_mag^-1",
+)  # fmt: skip
+"""Loads that are quadratic in the relative wind, with coefficients that turn with its direction:
+the first three harmonics.
+"""
+
+
 def _fossen(roles: Roles) -> list[str]:
     """Return the terms of Fossen's manoeuvring model.
 
@@ -127,9 +139,7 @@ def _fossen(roles: Roles) -> list[str]:
     """
     if "z" in roles.moving:
         return submerged(roles)
-    hull = ["u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|"]
-    if "p" in roles.moving:
-        hull += ["u p", "p|p|", "u|u| phi", "phi^3"]
+    hull = (*HULL, *(ROLL if "p" in roles.moving else ()))
     drives, steers = roles.known("fossen").drives, roles.steers
     controls = [t for drive in drives for t in _thrust(drive)]
     controls += [t for steer in steers for t in _turning(steer, drives)]
@@ -183,17 +193,11 @@ def _abkowitz(roles: Roles) -> list[str]:
 
 
 def _wind(roles: Roles) -> list[str]:
-    """Return the loads of the relative wind.
-
-    They are quadratic in it, with coefficients that turn with its direction (first three
-    harmonics).
-    """
     if not roles.wind:
         raise ConfigError(
             "set 'wind' needs the true wind; add wind_speed and wind_dir to signals.exogenous"
         )
-    harmonics = ["wind_u wind_v", "wind_u wind_v^2 wind_mag^-1", "wind_v wind_u^2 wind_mag^-1"]
-    return ["wind_u", "wind_v", "wind_u wind_mag", "wind_v wind_mag", *harmonics]
+    return list(WIND)
 
 
 def _astern(roles: Roles) -> list[str]:

@@ -50,14 +50,6 @@ commands of a second under way at 50 Hz are so many.
 """
 
 
-def _chosen(condition: Any, a: Any, b: Any) -> Any:
-    return ca.if_else(condition, a, b)
-
-
-def _truncated(a: Any) -> Any:
-    return ca.sign(a) * ca.floor(ca.fabs(a))
-
-
 def _number(a: Any) -> Any:
     # CasADi takes a == a to be true
     return ca.logic_or(a <= 0, a > 0)
@@ -76,12 +68,14 @@ _ELEMENTWISE: Final[dict[str, Callable[..., Any]]] = {
     "neg": operator.neg, "abs": ca.fabs, "square": lambda a: a * a,
     "reciprocal": lambda a: 1.0 / a, "rsqrt": lambda a: 1.0 / ca.sqrt(a),
     "sigmoid": lambda a: 1.0 / (1.0 + ca.exp(-a)), "relu": lambda a: ca.fmax(a, 0.0),
-    "trunc": _truncated, "round": lambda a: ca.floor(a + 0.5), "pow": ca.power,
+    "trunc": lambda a: ca.sign(a) * ca.floor(ca.fabs(a)),
+    "round": lambda a: ca.floor(a + 0.5), "pow": ca.power,
     "exp2": lambda a: ca.power(2.0, a), "log2": lambda a: ca.log(a) / ca.log(2.0),
     "remainder": lambda a, b: a - b * ca.floor(a / b),
     # comparisons with what is no number are false, so that it stays what it is
-    "maximum": lambda a, b: _chosen(a < b, b, a), "minimum": lambda a, b: _chosen(a > b, b, a),
-    "where": _chosen, "isnan": lambda a: ca.logic_not(_number(a)),
+    "maximum": lambda a, b: ca.if_else(a < b, b, a),
+    "minimum": lambda a, b: ca.if_else(a > b, b, a), "where": lambda c, a, b: ca.if_else(c, a, b),
+    "isnan": lambda a: ca.logic_not(_number(a)),
     "isinf": lambda a: ca.eq(ca.fabs(a), ca.inf),
     **dict.fromkeys(("logical_not", "bitwise_not"), ca.logic_not),
     **dict.fromkeys(("logical_and", "bitwise_and"), ca.logic_and),
@@ -633,7 +627,7 @@ def _extreme(name: Literal["max", "min"], example: Any, given: _Value, dim: int)
     for k in range(1, size):
         other = _taken(given.column, rows[:, k])
         better = other > best if name == "max" else other < best
-        best, place = _chosen(better, other, best), _chosen(better, k, place)
+        best, place = ca.if_else(better, other, best), ca.if_else(better, k, place)
     return [_Value(example[0], best), _Value(example[1], place)]
 
 
@@ -709,7 +703,7 @@ def _picked(table: Any, places: Tensor, at: Any) -> Any:
         return ca.vec(_taken(table, places).get_nz(False, row * size + ca.DM(list(range(size)))))
     out = _taken(table, places[0])
     for i in range(1, rows):
-        out = _chosen(at >= i, _taken(table, places[i]), out)
+        out = ca.if_else(at >= i, _taken(table, places[i]), out)
     return out
 
 

@@ -22,7 +22,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.fitter import FittedModel, references
-from residnet.identification.recipe import HULL, MEAN
+from residnet.identification.recipe import MEAN, SINGLE
 from residnet.identification.settings import FitSettings
 from residnet.judge.band import Bands
 from residnet.judge.freerun import Candidate, FreeRun, free_run
@@ -303,12 +303,12 @@ class Identified(Mapping[str, FittedModel]):
         if self.settings.recipe is None or MEAN not in self.models:
             return found
         found = replace(found, selected_ensemble=MEAN, leading=MEAN)
-        hull = next((one for one in found.contenders if one.name == HULL), None)
+        hull = next((one for one in found.contenders if one.name == SINGLE), None)
         if hull is None or hull.diverged:
             return found
         against = f"; against it speaks: {'; '.join(hull.faults)}" if hull.faults else ""
         return replace(
-            found, selected=HULL, reason=f"{HULL} is the recipe's single model{against}."
+            found, selected=SINGLE, reason=f"{SINGLE} is the recipe's single model{against}."
         )
 
     def __getitem__(self, name: str) -> FittedModel:

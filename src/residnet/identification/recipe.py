@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
-from residnet.baselines.sets import Roles, submerged
+from residnet.baselines.sets import HULL, ROLL, WIND, Roles, submerged
 from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
 from residnet.core.names import BOW_WIND, CHANNEL_UNITS, WIND_INPUTS
@@ -80,9 +79,18 @@ class Facts:
             for name in _acting(names)
             if spread[names.index(name)] > _STILL * size[names.index(name)]
         ]
-        astern = [name for name in moving if _both_signs(z[:, names.index(name)])]
+        astern = []
+        for name in moving:
+            column = z[:, names.index(name)]
+            shares = [float(side.double().mean()) for side in (column > 0, column < 0)]
+            astern += [name] if min(shares) > _ASTERN else []
         length, history = _free_run(logs, evaluation, step)
-        stretch, rolling = _stretch(logs) * step, math.inf
+        lengths = np.concatenate(
+            [np.diff(np.stack(stretches(log.piece)), axis=0).flatten() for log in logs]
+        )
+        falling = np.sort(lengths)[::-1]
+        half = falling[np.searchsorted(np.cumsum(falling), 0.5 * falling.sum())]
+        stretch, rolling = float(half) * step, math.inf
         if "p" in names:
             angle, rate = (float(spread[names.index(name)]) for name in ("phi", "p"))
             rolling = angle / max(rate, 1e-9)
@@ -117,20 +125,6 @@ def _acting(names: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-def _stretch(logs: Sequence[Prepared]) -> float:
-    """Return the number of samples of stretches in which half of all samples lie, or longer."""
-    lengths = np.concatenate(
-        [np.diff(np.stack(stretches(log.piece)), axis=0).flatten() for log in logs]
-    )
-    falling = np.sort(lengths)[::-1]
-    return float(falling[np.searchsorted(np.cumsum(falling), 0.5 * falling.sum())])
-
-
-def _both_signs(values: torch.Tensor) -> bool:
-    ahead = float((values > 0).double().mean())
-    return min(ahead, float((values < 0).double().mean())) > _ASTERN
-
-
 def _free_run(
     logs: Sequence[Prepared], evaluation: EvaluationConfig, step: float
 ) -> tuple[float, float]:
@@ -146,17 +140,6 @@ def _free_run(
     return (float(np.median(found)) * step if found else _USUAL), protocol.initial
 
 
-_HULL = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
-_ROLL = ("u p", "p|p|", "u|u| phi", "phi^3")
-_WIND = (
-    "wind_u",
-    "wind_v",
-    "wind_u wind_mag",
-    "wind_v wind_mag",
-    "wind_u wind_v",
-    "wind_u wind_v^2 wind_mag^-1",
-    "wind_v wind_u^2 wind_mag^-1",
-)
 _FURTHER = ("u^2 v", "u^2 r", "v^2", "r^2")
 """Terms that only long logs determine."""
 LONG = 1200.0
@@ -213,10 +196,10 @@ def _terms(facts: Facts) -> list[str]:
     if live.spatial:
         return submerged(Roles(live.channels, (*forces, *driving), tuple(turning), (), False))
     return [
-        *("1", *moving, *_HULL, *(_ROLL if "p" in moving else ()), *forces),
+        *("1", *moving, *HULL, *(ROLL if "p" in moving else ()), *forces),
         *(term for name in driving for term in _propeller(name, name in facts.astern)),
         *(term for name in turning for term in _rudder(name, driving, facts)),
-        *(_WIND if facts.wind else ()),
+        *(WIND if facts.wind else ()),
     ]
 
 
@@ -333,9 +316,9 @@ PARTS = (
     "baseline", "baselines", "refit", "heads", "base_of", "ensembles", "means", "training",
 )  # fmt: skip
 """Keys of a fit that the recipe stands in place of."""
-HULL = "hull"
+SINGLE = "hull"
 """Name of the model that is taken where one single is needed."""
-_BASES = {"hull_network": HULL, "network": "zero"}
+_BASES = {"hull_network": SINGLE, "network": "zero"}
 """What the networks stand on."""
 MEAN = "mean"
 """Name of the mean of unlike models, which is reported first."""
@@ -367,12 +350,12 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     moving = [name for name in live_of(facts.names).moving if name != "z"]
     return {
         "baseline": _regressors(1e-6, ["1", *moving, *facts.inputs, *wind]),
-        "baselines": {HULL: _regressors(ridge, terms)},
-        "refit": dict.fromkeys(("baseline", HULL), refit_settings(facts)),
+        "baselines": {SINGLE: _regressors(ridge, terms)},
+        "refit": dict.fromkeys(("baseline", SINGLE), refit_settings(facts)),
         "heads": heads,
         "base_of": {name: base for name, base in _BASES.items() if name in heads},
         "ensembles": {},
-        "means": {MEAN: (HULL, *heads)},
+        "means": {MEAN: (SINGLE, *heads)},
         "training": dict.fromkeys(heads, training_settings(facts, effort)),
     }
 

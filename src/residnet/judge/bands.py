@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,7 +25,7 @@ from residnet.judge.band import (
     run_weights,
     worst,
 )
-from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction
+from residnet.judge.freerun import Errors, Prediction
 from residnet.judge.protocol import Window
 
 _MASKED = tuple(PLANAR.banded.index(name) for name in ("u", "v", "position"))
@@ -125,29 +125,8 @@ class BandCounts:
         }
 
 
-def count_bands(
-    run: FreeRun,
-    candidates: Sequence[Candidate],
-    logs: Sequence[Prepared],
-    found: Mapping[str, Errors],
-) -> dict[str, BandCounts]:
-    """Return how the bands fared over the windows of one protocol, by model.
-
-    Args:
-        run: free runs of all models.
-        candidates: the models; those without a band under this protocol are left out.
-    """
-    return {
-        one.name: _counted(
-            run_errors(run.windows, run.predictions[one.name], logs, found[one.name]),
-            one.bands[run.protocol],
-        )
-        for one in candidates
-        if run.protocol in one.bands
-    }
-
-
-def _counted(runs: Sequence[RunErrors], band: Band) -> BandCounts:
+def counted(runs: Sequence[RunErrors], band: Band) -> BandCounts:
+    """Return how a band fared over free runs of its model."""
     errors = [own.error for own in runs]
     widths = [own.within(band) for own in runs]
     largest = worst(errors, widths)

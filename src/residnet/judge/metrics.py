@@ -17,7 +17,7 @@ from residnet.core.layout import PLANAR, VELOCITIES, Live
 from residnet.core.names import END_UNITS
 from residnet.data.prepare import Prepared
 from residnet.judge.band import Bands
-from residnet.judge.bands import count_bands, limits
+from residnet.judge.bands import counted, limits, run_errors
 from residnet.judge.freerun import Candidate, Errors, FreeRun, drift
 from residnet.judge.verdict import FEW_LOGS, diverged_note
 
@@ -248,7 +248,19 @@ class Judged:
         kinds = [log.log.manoeuvre for log, _ in self.parts]
         subsets: dict[str, Sequence[str]] = {"all": kinds}
         subsets |= {kind: [kind] for kind in sorted(set(kinds))} | dict(groups)
-        banded = count_bands(self.run, self.candidates, self.logs, self.found)
+        banded = {
+            one.name: counted(
+                run_errors(
+                    self.run.windows,
+                    self.run.predictions[one.name],
+                    self.logs,
+                    self.found[one.name],
+                ),
+                one.bands[self.run.protocol],
+            )
+            for one in self.candidates
+            if self.run.protocol in one.bands
+        }
         out = []
         for one in self.candidates:
             for name, members in subsets.items():

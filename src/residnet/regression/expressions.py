@@ -283,17 +283,13 @@ def values_of(function: Function, x: np.ndarray) -> np.ndarray:
     return np.asarray(_VALUES[function](x))
 
 
-def _inverse(x: np.ndarray) -> np.ndarray:
-    return np.where(x == 0.0, 0.0, 1.0 / np.where(x == 0.0, 1.0, x))
-
-
 _VALUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "sum": lambda x: x,
     "abs": np.abs,
     "sin": np.sin,
     "cos": np.cos,
     "sqrt": lambda x: np.sqrt(np.abs(x)),
-    "inv": _inverse,
+    "inv": lambda x: np.where(x == 0.0, 0.0, 1.0 / np.where(x == 0.0, 1.0, x)),
 }
 
 

@@ -20,7 +20,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from residnet.core.columns import heading, pose, surge, sway, velocities, yaw_rate
+from residnet.core.columns import heading, pose, surge, sway, velocities
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.simulators.vehicle import Vehicle
@@ -140,23 +140,6 @@ TASKS: dict[str, ReferenceTask] = {
 }
 
 
-def task_named(name: str) -> ReferenceTask:
-    """Return a task by its name.
-
-    Raises:
-        UsageError: where there is none.
-    """
-    if name not in TASKS:
-        raise UsageError(f"no task '{name}'{nearest(name, TASKS)}")
-    return TASKS[name]
-
-
-def motion_seen(x: Tensor, cruise: float) -> Tensor:
-    """Return the velocities in units of the cruise speed, [B, 3]; yaw in turns of a look-ahead."""
-    u, v, _ = velocities(x).unbind(-1)
-    return torch.stack((u / cruise, v / cruise, yaw_rate(x) * AHEAD), dim=-1)
-
-
 def _uniform(rows: int, random: torch.Generator, like: Tensor) -> Tensor:
     return torch.rand(rows, 1, generator=random, dtype=torch.float64).to(like.dtype)
 
@@ -169,10 +152,15 @@ class Episodes:
         task: name of the task.
         rows: number of episodes side by side.
         steps: length of an episode.
+
+    Raises:
+        UsageError: where there is no such task.
     """
 
     def __init__(self, vehicle: Vehicle, task: str, rows: int, steps: int) -> None:
-        self.vehicle, self.task, self.rows, self.steps = vehicle, task_named(task), rows, steps
+        if task not in TASKS:
+            raise UsageError(f"no task '{task}'{nearest(task, TASKS)}")
+        self.vehicle, self.task, self.rows, self.steps = vehicle, TASKS[task], rows, steps
         self.random = torch.Generator()
         self.random.seed()
         self.size = 3 + self.task.seen + vehicle.commands
@@ -201,9 +189,11 @@ class Episodes:
 
     def observation(self) -> np.ndarray:
         """Return what is seen, [B, size] float32."""
-        cruise = self.vehicle.cruise
-        parts = (motion_seen(self.x, cruise), self.task.observe(self.x, self.goal, cruise))
-        seen: np.ndarray = torch.cat((*parts, self.last), dim=-1).float().numpy()
+        cruise, (u, v, r) = self.vehicle.cruise, velocities(self.x).unbind(-1)
+        # yaw in turns of a look-ahead
+        motion = torch.stack((u / cruise, v / cruise, r * AHEAD), dim=-1)
+        parts = (motion, self.task.observe(self.x, self.goal, cruise), self.last)
+        seen: np.ndarray = torch.cat(parts, dim=-1).float().numpy()
         return seen
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

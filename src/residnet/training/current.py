@@ -84,7 +84,11 @@ def estimate_currents(
     precision = config.spread**-2
     problem = _Problem(baseline, signals, logs, precision)
     current, error, theta = _found(problem, config)
-    apart, alone, _ = _found(replace(problem, logs=[h for p in logs for h in _halves(p)]), config)
+    halves = []
+    for p in logs:
+        late = np.arange(len(p)) >= np.flatnonzero(p.good)[p.good.sum() // 2]
+        halves += [replace(p, good=p.good & half) for half in (~late, late)]
+    apart, alone, _ = _found(replace(problem, logs=halves), config)
     first, second = apart.reshape(-1, 2, 2).unbind(1)
     scatter = (first - second).square() / alone.reshape(-1, 2, 2).square().sum(1)
     widened = max(float(scatter.mean().sqrt()), 1.0)
@@ -102,13 +106,6 @@ def estimate_currents(
         for i, (p, c, e) in enumerate(zip((*logs, *others), current, error, strict=True))
     ]
     return current.numpy(), rows
-
-
-def _halves(log: Prepared) -> list[Prepared]:
-    """Return a log twice, with the samples of its first and of its second half."""
-    rows = np.flatnonzero(log.good)
-    late = np.arange(len(log)) >= (rows[len(rows) // 2] if len(rows) else 0)
-    return [replace(log, good=log.good & part) for part in (~late, late)]
 
 
 def _found(problem: _Problem, config: CurrentConfig) -> tuple[Tensor, Tensor, Tensor]:
@@ -287,7 +284,10 @@ class _Problem:
             ) + self.precision * trial.square().sum(1)
 
         best, found = cost(current), current.clone()
-        for point in _grid(1.25 * spread, spread / 6):
+        radius, spacing = 1.25 * spread, spread / 6
+        line = torch.arange(-radius, radius + spacing / 2, spacing, dtype=torch.float64)
+        points = torch.cartesian_prod(line, line)
+        for point in points[points.norm(dim=1) <= radius]:
             trial = point.expand(count, 2)
             trial_cost = cost(trial)
             found = torch.where((trial_cost < best)[:, None], trial, found)
@@ -305,13 +305,6 @@ class _Problem:
             phi, target, _ = self.regression(moved)
             ends.append(target - phi @ state.theta.T)
         return (ends[0] - ends[1]) / 2e-4
-
-
-def _grid(radius: float, spacing: float) -> Tensor:
-    """Points [G, 2] of a square grid within a circle about zero."""
-    line = torch.arange(-radius, radius + spacing / 2, spacing, dtype=torch.float64)
-    points = torch.cartesian_prod(line, line)
-    return points[points.norm(dim=1) <= radius]
 
 
 def _gram(phi: Tensor) -> Tensor:

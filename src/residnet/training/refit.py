@@ -290,10 +290,6 @@ class Problem:
         still[list(numbers)] = True
         return replace(self, still=still)
 
-    def with_only(self, numbers: Sequence[int]) -> Problem:
-        """Return the problem in which these free parameters stay at zero, and no others."""
-        return replace(self, still=torch.zeros_like(self.still)).at_rest(numbers)
-
     def over(self, steps: int) -> Problem:
         """Return the problem whose free runs are so many steps long."""
         return replace(
@@ -522,7 +518,7 @@ def refit(
         elif turned := baseline.undamped(samples):
             # what fed energy beside these may not without them
             turning += turned
-            problem = problem.with_only(turning)
+            problem = replace(problem, still=torch.zeros_like(problem.still)).at_rest(turning)
         else:
             break
         # those that are to rest at zero

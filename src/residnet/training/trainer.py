@@ -14,7 +14,7 @@ import warnings
 from abc import ABC, abstractmethod
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Any
 
 import lightning as L
 import torch
@@ -25,40 +25,11 @@ from residnet.core.errors import FitError, UsageError
 from residnet.core.files import whole
 from residnet.core.progress import report
 from residnet.data.module import EpochDataModule, epoch_seed
-from residnet.training.config import MachineConfig
+from residnet.training.config import MachineConfig, OneStage, TrainingConfig
 from residnet.training.score import Shown
 
-
-class Epochs(Protocol):
-    """Settings of a training, as far as the trainer needs them."""
-
-    @property
-    def epochs(self) -> int:
-        """Of all stages together."""
-
-    @property
-    def gradient_clip(self) -> float:
-        """Largest norm of the gradient."""
-
-    @property
-    def patience(self) -> int:
-        """Validations without gain after which the last stage ends."""
-
-    @property
-    def validate_every(self) -> int:
-        """Number of epochs between validations."""
-
-    def stage(self, epoch: int) -> tuple[int, int]:
-        """Return (stage, epoch within it)."""
-
-    def model_dump(self, *, mode: str) -> dict[str, Any]:
-        """Return all settings as plain values."""
-
-    @property
-    def last_stage(self) -> int:
-        """Number of the stage that may stop early."""
-
-
+Epochs = OneStage | TrainingConfig
+"""Settings of a training."""
 _KEPT = (
     "best_score", "best_diverged", "best_state", "start_score", "without_gain", "history",
     "stopped",
