@@ -66,8 +66,6 @@ class _NomotoConfig(SteeredConfig, ABC):
     T_u u_dot + u = K_u drive + b_u (eq. (12)) and T r_dot + r = K steer + b (eq. (13)).
 
     Attributes:
-        drive: channel that drives surge.
-        steer: channel that turns the vessel.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
     """
 
@@ -204,8 +202,6 @@ class LinearSteadyConfig(SteeredConfig):
     derivatives (eq. (29)), and B = -A Phi (eq. (28)). Nomoto's models are identified alike.
 
     Attributes:
-        drive: channel that drives surge.
-        steer: channel that turns the vessel.
         steering_model: `linear` is (16). `nomoto` is (13), in which sway velocity decays with
             yaw's time constant. `nomoto_sideslip` is (15) with side slip written as sway velocity:
             the yaw rate alone drives sway.

@@ -127,7 +127,6 @@ class ZigzagFamily(Family):
     first.
 
     Attributes:
-        count: how many manoeuvres.
         heading: changes of heading to choose from in rad.
         steer: range of the share of full steer.
         drive: range of the share of full drive.
@@ -271,7 +270,6 @@ class TurningCircleFamily(Family):
     """Turning circles drawn at random: steer and drive uniform in their ranges, to either side.
 
     Attributes:
-        count: how many manoeuvres.
         steer: range of the share of full steer.
         drive: range of the share of full drive.
         start: time of the helm order in s.
@@ -465,7 +463,6 @@ class DivingFamily(Family, ABC):
     """Manoeuvres in depth drawn at random, to either side, down or up first.
 
     Attributes:
-        count: how many.
         drive: range of the share of full drive.
         dive: range of the share of full dive.
         start: when it begins.

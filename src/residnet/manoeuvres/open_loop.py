@@ -95,7 +95,6 @@ class AccelerationDecelerationFamily(Family):
     The high level is lowered by a quarter and by half in turn; all is uniform in its range.
 
     Attributes:
-        count: how many manoeuvres.
         high: range of the high level of the drive.
         low: range of the low level of the drive.
         hold: range of the time for which a level is held in s.
@@ -155,7 +154,6 @@ class ThreeTwoOneOneFamily(Family):
     """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated.
 
     Attributes:
-        count: how many manoeuvres.
         unit: range of the shortest step in s.
         steer: range of the share of full steer.
         drive: range of the share of full drive.
@@ -202,7 +200,6 @@ class Excitation(Scheduled, ABC):
         band: frequencies that the demands excite.
         seed: of everything random.
         start: when they begin; before, the drive is held and the steer is zero.
-        kind: kind of the manoeuvre.
     """
 
     drive: float = Field(ge=-1, le=1)
@@ -312,7 +309,6 @@ class ExcitationFamily(Family):
     """Random excitation: everything uniform in its range, the band as given.
 
     Attributes:
-        count: how many manoeuvres.
         drive: range of the mean drive.
         drive_amplitude: range of the drive's amplitude.
         steer_amplitude: range of the steer's amplitude.

@@ -80,8 +80,6 @@ class AbkowitzConfig(VesselFile):
     M nu_dot = sum of terms in (du, v, r, delta, dn).
 
     Attributes:
-        name: of the vessel, as its file is called.
-        description: one line for `residnet list vessels`.
         length: L, between perpendiculars.
         units: `prime` for dimensionless coefficients (SNAME's prime system: forces over 0.5 rho L^2
             U^2, moments over 0.5 rho L^3 U^2, masses over 0.5 rho L^3, with U the present speed

@@ -162,7 +162,6 @@ class HullConfig(HullVessel, ABC):
         scale: what M, C and D are all multiplied by: a true vessel beside the believed one of its
             `base` (document 002 eq. (4.2)).
         damping: terms of D(nu) nu on each axis; positive coefficients brake.
-        actuators: what the vessel is driven and steered by.
     """
 
     scale: float = Field(default=1.0, gt=0)
@@ -296,7 +295,6 @@ class OdinConfig(HullVessel):
     Attributes:
         gains: acceleration per force.
         terms: acceleration without force; terms that brake are negative.
-        actuators: what the vessel is driven and steered by.
     """
 
     kind: Literal["odin"]
@@ -320,10 +318,7 @@ class RollingBody(RigidBody):
     """The rigid body of a vessel that rolls.
 
     Attributes:
-        m: mass in kg.
         I_x: moment of inertia in roll about the body origin in kg m^2.
-        I_z: moment of inertia in yaw about the body origin in kg m^2.
-        x_G: centre of gravity ahead of the body origin in m.
         z_G: centre of gravity below the body origin in m; negative above it.
     """
 
@@ -335,16 +330,11 @@ class RollingAddedMass(AddedMass):
     """The hydrodynamic derivatives of the accelerations in surge, sway, roll and yaw (SNAME).
 
     Attributes:
-        X_udot: surge force by surge acceleration in kg.
-        Y_vdot: sway force by sway acceleration in kg.
         Y_pdot: sway force by roll acceleration in kg m.
-        Y_rdot: sway force by yaw acceleration in kg m.
         K_vdot: roll moment by sway acceleration in kg m.
         K_pdot: roll moment by roll acceleration in kg m^2.
         K_rdot: roll moment by yaw acceleration in kg m^2.
-        N_vdot: yaw moment by sway acceleration in kg m.
         N_pdot: yaw moment by roll acceleration in kg m^2.
-        N_rdot: yaw moment by yaw acceleration in kg m^2.
     """
 
     Y_pdot: MassArm
@@ -437,12 +427,7 @@ class SubmergedBody(RollingBody):
     """The rigid body of a vessel under water, symmetric to port and starboard.
 
     Attributes:
-        m: mass in kg.
-        I_x: moment of inertia in roll about the body origin in kg m^2.
         I_y: moment of inertia in pitch about the body origin in kg m^2.
-        I_z: moment of inertia in yaw about the body origin in kg m^2.
-        x_G: centre of gravity ahead of the body origin in m.
-        z_G: centre of gravity below the body origin in m.
     """
 
     I_y: Annotated[Inertia, Positive]

@@ -388,8 +388,6 @@ class VectoredThrusterConfig(PlaceConfig):
 
     Attributes:
         name: ends its command, cmd_thrust_<name>, in N.
-        x: place ahead of the body origin in m.
-        y: place to starboard of the body origin in m.
         z: place below the body origin in m.
         push: direction of its force ahead, to starboard and down; made of length one.
     """
