@@ -102,7 +102,6 @@ class StillConfig(GivenConfig):
     kind: Literal["still"] = "still"
 
     def build(self, names: Sequence[str]) -> GivenBaseline:
-        """Return the module; it has no parameters."""
         return GivenBaseline([], names)
 
 

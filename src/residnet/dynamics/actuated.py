@@ -163,7 +163,6 @@ class GivenActuators(Actuators):
         self.dt = dt
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., c], within their limits."""
         both = torch.stack((drive, steer), dim=-1) @ self.shares.to(drive.dtype)
         limit = self.limit.to(drive.dtype)
         return self.centre.to(drive.dtype) + torch.minimum(torch.maximum(both, -limit), limit)

@@ -36,7 +36,6 @@ class MeanBaseline(Baseline):
         return total / len(self.members)
 
     def parameter_count(self) -> list[float]:
-        """Return the parameters of each axis, those of all members together."""
         return _parameters(self.members)
 
 
@@ -89,7 +88,6 @@ class MeanHead(ResidualHead):
         return torch.cat(low), torch.cat(high)
 
     def parameter_count(self) -> list[float]:
-        """Return the parameters of each axis, those of all members together."""
         return _parameters(self.members)
 
 
@@ -169,7 +167,6 @@ class MeanOfTrajectories(HybridDynamics):
         return self._joined(x, reached, memory)
 
     def ahead(self, w: Tensor, s: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-        """Return what a stretch of steps needs that no state decides, of each member in turn."""
         rows: list[list[Tensor]] = []
         for _ in range(w.shape[1]):
             rows.append([])
@@ -185,7 +182,6 @@ class MeanOfTrajectories(HybridDynamics):
     def go(
         self, x: Tensor, row: list[Tensor], shared: list[list[Tensor]], s: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step later, by what `ahead` found."""
         x = self.alive(x)
         kept = self._kept(x, s)
         reached: list[Tensor] = []
@@ -303,7 +299,6 @@ class SampledDynamics(Dynamics):
         self.n_state = dynamics.n_state
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step later, each draw with its own parameters."""
         draws, parameter = self.theta.shape[0], f"dynamics.{self.name}"
 
         def one(theta: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:

@@ -228,7 +228,6 @@ class HybridDynamics(Dynamics):
         return torch.cat((place, psi, after), dim=-1)
 
     def ahead(self, w: Tensor, s: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-        """Return what a stretch of steps needs that no state decides; see `Dynamics.ahead`."""
         p = self.signals.prepare(w)
         rows: list[list[Tensor]] = []
         if self.positions or self.signals.wind or self.spatial:
@@ -251,7 +250,6 @@ class HybridDynamics(Dynamics):
     def go(
         self, x: Tensor, row: list[Tensor], shared: list[list[Tensor]], s: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step later, by what `ahead` found."""
         if self.positions or self.signals.wind or self.spatial:
             return self.stepped(x, row[0], s)
         x = self.alive(x)

@@ -58,7 +58,6 @@ class PlantDynamics(Dynamics):
         return self.plant.held_rate(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state after a step of the log; the memory passes through."""
         for _ in range(self.substeps):
             x = self.plant.end_step(self.integrate(x, self.plant.prepare(x, w), s), w, self.dt)
         return x, s
@@ -98,7 +97,6 @@ class RecordedPlantDynamics(Dynamics):
 
     @torch.no_grad()
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state after a step of the log; the memory passes through."""
         if self._one is None and self._plain is None:
             try:
                 self._one = self._recorded()

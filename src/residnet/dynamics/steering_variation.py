@@ -144,7 +144,6 @@ class VariedPlant(Dynamics):
         return torch.cat((x[:, : self.rudder], angle, x[:, self.rudder + 1 :]), dim=-1)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state after a step; the variation passes through."""
         varied = torch.cat((s[:, :1], s[:, 2:3], 1.0 / s[:, 1:2] - 1.0), dim=-1)
         ordered = w[:, self.take]
         if self.moving:
@@ -254,7 +253,6 @@ class PushedSteering(Dynamics):
         self.n_state, self.inputs = inner.n_state, inputs
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state after a step and the memory, whose bias is the constant one."""
         bias = len(VARIATION) - 1
         push = w[:, self.inputs : self.inputs + 1]
         pushed = torch.cat((s[:, :bias], s[:, bias : bias + 1] + push, s[:, bias + 1 :]), dim=1)

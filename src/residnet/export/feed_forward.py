@@ -242,7 +242,6 @@ class ExportedForce(Exported):
         return {"steps": len(motion), "share_of_range": worst}
 
     def contents(self) -> dict[str, Any]:
-        """Return what a controller needs to know."""
         known = GuardedForce(self.inner, self.ranges).ranges
         accepted = torch.stack((known.least, known.most), dim=1).tolist()
         return {

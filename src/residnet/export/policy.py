@@ -332,7 +332,6 @@ class ExportedController(Exported):
         return _Answer(self.controller(dtype)).eval()
 
     def contents(self) -> dict[str, Any]:
-        """Return all that a user needs to run the policy, and how good it is."""
         module, policy = self.controller(self.precisions[0]), self.policy
         ranges = zip(module.low.tolist(), module.high.tolist(), strict=True)
         held = "held" if self.safe == "hold" else "amidships"
@@ -494,7 +493,6 @@ class ExportedCoursePolicy(ExportedController):
         return (torch.stack(y, dim=-1),)
 
     def described(self, module: Any) -> dict[str, Any]:
-        """Return start, length and memory."""
         course, count = self.course, module.guidance.n_state
         names = ("place", "drift_north", "drift_east")[:count]
         (north, east), heading = course.track[0].tolist(), float(course.heading[0])

@@ -221,7 +221,6 @@ class ExportedVessel(Exported):
                 )
 
     def contents(self) -> dict[str, Any]:
-        """Return all that a user needs to drive the model, and how good it is."""
         spec, band = self.spec, self.spec.band
         units, live = spec.signals.units(), spec.signals.live
         known = GuardedDynamics(self.model, spec).ranges

@@ -114,7 +114,6 @@ class BasisHead(ClosedFormHead):
         return row, [low, high, scale, own]
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, n] at velocities nu [B, n], by what `ahead` found."""
         rho: Tensor = self.split(torch.clamp(nu, held[0], held[1]) / held[2], row, held[3])
         return rho, s
 

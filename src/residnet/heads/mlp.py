@@ -82,7 +82,6 @@ class MlpHead(ResidualHead):
         return row, [low, high, own]
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, n] at velocities nu [B, n], by what `ahead` found."""
         out = torch.addmm(row, torch.clamp(nu, held[0], held[1]), held[2])
         for i, layer in enumerate(self.net):
             if i > 0:

@@ -108,7 +108,6 @@ class RecurrentHead(ResidualHead):
         return rho, h.reshape(-1, self.n_state)
 
     def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return what velocities do not decide; see `ResidualHead.ahead`."""
         hidden, count = self.n_state, self.features.count
         # of gates and residual, one layer: [K, 3 H + n, F]
         weight = torch.cat((self.w_input, self.w_skip), dim=-1)
@@ -126,7 +125,6 @@ class RecurrentHead(ResidualHead):
         return torch.cat(rows), held
 
     def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [K B, n] and the memories, by what `ahead` found."""
         near, wrong = nu.split([self.dof, self.dof], dim=-1)
         far = self.far * self.scale.spread.to(nu.dtype)
         seen = torch.cat(
@@ -156,7 +154,6 @@ class RecurrentHead(ResidualHead):
         return new + kept * (h - new)
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Return residuals [K B, T, n] along measured channels [K B, T, nz], from no memory."""
         s = torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
         residuals: list[Tensor] = []
         for k in range(z.shape[1]):
@@ -165,7 +162,6 @@ class RecurrentHead(ResidualHead):
         return torch.stack(residuals, dim=1)
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Return the memory [K B, H] that past channels [K B, T, nz] leave."""
         s = torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
         for k in range(z.shape[1]):
             s = self.forward(z[:, k], s)[1]

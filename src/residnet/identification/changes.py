@@ -171,7 +171,6 @@ class ChangedDynamics(Dynamics):
         self.damped = of_damped([changes[k].size for k in damped])
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return state and memory one step later, with the changed acceleration."""
         w = w * self.gain + self.offset
         after, memory = self.model.step(x, w, s)
         nu = x[:, MOVING]

@@ -326,10 +326,12 @@ class ClosedLoop(Manoeuvre):
     """
 
     watches: ClassVar[tuple[str, ...]]
+    told: ClassVar[tuple[str, ...]] = ()
+    """Settings that the law needs to know as they are."""
 
-    @abstractmethod
     def numbers(self, helm: Helm) -> dict[str, Any]:
         """Return what the law needs to know of this manoeuvre, numbers or lists of them."""
+        return {name: getattr(self, name) for name in self.told}
 
     @classmethod
     @abstractmethod

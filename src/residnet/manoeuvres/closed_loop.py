@@ -49,6 +49,7 @@ class Zigzag(RudderSteering, ClosedLoop):
     """
 
     watches: ClassVar[tuple[str, ...]] = ("psi",)
+    told: ClassVar[tuple[str, ...]] = ("drive", "start")
     kind: Literal["zigzag"] = "zigzag"
     heading: Radians = Field(gt=0)
     first: Literal["starboard", "port"] = "starboard"
@@ -56,7 +57,6 @@ class Zigzag(RudderSteering, ClosedLoop):
 
     @property
     def goal(self) -> str | None:
-        """The end of the manoeuvre: a number of reversals, and the way back."""
         if self.reversals is None:
             return None
         angle = f"{math.degrees(self.heading):.4g} deg"
@@ -83,11 +83,8 @@ class Zigzag(RudderSteering, ClosedLoop):
         return {}
 
     def numbers(self, helm: Helm) -> dict[str, Any]:
-        """Return steer, bounds and sides; a negative steer turns to the other side."""
-        return {
-            "drive": self.drive,
+        return super().numbers(helm) | {
             "steer": self.share(helm),
-            "start": self.start,
             "bound": self.heading,
             "sense": self.side,
             "first": 1.0 if self.first == "starboard" else -1.0,
@@ -120,24 +117,29 @@ class Zigzag(RudderSteering, ClosedLoop):
         return (count >= numbers["most"]) & back
 
 
-class ZigzagFamily(Family):
-    """Zigzags drawn at random.
+class SteeringFamily(Family, ABC):
+    """Manoeuvres of a steer and a drive that are uniform in their ranges.
 
-    The heading is one of some, steer and drive are uniform in their ranges, either side comes
-    first.
+    Attributes:
+        steer: range of the share of full steer.
+        drive: range of the share of full drive.
+        start: time of the first helm order in s.
+    """
+
+    steer: Range = (0.25, 1.0)
+    drive: Range = (0.2, 1.0)
+    start: Seconds = 5.0
+
+
+class ZigzagFamily(SteeringFamily):
+    """Zigzags drawn at random: the heading is one of some, either side comes first.
 
     Attributes:
         heading: changes of heading to choose from in rad.
-        steer: range of the share of full steer.
-        drive: range of the share of full drive.
-        start: time of the first execute in s.
     """
 
     kind: Literal["zigzag"] = "zigzag"
     heading: tuple[Radians, ...] = Field(min_length=1)
-    steer: Range = (0.25, 1.0)
-    drive: Range = (0.2, 1.0)
-    start: Seconds = 5.0
 
     def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
         heading = float(random.choice(self.heading))
@@ -158,10 +160,6 @@ class SteadyConfig(Config):
 
     window: Seconds = Field(default=10.0, gt=0)
     tolerance: float = Field(default=0.005, gt=0)
-
-    def numbers(self) -> dict[str, float]:
-        """Return what `steadied` needs to know."""
-        return {"window": self.window, "tolerance": self.tolerance}
 
 
 def steady_at(r: Tensor) -> Tensor:
@@ -202,6 +200,7 @@ class TurningCircle(RudderSteering, ClosedLoop):
     """
 
     watches: ClassVar[tuple[str, ...]] = ("psi", "r")
+    told: ClassVar[tuple[str, ...]] = ("drive", "start", "until", "side")
     kind: Literal["turning_circle"] = "turning_circle"
     until: Radians = Field(default=3.0 * math.pi, gt=0)
     pull_out: bool = False
@@ -209,7 +208,6 @@ class TurningCircle(RudderSteering, ClosedLoop):
 
     @property
     def goal(self) -> str:
-        """The heading change, and the end of the pull-out."""
         turned = f"a heading change of {math.degrees(self.until):.4g} deg"
         return f"{turned} and a steady pull-out" if self.pull_out else turned
 
@@ -227,15 +225,8 @@ class TurningCircle(RudderSteering, ClosedLoop):
         return indices.turning_limits(length) if full else {}
 
     def numbers(self, helm: Helm) -> dict[str, Any]:
-        """Return steer, sides and bounds."""
-        return {
-            "drive": self.drive,
-            "steer": self.share(helm),
-            "start": self.start,
-            "until": self.until,
-            "side": self.side,
-            "after": 1.0 if self.pull_out else 2.0,
-        } | self.steady.numbers()
+        own = {"steer": self.share(helm), "after": 1.0 if self.pull_out else 2.0}
+        return super().numbers(helm) | own | dict(self.steady)
 
     @classmethod
     def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
@@ -262,24 +253,17 @@ class TurningCircle(RudderSteering, ClosedLoop):
 
     @classmethod
     def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
-        """Return the rows that have turned, and pulled out."""
         return memory[:, 1] == 2
 
 
-class TurningCircleFamily(Family):
-    """Turning circles drawn at random: steer and drive uniform in their ranges, to either side.
+class TurningCircleFamily(SteeringFamily):
+    """Turning circles drawn at random, to either side.
 
     Attributes:
-        steer: range of the share of full steer.
-        drive: range of the share of full drive.
-        start: time of the helm order in s.
         until: change of heading that ends the manoeuvre in rad.
     """
 
     kind: Literal["turning_circle"] = "turning_circle"
-    steer: Range = (0.25, 1.0)
-    drive: Range = (0.2, 1.0)
-    start: Seconds = 5.0
     until: Radians = Field(default=3.0 * math.pi, gt=0)
 
     def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
@@ -300,6 +284,7 @@ class Stopping(ClosedLoop):
     """
 
     watches: ClassVar[tuple[str, ...]] = ("u",)
+    told: ClassVar[tuple[str, ...]] = ("drive", "astern", "start")
     kind: Literal["stopping"] = "stopping"
     drive: float = Field(gt=0, le=1)
     astern: float = Field(default=-1.0, ge=-1, le=0)
@@ -315,10 +300,6 @@ class Stopping(ClosedLoop):
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
         """Return IMO's limit, which holds for full astern."""
         return indices.stopping_limits(length) if self.astern <= -0.999 else {}
-
-    def numbers(self, helm: Helm) -> dict[str, Any]:
-        """Return both drives and the time of the order."""
-        return {"drive": self.drive, "astern": self.astern, "start": self.start}
 
     @classmethod
     def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
@@ -357,6 +338,7 @@ class Spiral(ClosedLoop):
     """
 
     watches: ClassVar[tuple[str, ...]] = ("r",)
+    told: ClassVar[tuple[str, ...]] = ("drive", "start")
     kind: Literal["spiral"] = "spiral"
     drive: float = Field(ge=-1, le=1)
     steers: tuple[float, ...] = ()
@@ -379,7 +361,6 @@ class Spiral(ClosedLoop):
 
     @property
     def goal(self) -> str:
-        """The steady yaw rate at all of the angles."""
         return f"a steady yaw rate at each of {len(self.angles)} helm angles"
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
@@ -406,14 +387,9 @@ class Spiral(ClosedLoop):
         return found
 
     def numbers(self, helm: Helm) -> dict[str, Any]:
-        """Return the shares of full steer, zero behind the last, and how many there are."""
         shares = [rudder_share(a, helm) if self.rudders else a for a in self.angles]
-        return {
-            "drive": self.drive,
-            "start": self.start,
-            "shares": [*shares, 0.0],
-            "count": float(len(shares)),
-        } | self.steady.numbers()
+        own = {"shares": [*shares, 0.0], "count": float(len(shares))}
+        return super().numbers(helm) | own | dict(self.steady)
 
     @classmethod
     def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
@@ -434,7 +410,6 @@ class Spiral(ClosedLoop):
 
     @classmethod
     def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
-        """Return the rows that have held their last angle."""
         return memory[:, 0] >= numbers["count"]
 
 
@@ -507,22 +482,17 @@ class VerticalZigzag(ClosedLoop):
     """
 
     watches: ClassVar[tuple[str, ...]] = ("z",)
+    told: ClassVar[tuple[str, ...]] = ("drive", "start")
     kind: Literal["vertical_zigzag"] = "vertical_zigzag"
     drive: float = Field(ge=-1, le=1)
     dive: float = Field(ge=-1, le=1)
     depth: Metres = Field(gt=0)
     start: Seconds = Field(default=5.0, ge=0)
 
-    def numbers(self, helm: Any) -> dict[str, Any]:
-        """Return demands and bound."""
+    def numbers(self, helm: Helm) -> dict[str, Any]:
         first = -1.0 if self.dive < 0 else 1.0
-        return {
-            "drive": self.drive,
-            "dive": abs(self.dive),
-            "first": first,
-            "bound": self.depth,
-            "start": self.start,
-        }
+        own = {"dive": abs(self.dive), "first": first, "bound": self.depth}
+        return super().numbers(helm) | own
 
     @classmethod
     def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
@@ -571,6 +541,9 @@ class DepthStep(ClosedLoop):
     """
 
     watches: ClassVar[tuple[str, ...]] = ("z", "u", "v", "w", "phi", "theta", "q")
+    told: ClassVar[tuple[str, ...]] = (
+        "drive", "dive", "depth", "start", "gain", "damping", "pitch_damping",
+    )  # fmt: skip
     kind: Literal["depth_step"] = "depth_step"
     drive: float = Field(ge=-1, le=1)
     dive: float = Field(default=0.5, gt=0, le=1)
@@ -579,11 +552,6 @@ class DepthStep(ClosedLoop):
     gain: float = Field(default=0.3, gt=0)
     damping: float = Field(default=1.0, ge=0)
     pitch_damping: float = Field(default=1.0, ge=0)
-
-    def numbers(self, helm: Any) -> dict[str, Any]:
-        """Return demands and gains."""
-        names = ("drive", "dive", "depth", "start", "gain", "damping", "pitch_damping")
-        return {name: getattr(self, name) for name in names}
 
     @classmethod
     def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:

@@ -496,7 +496,6 @@ class Replay(Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Return the playback of the recorded inputs."""
         return RecordedSource(
             torch.stack([m.inputs(helm, t) for m in manoeuvres if isinstance(m, Replay)])
         )

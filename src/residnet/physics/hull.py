@@ -492,7 +492,6 @@ class SubmergedConfig(HullVessel):
     actuators: SubmergedActuatorsConfig
 
     def start(self) -> Mapping[str, float]:
-        """Return the speed."""
         return {"u": self.speed}
 
     def hull(self) -> Hull:

@@ -233,7 +233,6 @@ class HeadTraining(EpochTraining):
         return torch.optim.AdamW(groups, lr=1e-3, fused=True)
 
     def on_fit_start(self) -> None:
-        """Reset the losses."""
         super().on_fit_start()
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             self.rank, self.world = self.global_rank, torch.distributed.get_world_size()
@@ -329,7 +328,6 @@ class HeadTraining(EpochTraining):
         return self._compiled
 
     def validated(self) -> tuple[nn.Module, float]:
-        """Return the model and its free-run error."""
         score = self.validate(self.model)
         self.diverged, self.axes, self.shown = score.diverged, score.axes, score.shown
         return self.model, score.error

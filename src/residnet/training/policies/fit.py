@@ -277,7 +277,6 @@ class HeadingChangesData(EpochDataModule):
         return int(self.fit.settings.steps)
 
     def batches(self, epoch: int) -> Iterator[HeadingChanges]:
-        """Yield the batches of an epoch, each drawn when its turn comes."""
         return (self.fit.batch(number) for number in range(self.steps))
 
 
