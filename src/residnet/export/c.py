@@ -115,58 +115,6 @@ class CFunction:
         return f"{self.prototype(prefix)} {{\n{inside}}}\n"
 
 
-_HEADER = """/*
-{comment}
- */
-#ifndef {guard}
-#define {guard}
-
-#include <stddef.h>
-
-#ifdef __cplusplus
-extern "C" {{
-#endif
-
-{precision}
-{numbers}
-
-{prototypes}
-
-#ifdef __cplusplus
-}}
-#endif
-
-#endif
-"""
-_EITHER = """/* define {macro} for double precision, here and in the source file */
-#ifdef {macro}
-typedef double {prefix}_real;
-#else
-typedef float {prefix}_real;
-#endif
-"""
-_DOUBLE_ALONE = """/* in double precision alone: single would not follow it closely enough */
-#ifndef {macro}
-#define {macro}
-#endif
-typedef double {prefix}_real;
-"""
-_SOURCE = """#include "{header}"
-
-#include <math.h>
-
-#define REAL {prefix}_real
-#define ZERO ((REAL)0)
-#define ONE ((REAL)1)
-#ifdef {macro}
-#define R(name) name
-#else
-#define R(name) name##f
-#endif
-
-"""
-
-
 def c_files(
     prefix: str,
     functions: Sequence[CFunction],
@@ -193,13 +141,15 @@ def c_files(
     names = {"prefix": prefix, "macro": f"{prefix.upper()}_DOUBLE"}
     words = set(re.findall(r"\w+", "\n".join(bodies)))
     used = [text for name, text in tables.lines.items() if name in words]
-    source = _SOURCE.format(header=header, **names) + "\n".join((*used, *bodies))
+    source = filled("c_source.c", header=header, body="\n".join((*used, *bodies)), **names)
     told = [(function.about, function.prototype(prefix)) for function in functions]
     told += [(comment, prototype) for comment, prototype, _ in extra]
-    return source, _HEADER.format(
+    return source, filled(
+        "c_header.h",
         comment="\n".join(f" * {x}".rstrip() for x in about.replace("*/", "* /").splitlines()),
         guard=f"{prefix.upper()}_H",
-        precision=(_DOUBLE_ALONE if double_only else _EITHER).format(**names),
+        double_only=double_only,
+        **names,
         numbers="\n".join(
             f"#define {prefix.upper()}_{name} {value} /* {text} */"
             for name, (value, text) in sizes.items()
@@ -235,7 +185,7 @@ def compile_shared(
     return out
 
 
-def footprint(source: Path, flags: Sequence[str] = ()) -> dict[str, Any]:
+def footprint(source: Path) -> dict[str, Any]:
     """Return what a C file takes on this machine, built for size, by the compiler's own account.
 
     That is the bytes of each function's stack, without those of the C library that it calls, and of
@@ -244,7 +194,7 @@ def footprint(source: Path, flags: Sequence[str] = ()) -> dict[str, Any]:
     """
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "made.o"
-        call = [compiler(), "-std=c99", "-Os", "-fstack-usage", "-c", *flags, str(source)]
+        call = [compiler(), "-std=c99", "-Os", "-fstack-usage", "-c", str(source)]
         if subprocess.run([*call, "-o", str(made)], capture_output=True).returncode:
             return {}
         out: dict[str, Any] = {"machine": f"{platform.machine()}, -Os"}
@@ -259,33 +209,6 @@ def footprint(source: Path, flags: Sequence[str] = ()) -> dict[str, Any]:
         return out
 
 
-_WARMUP = """    {p}_real after[{P}_STATES];
-    size_t k, good = count;
-    for (k = 0; k < {P}_MEMORY; k++) s[k] = 0;
-    for (k = 0; k < count && good == count; k++)
-        if ({p}_measured(x + {P}_STATES * k, w + {P}_INPUTS * k)) good = k;
-    for (k = 0; k < count && good < count; k++) {{
-        if ({p}_measured(x + {P}_STATES * k, w + {P}_INPUTS * k)) good = k;
-        (void){p}_step(x + {P}_STATES * good, w + {P}_INPUTS * good, s, after, s);
-    }}
-"""
-_BAND = """    static const int steps[{count}] = {{{steps}}};
-    static const REAL widths[{count}][{channels}] = {{{widths}}};
-    int i, after = 0;
-    REAL from, share;
-    while (after < {count} && steps[after] <= k) after++;
-    for (i = 0; i < {channels}; i++) {{
-        if (k <= 0) half[i] = ZERO;
-        else if (after == {count})
-            half[i] = widths[{last}][i] * ((REAL)k / (REAL)steps[{last}]);
-        else {{
-            from = after ? widths[after - 1][i] : ZERO;
-            share = (REAL)(k - (after ? steps[after - 1] : 0));
-            share /= (REAL)(steps[after] - (after ? steps[after - 1] : 0));
-            half[i] = from + share * (widths[after][i] - from);
-        }}
-    }}
-"""
 _STEP = {
     "vessel": "state and memory one step later; returns 1 where anything was outside the training"
     "\n * range or no number, else 0; results may go where arguments came from",
@@ -377,13 +300,7 @@ def _vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, 
     banded = exported.spec.signals.live.layout.banded
     rows = [(math.inf,) * len(banded)] if table is None else list(zip(*table.columns, strict=True))
     widths = ["{" + ", ".join(map(literal, row)) + "}" for row in rows]
-    band = _BAND.format(
-        count=len(steps),
-        last=len(steps) - 1,
-        channels=len(banded),
-        steps=", ".join(map(str, steps)),
-        widths=",\n        ".join(widths),
-    )
+    band = filled("c_band.c", steps=steps, widths=widths, channels=len(banded))
     return [
         (
             "memory without a past",
@@ -393,7 +310,7 @@ def _vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, 
         (
             "memory that a measured past leaves: count states and inputs, oldest first",
             f"void {prefix}_warmup(const {real} *x, const {real} *w, size_t count, {real} *s)",
-            _WARMUP.format(p=prefix, P=upper) if memory else unread,
+            filled("c_warmup.c", p=prefix, P=upper) if memory else unread,
         ),
         (
             f"half widths of {', '.join(banded)} k steps after a measured state: between"
