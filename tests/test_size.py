@@ -22,7 +22,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "core": (1615, 245),
     "data": (9725, 847),
     "documents": (2462, 227),
-    "dynamics": (2254, 279),
+    "dynamics": (2246, 277),
     "export": (1483, 172),
     "heads": (1233, 178),
     "identification": (2070, 204),

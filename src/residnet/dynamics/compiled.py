@@ -13,6 +13,7 @@ import ctypes
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
 from itertools import accumulate, chain, groupby, pairwise
 from typing import Any, final
 
@@ -47,19 +48,9 @@ _WHAT = "rollout"
 _TWO = ("atan2", "hypot", "pow", "fmod", "copysign")
 
 
-_PRELUDE = (
-    "#include <math.h>\n#include <string.h>\n"
-    "#if defined(__AVX512F__)\n#define BYTES 64\n#elif defined(__AVX__)\n#define BYTES 32\n"
-    "#else\n#define BYTES 16\n#endif\n"
-    "#define LANES ((long)(BYTES / sizeof(REAL)))\n"
-    "const long lanes = BYTES / sizeof(REAL);\n"
-    "#define ZERO ((REAL)0)\n#define ONE ((REAL)1)\n"
-    "typedef REAL V __attribute__((vector_size(BYTES)));\n"
-    "typedef REAL U __attribute__((vector_size(BYTES), aligned(4), may_alias));\n"
-    "typedef INT I __attribute__((vector_size(BYTES)));\n"
-    "#define ALL(number) ((V){0} + (REAL)(number))\n"
-    "#define EACH for (int l = 0; l < LANES; l++)\n"
-    "#define pick(c, a, b) ((V)(((c) & (I)(a)) | (~(c) & (I)(b))))\n"
+_PRELUDE, FLY, BACK = (
+    resources.files("residnet.dynamics").joinpath(name).read_text()
+    for name in ("lanes.h", "fly.c", "back.c")
 )
 _ONE_BY_ONE = {
     name: f"static __attribute__((noinline)) V v_{name}"
@@ -187,16 +178,6 @@ _PRODUCT = "".join(
     )
 )
 """Numbers [count] of a row times a matrix [count, to_count], and times the transposed of one."""
-_OUTER = """static __attribute__((noinline)) void outer(const REAL *restrict from, long count,
-    const REAL *restrict slope, long to_count, REAL *restrict sum) {
-    for (long i = 0; i < count; i++) {
-        V v = *(const U *)(from + i * LANES);
-        for (long j = 0; j < to_count; j++)
-            *(U *)(sum + (i * to_count + j) * LANES) += v * *(const U *)(slope + j * LANES);
-    }
-}
-"""
-"""Adds what numbers and slopes of a step give to the gradient of a matrix, each row for itself."""
 
 
 def _prelude(dtype: torch.dtype) -> str:
@@ -432,8 +413,8 @@ def _source(
     }
     text = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in counts.items())
     if trained is not None:
-        back.append(_OUTER + BACK.replace("OUTER\n", outer))
-    return "".join((_prelude(dtype), text, _AT, fly, *back[:1], FLY, *back[1:])), held, pulled
+        back.append(BACK.replace("OUTER\n", outer))
+    return "".join((_prelude(dtype), text, fly, *back[:1], FLY, *back[1:])), held, pulled
 
 
 _GIVEN = ("x", "w", "s", "q", "own", "theta")
@@ -509,56 +490,6 @@ def _slope(
         told,
     )
     return function, first
-
-
-_AT = """
-#define AT(array, n, k) (array + (n) * (k) * width + at)
-#define KEPT(array, n, k) (array + (at * steps + (k) * LANES) * (n))
-#define ROOM(n) (((n) ? (n) : 1) * LANES)
-#define BLOCKS for (long at = first * LANES; at < last * LANES; at += LANES)
-"""
-FLY = """
-void fly(const REAL *theta, const REAL *tables, const REAL *own, REAL *x, const REAL *w, REAL *s,
-         REAL *q, REAL *a, REAL *held, long keep, long steps, long width, long first, long last)
-{
-    BLOCKS {
-        REAL here[ROOM(N_HELD)];
-        for (long k = 0; k < steps; k++) {
-            /* without a gradient memories and products of the last step are all that is kept */
-            const long from = keep ? k : k & 1, to = keep ? k + 1 : ~k & 1;
-            step(AT(x, N_X, k), AT(w, N_W, k), AT(s, N_S, from), AT(q, N_Q, from),
-                 AT(own, N_OWN, 0), theta,
-                 AT(x, N_X, k + 1), AT(s, N_S, to), AT(q, N_Q, to), AT(a, N_A, k),
-                 tables, keep ? KEPT(held, N_HELD, k) : here, 0, width);
-        }
-    }
-}
-"""
-BACK = """
-void back(const REAL *theta, const REAL *tables, const REAL *own, const REAL *x, const REAL *w,
-          const REAL *s, const REAL *q, REAL *held, REAL *gx, const REAL *ga, REAL *gs,
-          REAL *pulled, REAL *total, long steps, long width, long first, long last) {
-    BLOCKS {
-        REAL slope_s[2][ROOM(N_S)], slope_q[2][ROOM(N_Q)];
-        memset(slope_q, 0, sizeof slope_q);
-        for (long i = 0; i < N_S; i++) EACH
-            slope_s[(steps - 1) & 1][i * LANES + l] = AT(gs, N_S, 0)[i * width + l];
-        for (long k = steps - 1; k >= 0; k--) {
-            slope(AT(x, N_X, k), AT(w, N_W, k), AT(s, N_S, k), AT(q, N_Q, k), AT(own, N_OWN, 0),
-                  theta, AT(gx, N_X, k + 1), slope_s[k & 1], slope_q[k & 1], AT(ga, N_A, k),
-                  AT(gx, N_X, k), slope_s[~k & 1], slope_q[~k & 1], total + at * N_TOTAL,
-                  tables, KEPT(held, N_HELD, k), KEPT(pulled, N_PULLED, k), width);
-OUTER
-        }
-        for (long i = 0; i < N_S; i++) EACH
-            AT(gs, N_S, 0)[i * width + l] = slope_s[1][i * LANES + l];
-    }
-}
-"""
-"""The slope of the state at a step's end is what came from outside and from the steps after it.
-
-What a step leaves stands where the one before it looks: for step 0 that is place ~0 & 1.
-"""
 
 
 class _Step(nn.Module):

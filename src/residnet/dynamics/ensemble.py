@@ -50,8 +50,7 @@ class MeanHead(ResidualHead):
         self.widths = [member.n_state for member in members]
         self.n_state = sum(self.widths)
 
-    def _each(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the members' residuals [K, B, n] and their memories side by side."""
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         residuals: list[Tensor] = []
         memory: list[Tensor] = []
         begin = 0
@@ -60,21 +59,13 @@ class MeanHead(ResidualHead):
             residuals.append(rho)
             memory.append(after)
             begin += self.widths[i]
-        return torch.stack(residuals), torch.cat(memory, dim=-1)
+        return torch.stack(residuals).mean(dim=0), torch.cat(memory, dim=-1)
 
-    def _sequences(self, z: Tensor) -> Tensor:
-        """Return the members' residuals [K, B, T, n] along channels [B, T, nz]."""
+    def sequence(self, z: Tensor) -> Tensor:
         residuals: list[Tensor] = []
         for member in self.members:
             residuals.append(member.sequence(z))  # type: ignore[operator]
-        return torch.stack(residuals)
-
-    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        residuals, memory = self._each(z, s)
-        return residuals.mean(dim=0), memory
-
-    def sequence(self, z: Tensor) -> Tensor:
-        return self._sequences(z).mean(dim=0)
+        return torch.stack(residuals).mean(dim=0)
 
     def warmup(self, z: Tensor) -> Tensor:
         memory: list[Tensor] = []

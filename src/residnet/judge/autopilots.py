@@ -181,10 +181,9 @@ def sea_flights(
     dt: float,
     duration: float,
     seed: int,
-    rows: int = 8,
 ) -> Flights:
-    """Run steps of the reference with the nominal vessel in several seaways."""
-    disturbance = Disturbance(waves=waves)
+    """Run steps of the reference with the nominal vessel in eight seaways."""
+    disturbance, rows = Disturbance(waves=waves), 8
     return fly(
         SteeredPlant(plant, calm=False),
         policy,

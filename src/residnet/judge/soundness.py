@@ -63,8 +63,8 @@ _FRACTIONS, _CRUISE = (0.0, 0.25, 0.5, 0.67, 1.0, 1.5), 0.67
 """Speeds of straight running, in the largest of the training data."""
 _CORNERS = 64
 """Corners of the inputs' ranges: all of up to six inputs."""
-_HELD = 0.02
-"""Share of an input's range within which it is held."""
+_HELD, _SHORTEST = 0.02, 5.0
+"""Share of an input's range within which it is held, and for how long in s at least."""
 _GROWN, _STAYED, _DECAYED = 20.0, 3.0, 3.0
 _MOST, _SETTLING = 20, 0.25
 """Steady runs that are looked at, and the share of each that settles; chosen by hand."""
@@ -156,18 +156,18 @@ class Recorded:
         return cls(torch.from_numpy(x), torch.from_numpy(w), longest, steady_runs(logs, step))
 
 
-def steady_runs(logs: Sequence[Prepared], step: float, shortest: float = 5.0) -> list[SteadyRun]:
+def steady_runs(logs: Sequence[Prepared], step: float) -> list[SteadyRun]:
     """Return the stretches of logs whose inputs hold within 2 % of their ranges.
 
     The first quarter of each is left out, in which the motion settles, and so are stretches of
-    fewer than `shortest` seconds.
+    fewer than five seconds.
     """
     used = [log.w[log.usable] for log in logs if log.usable.any()]
     ranges = np.max([w.max(0) for w in used], 0) - np.min([w.min(0) for w in used], 0)
     tolerance = _HELD * np.maximum(ranges, 1e-12)
     out = []
     for log in logs:
-        for begin, end in _held(log, tolerance, round(shortest / step)):
+        for begin, end in _held(log, tolerance, round(_SHORTEST / step)):
             rows = slice(begin + int(_SETTLING * (end - begin)), end)
             y, lateral = log.smooth[rows], log.smooth[rows, LATERAL]
             x = y.mean(0)

@@ -37,8 +37,9 @@ _ITERATIONS = 3000
 """Most rounds of coordinate descent for one penalty."""
 _TOLERANCE = 1e-4
 """Gap to the optimum at which coordinate descent ends."""
-LEAST_DAMPING = 1e-8
-"""Damping that changes no digit of a step that matters."""
+_LEAST_DAMPING, _ATTEMPTS = 1e-8, 8
+"""Damping that changes no digit of a step that matters, and dampings tried before a point counts as
+the minimum."""
 
 Point = TypeVar("Point")
 
@@ -242,7 +243,6 @@ def descend(
     *,
     gain: float,
     damping: float = 1e-3,
-    attempts: int = 8,
 ) -> Descent[Point]:
     """Descend to a minimum by Levenberg's and Marquardt's method.
 
@@ -254,19 +254,18 @@ def descend(
         gain: share of the cost that a step must gain for another one.
         damping: of the first step, in units of the Hessian's diagonal; a tenth after a step that
             gains, ten times after one that does not. 0 for Gauss-Newton as long as that gains.
-        attempts: dampings tried before a point counts as the minimum.
     """
     point, steps = begin, 0
     while steps < iterations:
         cost, trial = near(point)
-        for _ in range(attempts):
+        for _ in range(_ATTEMPTS):
             reached, moved = trial(damping)
             if math.isfinite(reached) and reached < cost:
                 break
-            damping = max(10.0 * damping, LEAST_DAMPING)
+            damping = max(10.0 * damping, _LEAST_DAMPING)
         else:
             break
-        point, steps, damping = moved, steps + 1, max(damping / 10.0, min(damping, LEAST_DAMPING))
+        point, steps, damping = moved, steps + 1, max(damping / 10.0, min(damping, _LEAST_DAMPING))
         if cost - reached < gain * abs(cost):
             break
     return Descent(point, steps)
