@@ -48,18 +48,6 @@ def description(card: Mapping[str, Any], token: str, version: str) -> str:
     return filled(f"fmi{version[0]}.xml", card=card, token=token, variables=variables)
 
 
-_BUILD = """<?xml version="1.0" encoding="UTF-8"?>
-<fmiBuildDescription fmiVersion="3.0">
-  <BuildConfiguration modelIdentifier="model">
-    <SourceFileSet language="C99">
-      <SourceFile name="fmi3.c"/>
-      <SourceFile name="model_code.c"/>
-    </SourceFileSet>
-  </BuildConfiguration>
-</fmiBuildDescription>
-"""
-
-
 class FmuExporter(Exporter):
     """A co-simulation unit in double precision, with its sources."""
 
@@ -108,7 +96,8 @@ class FmuExporter(Exporter):
                 for part, text in sources.items():
                     archive.writestr(f"sources/{part}", text)
                 if self.version == "3.0":
-                    archive.writestr("sources/buildDescription.xml", _BUILD)
+                    build = _packaged("fmi3_build.xml")
+                    archive.writestr("sources/buildDescription.xml", build)
                 for where, binary in binaries.items():
                     archive.write(binary, f"binaries/{where}/{NAME}{binary.suffix}")
         return card
@@ -116,20 +105,11 @@ class FmuExporter(Exporter):
     def _sources(self, written: CSource, token: str, dt: float) -> dict[str, str]:
         """Return the source files by name."""
         p, upper = written.prefix, written.prefix.upper()
-        model = (
-            f'#define {upper}_DOUBLE\n#include "model_code.h"\n\n'
-            f"#define MODEL_REAL {p}_real\n#define MODEL_STATES {upper}_STATES\n"
-            f"#define MODEL_INPUTS {upper}_INPUTS\n#define MODEL_MEMORY {upper}_MEMORY\n"
-            f"#define MODEL_DT {upper}_DT\n"
-            f'#define MODEL_DT_TEXT "{dt:g}"\n#define MODEL_STEP {p}_step\n'
-            f"#define MODEL_INITIAL_STATE {p}_initial_state\n"
-            f'#define MODEL_TOKEN "{token}"\n'
-        )
         part = f"fmi{self.version[0]}.c"
         return {
             part: _packaged(part),
             "instance.h": _packaged("instance.h"),
-            "model.h": model,
+            "model.h": filled("fmi_model.h", p=p, upper=upper, dt=f"{dt:g}", token=token),
             "model_code.c": f"#define {upper}_DOUBLE\n{written.source}",
             "model_code.h": written.header,
         }
