@@ -23,7 +23,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "data": (9725, 847),
     "documents": (2462, 227),
     "dynamics": (2246, 277),
-    "export": (1483, 172),
+    "export": (1482, 172),
     "heads": (1233, 178),
     "identification": (2070, 204),
     "judge": (1995, 212),

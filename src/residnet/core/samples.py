@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -45,18 +45,17 @@ class Samples:
 
     def where(self, keep: Tensor) -> Samples:
         """Return the samples at which `keep` [N] is True."""
-        return Samples(
-            taken(self.z, keep),
-            taken(self.target, keep),
-            taken(self.group, keep),
-            taken(self.t, keep),
-            self.kinds,
-            self.names,
+        return replace(
+            self,
+            z=taken(self.z, keep),
+            target=taken(self.target, keep),
+            group=taken(self.group, keep),
+            t=taken(self.t, keep),
         )
 
     def with_target(self, target: Tensor) -> Samples:
         """Return the same samples with another target [N, n]."""
-        return Samples(self.z, target, self.group, self.t, self.kinds, self.names)
+        return replace(self, target=target)
 
     def tally(self) -> tuple[Tally, Tally]:
         """Return what the channels are like, and the target."""

@@ -16,64 +16,42 @@ from functools import cache, lru_cache
 
 from residnet.core.errors import UsageError
 
-# unit -> (SI unit of its dimension, factor to it)
-_UNITS: dict[str, tuple[str, float]] = {
-    "-": ("-", 1.0),
-    "%": ("-", 0.01),
-    "m": ("m", 1.0),
-    "cm": ("m", 0.01),
-    "mm": ("m", 0.001),
-    "km": ("m", 1000.0),
-    "nmi": ("m", 1852.0),
-    "ft": ("m", 0.3048),
-    "m^2": ("m^2", 1.0),
-    "m^3": ("m^3", 1.0),
-    "s": ("s", 1.0),
-    "ms": ("s", 1e-3),
-    "us": ("s", 1e-6),
-    "ns": ("s", 1e-9),
-    "min": ("s", 60.0),
-    "h": ("s", 3600.0),
-    "day": ("s", 86400.0),
-    "Hz": ("1/s", 1.0),
-    "1/s": ("1/s", 1.0),
-    "1/min": ("1/s", 1.0 / 60.0),
-    "rps": ("1/s", 1.0),
-    "rpm": ("1/s", 1.0 / 60.0),
-    "1/s^2": ("1/s^2", 1.0),
-    "rpm/s": ("1/s^2", 1.0 / 60.0),
-    "m/s": ("m/s", 1.0),
-    "cm/s": ("m/s", 0.01),
-    "m/min": ("m/s", 1.0 / 60.0),
-    "kn": ("m/s", 1852.0 / 3600.0),
-    "km/h": ("m/s", 1.0 / 3.6),
-    "mph": ("m/s", 1609.344 / 3600.0),
-    "ft/s": ("m/s", 0.3048),
-    "m/s^2": ("m/s^2", 1.0),
-    "g": ("m/s^2", 9.80665),
-    "rad": ("rad", 1.0),
-    "deg": ("rad", math.pi / 180.0),
-    "cdeg": ("rad", math.pi / 18000.0),
-    "gon": ("rad", math.pi / 200.0),
-    "rad/s": ("rad/s", 1.0),
-    "rad/min": ("rad/s", 1.0 / 60.0),
-    "deg/s": ("rad/s", math.pi / 180.0),
-    "deg/min": ("rad/s", math.pi / 10800.0),
-    "rad/s^2": ("rad/s^2", 1.0),
-    "deg/s^2": ("rad/s^2", math.pi / 180.0),
-    "N": ("N", 1.0),
-    "kN": ("N", 1000.0),
-    "N m": ("N m", 1.0),
-    "kN m": ("N m", 1000.0),
-    "kg": ("kg", 1.0),
-    "t": ("kg", 1000.0),
-    "kg m": ("kg m", 1.0),
-    "kg m^2": ("kg m^2", 1.0),
-    "kg/m^3": ("kg/m^3", 1.0),
-    "V": ("V", 1.0),
-    "A": ("A", 1.0),
-    "W": ("W", 1.0),
+# SI unit of a dimension -> factors to it
+_FACTORS: dict[str, dict[str, float]] = {
+    "-": {"-": 1.0, "%": 0.01},
+    "m": {
+        "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "nmi": 1852.0, "ft": 0.3048,
+    },
+    "m^2": {"m^2": 1.0},
+    "m^3": {"m^3": 1.0},
+    "s": {
+        "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0,
+    },
+    "1/s": {
+        "Hz": 1.0, "1/s": 1.0, "1/min": 1.0 / 60.0, "rps": 1.0, "rpm": 1.0 / 60.0,
+    },
+    "1/s^2": {"1/s^2": 1.0, "rpm/s": 1.0 / 60.0},
+    "m/s": {
+        "m/s": 1.0, "cm/s": 0.01, "m/min": 1.0 / 60.0, "kn": 1852.0 / 3600.0, "km/h": 1.0 / 3.6,
+        "mph": 1609.344 / 3600.0, "ft/s": 0.3048,
+    },
+    "m/s^2": {"m/s^2": 1.0, "g": 9.80665},
+    "rad": {
+        "rad": 1.0, "deg": math.pi / 180.0, "cdeg": math.pi / 18000.0, "gon": math.pi / 200.0,
+    },
+    "rad/s": {
+        "rad/s": 1.0, "rad/min": 1.0 / 60.0, "deg/s": math.pi / 180.0, "deg/min": math.pi / 10800.0,
+    },
+    "rad/s^2": {"rad/s^2": 1.0, "deg/s^2": math.pi / 180.0},
+    "N": {"N": 1.0, "kN": 1000.0},
+    "N m": {"N m": 1.0, "kN m": 1000.0},
+    "kg": {"kg": 1.0, "t": 1000.0},
+    **{unit: {unit: 1.0} for unit in ("kg m", "kg m^2", "kg/m^3", "V", "A", "W")},
+}  # fmt: skip
+_UNITS = {
+    unit: (si, factor) for si, factors in _FACTORS.items() for unit, factor in factors.items()
 }
+"""SI unit of each unit's dimension, and the factor to it."""
 
 # a part of a unit -> what else people write for it
 _WORDS: dict[str, str] = {
@@ -110,24 +88,7 @@ _WORDS: dict[str, str] = {
     "deg/min": "degmin",
     "-": "none dimensionless",
 }
-_TURNS = (
-    "rev",
-    "revs",
-    "revolutions",
-    "r",
-    "u",
-    "tr",
-    "o",
-    "omw",
-    "omdr",
-    "obr",
-    "об",
-    "giri",
-    "转",
-    "turns",
-    "vueltas",
-    "回転",
-)
+_TURNS = "rev revs revolutions r u tr o omw omdr obr об giri 转 turns vueltas 回転"
 # where one part of a quotient is written in another way than the table does
 _PARTS = ("m", "km", "cm", "rad", "deg", "kg", "rpm", "1")
 _POWERS = {"²": "^2", "³": "^3", "**": "^", "⁻": "^-", "¹": "1"}
@@ -176,8 +137,7 @@ def known_unit(unit: str, expected: str | None = None) -> str:
         return fitting[0]
     usual = [name for name, (base, _) in _UNITS.items() if base == expected]
     if not meant:
-        near = _near(unit, expected)
-        hint = f"; did you mean '{near}'?" if near else ""
+        hint = f"; did you mean '{near}'?" if (near := _near(unit, expected)) else ""
         listed = sorted(usual) if expected is not None else [*sorted(_UNITS)[:24], "..."]
         raise UsageError(f"unknown unit '{unit}'{hint or '; valid: ' + ', '.join(listed)}")
     if not fitting:
@@ -250,7 +210,7 @@ def _written() -> Iterator[tuple[str, str]]:
         # a power stays behind the word that it belongs to
         below, caret, power = below.partition("^")
         tops = [above, *_WORDS.get(above, "").split()] if above in _PARTS else [above]
-        tops += list(_TURNS) if above == "1" and not power else []
+        tops += _TURNS.split() if above == "1" and not power else []
         for top, bottom in itertools.product(tops, [below, *_WORDS.get(below, "").split()]):
             yield f"{top}/{bottom}{caret}{power}", unit
 
