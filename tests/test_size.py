@@ -17,7 +17,7 @@ import residnet
 ROOT = Path(residnet.__file__).parent
 STATEMENTS_AND_FUNCTIONS = {
     "api": (706, 79),
-    "baselines": (891, 130),
+    "baselines": (886, 129),
     "control": (3179, 362),
     "core": (1615, 245),
     "data": (9725, 847),
@@ -27,15 +27,15 @@ STATEMENTS_AND_FUNCTIONS = {
     "heads": (1233, 178),
     "identification": (2070, 204),
     "judge": (1995, 212),
-    "manoeuvres": (965, 140),
+    "manoeuvres": (962, 140),
     "physics": (2099, 262),
-    "regression": (1737, 191),
+    "regression": (1737, 192),
     "report": (2516, 280),
     "runs": (380, 50),
     "simulators": (351, 40),
     "tasks": (3207, 265),
     "testing": (446, 26),
-    "training": (1334, 142),
+    "training": (1332, 143),
     "": (448, 52),
 }
 

@@ -244,7 +244,7 @@ class LinearSteadyConfig(SteeredConfig):
         """
         self._means(samples, ())
         for kinds in (self.speed, self.steering):
-            self._dynamic(samples, kinds)
+            of_manoeuvres(samples, kinds)
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Return the one solution; its notes hold the steady states and Phi (Table 1).
@@ -279,15 +279,6 @@ class LinearSteadyConfig(SteeredConfig):
         found = baseline.solution(fits, {})
         return [replace(found, notes={"steady_states": states, "steady_constraints": phi})]
 
-    def _dynamic(self, samples: Samples, kinds: tuple[str, ...]) -> Samples:
-        dynamic = samples.of_kinds(kinds)
-        if len(dynamic) == 0:
-            raise FitError(
-                f"baseline 'linear_steady' needs manoeuvres of kinds {list(kinds)}; kinds in the"
-                f" data: {sorted(set(samples.kinds))}"
-            )
-        return dynamic
-
     def _means(self, samples: Samples, names: Sequence[str]) -> Tensor:
         """Return the means [n, len(names)] of the settled part of every constant manoeuvre."""
         settled = samples.of_kinds(self.steady)
@@ -311,7 +302,7 @@ class LinearSteadyConfig(SteeredConfig):
         First stands A, then B = -A Phi and -A Phi_bias, errors to first order as if those of A and
         Phi were independent.
         """
-        dynamic, states = self._dynamic(samples, block.kinds), block.states
+        dynamic, states = of_manoeuvres(samples, block.kinds), block.states
         phi, phi_error = steady.coefficients, steady.errors
         x = torch.stack([dynamic.column(name) for name in states], dim=1)
         (fit,) = LeastSquares().fit(

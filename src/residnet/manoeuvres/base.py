@@ -326,7 +326,7 @@ class ClosedLoop(Manoeuvre):
     """
 
     watches: ClassVar[tuple[str, ...]]
-    told: ClassVar[tuple[str, ...]] = ()
+    told: ClassVar[tuple[str, ...]] = ("drive", "start")
     """Settings that the law needs to know as they are."""
 
     def numbers(self, helm: Helm) -> dict[str, Any]:

@@ -49,7 +49,6 @@ class Zigzag(RudderSteering, ClosedLoop):
     """
 
     watches: ClassVar[tuple[str, ...]] = ("psi",)
-    told: ClassVar[tuple[str, ...]] = ("drive", "start")
     kind: Literal["zigzag"] = "zigzag"
     heading: Radians = Field(gt=0)
     first: Literal["starboard", "port"] = "starboard"
@@ -338,7 +337,6 @@ class Spiral(ClosedLoop):
     """
 
     watches: ClassVar[tuple[str, ...]] = ("r",)
-    told: ClassVar[tuple[str, ...]] = ("drive", "start")
     kind: Literal["spiral"] = "spiral"
     drive: float = Field(ge=-1, le=1)
     steers: tuple[float, ...] = ()
@@ -482,7 +480,6 @@ class VerticalZigzag(ClosedLoop):
     """
 
     watches: ClassVar[tuple[str, ...]] = ("z",)
-    told: ClassVar[tuple[str, ...]] = ("drive", "start")
     kind: Literal["vertical_zigzag"] = "vertical_zigzag"
     drive: float = Field(ge=-1, le=1)
     dive: float = Field(ge=-1, le=1)

@@ -268,6 +268,18 @@ def require_data(x: Regressors, y: Tensor, names: Sequence[str], outputs: Sequen
         require_finite(y[rows], outputs, "output", rows.start)
 
 
+def require_more(x: Regressors, what: str) -> None:
+    """Check that there are more samples than columns, which are `what`.
+
+    Raises:
+        FitError: where there are not.
+    """
+    if len(x) <= x.shape[1]:
+        raise FitError(
+            f"{len(x)} samples do not determine {x.shape[1]} {what}; give more data or fewer terms"
+        )
+
+
 USUAL_FOLDS = 5
 """Folds of a cross-validation where nobody asks for another number."""
 

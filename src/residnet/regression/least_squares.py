@@ -20,6 +20,7 @@ from residnet.regression.estimator import (
     Solution,
     fold_numbers,
     pieces,
+    require_more,
     whole,
 )
 
@@ -64,11 +65,7 @@ class LeastSquares(Estimator):
     def solve(self, data: Data) -> list[Solution]:
         x, y, groups, names, outputs = data
         n, j = x.shape
-        if n <= j:
-            raise FitError(
-                f"{n} samples do not determine {j} coefficients ({', '.join(names)}); give longer"
-                " or more logs"
-            )
+        require_more(x, f"coefficients ({', '.join(names)})")
         scale = _sum(x, lambda _, part: part.square().sum(0)).div(n).sqrt()
         if bool((scale <= 0).any()):
             dead = [name for name, s in zip(names, scale.tolist(), strict=True) if s <= 0]
@@ -118,11 +115,7 @@ class CentredLeastSquares(Estimator):
 
     def solve(self, data: Data) -> list[Solution]:
         x, y, names = whole(data.x), data.y, data.names
-        if len(x) <= x.shape[1]:
-            raise FitError(
-                f"{len(x)} samples do not determine {x.shape[1]} basis functions; give more data or"
-                " fewer terms"
-            )
+        require_more(x, "basis functions")
         mean_x, mean_y = x.mean(0), y.mean(0)
         e, f = x - mean_x, y - mean_y
         _, singular, right = torch.linalg.svd(e, full_matrices=False)

@@ -22,6 +22,7 @@ from residnet.regression.estimator import (
     Solution,
     fold_numbers,
     pieces,
+    require_more,
 )
 
 CONSTANT = 1e-9
@@ -107,11 +108,7 @@ class FoldMoments:
             FitError: with too few groups, or no more samples than columns.
         """
         fold = fold_numbers(groups, folds) if groups is not None else y.new_zeros(len(x))
-        if len(x) <= x.shape[1]:
-            raise FitError(
-                f"{len(x)} samples do not determine {x.shape[1]} basis functions; give more data or"
-                " fewer terms"
-            )
+        require_more(x, "basis functions")
         return cls.gather(x, y, fold, int(fold.max()) + 1)
 
     def centred(self, total: Tensor) -> Centred:

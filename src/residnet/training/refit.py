@@ -73,7 +73,6 @@ def step_sensitivities(model: HybridDynamics, x: Tensor, p: Tensor, s: Tensor) -
     baseline = parametric(model)
     if model.spatial:
         return _spatial_sensitivities(model, baseline, x, p, s)
-    count = int(baseline.free_indices().numel())
     stage_x, stage_s = x, s
     after, stage_rate = s, s
     for node, weight in zip(model.nodes, model.weights, strict=True):
@@ -81,10 +80,7 @@ def step_sensitivities(model: HybridDynamics, x: Tensor, p: Tensor, s: Tensor) -
             stage_s = torch.add(s, stage_rate, alpha=node * model.dt)
             residual = zero_acceleration(x, model.dof)
             stage_x = x + node * model.dt * model.rate(stage_x, p, residual)
-        z = model.signals(stage_x, p)
-        slopes = baseline.along(z, model.signals.slopes(stage_x, p)).permute(1, 2, 0)
-        nu_dot = slopes @ stage_s
-        nu_dot[..., -count:] += baseline.sensitivity(z)
+        nu_dot = _accelerations(model, baseline, stage_x, p, stage_s)
         if model.rolls:
             nu_dot = nu_dot * model.live[:, None] + model.known_rates.T @ stage_s[:, 1:]
         stage_rate = torch.cat((_turned(model, stage_x, stage_s), nu_dot), dim=1)
@@ -101,6 +97,17 @@ def step_sensitivities(model: HybridDynamics, x: Tensor, p: Tensor, s: Tensor) -
         turned = s[:, _HEADING_ROW] + model.dt * _turned(model, new, after)
         after = torch.cat((turned, after[:, _HEADING_ROW.stop :]), dim=1)
     return after
+
+
+def _accelerations(
+    model: HybridDynamics, baseline: ParametricBaseline, x: Tensor, p: Tensor, s: Tensor
+) -> Tensor:
+    """Return the sensitivities [B, n, Q] of what the baseline accelerates at states x."""
+    z = model.signals(x, p)
+    nu_dot = baseline.along(z, model.signals.slopes(x, p)).permute(1, 2, 0) @ s
+    own = baseline.sensitivity(z)
+    nu_dot[..., -own.shape[-1] :] += own
+    return nu_dot
 
 
 _AT_ONCE = 1_024
@@ -147,7 +154,6 @@ def _spatial_sensitivities(
 ) -> Tensor:
     """Return `step_sensitivities` where rotations are composed: those of the angles themselves."""
     residual = zero_acceleration(x, model.dof)
-    count = int(baseline.free_indices().numel())
     stage_x, stage_s, rate, slope = x, s, x, s
     change, moved = torch.zeros_like(x), torch.zeros_like(s)
     total, sensed = torch.zeros_like(x), torch.zeros_like(s)
@@ -156,10 +162,7 @@ def _spatial_sensitivities(
             change, moved = node * model.dt * rate, node * model.dt * slope
             stage_x = model.moved_on(x, change)
             stage_s = _composed(x, change, stage_x, s, moved)
-        z = model.signals(stage_x, p)
-        ahead = baseline.along(z, model.signals.slopes(stage_x, p)).permute(1, 2, 0)
-        nu_dot = ahead @ stage_s
-        nu_dot[..., -count:] += baseline.sensitivity(z)
+        nu_dot = _accelerations(model, baseline, stage_x, p, stage_s)
         nu_dot = nu_dot * model.live[:, None]
         slope = _known_slopes(stage_x, stage_s, torch.cat((torch.zeros_like(s[:, :1]), nu_dot), 1))
         rate = model.rate(stage_x, p, residual)
