@@ -281,7 +281,7 @@ WRONG = [
     ("prepare(logs, 'n_port')", "expected a list"),
     ("prepare(logs, ['n_prt', 'n_stbd'])", "no channel 'n_prt'; did you mean 'n_port'"),
     ("prepare(logs, ['n_port'], step='0.1 m')", "step: unit 'm' does not measure"),
-    ("fit(data, heads=['lsmt'])", "unknown value 'lsmt'; did you mean 'lstm'"),
+    ("fit(data, heads='lsmt')", "unknown value 'lsmt'; did you mean 'lstm'"),
     ("fit(data, 'regresors')", "unknown value 'regresors'; did you mean 'regressors'"),
     ("head('lstm', hiden_size=3)", "hiden_size: unknown key; did you mean 'hidden_size'"),
     ("head('lstm', hidden_size='3')", "a whole number"),

@@ -55,9 +55,9 @@ def test_errors_are_one_line(
 @pytest.mark.parametrize(
     ("number", "code", "made_of_it"),
     [
-        (signal.SIGINT, 130, KeyboardInterrupt),
         (signal.SIGINT, 130, SystemExit),
-        (signal.SIGTERM, 143, ImportError),
+        (signal.SIGINT, 130, ImportError),
+        (signal.SIGTERM, 143, KeyboardInterrupt),
     ],
 )
 def test_signals_are_told_with_the_hint(

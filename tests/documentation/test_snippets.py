@@ -28,14 +28,13 @@ import residnet
 from residnet.cli import app
 from residnet.core.config import load_config, load_mapping, validate
 from residnet.physics.vessel import VesselConfig
-from residnet.tasks.registry import TaskConfig, load_task
+from residnet.tasks.registry import TaskConfig
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FENCE = re.compile(r"```(?P<kind>\w+)\n(?P<text>.*?)```", re.S)
 TEXT = "\n".join(page.read_text() for page in PAGES)
 NAMED = set(re.findall(r"residnet run ((?!configs\b)[a-z_0-9]+)\b(?!\.)", TEXT))
-FILES = sorted(set(re.findall(r"residnet (?:run|check) (configs/[\w./-]+\.yaml)", TEXT)))
 
 
 @dataclass(frozen=True)
@@ -136,17 +135,6 @@ def test_commands_exist(block: Block) -> None:
         for word in words[2:]:
             if re.match(r"-{1,2}[a-z]", word):
                 assert word in options, f"{block}: {words[1]} has no option {word}"
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_config_files_that_are_named_are_read(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    split = "train: [a.csv]\nvalidation: [b.csv]\ntest: [c.csv]\n"
-    (tmp_path / "esso_osaka").mkdir()
-    (tmp_path / "esso_osaka" / "split.yaml").write_text(split)
-    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
-    assert load_task(ROOT / name, []).name
 
 
 @pytest.mark.parametrize("block", of_kind("python"))

@@ -251,19 +251,6 @@ def test_nothing_is_wider_than_the_window_and_no_word_is_broken(
         assert (found.overflow, found.broken) == (0, []), width
 
 
-@pytest.mark.long
-@needs_browser
-def test_the_browser_sees_what_is_too_wide_and_what_is_broken(tmp_path: Path) -> None:
-    page = tmp_path / "bad.html"
-    page.write_text(
-        "<!DOCTYPE html><html><body><div style='width:900px'>wide</div>"
-        "<p style='width:3em;overflow-wrap:anywhere'>tacticaldiameter</p></body></html>"
-    )
-    found = layout(page, 360, tmp_path)
-    assert found.overflow > 400
-    assert found.broken == ["tacticaldiameter"]
-
-
 def test_controllers_are_compared_by_settling_time_and_effort(
     page_of: Callable[[str], Path],
 ) -> None:

@@ -54,7 +54,6 @@ BASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "csv": measured,
     "recipe": by_recipe,
     "ferry": lambda _: FERRY,
-    "trials": lambda _: {"task": "simulate", "name": "trials", "data": TINY["data"]},
     "ship": flown,
     "sweep": of_tiny(SWEEP),
     "study": of_tiny(STUDY),
@@ -64,60 +63,38 @@ BASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "import": imported,
 }
 M = "programme.manoeuvres=[{kind: "
+STOP = "stopping, name: a, drive: 1"
+ROUND = "{kind: enclosure, radius: 9}"
 RUN = "programme.model={run: runs/tiny"
 CASES: dict[str, list[tuple[str, str]]] = {
     "fit": [
-        ("heads.lstm.kind=lstn", "did you mean 'lstm'"),
         ("evaluation.selection=manuvre", "did you mean 'manoeuvre'"),
         ("'heads.ridge.features=[u, w]'", "'w' is not a channel"),
-        ("'data.identification={zigzag: 9}'", "leaves a split empty"),
         ("training.mlp.steps=3", "no head is named 'mlp'"),
         ("export.models=[lstmm]", "did you mean 'lstm'"),
         ("heads.ridge.folds=40", "head ridge: 40 folds need as many manoeuvres"),
         ("'baseline={kind: linear_steady, speed: [spiral]}'", "linear_steady"),
         ("prepare.grid.step=0.2", "must equal data.step (0.1 s)"),
-        ("study=woo2018", "'nomoto' is absent; give it, or leave the study out"),
         ("current.baseline=bseline", "did you mean 'baseline'"),
         ("current.baseline=held baselines.held.kind=still", "no regressors to tell a current by"),
     ],
     "csv": [
-        ("data.reader.channels.u.column=speed", "no column 'speed'"),
-        ("'signals.inputs=[n, rudder]' 'baseline.terms=[u, rudder]'", "rudder"),
-        ("heads.ridge.folds=9", "head ridge: 9 folds need as many manoeuvres"),
         ("training.mlp.one_step.window=99.0", "no training log holds a window of 990 samples"),
-        ("evaluation.protocols.T5.length=900", "no window of a protocol"),
     ],
     "ferry": [
-        ("'heads.ridge.terms=[u_dot u]'", "accelerations only by themselves"),
-        ("'heads.ridge={kind: ridge, terms: [u_dot]}'", "space: force"),
-        (
-            "'baseline={kind: regressors, terms: [u, tau_x]}'",
-            "needs a baseline that knows its mass",
-        ),
+        ("'baseline={kind: regressors, terms: [u, tau_x]}'", "a baseline that knows its mass"),
         ("'heads.mlp={kind: mlp, features: [u_dot]}'", "only a residual in force space knows it"),
-    ],
-    "trials": [
-        ("'data.identification={zigzag: 5}'", "leaves a split empty"),
     ],
     "ship": [
         ("~programme.vessel", "nothing flies"),
         (f"'{M}zigzag, drive: 0.5, heading: 10 deg}}]'", "give either steer"),
-        (
-            f"'{M}zigzag, drive: 0.5, rudder: 10 deg, heading: 10 deg}}]'",
-            "the vessel has no rudder",
-        ),
-        (
-            f"programme.vessel=mariner '{M}turning_circle, drive: 1, rudder: 60 deg}}]'",
-            "the vessel's goes to 40 deg",
-        ),
+        (f"'{M}zigzag, drive: 0.5, rudder: 10 deg, heading: 10 deg}}]'", "has no rudder"),
+        (f"programme.vessel=mariner '{M}turning_circle, drive: 1, rudder: 60 deg}}]'", "to 40 deg"),
         ("'programme.initial={uu: 1}'", "no state 'uu'"),
         ("'programme.initial={u: 3 deg}'", "does not measure [m/s]"),
         ("'programme.disturbance.wind={speed: 3, direction: 0}'", "has no input 'wind_speed'"),
         (f"'{M}random_steps, drive: 0.5, band: [0.2, 0.1]}}]'", "a band goes from a low"),
-        (
-            f"'{M}stopping, name: a, drive: 1}}, {{kind: stopping, name: a, drive: 1}}]'",
-            "two manoeuvres are named 'a'",
-        ),
+        (f"'{M}{STOP}}}, {{kind: {STOP}}}]'", "two manoeuvres are named 'a'"),
         (f"~programme.step '{RUN}, name: rigde}}'", "did you mean 'ridge'"),
         (f"programme.step=0.2 '{RUN}, name: ridge}}'", "must be that of model 'ridge' (0.1 s)"),
         (f"~programme.vessel '{RUN}, name: ridge}}'", "a model flies with actuators"),
@@ -143,6 +120,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
     ],
     "actuators": [
         ("~throttle", "no test is named"),
+        ("throttle.n.column=rmp", "no column 'rmp'; did you mean 'rpm'"),
     ],
     "autopilot": [
         ("conditions=null", "give 'conditions' to train it under"),
@@ -161,13 +139,12 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("peers=[pid]", "peers: 'pid' is none of"),
         ("'others={pd: {kind: document, horizon: 2 s}}'", "'pd' is a policy or peer already"),
         ("'spread.effect=[1.1, 0.9]'", "effect: low and high must be positive and in order"),
-        (
-            "'line_of_sight=[{kind: enclosure, radius: 9}, {kind: enclosure, radius: 8}]'",
-            "each kind once",
-        ),
+        (f"'line_of_sight=[{ROUND}, {ROUND}]'", "each kind once"),
     ],
     "import": [
         ("'logs=[/log_*]'", "set `root` instead"),
+        ("'logs=[raw_*]'", "'raw_*' matches nothing"),
+        ("root=nowhere", "there is no folder"),
     ],
 }
 
