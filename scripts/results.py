@@ -126,11 +126,7 @@ def make(name: str, runs: Path, now: str, minutes: float) -> str:
 
 
 def figure(where: str, runs: Path) -> str:
-    """Return a figure from a run as it stands in a page.
-
-    Raises:
-        LookupError: where the run has no such entry.
-    """
+    """Return a figure from a run as it stands in a page; a LookupError where it has none."""
     name, file, path, *scale = where.split()
     content = (runs / name / file).read_text(encoding="utf-8")
     if file == "stdout":
@@ -156,11 +152,7 @@ def lacking(name: str, runs: Path) -> str:
 
 
 def entry(content: Any, path: str) -> Any:
-    """Return what a path leads to.
-
-    Raises:
-        LookupError: where it leads nowhere.
-    """
+    """Return what a path leads to; a LookupError where it leads nowhere."""
     for key, wanted in re.findall(r"([^.\[\]]+)?(?:\[([^\]]*)\])?(?:\.|$)", path):
         if key:
             content = content[int(key) if isinstance(content, list) else key]
@@ -185,11 +177,7 @@ def shown(value: Any, factor: float, digits: int = 3) -> str:
 
 
 def rewrite(page: Path, runs: Path, missing: Sequence[str]) -> int:
-    """Put the figures of finished sources into a page; return how many changed.
-
-    Raises:
-        LookupError: where a run has no such entry.
-    """
+    """Put the figures of finished sources into a page; return how many changed."""
     text = page.read_text(encoding="utf-8")
     changed = 0
 

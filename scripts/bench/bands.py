@@ -262,7 +262,7 @@ def singles(found: Found, calibrate: int) -> None:
 def main() -> None:
     """Print the tables of a run, of a config's folds, or of drawn vessels."""
     given = bench.options(
-        __doc__, run=(), cross=None, model=None, alone=False, kinds=False, s=[],
+        __doc__, run=("runs/esso_osaka",), cross=None, model=None, alone=False, kinds=False, s=[],
         draws=0, seed=0, logs=40, test=25, others=False,
     )  # fmt: skip
     if given.draws:
