@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import subprocess
 import sys
@@ -193,15 +194,16 @@ def test_save_load_export(
 
 @pytest.mark.long
 def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> None:
+    config = copy.deepcopy(TINY)
     metrics = read_json(tiny_run / "metrics.json")
     table = metrics_table(metrics["rows"])
-    result = residnet.run(TINY, report=False)
+    result = residnet.run(config, report=False)
     pd.testing.assert_frame_equal(result.metrics, table, rtol=1e-12)
-    prepared, evaluation = TINY["prepare"], TINY["evaluation"]
+    prepared, evaluation = config["prepare"], config["evaluation"]
     data = residnet.prepare(
-        TINY["data"],
-        TINY["signals"]["inputs"],
-        forces=TINY["signals"]["forces"],
+        config["data"],
+        config["signals"]["inputs"],
+        forces=config["signals"]["forces"],
         step=prepared["grid"]["step"],
         derivative=prepared["derivative"],
         hold="start",
@@ -210,10 +212,10 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> No
     )
     models = residnet.fit(
         data,
-        TINY["baseline"],
-        {name: residnet.head(head) for name, head in TINY["heads"].items()},
-        ensembles=TINY["ensembles"],
-        training=TINY["training"],
+        config["baseline"],
+        {name: residnet.head(head) for name, head in config["heads"].items()},
+        ensembles=config["ensembles"],
+        training=config["training"],
     )
     pd.testing.assert_frame_equal(models.metrics, table, rtol=1e-9)
     assert models.selected == metrics["selected"]
