@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -273,7 +274,7 @@ def test_trials_of_a_sweep_over_their_keys() -> None:
         {"number": i, "value": 0.1 * i, "values": {"heads.size": i, "kind": "ab"[i % 2]}}
         for i in range(20)
     ]
-    content = {"keys": ["heads.size", "kind"], "log": [], "objective": "score [-]"}
+    content: dict[str, Any] = {"keys": ["heads.size", "kind"], "log": [], "objective": "score [-]"}
     content |= {"trials": [*trials, {"number": 20, "value": None, "values": {}}]}
     figure = parallel_coordinates({**content, "minimized": False})
     names = ("heads.size\n0 to 19", 'kind\n"a" to "b"', "score\n0 to 1.9")

@@ -126,7 +126,13 @@ def judged(run: Path, level: str) -> Path:
     most = 100.0 if level == "limited" else 1.1
     spans = {of: [0.9 * x, most * x] for of, x in ends.items()}
     windows = 3 if level == "too few windows" else 12
-    horizon = {"seconds": 30.0, "windows": windows, "logs": 4, "slowest": 0.9, "fastest": 1.1}
+    horizon: dict[str, Any] = {
+        "seconds": 30.0,
+        "windows": windows,
+        "logs": 4,
+        "slowest": 0.9,
+        "fastest": 1.1,
+    }
     horizon |= {"sailed": 30.0, "floor": ends, "models": {"plsr": {**ends, "intervals": spans}}}
     path = made_run(run)
     write_json(path / "limits.json", {"splits": {"test": {"whole": {"horizons": [horizon]}}}})

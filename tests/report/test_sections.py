@@ -47,15 +47,21 @@ def spread(mean: float) -> dict[str, float]:
 def made_autopilot(run: Path) -> Path:
     """Two controllers of one vessel; the second does not settle in four flights."""
     sea = {"significant_height": 1.5, "peak_period": 8.0, "direction": 45 * DEG}
-    test = {"heading": 30 * DEG, "band": DEG, "plants": 5, "bias": DEG, "bias_time": 60.0}
+    test: dict[str, Any] = {
+        "heading": 30 * DEG,
+        "band": DEG,
+        "plants": 5,
+        "bias": DEG,
+        "bias_time": 60.0,
+    }
     test |= {"overshoot": 0.1 * DEG, "wind": 10.0, "sea_time": 300.0}
     test |= {"sea": {**sea, "spectrum": {"kind": "jonswap"}}}
     resolved(run, {"task": "autopilot", "rudder": 20 * DEG, "test": test})
     rows = []
     for place, (model, kind) in enumerate({"net": "policy", "pd": "classical"}.items()):
         base = {"model": model, "kind": kind, "split": "simulated", "n": 5, "diverged": 0}
-        found = {"settling": 10.0 + place, "overshoot": 0.2 * DEG, "iae": 1.0, "travel": 0.5}
-        found = {name: spread(mean) for name, mean in (found | {"energy": 0.1}).items()}
+        means = {"settling": 10.0 + place, "overshoot": 0.2 * DEG, "iae": 1.0, "travel": 0.5}
+        found = {name: spread(mean) for name, mean in (means | {"energy": 0.1}).items()}
         for protocol in ("nominal", "corners", "random"):
             unsettled = 4 * place if protocol == "random" else 0
             rows.append({**base, "protocol": protocol, **found, "unsettled": unsettled})
@@ -130,7 +136,11 @@ def made_simulate(run: Path, logs: int = 2) -> Path:
         for craft, overshoot in (("ship", 9.0), ("model", 11.0)):
             distance = {"initial_turning_distance": 8.0, "initial_turning_distance_lengths": 2.0}
             limits = {"first_overshoot": {"limit": 10 * DEG, "kept": overshoot < 10}}
-            row = {"log": f"zigzag_{number + 1:02d}", "manoeuvre": "zigzag", "craft": craft}
+            row: dict[str, Any] = {
+                "log": f"zigzag_{number + 1:02d}",
+                "manoeuvre": "zigzag",
+                "craft": craft,
+            }
             row |= {"fault": "", "timed_out": False, "limits": limits}
             rows.append(row | {"indices": {"first_overshoot": overshoot * DEG, **distance}})
     steady = {"log": "constant_01", "manoeuvre": "constant", "indices": {}, "limits": {}}

@@ -50,7 +50,12 @@ def row(
     rmse = {name: factor * value for name, value in zip("uvr", LEVEL[model], strict=True)}
     nrmse = {name: rmse[name] / scale for name, scale in SCALES.items()}
     mean = sum(nrmse.values()) / 3
-    found = {"model": model, "kind": MODELS[model], "split": split, "protocol": protocol}
+    found: dict[str, Any] = {
+        "model": model,
+        "kind": MODELS[model],
+        "split": split,
+        "protocol": protocol,
+    }
     found |= {"manoeuvre": manoeuvre, "windows": 6, "n": 600, "diverged": 0}
     found |= {"rmse": rmse, "mae": rmse, "nrmse": nrmse | {"mean": mean}}
     found |= {"rmse_ci95": {name: [0.9 * value, 1.1 * value] for name, value in rmse.items()}}
