@@ -301,6 +301,20 @@ def test_the_side_and_the_time_of_an_answer() -> None:
         assert late.figures["lag"] == pytest.approx(-early, abs=0.25)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_turning_circle_that_loses_its_speed_is_no_reversed_rudder(side: float) -> None:
+    t, r = np.arange(0.0, 900.0), np.zeros(900)
+    delta = side * np.clip((t - 60.0) / 14.0, 0.0, 1.0) * np.radians(35.0)
+    speed = np.where(t < 60.0, 14.0, 6.0 + 8.0 * np.exp(-(t - 60.0) / 150.0))
+    for k in range(t.size - 1):
+        r[k + 1] = r[k] + 0.15 * (0.009 * speed[k] * delta[k] - r[k])
+    r += np.random.default_rng(5).normal(0.0, 2e-4, r.size)
+    good = one(inspect(Log("circle", t, {"r": r, "delta": delta})), "rudder_sign")
+    assert good.level == "note"
+    wrong = one(inspect(Log("circle", t, {"r": r, "delta": -delta})), "rudder_sign")
+    assert wrong.level == "will mislead"
+
+
 @pytest.mark.parametrize(("period", "late"), [(5.8, 0.1), (8.4, 0.4), (11.0, 0.4), (11.0, 0.1)])
 def test_a_repeated_manoeuvre_is_not_answered_half_a_period_early(
     period: float, late: float

@@ -292,9 +292,14 @@ def rudder_sign(log: Record, found: Check) -> Iterator[Finding]:
     r, given = log.smooth("r")[good], steer[good]
     if good.sum() >= 2 * FEWEST and float(np.abs(r).mean()) >= 6.0 * log.noise("r"):
         one_sided = all(abs(x.sum()) > 0.95 * np.abs(x).sum() for x in (r, given))
+        # of a turning circle the loss of speed slows the turn, which no rudder does
         if one_sided and float(r.sum()) * float(given.sum()) < 0.0:
             text = f"{name} stays on one side and the vessel turns to the other"
             yield found(text, fix=_TURN_AND_CHECK)
+        elif one_sided:
+            text = f"{name} stays on one side and the vessel turns to it"
+            yield found(text, level="note", fix="")
+        if one_sided:
             return
     # a rudder turns by the square of the speed past it
     flow = np.abs(log.smooth("u")) if "delta" in name and "u" in log else np.ones(len(log))

@@ -662,6 +662,11 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
                 surprise, size = min((surprise, size), (float(near.fun), float(near.x)))
             text = _in_words(kind, name, log.units[name], size)
             out.append(Cause(kind, name, size, surprise, text))
+    for name in (one for one in fleet.driving if f"cmd_{one}" in fleet.driving):
+        both = {one: -log[one] for one in (name, f"cmd_{name}")}
+        text = f"{name} and its command would have to have the opposite sign"
+        surprise = model.surprise(fleet.of(changed(log, both)))
+        out.append(Cause("sign", name, -1.0, surprise, text))
     for port in (one for one in fleet.driving if one.endswith("_port")):
         if (stbd := port.removesuffix("port") + "stbd") in fleet.driving:
             surprise = model.surprise(fleet.of(changed(log, {port: log[stbd], stbd: log[port]})))
