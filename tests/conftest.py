@@ -16,7 +16,7 @@ DEAR = (
     "corpus/test_corpus.py",
     "tasks/test_refusals.py",
     "data/test_doctor_faults.py",
-    "contracts/test_six.py",
+    "contracts/test_beyond_the_plane.py",
     "physics/test_every_vessel.py",
     "identification/monitoring/test_monitor.py",
     "data/test_others.py",

@@ -71,20 +71,6 @@ def test_linear_baseline_equals_the_matrix_exponential() -> None:
         np.testing.assert_allclose(states[:, k + 1, 3:], nu, atol=2e-8)
 
 
-def test_heading_and_position_follow_the_velocities() -> None:
-    """Constant velocities: a circle of radius U / r."""
-    model = linear()
-    model.baseline.theta.data.zero_()  # type: ignore[union-attr, operator]
-    x0 = torch.tensor([[1.0, 2.0, 0.5, 2.0, 0.0, 0.1]], dtype=torch.float64)
-    with torch.no_grad():
-        states, _, _ = Rollout(model)(x0, torch.zeros(1, 300, 2, dtype=torch.float64), x0[:, :0])
-    t = 0.1 * np.arange(301)
-    psi = 0.5 + 0.1 * t
-    np.testing.assert_allclose(states[0, :, 2], psi, atol=1e-12)
-    np.testing.assert_allclose(states[0, :, 0], 1 + 20 * (np.sin(psi) - np.sin(0.5)), atol=1e-8)
-    np.testing.assert_allclose(states[0, :, 1], 2 - 20 * (np.cos(psi) - np.cos(0.5)), atol=1e-8)
-
-
 def test_a_run_in_two_parts_is_the_whole_run() -> None:
     model, x0, w = lstm_model(), starts(3), inputs(3, 30)
     s = model.initial_state(3).double()

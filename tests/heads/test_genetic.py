@@ -10,7 +10,7 @@ import pytest
 import sympy
 import torch
 from made_equations import CHANNELS, draw_ship
-from made_odin import FORCE_TRUTH, MSD_TRUTH, force_logs, msd_log
+from made_odin import FORCE_TRUTH, force_logs
 from made_samples import sampled
 
 from residnet.core.names import ACCELERATION
@@ -28,7 +28,6 @@ from residnet.regression.expressions import (
     tables,
     term,
 )
-from residnet.regression.genetic import breed, limits_of
 from residnet.testing import example_samples
 from residnet.testing.checks import example_model, example_spec
 
@@ -81,26 +80,6 @@ def test_noise_hides_no_equation_that_a_sparse_search_finds(final: bool) -> None
             }
             wanted = {tuple(sorted(parse_term(term, CHANNELS))): truth[term] for term in truth}
             assert found == pytest.approx(wanted, rel=0.1)
-
-
-@pytest.mark.parametrize("final", [True, False])
-def test_mass_spring_damper(final: bool) -> None:
-    """Document 000 eq. (5.13); without a final choice the result may hold terms that do nothing."""
-    evolution: dict[str, Any] = {"population": 500, "tournament": 3, "depth": 7, "split": "sum"}
-    evolution |= {"operators": ["+", "-", "*", "abs"]}
-    config = GeneticConfig.model_validate(
-        {"evolution": evolution} | ({} if final else {"final": None})
-    )
-    log, names = msd_log(), ("x", "w", "tau")
-    algebra = Algebra(names, limits_of(config.evolution))
-    bred = breed(algebra, log, log["w_dot"], np.arange(len(log["t"])) % 50 < 35, config, seed=1)
-    found = {
-        term(algebra, product): value
-        for product, value in zip(bred.products, bred.values, strict=True)
-    }
-    assert {name: found.pop(name) for name in MSD_TRUTH} == pytest.approx(MSD_TRUTH, rel=1e-6)
-    assert not (final and found)
-    assert all(abs(value) < 1e-6 for value in found.values())
 
 
 def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:

@@ -83,20 +83,13 @@ def test_the_jets_equations_from_steps(file: Path) -> None:
             assert found(notes, axis) == pytest.approx(terms, rel=0.01)
 
 
-@pytest.mark.parametrize("delay", [0, 3])
-def test_structure_of_random_equations_with_products_magnitudes_and_ratios(delay: int) -> None:
-    """A tenth of a standard deviation of noise; inputs at once or 0.3 s late."""
-    right = 0
-    for seed in (3, 4):
-        drawn = draw(seed, delay=delay)
-        config: dict[str, Any] = {"candidates": SPACE.model_dump()}
-        if delay:
-            config["delay"] = {"channels": ["n", "delta"], "longest": 5}
-        _, notes = fitted(config, drawn.samples)
-        for axis, terms in zip(ACCELERATION, drawn.truth, strict=True):
-            right += set(found(notes, axis)) == set(terms)
-        assert notes.get("delay", {"steps": 0})["steps"] == delay
-    assert right == 6
+@pytest.mark.parametrize("seed", [3, 4])
+def test_structure_of_random_equations_with_products_magnitudes_and_ratios(seed: int) -> None:
+    """A tenth of a standard deviation of noise."""
+    drawn = draw(seed)
+    _, notes = fitted({"candidates": SPACE.model_dump()}, drawn.samples)
+    for axis, terms in zip(ACCELERATION, drawn.truth, strict=True):
+        assert set(found(notes, axis)) == set(terms)
 
 
 @pytest.mark.parametrize("ratios", [False, True])
@@ -147,10 +140,10 @@ def measured(log: Log, noise: float, window: float, step: float) -> Samples:
 
 
 def test_velocities_alone_by_the_weak_form() -> None:
-    """1 % noise on velocities, forces in steps, jumps masked: 600 s at 25 Hz. The linear drag in
+    """1 % noise on velocities, forces in steps, jumps masked: 300 s at 25 Hz. The linear drag in
     surge, a tenth of its acceleration's noise, is the hardest.
     """
-    data = measured(step_log(0, 600.0, 0.04), 0.01, 0.12, 0.04)
+    data = measured(step_log(0, 300.0, 0.04), 0.01, 0.12, 0.04)
     _, weak = fitted({**FORCE, "estimator": {"kind": "weak", "window": "2 s"}}, data)
     for axis, terms in FORCE_TRUTH.items():
         got = found(weak, axis)
@@ -171,18 +164,6 @@ SPRING: dict[str, Any] = {
     "candidates": {"motions": ["u", "v"], "input_degree": 2, "coupling": ["u", "v"]}
 }
 SPRING_TRUTH = {"u": MSD_TRUTH["x"], "v": MSD_TRUTH["w"], "tau": MSD_TRUTH["tau"]}
-
-
-def test_the_mass_spring_damper_without_and_with_noise() -> None:
-    log = msd_log()
-    _, notes = fitted(SPRING, spring(log, log["w_dot"]))
-    assert found(notes, "v_dot") == pytest.approx(SPRING_TRUTH, rel=1e-9)
-    right = 0
-    for seed in range(10):
-        noise = 0.1 * np.random.default_rng(seed).uniform(-1, 1, len(log["t"]))
-        _, notes = fitted(SPRING, spring(log, log["w_dot"] + noise))
-        right += set(found(notes, "v_dot")) == set(SPRING_TRUTH)
-    assert right >= 8
 
 
 def test_a_delay_is_found_inside_the_regression_and_remembered() -> None:

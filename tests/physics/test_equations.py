@@ -10,17 +10,16 @@ import numpy as np
 import pytest
 import torch
 from exact_steps import NomotoDynamics
-from numpy.polynomial.polynomial import polyval, polyval2d
+from numpy.polynomial.polynomial import polyval
 from scipy.signal import TransferFunction, lsim
 from torch import Tensor
 
 from residnet.core.config import load_config
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
+from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.hull import PHASES, froude_number, phase_of
-from residnet.physics.plant import Plant
 from residnet.physics.vessel import VesselConfig, load_vessel
 from residnet.physics.vessel_file import vessel_files
 
@@ -70,66 +69,17 @@ def test_matrices_of_a_hull_written_out() -> None:
 @pytest.mark.parametrize(
     ("name", "speed", "pole", "allowed"),
     [
-        ("milliampere", 0.0, -0.019, 1e-3), ("milliampere", 0.2, 0.0064, 2e-4),
-        ("milliampere", 1.0, 0.135, 3e-3), ("milliampere", 2.0, 0.296, 6e-3),
-        ("odin_forces", 1.0, 0.194, 6e-3), ("odin_forces", 10.0, 0.73, 6e-3),
+        ("milliampere", 0.0, -0.019, 1e-3),
+        ("milliampere", 2.0, 0.296, 6e-3),
+        ("odin_forces", 1.0, 0.194, 6e-3),
     ],
-)  # fmt: skip
+)
 def test_poles_of_sway_and_yaw(name: str, speed: float, pole: float, allowed: float) -> None:
     """Corrections J6 and H5: unstable above walking pace."""
-    hull = plant_of(name).hull
-    nu = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
+    hull, nu = plant_of(name).hull, torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
     slope = torch.autograd.functional.jacobian(lambda x: hull(x, torch.zeros_like(x)), nu)
     largest = float(torch.linalg.eigvals(slope[1:, 1:]).real.max())
     assert largest == pytest.approx(pole, abs=allowed)
-
-
-def test_speeds_in_the_end() -> None:
-    """Surge balances: W5's 2.19 m/s, a pivot at 25.9 deg/s; H16's 9.96 m/s; document 002's drag."""
-    boat = plant_of("wam_v_cal").in_calm_water()
-    one, none = torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-    w = boat.demand(torch.cat((one, none)), torch.cat((none, one)))
-    end = rolled(
-        RecordedPlantDynamics(boat, 0.05), boat.approach(2), w[:, None].expand(-1, 1200, -1)
-    )
-    assert float(end[0, -1, 3]) == pytest.approx(2.19, abs=0.005)
-    assert np.degrees(float(end[1, -1, 5])) == pytest.approx(25.9, abs=0.05)
-    assert float(end[1, -1, 4]) == pytest.approx(-0.19, abs=0.005)
-    jets = plant_of("odin_jets").in_calm_water()
-    w = torch.tensor([[2000 / 60, 0.0]], dtype=torch.float64)[:, None].expand(1, 1200, 2)
-    assert float(rolled(RecordedPlantDynamics(jets, 0.05), jets.approach(1), w)[0, -1, 3]) == (
-        pytest.approx(9.96, abs=0.005)
-    )
-    ferry = plant_of("milliampere", "actuators.response={kind: immediate}").in_calm_water()
-    w = torch.tensor([[200.0, 0.0, 0.0]], dtype=torch.float64)[:, None].expand(1, 3000, 3)
-    u = float(rolled(RecordedPlantDynamics(ferry, 0.1), ferry.approach(1), w)[0, -1, 3])
-    assert 27.632 * u + 110.064 * u**2 + 13.965 * u**3 == pytest.approx(200.0, rel=1e-6)
-
-
-def test_jet_model_against_the_printed_polynomials() -> None:
-    """Surge by (6.21) with g of (6.20) as H9 corrects it, and the yaw terms of (6.54) as H6 and H7
-    do; both rounded to three digits.
-    """
-    random = np.random.default_rng(0)
-    low, high = np.array([[0, 300, -0.3], [10, 2000, 0.3]])
-    u, rpm, nozzle = random.uniform(low, high, (400, 3)).T
-    plant = plant_of("odin_jets")
-    x = torch.zeros(400, 6, dtype=torch.float64)
-    x[:, 3] = torch.from_numpy(u)
-    w = torch.zeros(400, len(plant.inputs), dtype=torch.float64)
-    w[:, :2] = torch.from_numpy(np.stack([rpm / 60, nozzle], axis=1))
-    rate = plant.rate(x, w).numpy()
-    # by powers of the speed, then of the revolutions
-    g = polyval2d(u, rpm, [
-        [0.048, -1.0e-3, 2.98e-6], [-2.65e-3, 5.554e-5, -1.65e-7], [2.55e-5, -5.31e-7, 1.58e-9],
-    ])  # fmt: skip
-    # 0.054 m/s^2 is what correction H11 measured between (6.20) and (6.16)
-    assert np.abs(rate[:, 3] - (g * np.cos(nozzle) - 0.0101 * u - 0.0492 * u**2)).max() < 0.06
-    yaw = polyval2d(u, rpm, [
-        [-0.04321, 9.03e-4, -2.683e-6], [2.396e-3, -5.01e-5, 1.488e-7],
-        [-2.294e-5, 4.79e-7, -1.425e-9],
-    ])  # fmt: skip
-    assert np.abs(rate[:, 5] - yaw * np.sin(nozzle)).max() < 5e-3 * np.abs(rate[:, 5]).max()
 
 
 def test_jets_thrust_as_printed_saturate_and_turn_to_the_side_that_is_asked_for() -> None:
@@ -206,26 +156,16 @@ def test_allocation_makes_the_wanted_forces_with_least_thrust() -> None:
 THRUST = 1960 * 7.71**2
 
 
-def inputs(plant: Plant, rows: int, delta: float = 0.0, thrust: float = THRUST) -> torch.Tensor:
-    w = torch.zeros(rows, len(plant.inputs), dtype=torch.float64)
-    w[:, 0], w[:, 1] = delta, thrust
-    return w
-
-
-@pytest.mark.parametrize("name", ["patrol_p06", "patrol_p06_linear"])
-def test_a_foil_beyond_stall_lifts_no_more(name: str) -> None:
-    rudders = load_vessel(name).actuators.build()
+def test_a_foil_beyond_stall_lifts_no_more() -> None:
+    rudders = load_vessel("patrol_p06").actuators.build()
     delta = torch.linspace(-0.6, 0.6, 241, dtype=torch.float64)
     u, v, thrust = (torch.full_like(delta, value) for value in (7.0, 0.5, THRUST))
     lift, drag = rudders.config.foil(delta, u, v, thrust)
     torch.testing.assert_close(lift, -lift.flip(0), rtol=1e-12, atol=1e-9)
     torch.testing.assert_close(drag, drag.flip(0), rtol=1e-12, atol=1e-9)
     stalled = delta > np.radians(23)
-    if name.endswith("linear"):
-        torch.testing.assert_close(lift, 7008.8 * 49.0 * delta)
-    else:
-        assert lift[stalled].unique().numel() == 1
-        assert bool((lift[~stalled].diff() >= 0).all())
+    assert lift[stalled].unique().numel() == 1
+    assert bool((lift[~stalled].diff() >= 0).all())
 
 
 def test_rudders_at_rest() -> None:
@@ -241,43 +181,6 @@ def test_rudders_at_rest() -> None:
     assert tau[1].abs().max().item() == 0.0
     (slope,) = torch.autograd.grad(tau.sum(), nu)
     assert bool(torch.isfinite(slope).all())
-
-
-@pytest.mark.long
-def test_heel_and_steady_turns_are_those_of_errata() -> None:
-    """G9: 10 deg of rudder heel 1.25 deg inward at first and 3.34 deg outward in the end; G17, G18:
-    7.00 m/s and 190 m at 5 deg, 124 m at 10 deg.
-    """
-    # the rudder steps
-    plant = plant_of("patrol_p06", "actuators.rate=null")
-    w = torch.cat([inputs(plant, 1, np.radians(angle)) for angle in (5.0, 10.0)])
-    states = rolled(
-        RecordedPlantDynamics(plant, 0.05), plant.approach(2), w[:, None].expand(-1, 4000, -1)
-    )
-    phi = np.degrees(states[1, :, 2].numpy())
-    assert phi.max() == pytest.approx(1.25, abs=0.01)
-    assert phi[-1] == pytest.approx(-3.34, abs=0.01)
-    assert np.degrees(float(states[0, -1, 7])) == pytest.approx(2.13, abs=0.01)
-    assert float(states[0, -1, 4]) == pytest.approx(7.00, abs=0.01)
-    speed = torch.linalg.vector_norm(states[:, -1, 4:6], dim=-1)
-    radius = speed / (states[:, -1, 7] * torch.cos(states[:, -1, 2]))
-    assert radius.tolist() == pytest.approx([190, 124], abs=0.7)
-
-
-def test_roll_decays_with_the_period_of_errata() -> None:
-    """From 10 deg: 6.63 s at 7.71 m/s, 6.69 s at rest; document 004, Table 5.2 prints 6.76 s."""
-    plant = plant_of("patrol_p06")
-    x0 = plant.approach(2)
-    x0[1, 4] = 0.0
-    x0[:, 2] = np.radians(10.0)
-    w = torch.cat((inputs(plant, 1), inputs(plant, 1, 0.0, 0.0)))
-    states = rolled(RecordedPlantDynamics(plant, 0.01), x0, w[:, None].expand(-1, 3000, -1))
-    for row, period in enumerate((6.63, 6.69)):
-        phi = states[row, :, 2].numpy()
-        at = np.flatnonzero((phi[:-1] > 0) & (phi[1:] <= 0))
-        crossings = 0.01 * (at + phi[at] / (phi[at] - phi[at + 1]))
-        assert np.diff(crossings)[:2].mean() == pytest.approx(period, abs=0.04)
-        assert np.abs(phi[-600:]).max() < 0.5 * phi[0]
 
 
 LENGTH, SERVICE = 160.93, 7.7175
@@ -456,23 +359,7 @@ def test_the_exact_step_is_that_of_rk4(name: str) -> None:
     assert (np.abs(exact - stepped).max(0) <= 1e-7 * np.ptp(exact, axis=0)).all()
 
 
-def test_a_steady_turn_and_an_unstable_ship() -> None:
-    """Corrections G18, G20: 5 deg turn at 17.3 deg/s, at 3.2 m/s on a radius of 10.57 m."""
-    plant = plant_of("nomoto_oceanos")
-    end = flown(NomotoDynamics(plant, 0.1), np.full(600, np.radians(5.0)))[-1]
-    assert np.degrees(end[5]) == pytest.approx(17.35, abs=0.01)
-    assert end[3] / end[5] == pytest.approx(10.57, abs=0.01)
+def test_an_unstable_ship_has_both_signs_negative() -> None:
     plant = plant_of("nomoto_oceanos", "K.value=-1", "T.value=-20")
     end = flown(NomotoDynamics(plant, 0.1), np.full(100, 0.1))[-1]
     assert end[5] == pytest.approx(0.1 * (np.exp(10.0 / 20) - 1), rel=1e-12)
-
-
-def test_the_linear_mariner_is_the_mariner_about_straight_motion() -> None:
-    """Poles, gains and zeros from derivatives of the Abkowitz series at 15 kn."""
-    series, linear = load_vessel("mariner").build(), load_vessel("nomoto_mariner").build()
-    x = series.approach(1)
-    w = torch.zeros(1, len(series.inputs), dtype=torch.float64)
-    slope = torch.autograd.functional.jacobian(lambda x: series.rate(x, w)[0, 4:6], x)[:, 0]
-    delta = series.state.index("delta")
-    torch.testing.assert_close(linear.a, slope[:, 4:6], rtol=1e-6, atol=0)
-    torch.testing.assert_close(linear.b, slope[:, delta], rtol=1e-6, atol=0)

@@ -75,25 +75,9 @@ def test_a_vessel_in_a_batch_with_gradients(name: str) -> None:
     assert {"x", "y", "psi", "u", "v", "r"} <= set(plant.state)
 
 
-VARIOUS = ("wam_v_cal", "milliampere", "milliampere_azimuth", "odin_jets", "patrol_p06",
-           "patrol_p06_wind", "example_rudder_boat", "mariner", "nomoto_mariner")  # fmt: skip
-
-
-@pytest.mark.parametrize("name", VARIOUS)
-def test_gradients_are_those_of_differences(name: str) -> None:
-    plant = load_vessel(name).build()
-    x, w = scene(plant, 2)
-    # in units in which each input moves the vessel alike
-    scale = torch.where(w.abs() > 1.0, w.abs(), torch.ones_like(w))
-    assert torch.autograd.gradcheck(
-        lambda x, w: plant.rate(x, w * scale), (x.requires_grad_(), (w / scale).requires_grad_()),
-        atol=1e-6,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("name", vessel_files())
 def test_a_vessel_turns_to_starboard_where_it_is_steered(name: str) -> None:
-    """From where trials start, at full drive, to one side and the other, in mirror images."""
+    """From where trials start, at full drive, to one side and the other."""
     plant = load_vessel(name).build()
     x = plant.approach(2)
     steer = torch.tensor([0.3, -0.3], dtype=torch.float64)
@@ -104,9 +88,6 @@ def test_a_vessel_turns_to_starboard_where_it_is_steered(name: str) -> None:
     turned = states[:, -1, plant.state.index("psi")]
     assert float(turned[0]) > 0 > float(turned[1])
     assert bool((states[:, -1, plant.state.index("u")] > 0).all())
-    if name in SYMMETRIC:
-        other = mirrored(states[1], plant.state)
-        torch.testing.assert_close(other, states[0], rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", SYMMETRIC)
@@ -164,22 +145,6 @@ def test_a_current_carries_and_a_force_in_earth_axes_turns(name: str) -> None:
     torch.testing.assert_close(plant.rate(x, w), plant.rate(x, turned), rtol=1e-9, atol=1e-12)
 
 
-def test_a_manoeuvre_in_a_current_is_the_manoeuvre_and_the_drift() -> None:
-    """Galilei: also while the hull turns and its water velocities change with it."""
-    plant = load_vessel("wam_v_cal").build()
-    w = torch.zeros(2, 500, len(plant.inputs), dtype=torch.float64)
-    both = torch.tensor([0.6, 0.3], dtype=torch.float64)
-    w[:, :, :2] = plant.demand(both[0], both[1])
-    w[1, :, 5], w[1, :, 6] = 0.3, 0.2
-    x0 = plant.approach(2)
-    x0[1, 3], x0[1, 4] = 0.3, 0.2
-    with torch.no_grad():
-        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.04))(x0, w, x0[:, :0])
-    drift = states[1, -1, :3] - states[0, -1, :3]
-    wanted = torch.tensor([0.3 * 20, 0.2 * 20, 0.0], dtype=torch.float64)
-    torch.testing.assert_close(drift, wanted, rtol=0, atol=1e-4)
-
-
 _SKEW = ("rigid_body.x_G.value=0.4", "added_mass.Y_rdot.value=-60", "added_mass.N_vdot.value=-60")
 _EVEN = ("added_mass.K_vdot.value=-296000", "added_mass.N_vdot.value=-1.4e6")
 LOSSLESS = {
@@ -187,20 +152,12 @@ LOSSLESS = {
     "patrol_p06": ("forces={}", *_EVEN),
     "remus_100": ("forces={}", "rigid_body.x_G.value=0.03", "buoyancy.volume.value=0.0305"),
 }
-BRAKED = (
-    *_EVEN,
-    "forces={X: {u|u|: {value: -1960, unit: kg/m, source: made}},"
-    " Y: {v|v|: {value: -3700, unit: kg/m, source: made}},"
-    " K: {p: {value: -5e5, unit: kg m^2/s, source: made}},"
-    " N: {r|r|: {value: -2e8, unit: kg m^2, source: made}}}",
-)
 
 
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [
         *LOSSLESS.items(),
-        ("patrol_p06", BRAKED),
         ("wam_v_vrx", ()),
         ("milliampere", ()),
         ("bluerov2_heavy", ()),
@@ -244,32 +201,3 @@ def test_energy_is_kept_without_damping_and_falls_with_it(
         assert float((energy / energy[:, :1] - 1).abs().max()) < 1e-7
     else:
         assert bool((energy.diff(dim=1) < 0).all())
-
-
-def test_the_torpedo_makes_its_published_speed() -> None:
-    """2.5 m/s at 1525 rpm (Fossen, PythonVehicleSimulator, remus100.py), within 5 %."""
-    plant = load_vessel("remus_100").build()
-    w = torch.zeros(1, 150, len(plant.inputs), dtype=torch.float64)
-    w[:, :, plant.inputs.index("cmd_n")] = 1525.0 / 60.0
-    x0 = plant.approach(1)
-    with torch.no_grad():
-        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.2))(x0, w, x0[:, :0])
-    assert float(states[0, -1, plant.state.index("u")]) == pytest.approx(2.5, rel=0.05)
-
-
-@pytest.mark.parametrize("name", ["remus_100", "bluerov2_heavy"])
-def test_a_submerged_vessel_rights_itself_and_settles(name: str) -> None:
-    """Heeled and pitched at rest it comes back upright, and what is heavier than water sinks."""
-    plant = load_vessel(name).build()
-    x0 = torch.zeros(1, len(plant.state), dtype=torch.float64)
-    x0[0, 3], x0[0, 4] = 0.5, 0.4
-    w = torch.zeros(1, 900, len(plant.inputs), dtype=torch.float64)
-    with torch.no_grad():
-        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.1, 2))(x0, w, x0[:, :0])
-    last = states[0, -1]
-    assert float(last[3:5].abs().max()) < 0.05
-    # of 13.5 kg in 13.4 l of fresh water 1 N weighs down, against 33 N s/m and 190 N s^2/m^2
-    assert float(last[plant.state.index("w")]) == pytest.approx(
-        0.025 if name == "bluerov2_heavy" else 0.0, abs=0.003
-    )
-    torch.testing.assert_close(plant.hull.mass, plant.hull.mass.T)  # type: ignore[union-attr]

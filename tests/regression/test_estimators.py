@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from sklearn.cross_decomposition import PLSRegression
-from sklearn.kernel_ridge import KernelRidge as ReferenceKernelRidge
 from sklearn.linear_model import ElasticNet as ReferenceElasticNet
 from sklearn.linear_model import LinearRegression
 from sklearn.linear_model import Ridge as ReferenceRidge
@@ -152,20 +151,6 @@ def test_the_chosen_elastic_net_is_scikit_learns_at_its_penalty(seed: int) -> No
         np.testing.assert_allclose(found.coefficients[:, output], model.coef_, atol=1e-3)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
-def test_kernel_ridge_is_scikit_learns_for_any_number_of_outputs(seed: int) -> None:
-    n = 1 + seed
-    x, y = drawn(60, 3, n, seed)
-    x = (x - x.mean(0)) / x.std(0)
-    kernel = Rbf(sigma=(5.0,)).build(3, n)
-    inputs = torch.from_numpy(x)
-    estimator = KernelRidge(kernel, (1e-3,), folds=3)
-    found = estimator.fit(inputs, torch.from_numpy(y), torch.arange(60) // 20)[0]
-    kernel.load_state_dict(found.state, strict=False)
-    model = ReferenceKernelRidge(alpha=1e-3 * 60, kernel="rbf", gamma=0.1).fit(x, y)
-    np.testing.assert_allclose(kernel(inputs), model.predict(x).reshape(60, n), atol=1e-9)
-
-
 @pytest.mark.parametrize("kind", ["plsr", "ridge", "elastic net", "surface", "rbf"])
 def test_without_groups_nothing_is_chosen(kind: str) -> None:
     x, y = (torch.from_numpy(part) for part in drawn(60, 4, 2))
@@ -197,3 +182,63 @@ def test_a_group_is_never_split_between_folds() -> None:
     assert fold_numbers(groups, None).tolist() == [0, 0, 1, 1, 1, 2, 3, 3, 4]
     with pytest.raises(FitError, match="3 folds need as many manoeuvres, the training data have 2"):
         fold_numbers(torch.tensor([0, 0, 1]), 3)
+
+
+def least_squares(x: np.ndarray, y: np.ndarray, groups: int = 1, ridge: float = 0.0) -> Solution:
+    group = torch.arange(len(x)) * groups // len(x)
+    given = (torch.from_numpy(x), torch.from_numpy(y), group)
+    (found,) = LeastSquares((ridge,)).fit(*given, names=("a", "b", "c"))
+    return found
+
+
+def problem(count: int) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(count)
+    x = random.normal(size=(count, 3)) * [1.0, 30.0, 0.02] + [0.5, 0.0, 0.0]
+    return x, random.normal(size=(count, 2))
+
+
+def test_ridge_is_a_share_of_each_column_s_energy() -> None:
+    x, y = problem(200)
+    fit = least_squares(x, y, 5, ridge=0.3)
+    size = np.sqrt((x**2).mean(0))
+    truth = (
+        ReferenceRidge(alpha=0.3 * 200, fit_intercept=False, tol=1e-14).fit(x / size, y).coef_
+        / size
+    )
+    np.testing.assert_allclose(fit.coefficients, truth.T, rtol=1e-10)
+
+
+@pytest.mark.parametrize("groups", [1, 7])
+def test_coefficients_and_errors_in_closed_form(groups: int) -> None:
+    """The textbook's with one manoeuvre; of clusters (X'X)^-1 sum_g X_g'e_g e_g'X_g (X'X)^-1 G / (G
+    - 1), in the columns' own units.
+    """
+    x, y = problem(210)
+    fit = least_squares(x, y, groups)
+    wanted = np.linalg.lstsq(x, y, rcond=None)[0]
+    np.testing.assert_allclose(fit.coefficients, wanted, rtol=1e-10)
+    scaled = x / np.sqrt((x**2).mean(0))
+    assert fit.notes["condition"] == pytest.approx(np.linalg.cond(scaled), rel=1e-9)
+    bread = np.linalg.inv(x.T @ x)
+    for k, e in enumerate((y - x @ wanted).T):
+        scores = (x * e[:, None]).reshape(groups, -1, 3).sum(1)
+        meat = scores.T @ scores * groups / max(groups - 1, 1)
+        covariance = bread @ meat @ bread if groups > 1 else e @ e / 207 * bread
+        np.testing.assert_allclose(fit.errors[:, k], np.sqrt(np.diag(covariance)), rtol=1e-9)
+
+
+NOISE = np.random.default_rng(5).normal(size=(60, 3))
+
+
+@pytest.mark.parametrize(
+    ("x", "message"),
+    [
+        (np.ones((3, 3)), "3 samples do not determine 3 coefficients"),
+        (NOISE * [1, 0, 1], "regressor 'b' is zero in all 60 samples"),
+        (NOISE[:, [0, 1, 1]] * [1, 1, 3], r"'(b' and 'c|c' and 'b)'"),
+    ],
+)
+def test_what_the_data_do_not_determine_is_refused(x: np.ndarray, message: str) -> None:
+    with pytest.raises(FitError, match=message) as caught:
+        least_squares(x, NOISE[: len(x), :1])
+    assert "\n" not in str(caught.value)

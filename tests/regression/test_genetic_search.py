@@ -1,5 +1,5 @@
-"""Genetic programming: fitness against NumPy's least squares, equations that are known, limits, and
-the library that it needs.
+"""Genetic programming: expressions in normal form against SymPy and their own values, fitness
+against NumPy's least squares, equations that are known, and the library that it needs.
 """
 
 from __future__ import annotations
@@ -9,9 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy
 
 from residnet.core.errors import FitError, UsageError
-from residnet.regression.expressions import Algebra, Limits, Product
+from residnet.regression.expressions import (
+    FUNCTIONS,
+    ONE,
+    Algebra,
+    Limits,
+    Product,
+    Sum,
+    TooLargeError,
+    values_of,
+)
 from residnet.regression.genetic import (
     EvolutionConfig,
     Fitness,
@@ -24,6 +34,95 @@ NAMES = ("a", "b", "c")
 DATA = {name: np.random.default_rng(i).normal(size=200) for i, name in enumerate(NAMES)}
 TRAIN = np.arange(200) % 3 != 0
 NOISY = 2 * DATA["a"] - DATA["b"] * DATA["c"] + 0.1 * np.random.default_rng(9).normal(size=200)
+
+
+def value(algebra: Algebra, meant: Sum) -> np.ndarray:
+    if not meant:
+        return np.zeros(200)
+    return np.array(list(meant.values())) @ algebra.values(list(meant), DATA)
+
+
+def grown(algebra: Algebra, seed: random.Random, depth: int) -> tuple[Sum, np.ndarray]:
+    """A random expression, and its values worked out beside it."""
+    more = ("add", "subtract", "multiply", "function", "channel")
+    kind = seed.choice(more if depth else ("channel", "number"))
+    if kind == "channel":
+        name = seed.choice(NAMES)
+        return algebra.channel(name), DATA[name]
+    if kind == "number":
+        number = seed.choice((-1.5, 1.0, 2.0))
+        return {ONE: number}, np.full(200, number)
+    a, x = grown(algebra, seed, depth - 1)
+    if kind == "function":
+        function = seed.choice([f for f in FUNCTIONS if f != "sum"])
+        return algebra.apply(function, a), values_of(function, x)
+    b, y = grown(algebra, seed, depth - 1)
+    if kind == "multiply":
+        return algebra.multiply(a, b), x * y
+    sign = 1.0 if kind == "add" else -1.0
+    return algebra.add(a, b, sign), x + sign * y
+
+
+@pytest.mark.parametrize("expand", [True, False])
+def test_normal_form_keeps_the_values(expand: bool) -> None:
+    limits = Limits(terms=200, degree=16, nesting=5, expand=expand)
+    algebra, seed, tried = Algebra(NAMES, limits), random.Random(1), 0
+    while tried < 100:
+        try:
+            meant, truth = grown(algebra, seed, 4)
+        except TooLargeError:
+            continue
+        if np.abs(truth).max() > 1e-9:
+            size = np.abs(truth).max()
+            found = value(algebra, meant)
+            np.testing.assert_allclose(found, truth, rtol=1e-6, atol=1e-8 * size)
+            tried += 1
+
+
+def test_products_are_multiplied_out_as_sympy_does() -> None:
+    algebra = Algebra(NAMES)
+    a, b, c = (algebra.channel(name) for name in NAMES)
+    second = algebra.multiply(algebra.add(a, c, -2.0), algebra.add(b, algebra.multiply(c, c)))
+    made = algebra.multiply(algebra.add(a, b), second)
+    x, y, z = sympy.symbols(NAMES)
+    truth = sympy.Poly(sympy.expand((x + y) * (x - 2 * z) * (y + z**2)), x, y, z).as_dict()
+    powers = {tuple(product.count(i) for i in range(3)): made[product] for product in made}
+    assert powers == {k: float(v) for k, v in truth.items()}
+    # unless brackets are to stay
+    closed = Algebra(NAMES, Limits(expand=False))
+    assert len(closed.add(closed.multiply(closed.add(a, b), closed.add(b, c)), a)) == 2
+
+
+def test_equal_expressions_are_one() -> None:
+    algebra = Algebra(NAMES)
+    a, b = algebra.channel("a"), algebra.channel("b")
+    minus = algebra.add({}, a, -1.0)
+    both = algebra.add(a, b)
+    turned = algebra.add({}, both, -1.0)
+    apply, times = algebra.apply, algebra.multiply
+    assert apply("abs", times(minus, b)) == times(apply("abs", a), apply("abs", b))
+    assert times(apply("abs", a), apply("abs", a)) == times(a, a)
+    assert apply("abs", times(a, a)) == times(a, a)
+    assert apply("abs", apply("abs", a)) == apply("abs", a)
+    assert apply("cos", turned) == apply("cos", both)
+    assert apply("sin", turned) == algebra.add({}, apply("sin", both), -1.0)
+    assert apply("abs", turned) == apply("abs", both)
+    assert algebra.add(a, a, -1.0) == {}
+
+
+def test_limits_hold() -> None:
+    algebra = Algebra(NAMES, Limits(terms=3, degree=2, nesting=1))
+    a, b, c = (algebra.channel(name) for name in NAMES)
+    with pytest.raises(TooLargeError):
+        algebra.multiply(algebra.multiply(a, b), c)
+    with pytest.raises(TooLargeError):
+        algebra.apply("sin", algebra.apply("cos", a))
+    with pytest.raises(TooLargeError):
+        algebra.multiply(algebra.add(a, b), algebra.add(b, c))
+    # overflow is told by values that are not finite
+    algebra = Algebra(("a",), Limits(degree=8))
+    column = algebra.values([(0,) * 8], {"a": np.array([1e60, 1.0])})
+    assert column[0].tolist() == [np.inf, 1.0]
 
 
 def breed(target: np.ndarray, seed: int = 0, **config: Any) -> tuple[Algebra, Found]:

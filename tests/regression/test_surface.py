@@ -72,16 +72,6 @@ def test_equals_scikit_learn(judged: str) -> None:
         assert found.error[k, order - 1, count] == min(own.values())
 
 
-def test_removal_names_each_basis_function_once() -> None:
-    x, y, fold = data()
-    found = surface(moments(x, y, fold))
-    for order in (1, 3, 7):
-        gone = [j for j in found.removal[0, order - 1].tolist() if j >= 0]
-        assert len(set(gone)) == len(gone) == 7 - max(order, 2)
-        assert found.kept(0, order, 7) == list(range(7))
-        assert set(found.kept(0, order, max(order, 2))) == set(range(7)) - set(gone)
-
-
 def test_what_explains_nothing_goes_first() -> None:
     random = np.random.default_rng(1)
     x = random.normal(size=(400, 5))

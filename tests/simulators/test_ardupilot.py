@@ -110,7 +110,7 @@ def test_the_motion_is_that_of_the_vehicle_and_consistent(end: ArduPilotBackEnd)
 def test_a_slower_vehicle_is_interpolated(boat: Vehicle) -> None:
     slow = vehicle("wam_v_cal", dt=0.05)
     ends = [ArduPilotBackEnd(it, servos(it), port=0) for it in (boat, slow)]
-    fine, coarse = (replies(end, list(range(1, 401)), 1800, 0, 1600) for end in ends)
+    fine, coarse = (replies(end, list(range(1, 801)), 1800, 0, 1600) for end in ends)
     for end in ends:
         end.close()
     for name in ("position", "velocity"):

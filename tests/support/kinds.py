@@ -2,18 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 T = TypeVar("T")
-# what makes a kind quick enough for a contract
-HEADS: dict[str, dict[str, Any]] = {
-    "genetic": {"evolution": {"population": 60, "generations": 3}},
-    "kernel": {"folds": 2, "penalties": [0.1]},
-    "mlp": {"hidden": [8]},
-    "lstm": {"hidden_size": 6},
-    "recurrent": {"hidden_size": 6},
-    "sklearn": {"pipeline": [{"sklearn.ensemble.HistGradientBoostingRegressor": {"max_iter": 9}}]},
-}
 
 
 def of_kind(value: object, kind: type[T]) -> T:

@@ -1,0 +1,432 @@
+"""The contracts of models that roll, or move in six degrees of freedom, and rotations."""
+
+from __future__ import annotations
+
+import functools
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from residnet.baselines.regressors import RegressorsConfig
+from residnet.control.heading.vessels import SteeredModel, SteeredPlant
+from residnet.core.config import validate
+from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.frames import rotated, to_earth, turn_between, upright
+from residnet.core.layout import ATTITUDE, ROLL, SIX, Live, levelled
+from residnet.core.log import Log
+from residnet.data.doctor import inspect
+from residnet.data.motion import MotionConfig, complete_motion
+from residnet.data.prepare import PrepareConfig, prepare, samples
+from residnet.data.simulated import (
+    Craft,
+    Disturbance,
+    Sea,
+    SensorNoise,
+    SimulatedTrials,
+    fly,
+    fly_trials,
+)
+from residnet.dynamics.actuated import ActuatedDynamics, PlantActuators
+from residnet.dynamics.base import Integrator
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.store import save_model
+from residnet.heads.linear import RidgeConfig
+from residnet.heads.recurrent import RecurrentConfig
+from residnet.identification.changes import Change, ChangedDynamics, causes
+from residnet.identification.monitoring import MonitorConfig, Piece, Watch, Watcher
+from residnet.identification.recipe import Preparation, integrator
+from residnet.judge.freerun import drift, integrate
+from residnet.manoeuvres.base import Helm
+from residnet.manoeuvres.open_loop import ConstantInput
+from residnet.physics.hull import SubmergedConfig
+from residnet.physics.signals import SignalsConfig
+from residnet.physics.vessel import load_vessel
+from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
+from residnet.simulators.vehicle import vehicle
+from residnet.testing import example_samples
+from residnet.testing.checks import ROLLING, STEP, SUBMERGED, example_model, example_spec
+from residnet.training import refit
+
+PHI, P, DEPTH = ROLL.names.index("phi"), ROLL.names.index("p"), SIX.names.index("z")
+HULL = RegressorsConfig(sets=("fossen",), ridge=1e-4)
+HEADS = [RidgeConfig(), RecurrentConfig(hidden_size=6)]
+
+
+def test_an_angle_has_no_equation_of_its_own_and_restores() -> None:
+    samples = example_samples(signals=ROLLING)
+    config = RegressorsConfig(bounded=True, dissipative=True)
+    baseline = config.build(samples.names)
+    table = config.fit(baseline, samples)
+    assert {entry.axis for entry in table} == {"u_dot", "v_dot", "r_dot", "p_dot"}
+    assert not samples.target[:, ROLL.moving.index("phi")].any()
+    roll = {entry.term: entry.value for entry in table if entry.axis == "p_dot"}
+    # 2 pi over the natural period of 6.76 s of document 004, Table 5.2
+    assert (-roll["phi"]) ** 0.5 == pytest.approx(2 * np.pi / 6.76, rel=0.1)
+    assert roll["p"] < 0.0
+
+
+def started(
+    head: Any, signals: SignalsConfig, scheme: Integrator, steps: int
+) -> tuple[HybridDynamics, Tensor, Tensor, Tensor]:
+    """A model of an integrator under way, inputs [2, T, m] that push it, and its memory."""
+    spec = example_spec(head, signals).model_copy(update={"integrator": scheme})
+    model, n = example_model(spec).double(), len(signals.live.moving)
+    low, high = torch.tensor(spec.low).double(), torch.tensor(spec.high).double()
+    x = torch.zeros(2, 3 + n, dtype=torch.float64)
+    x[:, 3:] = low[:n] * 0.3 + high[:n] * 0.7
+    w = (low[n:] * 0.4 + high[n:] * 0.6).expand(2, steps, -1)
+    return model, x, w, model.initial_state(2).double()
+
+
+@pytest.mark.parametrize(("scheme", "head"), [*zip(get_args(Integrator), 2 * HEADS, strict=True)])
+def test_the_roll_angle_moves_by_the_roll_rate(scheme: Integrator, head: Any) -> None:
+    model, x, w, s = started(head, ROLLING, scheme, 60)
+    states = scripted(Rollout(model), 10_000)(x, w, s)[0]
+    alone, after = [x], x
+    for k in range(60):
+        after, s = model.step(after, w[:, k], s)
+        alone.append(after)
+    torch.testing.assert_close(states, torch.stack(alone, dim=1), rtol=0, atol=1e-9)
+    moved = states[0].detach().numpy()
+    rate, p = np.diff(moved[:, PHI]) / model.dt, moved[:, P]
+    # the angle's rate lies between the velocities at both ends of a step
+    apart = np.abs(np.diff(p)).max() + 1e-9
+    assert np.abs(rate - 0.5 * (p[1:] + p[:-1])).max() <= 0.51 * apart
+    assert np.ptp(moved[:, PHI]) > 0.01
+    pose = integrate(moved[0, :3], moved[:, 3:], model.dt)
+    np.testing.assert_allclose(moved[:, :3], pose, atol=0.05 * np.ptp(moved[:, 0]))
+    nu = np.array([[1.0, 0.5, 0.2, 0.0, 1.0]])
+    np.testing.assert_allclose(levelled(nu), [[1.0, 0.5 * np.cos(1.0), 0.2 * np.cos(1.0)]])
+    assert levelled(nu[:, :3]) is not nu
+    np.testing.assert_array_equal(levelled(nu[:, :3]), nu[:, :3])
+
+
+def test_rotations_are_those_of_quaternions() -> None:
+    random = torch.Generator().manual_seed(0)
+    angles, turn, vector = torch.randn(3, 40, 3, generator=random, dtype=torch.float64)
+    angles[0] = torch.tensor([0.4, np.pi / 2, -0.3])
+
+    def known(a: torch.Tensor) -> Rotation:
+        return Rotation.from_euler("ZYX", a.numpy()[:, ::-1])
+
+    after = rotated(angles, turn)
+    wanted = known(angles) * Rotation.from_rotvec(turn.numpy())
+    assert float((known(after).inv() * wanted).magnitude().max()) < 1e-7
+    u, v, w = vector.T
+    ahead, across, down = upright(u, v, w, angles[:, 0], angles[:, 1])
+    north, east = to_earth(ahead, across, angles[:, 2])
+    np.testing.assert_allclose(
+        torch.stack((north, east, down), dim=1), known(angles).apply(vector.numpy()), atol=1e-12
+    )
+    size = turn_between(angles.numpy(), after.numpy())
+    full = turn.norm(dim=-1).numpy() % (2.0 * np.pi)
+    np.testing.assert_allclose(size, np.minimum(full, 2.0 * np.pi - full), atol=1e-7)
+    # whole turns are counted, and a loop through the vertical ends where it began
+    angles = torch.zeros(1, 3, dtype=torch.float64)
+    for _ in range(100):
+        angles = rotated(angles, torch.tensor([[0.0, 0.0, 0.1 * np.pi]]).double())
+    assert float(angles[0, 2]) == pytest.approx(10 * np.pi)
+    for _ in range(20):
+        angles = rotated(angles, torch.tensor([[0.0, 0.1 * np.pi, 0.0]]).double())
+    assert turn_between(angles.numpy(), np.array([[0.0, 0.0, 10 * np.pi]]))[0] < 1e-6
+
+
+@pytest.mark.parametrize(("scheme", "head"), [*zip(get_args(Integrator), 2 * HEADS, strict=True)])
+def test_attitude_depth_and_place_follow_the_velocities(scheme: Integrator, head: Any) -> None:
+    model, x, w, s = started(head, SUBMERGED, scheme, 40)
+    deep = x.clone()
+    deep[:, DEPTH] += 50.0
+    with torch.no_grad():
+        states, other = (Rollout(model)(start, w, s)[0] for start in (x, deep))
+        compiled = scripted(Rollout(model), 10_000)(x, w, s)[0]
+    torch.testing.assert_close(compiled, states, rtol=0, atol=1e-9)
+    # what the depth is changes nothing else
+    other[..., DEPTH] -= 50.0
+    torch.testing.assert_close(other, states, rtol=0, atol=1e-9)
+    path = states[0].numpy()
+    turned = turn_between(path[1:, ATTITUDE], path[:-1, ATTITUDE])
+    omega = np.linalg.norm(path[:, [7, 8, 5]], axis=1) * model.dt
+    # an angle of rotation is that of the velocities at one end of a step or between both
+    assert np.abs(turned - 0.5 * (omega[1:] + omega[:-1])).max() < 0.6 * np.ptp(omega)
+    ground = Rotation.from_euler("ZYX", path[:, [2, 11, 10]]).apply(path[:, [3, 4, 6]])
+    way = np.cumsum(0.5 * model.dt * (ground[1:] + ground[:-1]), axis=0)
+    moved = path[1:, [0, 1, DEPTH]] - path[0, [0, 1, DEPTH]]
+    np.testing.assert_allclose(moved, way, atol=0.06 * np.abs(way).max())
+
+
+@pytest.mark.parametrize("scheme", get_args(Integrator))
+def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> None:
+    spec = example_spec(None, SUBMERGED)
+    spec = spec.model_copy(update={"integrator": scheme, "baseline": HULL})
+    model = spec.build().double()
+    HULL.fit(model.baseline, example_samples(signals=SUBMERGED))
+    random = torch.Generator().manual_seed(0)
+    spread = torch.tensor([0, 0, 1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.3, 1, 0.6, 0.6]).double()
+    x = torch.randn(3, 12, generator=random, dtype=torch.float64) * spread
+    x[:, 3] += 1.5
+    p = model.signals.prepare(torch.tensor([[0.2, -0.1, 10.0]]).double().expand(3, 3))
+    baseline: Any = model.baseline
+    active = baseline.free_indices()
+    s = 0.1 * torch.randn(3, 10, len(active), generator=random, dtype=torch.float64)
+    found = refit.step_sensitivities(model, x, p, s)
+    start, size = baseline.theta.detach().flatten()[active].clone(), 1e-6
+    for j in range(0, len(active), 17):
+        ends = []
+        for sign in (1.0, -1.0):
+            values, moved = start.clone(), x.clone()
+            values[j] += sign * size
+            moved[:, 2:] += sign * size * s[:, :, j]
+            baseline.place(values)
+            with torch.no_grad():
+                ends.append(refit._ahead(model, moved, p)[:, 2:])
+        wanted = (ends[0] - ends[1]) / (2.0 * size)
+        torch.testing.assert_close(found[:, :, j].detach(), wanted, rtol=1e-6, atol=1e-6)
+
+
+def test_a_drafted_model_swings_as_its_vessel() -> None:
+    """The roll of a torpedo has a period of ten steps of its logs."""
+    rate, none = 6.3, ("u v",)
+    rows = dict.fromkeys(("u", "v", "r", "w", "q"), none) | {"p": ("cos(theta) sin(phi)",)}
+    swing = RegressorsConfig.model_validate({"terms": rows})
+    changes = {"integrator": integrator(SUBMERGED.live), "baseline": swing, "dt": 0.1}
+    model = example_spec(None, SUBMERGED).model_copy(update=changes).build().double()
+    baseline: Any = model.baseline
+    with torch.no_grad():
+        row = baseline.outputs.index("p_dot")
+        baseline.theta[row, baseline.library.terms.index("cos(theta) sin(phi)")] = -(rate**2)
+        x = torch.zeros(1, 12, dtype=torch.float64)
+        x[0, ATTITUDE[0]] = 0.05
+        run = Rollout(model)(x, torch.zeros(1, 50, 3).double(), model.initial_state(1).double())[0]
+    wanted = 0.05 * np.cos(rate * 0.1 * np.arange(51))
+    np.testing.assert_allclose(run[0, :, ATTITUDE[0]].numpy(), wanted, atol=0.1 * 0.05)
+
+
+def test_what_logs_tell() -> None:
+    def told(*names: str, moving: bool = True) -> Live:
+        return Live.told({name: moving * np.arange(99.0) for name in names})
+
+    assert told("x", "y", "psi", "phi").velocities == ("u", "v", "r", "p")
+    assert told("x", "y", "psi", "p").planar
+    assert told("x", "y", "psi", "phi", "p", moving=False).planar
+    motion, noise = 0.1 * np.sin(np.arange(0.0, 60.0, 0.1)), np.random.default_rng(0)
+    for size, moves in ((0.05, True), (0.2, False)):
+        phi = motion + size * noise.normal(size=motion.size)
+        assert Live.told({"u": motion, "phi": phi}).rolls == moves
+    rolls, planar = told("u", "r", "phi", "p"), Live()
+    assert rolls.dead == ("v",)
+    assert rolls.channels == ("u", "r", "p", "phi")
+    assert Live.shared([rolls, planar]).velocities == ("u", "r")
+    assert Live.shared([Live(("u",)), Live(("r",))]).planar
+    low, high = -np.ones(12), 2.0 * np.ones(12)
+    # a depth and a loop are no runaway
+    reach = SUBMERGED.live.largest(low, high)
+    assert reach[:6].tolist() == [2.0] * 6
+    assert np.isinf(reach[6:]).all()
+    assert planar.largest(low, high).tolist() == [2.0] * 3
+
+
+def trials(count: int, duration: float) -> SimulatedTrials:
+    """Noiseless trials of the torpedo in depth and heading."""
+    kinds_of: list[dict[str, Any]] = [
+        {"kind": "depth_step", "depth": [3.0], "start": 1.0},
+        {"kind": "helix", "drive": [0.5, 0.9], "start": 1.0},
+        {"kind": "random_steps", "dive_amplitude": [0.2, 0.6], "drive_amplitude": [0.1, 0.3]},
+    ]
+    content: dict[str, Any] = {
+        "vessel": "remus_100",
+        "step": STEP,
+        "substeps": 2,
+        "duration": duration,
+    }
+    content |= {"trials": [{**kind, "count": count} for kind in kinds_of]}
+    content |= {"identification": {}, "validation": {}, "noise": dict.fromkeys("uvr", 0.0)}
+    return SimulatedTrials.model_validate(content)
+
+
+def test_what_logs_of_a_torpedo_tell_and_lack() -> None:
+    config = trials(2, 15.0)
+    log = fly_trials(config.draw(), config)[0].log
+    live = Live.told(log.channels)
+    assert live.spatial
+    assert live.whole
+    assert live.channels == ("u", "v", "r", "w", "p", "q", "z", "phi", "theta")
+    assert Live.shared([live, live]) == live
+    assert Live.shared([live, Live()]).planar
+    held = {name: values for name, values in log.channels.items() if name != "z"}
+    assert not Live.told(held).spatial
+    with pytest.raises(UsageError, match="z is not measured at every sample"):
+        complete_motion(log.replace(channels=held), MotionConfig(), live)
+    with pytest.raises(ResidnetError, match="all six"):
+        validate({"inputs": ["n"], "velocities": ["u", "v", "w"]}, SignalsConfig, "here")
+    assert {"damping heave", "damping pitch", "restoring pitch"} <= {
+        c.name for c in causes(SUBMERGED)
+    }
+    # the rates of the pose are those of the log
+    rate = np.gradient(log["psi"], log.t)
+    assert np.abs(rate - levelled(log.stack(live.moving))[:, 2])[5:-5].max() < 0.03
+
+
+@functools.cache
+def flown() -> list[Log]:
+    config = trials(4, 40.0)
+    return [flight.log for flight in fly_trials(config.draw(), config)]
+
+
+def test_measured_velocities_lead_to_the_measured_pose() -> None:
+    y = np.stack([log.stack(SIX.names) for log in flown()])
+    off = drift(y, SUBMERGED.live, STEP)
+    assert list(off) == list(SUBMERGED.live.ends) == ["position", "depth", "attitude"]
+    way = np.hypot(*np.diff(y[:, :, :2], axis=1).T).sum(axis=0)
+    assert (off["position"] < 0.01 * way).all()
+    assert (off["depth"] < 0.01 * way).all()
+    assert (off["attitude"] < 0.01).all()
+
+
+@pytest.mark.parametrize("beside", ["samples", "means"])
+def test_least_squares_find_the_vessel(beside: str) -> None:
+    """Of noiseless trials: what the trials determine is that of the vessel's file."""
+    signals = SUBMERGED.build()
+    # means are right by a smoother that softens the swing in roll
+    smoother = {"kind": "savitzky_golay", "window": 0.5, "order": 2 if beside == "means" else 4}
+    how = PrepareConfig.model_validate(
+        {"grid": {"step": STEP}, "derivative": smoother, "beside": beside, "hold": "mean"}
+    )
+    logs = [prepare(log, "train", SUBMERGED.columns, how, SUBMERGED.live) for log in flown()]
+    found_in = samples(logs, signals)
+    exact = RegressorsConfig(sets=("fossen",), ridge=1e-9)
+    table = exact.fit(exact.build(found_in.names), found_in)
+    vessel = load_vessel("remus_100")
+    assert isinstance(vessel, SubmergedConfig)
+    terms, rows = vessel.hull().equations()
+    axes = zip(("u", "v", "w", "p", "q", "r"), rows, strict=True)
+    true = {(axis, term): row[i] for axis, row in axes for i, term in enumerate(terms)}
+    for axis, term in (
+        ("u", "u|u|"),
+        ("r", "r|r|"),
+        ("q", "sin(theta)"),
+        ("q", "q"),
+        ("v", "u r"),
+        ("w", "u q"),
+        ("p", "cos(theta) sin(phi)"),
+    ):
+        (found,) = (one.value for one in table if (one.axis, one.term) == (f"{axis}_dot", term))
+        assert found == pytest.approx(true[axis, term], rel=0.05)
+
+
+def test_a_draft_sets_the_rates_of_a_roll_beside_means() -> None:
+    t = np.arange(0.0, 60.0, 0.1)
+    log = Log("swing", t, dict.fromkeys(("u", "v", "r", "p", "phi", "delta"), np.sin(t)))
+    for live, beside in ((Live(("u", "v", "r", "p")), "means"), (Live(), None)):
+        drafted = Preparation.of([log], ["delta"], live).content()
+        assert drafted.get("beside") == beside
+
+
+@pytest.mark.parametrize(
+    ("signals", "names"),
+    [
+        (ROLLING, ("restoring", "damping roll")),
+        pytest.param(SUBMERGED, ("restoring pitch", "damping pitch"), marks=pytest.mark.long),
+    ],
+    ids=["roll", "six"],
+)
+def test_a_monitor_tells_stiffness_from_damping(
+    signals: SignalsConfig, names: tuple[str, ...]
+) -> None:
+    spec, live = example_spec(None, signals), signals.live
+    model = example_model(spec).double()
+    noise = np.full(len(live.states), 0.003)
+    noise[:5] = 0.0, 0.0, 0.002, 0.02, 0.02
+    low, high = (np.array(ends[live.size :]) for ends in (spec.low, spec.high))
+
+    def logs(change: Change, count: int, seed: int) -> list[list[Piece]]:
+        random = np.random.default_rng(seed)
+        w = random.uniform(low, high, size=(count, 6, low.size)).repeat(50, axis=1)
+        x = torch.zeros(count, noise.size).double()
+        x[:, 3] = 0.7 * spec.high[0]
+        changed = ChangedDynamics(model, [change], count, low.size)
+        with torch.no_grad():
+            states = Rollout(changed)(x, torch.from_numpy(w), x[:, :0])[0].numpy()
+        y = states + noise * random.normal(size=states.shape)
+        return [
+            [Piece(a[k : k + 101], b[k : k + 100], a[:0], b[:0]) for k in (0, 100, 200)]
+            for a, b in zip(y, w, strict=True)
+        ]
+
+    watch = Watch(spec, model, logs(Change("none", "", "", 1.0), 24, 0), MonitorConfig())
+    assert list(watch.seen) == [*live.channels, "heading"]
+    for cause in names:
+        watcher = Watcher(watch)
+        (known,) = (one for one in watch.causes if one.name == cause)
+        for log in logs(replace(known, size=-0.3), 3, 1):
+            watcher.restart()
+            for sums in watch.sums(log):
+                verdict = watcher.take(sums)
+        first = verdict.suspects[0]
+        assert verdict.alarm
+        assert first.change.name == cause
+        assert first.size == pytest.approx(-0.3, rel=0.3)
+
+
+def test_a_model_that_rolls_flies_behind_the_gear_of_its_vessel() -> None:
+    spec, plant = example_spec(RidgeConfig(), ROLLING), load_vessel("patrol_p06_linear").build()
+    model, columns = example_model(spec).double(), spec.signals.columns
+    gear = PlantActuators(plant, spec.dt)
+    flown = ActuatedDynamics(model, columns, "start", gear)
+    helm = Helm(gear.demand, flown.state, gear.inputs)
+    craft = Craft("own", flown, helm, gear.commands, flown.approach(1))
+    turn = ConstantInput(drive=0.8, steer=0.5, duration=12.0)
+    log = fly(craft, [turn], Sea(None, Disturbance(), SensorNoise(), 0), 12.0, spec.dt)[0].motion
+    x, w = flown.approach(1)[:, : len(ROLL.names)], torch.from_numpy(log.stack(columns))[None]
+    with torch.no_grad():
+        alone = Rollout(model)(x, w[:, :-1], model.initial_state(1).double())[0][0].numpy()
+    np.testing.assert_allclose(log.stack(ROLL.names), alone, atol=1e-9)
+    assert np.ptp(log["phi"]) > 0.01
+    # a heading controller sees the same steps
+    steered = SteeredModel(model, columns, "start", SteeredPlant(plant))
+    straight, held = steered.start(torch.ones(1).double())
+    memory = steered.memory(torch.tensor([[1.0, 1.0, 0.0]]).double())
+    with torch.no_grad():
+        moved = steered.model(spec.dt).step(straight, held, memory)[0]
+        wanted = model.step(straight[:, :8], held[:, :2], model.initial_state(1).double())[0]
+    assert steered.state[:8] == ROLL.names
+    torch.testing.assert_close(moved[:, :8], wanted)
+
+
+def test_a_simulator_shows_the_roll(tmp_path: Path) -> None:
+    spec = example_spec(RidgeConfig(), ROLLING)
+    save_model(tmp_path / "models" / "example", spec, example_model(spec))
+    known = vehicle(tmp_path, model="example")
+    assert known.states == ROLL.names
+    assert known.low.tolist() == pytest.approx(spec.low[5:])
+    back = ArduPilotBackEnd(known, servos(known), port=0)
+    try:
+        pulses = [1900, 1500, 1900, *[0] * 13]
+        for frame in range(1, 200):
+            said = json.loads(back.answer(struct.pack("<HHI16H", 18458, 50, frame, *pulses)) or b"")
+    finally:
+        back.close()
+    phi, p = (float(back.after[0, place]) for place in (PHI, P))
+    assert abs(phi) > 0.01
+    assert said["attitude"][0] == pytest.approx(phi, abs=0.1 * abs(p) + 1e-6)
+    assert said["imu"]["gyro"][0] == pytest.approx(p, abs=0.05)
+
+
+@pytest.mark.parametrize("gain", [1.0, -1.0, 57.3])
+def test_the_doctor_sets_the_roll_rate_against_the_roll_angle(gain: float) -> None:
+    random, t = np.random.default_rng(2), np.arange(0.0, 120.0, 0.1)
+    phi = 0.05 * np.sin(0.9 * t) + 0.001 * random.normal(size=t.size)
+    p = gain * 0.05 * 0.9 * np.cos(0.9 * t) + 0.001 * random.normal(size=t.size)
+    still = dict.fromkeys(("x", "y", "psi", "u", "v", "r"), 0.0 * t)
+    log = Log("rolls", t, {**still, "phi": phi, "p": p}, {"phi": "rad", "p": "rad/s"})
+    found = [one.text for one in inspect(log, []).findings if one.code == "roll_rate"]
+    assert len(found) == (gain != 1.0)
+    assert all(text.startswith(f"phi moves by {1.0 / gain:.2g} times") for text in found)
