@@ -66,7 +66,10 @@ GONE: dict[str, str] = {
     "published_absolute": "its numbers are the last three of `published`",
 }
 """Keys that nothing took the place of, and what holds instead."""
-IDLE: dict[str, Any] = {"disturbance": None, "encoder": False, "intercept": False, "one": False}
+IDLE: dict[str, Any] = {
+    **{"disturbance": None, "encoder": False, "intercept": False, "one": False},
+    **{"always": False, "longest_gap": 1.0},
+}
 """Keys that are gone, and the value with which they did nothing: runs of before hold them so."""
 
 

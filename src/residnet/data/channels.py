@@ -104,11 +104,6 @@ def _medians(members: Callable[[slice], list[np.ndarray]], count: int) -> np.nda
     return out
 
 
-def spikes(values: np.ndarray) -> np.ndarray:
-    """Return [T] bool: samples that the mask `hampel` with its defaults leaves out."""
-    return far_from_medians([values])[0]
-
-
 def far_from_medians(
     columns: Sequence[np.ndarray], sigmas: float = 6.0, samples: int = 11
 ) -> list[np.ndarray]:
@@ -179,6 +174,14 @@ def spread_rows(count: int, most: int, stretches: int, about: int | None = None)
         begin = min(max(about - size // 2, 0), count - size)
         first[np.argmin(np.abs(first - begin))] = begin
     return np.unique((first[:, None] + np.arange(size)).ravel())
+
+
+def covered(size: int, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
+    """Return [size] bool, True inside any of the half-open ranges: the way back of `stretches`."""
+    marks = np.zeros(size + 1, dtype=np.int64)
+    np.add.at(marks, np.clip(starts, 0, size), 1)
+    np.add.at(marks, np.clip(stops, 0, size), -1)
+    return np.cumsum(marks[:-1]) > 0
 
 
 def steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
@@ -283,9 +286,8 @@ def _spikes(values: np.ndarray, moved: bool) -> np.ndarray:
     else:
         far = (beyond > 0.5 * span) & (distance > 0.5 * span) if span > 0.0 else beyond < -1.0
     starts, stops = stretches(far)
-    for start, stop in zip(starts, stops, strict=True):
-        if stop - start <= _LONGEST and start > 0 and stop < known.size:
-            out[at[start:stop]] = True
+    single = (stops - starts <= _LONGEST) & (starts > 0) & (stops < known.size)
+    out[at] = covered(known.size, starts[single], stops[single])
     # many spikes are a fault of the sensor, not of single samples
     return out if out.sum() <= max(3, 0.01 * known.size) else np.zeros_like(out)
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from abc import ABC
 from functools import cache
-from typing import Annotated, ClassVar, Literal, final
+from typing import Annotated, Literal, final
 
 import numpy as np
 from pydantic import Field
 
-from residnet.core.config import Config, Hertz, Seconds
+from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.stretches import stretches
 
@@ -24,8 +24,6 @@ class Derivative(Config, ABC):
     Where it has no smoother the values stay as they are, and where it has no rate of its own that
     is the difference to the next sample; the last sample of a piece is then invalid.
     """
-
-    backward: ClassVar[bool] = False
 
     def derive(
         self, values: np.ndarray, step: float, pieces: np.ndarray
@@ -70,7 +68,7 @@ class Derivative(Config, ABC):
     def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the smoothed values and rates [T, n] of one piece, NaN where there is no rate."""
         rate = np.full(values.shape, np.nan)
-        rate[1 if self.backward else 0 : None if self.backward else -1] = np.diff(values, axis=0)
+        rate[:-1] = np.diff(values, axis=0)
         return values, rate / step
 
 
@@ -140,17 +138,6 @@ def _fitting(size: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @final
-class BackwardDifference(Derivative):
-    """The difference to the sample before; values are not smoothed.
-
-    The first sample of a piece is invalid.
-    """
-
-    backward: ClassVar[bool] = True
-    kind: Literal["backward"] = "backward"
-
-
-@final
 class ForwardDifference(Derivative):
     """The difference to the next sample; values are not smoothed.
 
@@ -160,43 +147,5 @@ class ForwardDifference(Derivative):
     kind: Literal["forward"] = "forward"
 
 
-@final
-class Butterworth(Derivative):
-    """A Butterworth low-pass run forward and backward (zero phase), then the forward difference.
-
-    Attributes:
-        order: of the filter, for one of the two passes.
-        cutoff: frequency of half gain in Hz.
-
-    Source: document 000, section 7.3; correction H27.
-
-    The two passes square the magnitude: the gain at `cutoff` is 1/2, not 1/sqrt(2). The document's
-    normalised cut-off is a share of the Nyquist frequency: its 0.1 at 20 Hz is 1 Hz here. The last
-    sample of a piece is invalid, as is a piece no longer than the filter's padding.
-    """
-
-    kind: Literal["butterworth"] = "butterworth"
-    order: int = Field(default=2, ge=1, le=8)
-    cutoff: Hertz = Field(gt=0.0)
-
-    def shortest(self, step: float) -> int:
-        if self.cutoff >= 0.5 / step:
-            raise ConfigError(
-                f"butterworth: cutoff {self.cutoff:g} Hz is not below the Nyquist frequency"
-                f" {0.5 / step:g} Hz of a step of {step:g} s; lower it"
-            )
-        return 3 * (self.order + 1) + 2
-
-    def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        from scipy.signal import butter, filtfilt
-
-        low_pass = butter(self.order, self.cutoff, fs=1.0 / step)
-        smooth = filtfilt(*low_pass, values, axis=0, padlen=3 * (self.order + 1))
-        return super().piece(smooth, step)
-
-
-DerivativeConfig = Annotated[
-    SavitzkyGolay | BackwardDifference | ForwardDifference | Butterworth,
-    Field(discriminator="kind"),
-]
+DerivativeConfig = Annotated[SavitzkyGolay | ForwardDifference, Field(discriminator="kind")]
 """Any rule for derivatives; its `kind` says which."""

@@ -22,6 +22,7 @@ from residnet.core.log import Log
 from residnet.core.stretches import stretch_numbers, stretches
 from residnet.data.channels import (
     SIGMA_OF_MAD,
+    covered,
     far_from_medians,
     spike_cells,
     steps_above,
@@ -86,7 +87,7 @@ class Frozen(Mask):
         starts, last = starts[long], stops[long]
         # half a step of margin keeps `after` a whole number of samples in spite of rounding in t
         ends = np.searchsorted(log.t, log.t[last] + self.after - 0.5 * _step(log.t))
-        return _cover(len(log), starts, np.maximum(ends, last + 1))
+        return covered(len(log), starts, np.maximum(ends, last + 1))
 
 
 @final
@@ -143,7 +144,7 @@ class Jump(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         landed = steps_above(log, self.channel, self.limit)
-        return _cover(len(log), landed - self.before, landed + self.after)
+        return covered(len(log), landed - self.before, landed + self.after)
 
 
 @final
@@ -263,11 +264,8 @@ class InputJump(Mask):
         landed = np.concatenate([steps_above(log, name, self.limit) for name in self.channels])
         margin = 1e-6 * _step(log.t)
         starts = np.searchsorted(log.t, log.t[landed] - self.before - margin)
-        return _cover(
-            len(log),
-            starts,
-            np.searchsorted(log.t, log.t[landed] + self.after + margin, side="right"),
-        )
+        stops = np.searchsorted(log.t, log.t[landed] + self.after + margin, side="right")
+        return covered(len(log), starts, stops)
 
 
 MaskConfig = Annotated[
@@ -326,11 +324,3 @@ def _each(log: Log, names: Sequence[str], rule: Callable[[np.ndarray], np.ndarra
 def _step(t: np.ndarray) -> float:
     """Return the usual time step in s."""
     return float(np.median(np.diff(t))) if t.size > 1 else 0.0
-
-
-def _cover(size: int, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """Return [size] bool, True inside any of the half-open ranges."""
-    marks = np.zeros(size + 1, dtype=np.int64)
-    np.add.at(marks, np.clip(starts, 0, size), 1)
-    np.add.at(marks, np.clip(stops, 0, size), -1)
-    return np.cumsum(marks[:-1]) > 0

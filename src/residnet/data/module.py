@@ -76,14 +76,7 @@ class EpochBatches:
 class Windows(NamedTuple):
     """Windows of measured logs, B of L samples.
 
-    Attributes:
-        y: measured states [B, L, 3 + n], positions from the start of the log.
-        smooth: states with smoothed velocities [B, L, 3 + n].
-        nu_dot: accelerations [B, L, n].
-        w: inputs held over the step that follows each sample [B, L, m].
-        recorded: inputs at the samples [B, L, m].
-        usable: samples that may be scored [B, L].
-        good: samples whose derivative may be learned from [B, L].
+    Attributes are those of `Prepared` [B, L, ...], positions from the start of the log, and:
         past_y: measured states before the window [B, H, 3 + n].
         past_w: inputs before it [B, H, m].
         depth: samples since the stretch began [B]; 0 where the window begins it.

@@ -18,7 +18,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.log import Log
 from residnet.core.names import BOW_WIND, CHANNEL_UNITS, POSE, STATE, WIND_INPUTS
-from residnet.data.channels import noise_of, spikes, without_held
+from residnet.data.channels import far_from_medians, noise_of, without_held
 from residnet.data.readers.base import turned, unwrap
 from residnet.data.readers.quantities import Antenna
 from residnet.data.readers.recording import remark
@@ -45,17 +45,15 @@ class MotionConfig(Config):
     Attributes:
         antenna: where the antenna stands; null where x and y are those of the vessel's centre.
         delay: age of the positions in s: x and y at t are where the antenna was at t - delay.
-        always: smooth logs too in which everything is measured at every sample.
     """
 
     antenna: Antenna | None = None
     delay: Seconds = Field(default=0.0, ge=0.0)
-    always: bool = False
 
     @property
     def moves(self) -> bool:
         """Whether positions are moved in place or time, so that all must be smoothed."""
-        return self.always or self.delay > 0.0 or self.antenna is not None
+        return self.delay > 0.0 or self.antenna is not None
 
 
 def complete_motion(log: Log, config: MotionConfig, live: Live = ALIVE) -> Log:
@@ -106,7 +104,7 @@ def _completed(log: Log, config: MotionConfig, live: Live) -> Log:
             " and r without a position: either makes the other where it was not measured; name"
             f" their columns{'' if live.whole else few}"
         )
-    made |= set(STATE) if config.always else set(POSE) if config.moves else set()
+    made |= set(POSE) if config.moves else set()
     names = [name for name in STATE if name in made]
     smooth = _smoothed(told, config)
     text = f"{', '.join(names)} come from a smoother of the measured motion: "
@@ -382,9 +380,9 @@ def _near(t: np.ndarray, at: np.ndarray) -> np.ndarray:
 def _smoothed(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
     """Return the smoothed motion by channel [T], NaN in gaps of position or heading."""
     t, psi = log.t, unwrap(log["psi"])
-    psi[spikes(psi)] = np.nan
     place = np.stack((log["x"], log["y"]), axis=1)
-    place[spikes(log["x"]) | spikes(log["y"])] = np.nan
+    turned_away, *moved_away = far_from_medians([psi, log["x"], log["y"]])
+    psi[turned_away], place[np.logical_or(*moved_away)] = np.nan, np.nan
     fixes = np.flatnonzero(np.isfinite(place).all(axis=1))
     headings = np.flatnonzero(np.isfinite(psi))
     if min(fixes.size, headings.size) < 5:

@@ -9,9 +9,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -66,22 +65,10 @@ class LogPart(Config):
             )
         return self
 
-
-@dataclass(frozen=True)
-class Part:
-    """One file or recording of a split, or a stretch of it.
-
-    Attributes:
-        path: of the file or folder.
-        start: time at which it begins, s; None for the log's start.
-        stop: time at which it ends, s; None for the log's end.
-        manoeuvre: it is left out unless the log is of this kind; None takes any.
-    """
-
-    path: Path
-    start: float | None = None
-    stop: float | None = None
-    manoeuvre: str | None = None
+    @property
+    def path(self) -> Path:
+        """The file or folder, where it names one (`parts_of`)."""
+        return Path(self.log)
 
     @property
     def whole(self) -> bool:
@@ -94,7 +81,7 @@ class Part:
         start, stop = self.start, self.stop
         return -np.inf if start is None else start, np.inf if stop is None else stop
 
-    def overlaps(self, other: Part) -> bool:
+    def overlaps(self, other: LogPart) -> bool:
         """Return whether two parts of one log share a stretch of time, whatever its kind."""
         apart = self.manoeuvre != other.manoeuvre and None not in (self.manoeuvre, other.manoeuvre)
         return not apart and max(self.ends[0], other.ends[0]) < min(self.ends[1], other.ends[1])
@@ -129,18 +116,22 @@ def stretch_of(log: Log, start: float, stop: float) -> Log:
     return part.on_disk() if lies_on_disk(log.t) else part
 
 
-def parts_of(root: Path, entries: Sequence[str | LogPart], where: str) -> list[Part]:
-    """Return the parts that a split's entries name, each once.
-
-    Raises:
-        ConfigError: where an entry matches nothing.
-    """
-    out: dict[Part, None] = {}
+def parts_of(root: Path, entries: Sequence[str | LogPart], where: str) -> list[LogPart]:
+    """Return the parts of single logs that a split's entries name, each once."""
+    out: dict[LogPart, None] = {}
     for entry in entries:
         wanted = entry if isinstance(entry, LogPart) else LogPart(log=entry)
         for path in matches(root, [wanted.log], where):
-            out[Part(path, wanted.start, wanted.stop, wanted.manoeuvre)] = None
+            out[wanted.model_copy(update={"log": str(path)})] = None
     return list(out)
+
+
+class SplitFile(Config):
+    """Logs of the three splits in a YAML file of their own, as in `SplitConfig`."""
+
+    train: tuple[str | LogPart, ...] = Field(min_length=1)
+    validation: tuple[str | LogPart, ...] = Field(min_length=1)
+    test: tuple[str | LogPart, ...] = Field(min_length=1)
 
 
 class SplitConfig(Config):
@@ -188,7 +179,7 @@ class SplitConfig(Config):
             )
         return self
 
-    def parts(self) -> dict[str, list[Part]]:
+    def parts(self) -> dict[str, list[LogPart]]:
         """Return what each split consists of, in the order of its patterns; nothing of `auto`.
 
         The matches of a pattern are sorted.
@@ -199,15 +190,9 @@ class SplitConfig(Config):
         """
         if self.auto:
             return {}
-        entries = (
-            {name: getattr(self, name) for name in SPLITS}
-            if self.file is None
-            else _from_file(self.file)
-        )
         root, where = self._root(), "split" if self.file is None else str(self.file)
-        parts = {
-            name: parts_of(root, wanted, f"{where}: {name}") for name, wanted in entries.items()
-        }
+        named = self if self.file is None else validate(load_mapping(self.file), SplitFile, where)
+        parts = {name: parts_of(root, getattr(named, name), f"{where}: {name}") for name in SPLITS}
         seen = [
             (part.path.resolve(), split, part) for split, some in parts.items() for part in some
         ]
@@ -247,27 +232,6 @@ class SplitConfig(Config):
         if not root.is_dir():
             raise ConfigError(f"split: root {root} is not a folder; correct `root`")
         return root
-
-
-def _from_file(file: Path) -> dict[str, tuple[str | LogPart, ...]]:
-    content: dict[str, Any] = load_mapping(file)
-    for key in content:
-        if key not in SPLITS:
-            raise ConfigError(f"{file}: unknown split '{key}'{nearest(key, SPLITS)}")
-    out = {}
-    for name in SPLITS:
-        entries = content.get(name)
-        listed = entries if isinstance(entries, list) else []
-        if not listed or not all(isinstance(entry, str | dict) for entry in listed):
-            raise ConfigError(
-                f"{file}: {name}: expected a list of at least one path or pattern, found"
-                f" {entries!r}"
-            )
-        out[name] = tuple(
-            entry if isinstance(entry, str) else validate(entry, LogPart, f"{file}: {name}")
-            for entry in listed
-        )
-    return out
 
 
 def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
@@ -392,17 +356,6 @@ def sampling(logs: Sequence[Log]) -> int:
     return -(-sum(len(log) for log in logs) // LARGE)
 
 
-def sampled_hashes(log: Log, channels: Sequence[str], one_of: int) -> np.ndarray:
-    """Return the hashes of a log's rows that are compared: of equal rows all are, or none.
-
-    Args:
-        one_of: of how many hashes one is kept, by its own number.
-    """
-    hashes = row_hashes(log, channels)
-    forget()
-    return np.asarray(hashes[hashes % np.uint64(one_of) == 0])
-
-
 _MOTION = (*STATE, "phi", "p")
 
 
@@ -414,9 +367,7 @@ def measured_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
     """
     motion = [name for name in channels if name in _MOTION] or channels
     measured = np.isfinite(log.stack(tuple(motion))).sum(axis=1)
-    hashes = row_hashes(log, channels)[2 * measured >= measured.max(initial=0)]
-    forget()
-    return np.asarray(hashes)
+    return np.asarray(row_hashes(log, channels)[2 * measured >= measured.max(initial=0)])
 
 
 def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
@@ -432,7 +383,9 @@ def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
             if log.units[name] == "rad"
             else values + 0.0
         )
-    return np.asarray(pd.util.hash_pandas_object(pd.DataFrame(columns), index=False).to_numpy())
+    hashes = pd.util.hash_pandas_object(pd.DataFrame(columns), index=False).to_numpy()
+    forget()
+    return np.asarray(hashes)
 
 
 def logs_below(folder: Path) -> list[Path]:

@@ -18,16 +18,9 @@ from residnet.data.prepare import Prepared
 
 @dataclass(frozen=True)
 class WindowStore:
-    """All logs end to end.
+    """All logs end to end, N samples.
 
-    Attributes:
-        y: measured states [N, 3 + n].
-        smooth: states with smoothed velocities [N, 3 + n].
-        nu_dot: rates of what moves [N, n].
-        w: inputs held over the step that follows each sample [N, m].
-        recorded: inputs at the samples themselves [N, m].
-        usable: samples that may be scored [N].
-        good: samples whose derivative may be learned from [N].
+    Attributes are those of `Prepared`, positions from the start of each log, and:
         reach: samples from here to the end of the stretch, itself included, [N]; 0 where there is
             none.
         depth: samples since the stretch began, [N].

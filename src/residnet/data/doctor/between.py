@@ -27,7 +27,7 @@ from residnet.data.doctor.findings import (
 )
 from residnet.data.doctor.others import Fleet, causes, nothing_steers
 from residnet.data.doctor.statistics import MEASURED, Record, averaged, high
-from residnet.data.split import row_hashes, sampled_hashes, sampling
+from residnet.data.split import row_hashes, sampling
 
 # so many rows in a row that two logs share are no chance
 _COPIED = 20
@@ -92,7 +92,9 @@ def copies(logs: Together, found: Check) -> Iterator[Finding]:
     members = [log.log for log in logs.logs]
     if names and (one_of := sampling(members)) > 1:
         # of very many rows a sample tells which logs have some in common
-        few = [sampled_hashes(log, names, one_of) for log in members]
+        # of equal rows all are in it, or none
+        every = (row_hashes(log, names) for log in members)
+        few = [hashes[hashes % np.uint64(one_of) == 0] for hashes in every]
         rows, count = np.unique(np.concatenate(few), return_counts=True)
         twice = rows[(count > 1) & (count <= 2 * len(members))]
         alike = [int(np.isin(part, twice).sum()) * one_of >= _COPIED for part in few]

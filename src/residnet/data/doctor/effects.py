@@ -12,7 +12,7 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.data.doctor.findings import Finding
-from residnet.data.doctor.statistics import Record, blocks_of, bridged, regressors
+from residnet.data.doctor.statistics import Record, blocks_of, bridged, of_inputs, of_motion
 from residnet.data.statistics import Blocks
 
 LEAST_EFFECT = 0.04
@@ -55,8 +55,12 @@ class OneStep:
             size = like.blocks.size
             first = np.arange(0, len(log) - size, max(size // 4, 1))
             blocks = dataclasses.replace(blocks, first=first, size=size)
-        velocity, inputs = ({n: log[n] for n in part} for part in (log.moving, log.inputs))
-        table = blocks.integrals(regressors(velocity, inputs, len(log)))(0)
+        velocity = {name: log[name] for name in log.moving}
+        driving = [log[name] for name in log.inputs if log.std(name) > 0.0]
+        # a polynomial that knows no vessel; beyond four inputs each enters linearly only
+        columns = [np.ones(len(log)), *of_motion(velocity)]
+        columns += of_inputs(driving, velocity.get("u"), linear=len(driving) > 4)
+        table = blocks.integrals(np.stack(columns, axis=-1))(0)
         change = blocks.change(np.stack([*velocity.values()] or [np.zeros(len(log))], axis=-1))
         known = np.isfinite(table).all(axis=1) & np.isfinite(change).all(axis=1)
         known &= blocks.change(log.t) <= (blocks.size + 3.0) * log.step

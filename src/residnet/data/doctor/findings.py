@@ -305,23 +305,14 @@ def share_of(part: float) -> str:
     return f"{100.0 * part:.2g} %" if part < 0.1 else f"{100.0 * part:.0f} %"
 
 
+_TAKEN = (
+    *((180.0 / math.pi, "deg", "rad"), (3600.0 / 1852.0, "knots", "m/s"), (3.6, "km/h", "m/s")),
+    *((1.0 / 0.3048, "feet", "metres"), (1000.0, "mm", "m"), (100.0, "cm", "m")),
+    (60.0, "per minute", "per second"),
+)
 # values too large by this factor -> what happened to them
-_SLIPS = {
-    180.0 / math.pi: "deg taken as rad",
-    math.pi / 180.0: "rad taken as deg",
-    3600.0 / 1852.0: "knots taken as m/s",
-    1852.0 / 3600.0: "m/s taken as knots",
-    3.6: "km/h taken as m/s",
-    1.0 / 3.6: "m/s taken as km/h",
-    1.0 / 0.3048: "feet taken as metres",
-    0.3048: "metres taken as feet",
-    1000.0: "mm taken as m",
-    0.001: "m taken as mm",
-    60.0: "per minute taken as per second",
-    1.0 / 60.0: "per second taken as per minute",
-    100.0: "cm taken as m",
-    0.01: "m taken as cm",
-}
+_SLIPS = {size: f"{one} taken as {other}" for size, one, other in _TAKEN}
+_SLIPS |= {1.0 / size: f"{other} taken as {one}" for size, one, other in _TAKEN}
 
 
 def slip_in_words(factor: float) -> str:

@@ -63,20 +63,11 @@ _MATERIAL = 0.15
 _WIND = ("wind_speed", "wind_dir")
 
 
-class Sampled:
-    """The channels of a log at the samples of its blocks, [K, samples of a block] each."""
-
-    def __init__(self, log: Record, at: np.ndarray) -> None:
-        self._log, self._at, self.units = log, at, log.units
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._log
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return np.asarray(self._log[name][self._at])
+_Sampled = Mapping[str, np.ndarray]
+"""Channels of a log at the samples of its blocks, [K, samples of a block] each."""
 
 
-def _wind(log: Sampled, names: Sequence[str]) -> list[np.ndarray]:
+def _wind(log: _Sampled, names: Sequence[str]) -> list[np.ndarray]:
     """Return the wind's load along and across the vessel; nothing without a wind."""
     if not (set(_WIND) <= set(names) and "psi" in log):
         return []
@@ -85,7 +76,7 @@ def _wind(log: Sampled, names: Sequence[str]) -> list[np.ndarray]:
     return [pressure * np.cos(side), pressure * np.sin(side), pressure * np.sin(2.0 * side)]
 
 
-def _weight(log: Sampled, moving: Sequence[str]) -> list[np.ndarray]:
+def _weight(log: _Sampled, moving: Sequence[str]) -> list[np.ndarray]:
     """Return the vertical along the axes of a vessel that dives; nothing on the surface."""
     if "q" not in moving:
         return []
@@ -93,7 +84,9 @@ def _weight(log: Sampled, moving: Sequence[str]) -> list[np.ndarray]:
     return [np.sin(log["theta"]), level * np.sin(log["phi"]), level * np.cos(log["phi"])]
 
 
-def _quadratic(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> list[np.ndarray]:
+def _quadratic(
+    log: _Sampled, units: Mapping[str, str], moving: Sequence[str], driving: Sequence[str]
+) -> list[np.ndarray]:
     """Return forces of second degree in velocities and revolutions, as a hull in water has.
 
     They stay right at speeds that the others have not run. Angles have no degree.
@@ -103,8 +96,8 @@ def _quadratic(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> l
     out = [state * np.abs(state) for state in states]
     out += [a * b for i, a in enumerate(states) for b in states[i + 1 :]]
     out += [np.abs(ahead) * state for state in states[1:]] + _weight(log, moving)
-    angles = [log[name] for name in driving if log.units[name] == "rad"]
-    turns = [log[name] for name in driving if log.units[name] != "rad"]
+    angles = [log[name] for name in driving if units[name] == "rad"]
+    turns = [log[name] for name in driving if units[name] != "rad"]
     for turn in turns:
         out += [turn * np.abs(turn), ahead * turn]
         out += [np.abs(turn) * state for state in states[1:]] if len(turns) <= 4 else []
@@ -115,7 +108,9 @@ def _quadratic(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> l
     return out
 
 
-def _polynomial(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> list[np.ndarray]:
+def _polynomial(
+    log: _Sampled, units: Mapping[str, str], moving: Sequence[str], driving: Sequence[str]
+) -> list[np.ndarray]:
     """Return a polynomial in velocities and inputs with constants and linear terms."""
     states, given = [log[name] for name in moving], [log[name] for name in driving]
     ahead = states[0]
@@ -129,7 +124,7 @@ def _polynomial(log: Sampled, moving: Sequence[str], driving: Sequence[str]) -> 
     return out
 
 
-_Form = Callable[[Sampled, Sequence[str], Sequence[str]], list[np.ndarray]]
+_Form = Callable[[_Sampled, Mapping[str, str], Sequence[str], Sequence[str]], list[np.ndarray]]
 
 
 @dataclass
@@ -216,6 +211,11 @@ class Model:
         """Return how much the coefficients' uncertainty adds to the variance [K], as a share."""
         return np.asarray(((rows.x @ self.inverse) * rows.x).sum(1))
 
+    def left(self, rows: Rows) -> np.ndarray:
+        """Return the mean square [n] that the model leaves of y."""
+        rest = rows.y - rows.x @ self.theta
+        return np.asarray((rest**2 / (1.0 + self.unsure(rows))[:, None]).mean(0))
+
     def rest(self, rows: Rows) -> np.ndarray:
         """Return what the model leaves of y [K, n], in standard deviations of what is usual."""
         spread = np.sqrt((self.usual + rows.noise) * (1.0 + self.unsure(rows))[:, None])
@@ -249,32 +249,24 @@ class Fleet:
             blocks_of(log, *self.moving).size * log.step for log in logs if len(log) >= FEWEST
         ]
         self.seconds = float(np.median(seconds)) if seconds else 1.0
-        self.form: _Form = _quadratic
-        self._plain: dict[_Form, list[Rows]] = {}
+        self.form: _Form = _polynomial
+        plain: dict[_Form, list[Rows]] = {}
         errors: dict[_Form, float] = {}
-        for form in (_quadratic, _polynomial):
-            self._take(form)
-            if len(self.told) > 1:
-                models = self._others(self.told, self.told)
-                left = np.stack([self._left(i, models[i]) for i in self.told])
-                errors[form] = float(np.median(np.sqrt(left).sum(1)))
-        simple = errors.get(_quadratic, 0.0)
-        self._take(
-            _polynomial if errors.get(_polynomial, simple) < _SIMPLER * simple else _quadratic
-        )
-        self._plain.clear()
+        for form in (_polynomial, _quadratic):
+            self.form = form
+            plain[form] = [self._rows(log) for log in self.logs]
+            errors[form] = self._take(plain[form])
+        if errors[_polynomial] < _SIMPLER * errors[_quadratic]:
+            self.form = _polynomial
+            self._take(plain[_polynomial])
         self.apart: list[int] = []
         self._rests: dict[int, list[tuple[int, int]]] = {}
         self._settle(list(self.told))
         if len(self.told) > 1:
             self._separate()
 
-    def _take(self, form: _Form) -> None:
-        """Make the rows of all logs in one form."""
-        self.form = form
-        if form not in self._plain:
-            self._plain[form] = [self._rows(log) for log in self.logs]
-        plain = self._plain[form]
+    def _take(self, plain: Sequence[Rows]) -> float:
+        """Take the rows of all logs; return what models of the others leave of most of them."""
         self.told = [i for i, one in enumerate(plain) if one.known]
         own = [plain[i] for i in self.told]
         ones = np.ones(1)
@@ -283,16 +275,21 @@ class Fleet:
         self.spread = np.sqrt(np.mean([np.mean(r.y**2, 0) for r in own], 0)) if own else ones
         self.spread[self.spread == 0.0] = 1.0
         self.rows = [self._scaled(one) for one in plain]
+        models = self._others(self.told, self.told) if len(self.told) > 1 else {}
+        left = [float(np.sqrt(model.left(self.rows[i])).sum()) for i, model in models.items()]
+        return float(np.median(left)) if left else 0.0
 
     def _rows(self, log: Record) -> Rows:
         size = max(round(self.seconds / log.step), 4) if len(log) >= FEWEST else len(log)
         stride = max(size // int(_OVERLAP), (len(log) - size) // _MOST_ROWS, 1)
         first, parts = np.arange(0, max(len(log) - size, 0), stride), []
+        needed = {*self.moving, *self.inputs, "psi", "phi", "theta"}
         # so many blocks at a time that their samples stay in a core's cache
         for some in np.array_split(first, max(first.size * size // _SAMPLES, 1)):
             at = some[:, None] + np.arange(size + 1)
-            seen, dt = Sampled(log, at), np.diff(log.t[at], axis=1)
-            columns = [*self.form(seen, self.moving, self.driving), *_wind(seen, self.inputs)]
+            seen, dt = {n: log[n][at] for n in log if n in needed}, np.diff(log.t[at], axis=1)
+            columns = self.form(seen, log.units, self.moving, self.driving)
+            columns += _wind(seen, self.inputs)
             parts.append(
                 np.stack([0.5 * ((c[:, 1:] + c[:, :-1]) * dt).sum(1) for c in columns], axis=-1)
             )
@@ -328,11 +325,6 @@ class Fleet:
         totals = _totals([self.rows[j] for j in core])
         return {i: self._without(i, totals, core) for i in of}
 
-    def _left(self, i: int, model: Model) -> np.ndarray:
-        """Return the mean square [n] that a model leaves of a log."""
-        rest = self.rows[i].y - self.rows[i].x @ model.theta
-        return np.asarray((rest**2 / (1.0 + model.unsure(self.rows[i]))[:, None]).mean(0))
-
     def _beyond_noise(
         self, core: Sequence[int], models: Mapping[int, Model]
     ) -> dict[int, np.ndarray]:
@@ -342,7 +334,7 @@ class Fleet:
         from its own remainder.
         """
         if len(core) > 3:
-            left = {i: self._left(i, models[i]) for i in core}
+            left = {i: models[i].left(self.rows[i]) for i in core}
         else:
             left = {i: self._by_stretches(self.rows[i]) for i in core}
         return {i: np.maximum(left[i] - self.rows[i].noise, 0.0) for i in core}
@@ -351,48 +343,39 @@ class Fleet:
     def _by_stretches(rows: Rows) -> np.ndarray:
         """Return the mean square [n] left of a log's quarters by models of its other quarters."""
         pieces = [rows.some(p) for p in np.array_split(np.arange(len(rows.y)), _STRETCHES)]
-        out = []
-        for k, piece in enumerate(pieces):
-            model = Model.of([other for j, other in enumerate(pieces) if j != k])
-            rest = piece.y - piece.x @ model.theta
-            out.append((rest**2 / (1.0 + model.unsure(piece))[:, None]).mean(0))
-        return np.asarray(np.mean(out, axis=0))
+        others = [[*pieces[:k], *pieces[k + 1 :]] for k in range(len(pieces))]
+        left = [Model.of(some).left(one) for some, one in zip(others, pieces, strict=True)]
+        return np.asarray(np.mean(left, axis=0))
 
     def scores(self, core: Sequence[int], of: Sequence[int]) -> dict[int, Score]:
         """Return how logs stand to the others of the core."""
         some = core[:: -(-len(core) // _MOST_USUAL)]
         every = [i for i in dict.fromkeys((*some, *of)) if len(core) > (i in core)]
         models = self._others(core, every)
-        left = {i: self._left(i, models[i]) for i in every}
+        left = {i: models[i].left(self.rows[i]) for i in every}
         known = self._beyond_noise(some, models)
-        together, own = np.median([*known.values()], axis=0), np.stack([known[j] for j in some])
-        usual = {
-            i: np.median(np.delete(own, some.index(i), 0), 0) if i in some else together
+        beyond = {
+            i: np.median([known[j] for j in some if j != i], axis=0) + self.rows[i].noise
             for i in every
         }
-        beyond = {i: usual[i] + self.rows[i].noise for i in every}
         ratio = {i: np.sqrt(left[i] / beyond[i]) for i in every}
+        logs = {i: np.log(np.maximum(one, 1e-6)) for i, one in ratio.items()}
         parts = {i: self._parts(i, models[i], beyond[i]) for i in every}
         inside = [i for i in some if i in ratio]
-        differ = np.array([parts[i][0] for i in inside])
-        logs = np.log(np.maximum([ratio[i] for i in inside], 1e-6))
+        # few logs have no scatter to speak of
+        middle, scatter, common = np.zeros(1), np.full(1, np.inf), 1.0
+        if len(inside) > 4:
+            middle = np.median([logs[i] for i in inside], axis=0)
+            scatter = np.median([np.abs(logs[i] - middle) for i in inside], axis=0)
+            scatter = np.hypot(SIGMA_OF_MAD * scatter, _LEAST_SCATTER)
+        if len(inside) > 2:
+            # a polynomial that does not fit the vessel differs from log to log by itself
+            common = max(1.0, float(np.median([parts[i][0] for i in inside])) / _USUAL_PARTS)
         out = {}
         for i in of:
-            scatters = 0.0
-            # few logs have no scatter to speak of
-            if len(inside) > 4:
-                middle = np.median(logs, axis=0)
-                scatter = SIGMA_OF_MAD * np.median(np.abs(logs - middle), axis=0)
-                over = (np.log(np.maximum(ratio[i], 1e-6)) - middle) / np.hypot(
-                    scatter, _LEAST_SCATTER
-                )
-                scatters = float(over.max())
-            apart, moved = parts[i]
-            # a polynomial that does not fit the vessel differs from log to log by itself
-            if len(inside) > 2:
-                apart /= max(1.0, float(np.median(differ)) / _USUAL_PARTS)
             excess = float(np.sqrt(np.maximum(left[i] - beyond[i], 0.0)).max())
-            out[i] = Score(apart, ratio[i], scatters, max(moved, excess))
+            scatters = float(((logs[i] - middle) / scatter).max())
+            out[i] = Score(parts[i][0] / common, ratio[i], scatters, max(parts[i][1], excess))
         return out
 
     @cached_property
@@ -442,7 +425,7 @@ class Fleet:
     def _misfits(self, core: Sequence[int], own: Mapping[int, np.ndarray]) -> dict[int, float]:
         """Return what a core leaves of each log, over what its own quarters leave of each other."""
         models = self._others(core, [i for i in self.told if [i] != core])
-        left = {i: self._left(i, model) for i, model in models.items()}
+        left = {i: model.left(self.rows[i]) for i, model in models.items()}
         return {i: float((left[i] / own[i]).max()) if i in left else 1.0 for i in self.told}
 
     def _agreeing(self) -> list[int]:
@@ -489,10 +472,10 @@ class Fleet:
         whole = {i: self.rows[i] for i in gone}
         for i in gone:
             # a hand on the wheel for some seconds does not make it another vessel
-            rows, clear = self.rows[i], np.ones(len(self.rows[i].first), dtype=bool)
-            for start, stop in self.rests(i):
-                clear &= (rows.first + rows.size <= start) | (rows.first >= stop)
-            kept = rows.some(clear)
+            rows = self.rows[i]
+            begin, end = np.array(self.rests(i), dtype=int).reshape(-1, 2).T
+            apart = (rows.first[:, None] + rows.size <= begin) | (rows.first[:, None] >= end)
+            kept = rows.some(np.asarray(apart.all(axis=1)))
             self.rows[i] = kept if kept.known else rows
         scores = self.scores(self.core, gone) if gone else {}
         again = [i for i in gone if scores[i].size <= 1.0]

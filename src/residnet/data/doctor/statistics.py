@@ -17,6 +17,7 @@ from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.stretches import stretches as runs_of
 from residnet.data.channels import (
     CACHED,
+    covered,
     deviation,
     far_from_medians,
     median,
@@ -170,10 +171,8 @@ class Record:
 
     def torn(self, reach: int) -> np.ndarray:
         """Return [T] bool: samples within so many of where two stretches meet."""
-        out = np.zeros(len(self), dtype=bool)
-        for at in np.searchsorted(self.t, () if self._seams is None else self._seams):
-            out[max(at - reach - _PAUSE, 0) : at + reach] = True
-        return out
+        at = np.searchsorted(self.t, np.zeros(0) if self._seams is None else self._seams)
+        return covered(len(self), at - reach - _PAUSE, at + reach)
 
     def of(self, statistic: Callable[..., _T], *about: Hashable) -> _T:
         """Return a statistic of this record, `statistic(record, *about)`, computed once."""
@@ -338,19 +337,8 @@ def blocks_of(log: Record, *moving: str) -> Blocks:
     return Blocks(log.t, np.arange(0, len(log) - size, stride), size)
 
 
-def regressors(
-    velocity: Mapping[str, np.ndarray], inputs: Mapping[str, np.ndarray], count: int
-) -> np.ndarray:
-    """Return a polynomial [T, k] of second degree in velocities and inputs that knows no vessel."""
-    driving = [values for values in inputs.values() if deviation(values) > 0.0]
-    columns = [np.ones(count), *of_motion(velocity)]
-    # beyond four inputs each enters linearly only
-    columns += of_inputs(driving, velocity.get("u"), linear=len(driving) > 4)
-    return np.stack(columns, axis=-1)
-
-
 def of_motion(velocity: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    """Return the terms of the regressors that hold velocities alone."""
+    """Return terms of second degree in velocities."""
     columns = [*velocity.values(), *(values * np.abs(values) for values in velocity.values())]
     if "u" in velocity:
         columns += [velocity["u"] * velocity[name] for name in ("v", "r") if name in velocity]
@@ -362,7 +350,7 @@ def of_motion(velocity: Mapping[str, np.ndarray]) -> list[np.ndarray]:
 def of_inputs(
     driving: Sequence[np.ndarray], u: np.ndarray | None, *, linear: bool
 ) -> list[np.ndarray]:
-    """Return the terms of the regressors that hold inputs; `u` is the speed ahead."""
+    """Return terms of second degree that hold inputs; `u` is the speed ahead."""
     if linear:
         return [*driving]
     flow = [] if u is None else [u * np.abs(u) * values for values in driving]

@@ -15,6 +15,7 @@ from residnet.core.names import POSE, STATE
 from residnet.core.stretches import stretches
 from residnet.data.channels import (
     beyond_belief,
+    covered,
     deviation,
     fills,
     median,
@@ -214,9 +215,10 @@ def frozen(log: Record, found: Check) -> Iterator[Finding]:
         starts, stops = stretches(held)
         if not starts.size:
             continue
-        seconds, at = log.t[stops - 1] - log.t[starts], held.copy()
-        for stop in stops if names[0] in ("x", "y") else ():
-            at[stop : int(np.searchsorted(log.t, log.t[stop - 1] + _RECOVERY - 1e-9))] = True
+        seconds, at = log.t[stops - 1] - log.t[starts], held
+        if names[0] in ("x", "y"):
+            after = np.searchsorted(log.t, log.t[stops - 1] + _RECOVERY - 1e-9)
+            at = held | covered(len(log), stops, np.maximum(after, stops))
         share, longest = float(at.mean()), int(np.argmax(seconds))
         text = (
             f"{'position' if len(names) == 2 else names[0]} is bit-identical in {starts.size}"
@@ -274,9 +276,7 @@ def _held(log: Record, names: tuple[str, ...]) -> np.ndarray:
     moved = np.full(starts.size, noisy)
     for name in () if noisy else names:
         moved |= _moves(log[name], stops)
-    for start, stop in zip(starts[moved], stops[moved], strict=True):
-        out[start : stop + 1] = True
-    return out
+    return covered(out.size, starts[moved], stops[moved] + 1)
 
 
 def _moves(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
@@ -310,9 +310,9 @@ def repeated_fix(log: Record, found: Check) -> Iterator[Finding]:
     """Report single rows in which position stands still while the vessel moves."""
     change = np.diff(log.log.stack(("x", "y")), axis=0)
     same = (change == 0.0).all(axis=1)
-    short = same.copy()
-    for start, stop in zip(*stretches(same), strict=True):
-        short[start:stop] = stop - start < _LONGEST_REPEAT
+    starts, stops = stretches(same)
+    few = stops - starts < _LONGEST_REPEAT
+    short = covered(same.size, starts[few], stops[few])
     share = float(short.mean())
     # a position moves by far more than its resolution where it moves
     steps = np.hypot(*change[~same].T)
@@ -389,11 +389,10 @@ def _straight(log: Record, name: str) -> np.ndarray:
     if float(flat.mean()) > _USUALLY_STRAIGHT:
         return out
     moving = np.abs(slope[:-1]) > 10.0 * rounding
-    for start, stop in zip(*stretches(flat & moving), strict=True):
-        long = log.t[stop] - log.t[start] >= _STRAIGHT_SECONDS
-        if stop - start >= _STRAIGHT_SAMPLES and long:
-            out[start : stop + 2] = True
-    return out
+    starts, stops = stretches(flat & moving)
+    long = log.t[stops] - log.t[starts] >= _STRAIGHT_SECONDS
+    long &= stops - starts >= _STRAIGHT_SAMPLES
+    return covered(out.size, starts[long], stops[long] + 2)
 
 
 @check(

@@ -401,7 +401,6 @@ def drafted_channels(
 
     Args:
         names: channel -> column.
-        marks: is told what is not sure.
         texts: names of columns and cells that may tell a frame.
     """
     attitude = {name: column for name, column in names.items() if name in QUATERNION}

@@ -105,9 +105,6 @@ def draft_recordings(
     them, or the pose comes rarely, other topics and frames are tried, unless the format fixes its
     frames. Inputs are found by names.
 
-    Args:
-        marks: is told what is not sure.
-
     Raises:
         UsageError: where the first one cannot be read.
         DataError: where it holds nothing that can be used.
@@ -348,8 +345,8 @@ def _velocities(recording: Recording) -> Iterator[tuple[Series, str, str]]:
 def _pose(recording: Recording, position: PositionConfig, heading: HeadingConfig) -> Raw | None:
     """Return north, east and heading at the times of the positions; None where they cannot be."""
     try:
-        place = position_part(recording, position, 1.0).log
-        angle = heading_part(recording, heading, 1.0).log
+        place = position_part(recording, position).log
+        angle = heading_part(recording, heading).log
     except ResidnetError:
         return None
     known = np.isfinite(angle["psi"])
@@ -507,7 +504,6 @@ def read_drafted(paths: Sequence[Path], marks: Marks, *, gridded: bool = True) -
     """Return the logs in files of one format, by a reader that is drafted from them.
 
     Args:
-        marks: is told what is not sure.
         gridded: recordings come on a uniform clock, and else on that of their positions.
 
     Raises:

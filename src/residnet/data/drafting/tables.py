@@ -92,7 +92,6 @@ def draft_tables(
 
     Args:
         files: at least one table.
-        marks: is told what is not sure.
         headed: whether other files may tell the heading.
 
     Raises:
@@ -270,7 +269,6 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
     A speed is that forward where no position and heading tell it.
 
     Args:
-        marks: is told what is not sure.
         headed: whether something else may tell the heading.
     """
     alone = {re.sub(r"\W*[\[(].*|_m$", "", column).strip().lower(): column for column in columns}

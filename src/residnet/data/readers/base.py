@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, Literal, Self, final
 
 import numpy as np
 
@@ -48,6 +48,14 @@ class LogReader(ABC):
             UsageError: where the file or a column is missing, or a unit does not fit.
             DataError: where the contents cannot be used.
         """
+
+
+class ConfiguredReader(Config, LogReader):
+    """A reader that is its own config."""
+
+    def build(self) -> Self:
+        """Return the reader of this config: itself."""
+        return self
 
 
 class ReaderKind(Config, ABC):
@@ -215,19 +223,11 @@ def readable(path: Path, what: str) -> Iterator[None]:
         raise DataError(f"{path}: damaged or not {what} ({reason})") from error
 
 
-class CanonicalConfig(Config):
+@final
+class CanonicalConfig(ConfiguredReader):
     """Logs that residnet wrote: they hold names, units and masks, so nothing is declared."""
 
     kind: Literal["canonical"] = "canonical"
-
-    def build(self) -> CanonicalReader:
-        """Build the reader of canonical logs."""
-        return CanonicalReader()
-
-
-@final
-class CanonicalReader(LogReader):
-    """Reads what `Log.save` wrote; where the log itself came from stays in `meta["origin"]`."""
 
     def read(self, path: Path) -> Log:
         """Return the log in `path`; see `LogReader.read`.

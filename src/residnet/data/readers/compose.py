@@ -8,19 +8,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, ClassVar, Literal, final
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.config import Config, Seconds
+from residnet.core.config import Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import ROLL, SIX, Live
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, to_si
 from residnet.data.channels import without_fills
 from residnet.data.derivatives import SavitzkyGolay
-from residnet.data.readers.base import LogReader, digest, require_samples, turned, unwrap
+from residnet.data.readers.base import ConfiguredReader, digest, require_samples, turned, unwrap
 from residnet.data.readers.messages import standard_plan
 from residnet.data.readers.quantities import (
     Angle,
@@ -57,11 +57,12 @@ from residnet.data.readers.topics import align_clocks, beside, traffic
 
 _STATE = ("x", "y", "psi", "u", "v", "r", "p", "phi")
 _MOVING = {*_STATE, "north_rate", "east_rate"}
-_USUAL_GAP = 3.0
-"""Usual steps of a topic that are bridged: two rows may get lost; chosen by hand."""
+_LONGEST_GAP, _USUAL_GAP = 1.0, 3.0
+"""Longest step that is bridged, s, and in usual steps of a topic: two rows may get lost; chosen by
+hand."""
 
 
-class RecordingConfig(Config, ABC):
+class RecordingConfig(ConfiguredReader, ABC):
     """What to take from a recording.
 
     Attributes:
@@ -76,8 +77,6 @@ class RecordingConfig(Config, ABC):
             takes, for a topic without header stamps, the usual latency of those that have them.
         zone: time by which the recorder's clock is ahead of UTC, s; null estimates it where topics
             have stamps and arrivals.
-        longest_gap: longest step that is interpolated across, s; slow topics may always step over
-            three of their usual steps.
         manoeuvre: kind of manoeuvre of every recording, `folder` takes the name of the folder it
             lies in, null says that it is not known.
     """
@@ -90,7 +89,6 @@ class RecordingConfig(Config, ABC):
     clock: ClockConfig = Field(default_factory=OfTopic)
     delays: dict[str, Seconds | Literal["estimated"]] = Field(default_factory=dict)
     zone: Seconds | None = None
-    longest_gap: Seconds = Field(default=1.0, gt=0.0)
     manoeuvre: str | None = None
     formats: ClassVar[Mapping[str, Callable[[Path, bytes], bool]]] = {}
     """Name of each format that it reads -> whether a path with these first bytes is of it."""
@@ -122,36 +120,24 @@ class RecordingConfig(Config, ABC):
             ResidnetError: where it cannot be read.
         """
 
-    def build(self) -> RecordingReader:
-        """Build the reader of recordings with this config."""
-        return RecordingReader(self)
-
-
-@final
-class RecordingReader(LogReader):
-    """Reads a recording and composes one log from it."""
-
-    def __init__(self, config: RecordingConfig) -> None:
-        self._config = config
-
     def read(self, path: Path) -> Log:
         """Return the log in `path`.
 
         See `LogReader.read`. `meta["findings"]` says what was noticed and mended on the way in.
         """
-        return self.log_of(self._config.load(path, self._wanted()))
+        return self.log_of(self.load(path, self._wanted()))
 
     def log_of(self, recording: Recording) -> Log:
         """Return the log of a recording as it was loaded; see `read`."""
-        config, path = self._config, recording.path
+        path = recording.path
         delays = {
-            topic: None if delay == "estimated" else delay for topic, delay in config.delays.items()
+            topic: None if delay == "estimated" else delay for topic, delay in self.delays.items()
         }
-        recording = align_clocks(recording, delays, config.zone)
-        plan = Plan(config.channels, config.position, config.heading, config.velocity)
-        if config.standard_messages:
+        recording = align_clocks(recording, delays, self.zone)
+        plan = Plan(self.channels, self.position, self.heading, self.velocity)
+        if self.standard_messages:
             plan = standard_plan(recording, plan)
-        log = compose(recording, plan, config.clock, config.longest_gap)
+        log = compose(recording, plan, self.clock)
         rest: set[str] = set()
         if not Live.told(log.channels).spatial:
             # of a vessel that does not dive nobody asked for these
@@ -159,26 +145,23 @@ class RecordingReader(LogReader):
         elif isinstance(plan.velocity, EarthFixed | CourseSpeed):
             # turned by the heading alone they are not along the axes of one that pitches
             rest = {"u", "v"}
-        kept = {
-            n: values for n, values in log.channels.items() if n not in rest - {*config.channels}
-        }
+        kept = {n: values for n, values in log.channels.items() if n not in rest - {*self.channels}}
         log = log.replace(channels=kept, units={name: log.units[name] for name in kept})
-        manoeuvre = path.resolve().parent.name if config.manoeuvre == "folder" else config.manoeuvre
+        manoeuvre = path.resolve().parent.name if self.manoeuvre == "folder" else self.manoeuvre
         meta = {**log.meta, "source": str(path), "sha256": digest(recording.files or (path,))}
         name = path.name if path.is_dir() else path.stem
         return log.replace(name=name, manoeuvre=manoeuvre or "unknown", meta=meta)
 
     def _wanted(self) -> Wanted:
         """Return what the config names; everything where standard messages may add to it."""
-        config = self._config
-        if config.standard_messages:
+        if self.standard_messages:
             return EVERYTHING
-        named = [(entry.topic, entry.field) for entry in config.channels.values()]
-        for source in (config.position, config.heading, config.velocity):
+        named = [(entry.topic, entry.field) for entry in self.channels.values()]
+        for source in (self.position, self.heading, self.velocity):
             if isinstance(source, Source):
                 named += [(source.topic, name) for name in source.fields]
-        if isinstance(config.clock, OfTopic) and config.clock.topic is not None:
-            named.append((config.clock.topic, CLOCK_ONLY))
+        if isinstance(self.clock, OfTopic) and self.clock.topic is not None:
+            named.append((self.clock.topic, CLOCK_ONLY))
         return Wanted(named)
 
 
@@ -225,7 +208,7 @@ class Part:
         return out
 
 
-def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: float) -> Log:
+def compose(recording: Recording, plan: Plan, clock: ClockConfig) -> Log:
     """Return the log of a recording whose clocks are settled.
 
     Time starts at 0 where the recording has dates (`meta["epoch"]`, Unix time in s), else it is the
@@ -237,7 +220,7 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
         DataError: where a topic that is used has no usable time, or the topics share no stretch of
             time.
     """
-    parts = _parts(recording, plan, longest_gap)
+    parts = _parts(recording, plan)
     times, step = _times(recording, parts, clock)
     derived = plan.velocity if isinstance(plan.velocity, Derived) else None
     lever = Antenna() if plan.position is None else plan.position.antenna
@@ -275,15 +258,15 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
     return log.replace(meta={**meta, "findings": findings})
 
 
-def _parts(recording: Recording, plan: Plan, longest_gap: float) -> list[Part]:
+def _parts(recording: Recording, plan: Plan) -> list[Part]:
     parts = []
     if plan.position is not None:
-        parts.append(position_part(recording, plan.position, longest_gap))
+        parts.append(position_part(recording, plan.position))
     if plan.heading is not None:
-        parts.append(heading_part(recording, plan.heading, longest_gap))
-    parts += _channel_parts(recording, plan.channels, longest_gap)
+        parts.append(heading_part(recording, plan.heading))
+    parts += _channel_parts(recording, plan.channels)
     if isinstance(plan.velocity, EarthFixed | CourseSpeed):
-        parts.append(_velocity_part(recording, plan.velocity, longest_gap))
+        parts.append(_velocity_part(recording, plan.velocity))
     for entry in (entry for part in parts for entry in part.remarks):
         if entry["level"] == "fatal":
             raise DataError(f"{recording.path}: {entry['text']}")
@@ -312,11 +295,11 @@ def _part(
     recording: Recording,
     series: Series,
     values: dict[str, np.ndarray],
-    gap: float,
     conversion: Sequence[str] = (),
     remarks: Sequence[Remark] = (),
     units: Mapping[str, str] | None = None,
     held: tuple[str, ...] = (),
+    gap: float = _LONGEST_GAP,
 ) -> Part:
     if len(series) < 2:
         raise DataError(
@@ -328,18 +311,27 @@ def _part(
     return Part(log, held, gap, (*series.remarks, *remarks), tuple(conversion))
 
 
-def _channel_parts(
-    recording: Recording, channels: Mapping[str, FieldMap], longest_gap: float
-) -> list[Part]:
+def _channel_parts(recording: Recording, channels: Mapping[str, FieldMap]) -> list[Part]:
     """Return one part for all channels of a topic that may share one.
 
     A channel with hardly a value has one of its own, of the rows that have any.
     """
     groups: dict[tuple[str, str | None, float, str], dict[str, FieldMap]] = {}
-    for name, entry in _present(recording, channels).items():
+
+    def there(entry: FieldMap) -> bool:
+        names = recording.series
+        topic = next(iter(names), "") if entry.topic is None else same_topic(entry.topic, names)
+        series = recording.series.get(topic or "")
+        found = series is not None and series.has(entry.field) and len(series) > 1
+        return bool(found and series is not None and np.isfinite(series[entry.field]).any())
+
+    for name, entry in channels.items():
+        if not (entry.required or there(entry)):
+            continue
         series = recording[entry.topic]
         sparse = np.isnan(series[entry.field]).mean() > 0.5
-        key = (series.name, entry.sender, entry.longest_gap or longest_gap, name if sparse else "")
+        gap = entry.longest_gap or _LONGEST_GAP
+        key = (series.name, entry.sender, gap, name if sparse else "")
         groups.setdefault(key, {})[name] = entry
     parts = []
     for (topic, sender, gap, alone), entries in groups.items():
@@ -358,21 +350,8 @@ def _channel_parts(
         ]
         units = {name: entry.si(name) for name, entry in entries.items()}
         held = tuple(name for name, entry in entries.items() if entry.hold)
-        parts.append(_part(recording, series, values, gap, conversion, (), units, held))
+        parts.append(_part(recording, series, values, conversion, (), units, held, gap))
     return parts
-
-
-def _present(recording: Recording, channels: Mapping[str, FieldMap]) -> dict[str, FieldMap]:
-    """Return the channels without those that may be missing and are."""
-
-    def there(entry: FieldMap) -> bool:
-        names = recording.series
-        topic = next(iter(names), "") if entry.topic is None else same_topic(entry.topic, names)
-        series = recording.series.get(topic or "")
-        found = series is not None and series.has(entry.field) and len(series) > 1
-        return bool(found and series is not None and np.isfinite(series[entry.field]).any())
-
-    return {name: entry for name, entry in channels.items() if entry.required or there(entry)}
 
 
 def _moved(lever: Antenna, what: str) -> tuple[str, ...]:
@@ -381,12 +360,12 @@ def _moved(lever: Antenna, what: str) -> tuple[str, ...]:
     return (f"{what}: moved to the vessel's centre from ({lever.x:g}, {lever.y:g}) m in body axes",)
 
 
-def position_part(recording: Recording, config: PositionConfig, longest_gap: float) -> Part:
+def position_part(recording: Recording, config: PositionConfig) -> Part:
     """Return x and y of the antenna, m."""
     series, moved = recording[config.topic], _moved(config.antenna, "x, y")
     first, second = (_numbers(recording, series, name, config.unit) for name in config.fields)
     if not isinstance(config, Geodetic):
-        return _part(recording, series, {"x": first, "y": second}, longest_gap, moved)
+        return _part(recording, series, {"x": first, "y": second}, moved)
     at = None if config.origin is None else (config.origin.latitude, config.origin.longitude)
     north, east, origin, none = fixes_on_plane(first, second, at)
     if origin is None:
@@ -398,11 +377,10 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
     remarks = [remark("note", "no_fix", text, rows=none)] if none else []
     degrees = np.degrees(origin)
     plane = f"x, y: tangent plane of WGS 84 at {degrees[0]:.7f} deg N, {degrees[1]:.7f} deg E"
-    values = {"x": north, "y": east}
-    return _part(recording, series, values, longest_gap, (plane, *moved), remarks)
+    return _part(recording, series, {"x": north, "y": east}, (plane, *moved), remarks)
 
 
-def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float) -> Part:
+def heading_part(recording: Recording, config: HeadingConfig) -> Part:
     """Return psi, unwrapped from its first value in [0, 2 pi); phi and theta where wanted."""
     series = recording[config.topic]
     values: dict[str, np.ndarray] = {}
@@ -445,12 +423,10 @@ def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float
     values["psi"] = psi
     text = "psi: counter-clockwise from east (REP-103) to clockwise from north"
     conversion = (text,) if config.frame == "enu" else ()
-    return _part(recording, series, values, longest_gap, conversion, remarks)
+    return _part(recording, series, values, conversion, remarks)
 
 
-def _velocity_part(
-    recording: Recording, config: EarthFixed | CourseSpeed, longest_gap: float
-) -> Part:
+def _velocity_part(recording: Recording, config: EarthFixed | CourseSpeed) -> Part:
     series = recording[config.topic]
     if isinstance(config, CourseSpeed):
         course = _numbers(recording, series, config.course, config.course_unit)
@@ -466,7 +442,7 @@ def _velocity_part(
     turned = "u, v: earth-fixed velocity turned into body axes"
     values = {"north_rate": north, "east_rate": east}
     moved = _moved(config.antenna, "u, v")
-    return _part(recording, series, values, longest_gap, (turned, *moved))
+    return _part(recording, series, values, (turned, *moved))
 
 
 def _usual_step(t: np.ndarray) -> float:
@@ -581,7 +557,7 @@ def _meta(
             (r["figures"] for r in found if r["code"] == "topic_rate"), {}
         )
         topics[series.name] = {"kind": series.kind, "rows": len(series), **rate}
-    present = _present(recording, plan.channels)
+    present = {name for part in parts for name in part.log.channels}
     absent = [name for name in plan.channels if name not in present]
     if absent:
         text = (

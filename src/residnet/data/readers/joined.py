@@ -11,13 +11,13 @@ from typing import Literal, NamedTuple, final
 import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.config import Config, Seconds
+from residnet.core.config import Seconds
 from residnet.core.errors import DataError, ResidnetError
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.align import GridConfig, onto
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.readers.base import LogReader, digest, require_file
+from residnet.data.readers.base import ConfiguredReader, digest, require_file
 from residnet.data.readers.recording import Level, Remark, remark
 from residnet.data.readers.tables import (
     TABLES,
@@ -45,8 +45,22 @@ _SAMPLES = 3000
 TableKind = CsvConfig | ParquetConfig | ExcelConfig | JsonLinesConfig
 
 
+class Shift(NamedTuple):
+    """The time in s to add to a clock, and what it explains of what the motion alone leaves.
+
+    Attributes:
+        seconds: to add.
+        explained: share of the variance, from 0 to 1.
+        other: the same with the best shift that is far from it.
+    """
+
+    seconds: float
+    explained: float
+    other: float
+
+
 @final
-class JoinedConfig(Config):
+class JoinedConfig(ConfiguredReader):
     """Files of one trip whose names differ in one word, such as gnss_1.csv beside motors_1.csv.
 
     The first part is that of the motion: a log is named by its file and has its clock. What the
@@ -73,36 +87,10 @@ class JoinedConfig(Config):
             )
         return self
 
-    def build(self) -> JoinedReader:
-        """Build the reader of joined files."""
-        return JoinedReader(self)
-
-
-class Shift(NamedTuple):
-    """The time in s to add to a clock, and what it explains of what the motion alone leaves.
-
-    Attributes:
-        seconds: to add.
-        explained: share of the variance, from 0 to 1.
-        other: the same with the best shift that is far from it.
-    """
-
-    seconds: float
-    explained: float
-    other: float
-
-
-@final
-class JoinedReader(LogReader):
-    """Reads the file of the motion and those beside it."""
-
-    def __init__(self, config: JoinedConfig) -> None:
-        self._config = config
-
     def logs_among(self, paths: Sequence[Path]) -> list[Path]:
         """Return the files of the motion."""
-        first, *others = self._config.parts
-        kind = self._config.parts[first].kind
+        first, *others = self.parts
+        kind = self.parts[first].kind
         return [
             path
             for path in paths
@@ -113,12 +101,12 @@ class JoinedReader(LogReader):
 
     def files(self, path: Path) -> list[Path]:
         """Return the files of the trip that a file of the motion is of."""
-        return [*self.parts(path).values()]
+        return [*self.trip(path).values()]
 
-    def parts(self, path: Path) -> dict[str, Path]:
+    def trip(self, path: Path) -> dict[str, Path]:
         """Return word -> file of the trip that a file of the motion is of."""
         require_file(path)
-        first, *others = self._config.parts
+        first, *others = self.parts
         before, found, after = path.name.rpartition(first)
         if not found:
             raise DataError(
@@ -135,8 +123,8 @@ class JoinedReader(LogReader):
 
     def read(self, path: Path) -> Log:
         """Return the log of one trip; see `LogReader.read`."""
-        files = self.parts(path)
-        logs = {word: self._config.parts[word].build().read(file) for word, file in files.items()}
+        files = self.trip(path)
+        logs = {word: self.parts[word].build().read(file) for word, file in files.items()}
         first, *others = logs
         log = logs[first]
         # what dates join may be what the shift of the others is found by
@@ -177,7 +165,7 @@ class JoinedReader(LogReader):
 
         Dates of both join them, unless what the channels explain is sure to say otherwise.
         """
-        given = self._config.shift.get(word)
+        given = self.shift.get(word)
         if given is not None:
             return given, remark("note", "joined", f"{word}: its clock is moved by {given:g} s")
         dated, give = _by_dates(log, other), f"give `shift: {{{word}: ...}}`"

@@ -158,17 +158,6 @@ def true_headings(psi: np.ndarray) -> np.ndarray:
     return out
 
 
-def told_headings(raw: np.ndarray, psi: np.ndarray) -> str:
-    """Return how many headings a recorder made up between 359 and 1 deg; empty for none."""
-    lost = int((np.isfinite(raw) & ~np.isfinite(psi)).sum())
-    return (
-        f"{lost} headings were interpolated by the recorder from 359 to 1 deg by way of 180; they"
-        " are left empty"
-        if lost
-        else ""
-    )
-
-
 class ChannelMap(Conversion):
     """One channel of a foreign table.
 
@@ -239,8 +228,8 @@ class FieldMap(Conversion):
         field: path of the field, for example `twist.linear.x`.
         sender: takes only the rows of one sender, where several publish to the topic.
         hold: the last value holds until the next (commands); otherwise values are interpolated.
-        longest_gap: longest step that is interpolated across or held over, s; null takes the
-            reader's.
+        longest_gap: longest step that is interpolated across or held over, s; null takes a second.
+            Slow topics may always step over three of their usual steps.
         required: stops where the recording has no such topic or no number in it; otherwise the log
             lacks the channel, and says so.
     """

@@ -26,7 +26,7 @@ from residnet.data.channels import beyond_belief, fills, largest
 from residnet.data.motion import with_true_wind
 from residnet.data.readers.base import (
     Advance,
-    LogReader,
+    ConfiguredReader,
     package,
     progress,
     provenance,
@@ -44,7 +44,6 @@ from residnet.data.readers.quantities import (
     ChannelMap,
     factor,
     fixes_on_plane,
-    told_headings,
     unit_quaternion,
     yaw_of,
 )
@@ -126,7 +125,7 @@ class TimeColumn(Config):
         return (self.column,) if self.date is None else (self.column, self.date)
 
 
-class TableConfig(Config, ABC):
+class TableConfig(ConfiguredReader, ABC):
     """The part that all tables have in common.
 
     Attributes:
@@ -168,9 +167,210 @@ class TableConfig(Config, ABC):
             DataError: where the file cannot be read.
         """
 
-    def build(self) -> TableReader:
-        """Build the reader of such tables."""
-        return TableReader(self)
+    def read(self, path: Path) -> Log:
+        """Return the log in `path`.
+
+        See `LogReader.read`. Fill values far from all else (-999, 9.97e36) count as missing, and
+        are counted. Rows without a measurement at either end, and blank rows, are dropped and
+        counted; other rows keep NaN where a channel was not measured.
+        """
+        import pandas as pd
+
+        require_file(path)
+        time, maps = self.time, self.channels
+        columns = [*time.columns, *(entry.column for entry in maps.values())]
+        sides = [entry.hemisphere for entry in maps.values() if entry.hemisphere]
+        with progress(path.name, path.stat().st_size, 1.0) as advance:
+            table = self.load(path, [*columns, *sides], advance)
+        # pandas copies all that is told of a table for each of its columns
+        about, table.attrs = table.attrs, {}
+        above, cut = about.get("above", 0), bool(about.get("cut"))
+        rows = len(table) + cut
+        cells = dict(zip([*columns, *sides], (cells for _, cells in table.items()), strict=True))
+        self._require_units(path, about.get("units", ()))
+        t, start, findings = self._times(path, cells, above)
+        raw = {name: self._values(path, name, cells, above) for name in maps}
+        # each column is let go where its channel is made
+        del table, cells
+        measured = np.zeros(t.size, dtype=bool)
+        for values in raw.values():
+            measured |= np.isfinite(values)
+        undated = np.flatnonzero(measured & ~np.isfinite(t))
+        if undated.size:
+            raise DataError(
+                f"{path}: {self._row(undated[0] + above)} has measurements but no time in column"
+                f" '{time.column}' ({undated.size} such rows); delete them or restore their"
+                " time"
+            )
+        for name, values in raw.items():
+            raw[name], said = self._plausible(path, name, values, above)
+            findings += said
+        ends = np.flatnonzero(measured)[[0, -1]] if measured.any() else np.array([0, -1])
+        kept = ends[0] + np.flatnonzero(np.isfinite(t[ends[0] : ends[1] + 1]))
+        require_samples(path, kept)
+        if (np.diff(t[kept]) < 0.0).all():
+            kept = kept[::-1]
+            text = "the rows stand with the newest first, and are read from the last one on"
+            findings.append(remark("note", "newest_first", text))
+        recorded = [*raw.values()]
+        fresh = first_of_copies(t[kept], (_at(values, kept) for values in recorded))
+        if not fresh.all():
+            text = f"{int((~fresh).sum())} rows repeat the one before them and are left out"
+            findings.append(remark("note", "copied_rows", text, rows=float((~fresh).sum())))
+            kept = kept[fresh]
+        held = [name for name in raw if maps[name].hold]
+        for name in held:
+            raw[name] = pd.Series(raw[name]).ffill().to_numpy()
+        if held and len(held) < len(raw):
+            # a row of commands alone belongs to the next sample of the motion
+            moving = [values[kept] for name, values in raw.items() if name not in held]
+            kept = kept[np.isfinite(np.stack(moving)).any(axis=0)]
+        tick = None if time.unit == DATE else to_si(time.unit)
+        clock, said = steady_clock(t[kept], (_at(values, kept) for values in recorded), tick)
+        findings += said
+        del recorded, values
+        require_increasing(path, clock, lambda i: self._row(int(kept[i]) + above))
+        channels: dict[str, np.ndarray] = {}
+        for name in maps:
+            own = _at(raw.pop(name), kept)
+            channels[name] = maps[name].convert(name, own)
+            require_values(path, name, maps[name].column, channels[name])
+            made_up = int((np.isfinite(own) & ~np.isfinite(channels[name])).sum())
+            if name == "psi" and made_up:
+                text = (
+                    f"{made_up} headings were interpolated by the recorder from 359 to 1 deg by way"
+                    " of 180; they are left empty"
+                )
+                findings.append(remark("note", "heading_interpolated", text))
+        channels, said = _placed(path, channels, maps)
+        findings += said
+        if channels.keys() >= {*QUATERNION} and "psi" not in channels:
+            # where qw has the frame `enu`, the heading counts anticlockwise from east
+            yaw = yaw_of(*unit_quaternion(*(channels.pop(name) for name in QUATERNION)))
+            if not np.isfinite(yaw).any():
+                columns = [maps[name].column for name in QUATERNION]
+                raise DataError(f"{path}: {', '.join(columns)} hold no attitude, all are empty")
+            channels["psi"] = unwrap(np.pi / 2.0 - yaw if maps["qw"].frame == "enu" else yaw)
+        for name in [one.removesuffix(COSINE) for one in channels if one.endswith(COSINE)]:
+            if name + SINE in channels and name not in channels:
+                sine, cosine = channels.pop(name + SINE), channels.pop(name + COSINE)
+                channels[name] = unwrap(np.arctan2(sine, cosine))
+        made = {"x": "m", "y": "m"}
+        units = {n: maps[n].si(n) if n in maps else made.get(n, "rad") for n in channels}
+        if cut:
+            text = "the file ends within its last line, which is left out"
+            findings.append(remark("note", "cut_line", text))
+        meta = provenance(path, rows, rows - kept.size)
+        meta |= {"findings": findings} if findings else {}
+        if start is not None:
+            first = start + int(np.rint(clock[0] * 1e9))
+            meta |= {"epoch": first * 1e-9, "epoch_ns": first}
+        kind = self.manoeuvre
+        kind = path.resolve().parent.name if kind == "folder" else kind
+        log = Log(path.stem, clock, channels, units, kind or "unknown", meta=meta)
+        return with_true_wind(log)
+
+    def _require_units(self, path: Path, written: Sequence[str]) -> None:
+        """Stop where cells name another unit than the channel map; `written` are those of cells."""
+        time, maps = self.time, self.channels.values()
+        clock = [(name, time.unit) for name in time.columns]
+        # with a scale, the map says what its numbers mean
+        mapped = [(one.column, "" if one.scale != 1.0 else one.unit) for one in maps]
+        for (column, unit), told in zip([*clock, *mapped], written, strict=False):
+            if told and unit and told != known_unit(unit):
+                raise DataError(
+                    f"{path}: the cells of column '{column}' are in {told}, not in {unit}; set"
+                    f" unit: {told}"
+                )
+
+    def _row(self, i: int) -> str:
+        return self.row.format(i + 1, i + 2)
+
+    def _times(
+        self, path: Path, cells: Mapping[str, pd.Series], above: int
+    ) -> tuple[np.ndarray, int | None, list[Remark]]:
+        """Return the times [T] in s, from Unix time in ns where there are dates, and remarks."""
+        time = self.time
+        texts = cells[time.column]
+        if time.unit != DATE:
+            return self._numbers(path, texts, time.column, above) * to_si(time.unit), None, []
+        if time.date is not None:
+            days = cells[time.date].astype("string").str.strip()
+            texts = days + " " + texts.astype("string").str.strip()
+        try:
+            stamps = parse_texts(texts, zone=time.zone, order=time.order, dates=True)
+        except DataError as error:
+            raise DataError(f"{path}: column '{time.column}': {error}") from None
+        known = np.ones(len(texts), dtype=bool) if stamps.known is None else stamps.known
+        start = int(stamps.ns[known][0]) if known.any() else 0
+        t = np.where(known, (stamps.ns - start) * 1e-9, np.nan)
+        return t, start if stamps.absolute else None, list(stamps.remarks)
+
+    def _values(
+        self, path: Path, name: str, cells: Mapping[str, pd.Series], above: int
+    ) -> np.ndarray:
+        """Return one channel [T] as it stands in the table, NaN where empty."""
+        import pandas as pd
+
+        entry = self.channels[name]
+        column = entry.column
+        written = name in FIX and not pd.api.types.is_numeric_dtype(cells[column])
+        if not entry.is_angle and not written:
+            return self._numbers(path, cells[column], column, above)
+        if known_unit(entry.unit) != "deg":
+            raise DataError(f"{path}: column '{column}' is written in degrees; set unit: deg")
+        try:
+            angles = degrees_of(cells[column], name, entry.form, entry.letter_o)
+            if entry.hemisphere is not None:
+                column = entry.hemisphere
+                angles = angles * side_signs(cells[column], name, entry.letter_o)
+        except DataError as error:
+            raise DataError(f"{path}: column '{column}': {error}") from None
+        return angles
+
+    def _numbers(self, path: Path, column: pd.Series, name: str, above: int) -> np.ndarray:
+        """Return the cells of one column as float64 [T], NaN where empty."""
+        import pandas as pd
+
+        numeric = (
+            column
+            if pd.api.types.is_numeric_dtype(column)
+            else pd.to_numeric(column.astype("string"), errors="coerce")
+        )
+        values = numeric.to_numpy(dtype=np.float64, na_value=np.nan)
+        if np.isfinite(values).all():
+            return values
+        bad = np.flatnonzero((np.isnan(values) & column.notna().to_numpy()) | np.isinf(values))
+        if bad.size:
+            i = int(bad[0])
+            raise DataError(
+                f"{path}: {self._row(i + above)}, column '{name}': '{shown(column.iloc[i])}' is not"
+                f" a finite number ({bad.size} such cells in {len(column)} rows); leave cells"
+                " without a measurement empty, and check `delimiter` and `decimal`"
+            )
+        return values
+
+    def _plausible(
+        self, path: Path, name: str, values: np.ndarray, above: int
+    ) -> tuple[np.ndarray, list[Remark]]:
+        """Return a channel [T] without fill values; stop at one that no vessel can have."""
+        entry, findings = self.channels[name], []
+        filled = fills(values)
+        if filled.any():
+            count = int(filled.sum())
+            text = f"{count} cells of {name} hold a fill value and count as missing"
+            findings.append(remark("note", "fill_values", text, count=count))
+            values = np.where(filled, np.nan, values)
+        unit = entry.si(name)
+        bad = np.flatnonzero(beyond_belief(entry.in_si(name, values), unit))
+        if bad.size:
+            i = int(bad[0])
+            raise DataError(
+                f"{path}: {self._row(i + above)}, column '{entry.column}': {values[i]:g} makes"
+                f" {name} larger than {largest(unit):g} {unit}, which no vessel reaches"
+                f" ({bad.size} such cells); correct or empty them, or correct the unit"
+            )
+        return values, findings
 
 
 @final
@@ -271,214 +471,6 @@ class JsonLinesConfig(TableConfig):
         table.columns = pd.Index(list(columns))
         table.attrs["cut"] = lines.cut
         return plain(table)
-
-
-@final
-class TableReader(LogReader):
-    """Reads a table by its channel map."""
-
-    def __init__(self, config: TableConfig) -> None:
-        self._config = config
-
-    def read(self, path: Path) -> Log:
-        """Return the log in `path`.
-
-        See `LogReader.read`. Fill values far from all else (-999, 9.97e36) count as missing, and
-        are counted. Rows without a measurement at either end, and blank rows, are dropped and
-        counted; other rows keep NaN where a channel was not measured.
-        """
-        import pandas as pd
-
-        require_file(path)
-        config, maps = self._config, self._config.channels
-        columns = [*config.time.columns, *(entry.column for entry in maps.values())]
-        sides = [entry.hemisphere for entry in maps.values() if entry.hemisphere]
-        with progress(path.name, path.stat().st_size, 1.0) as advance:
-            table = config.load(path, [*columns, *sides], advance)
-        # pandas copies all that is told of a table for each of its columns
-        about, table.attrs = table.attrs, {}
-        above, cut = about.get("above", 0), bool(about.get("cut"))
-        rows = len(table) + cut
-        cells = dict(zip([*columns, *sides], (cells for _, cells in table.items()), strict=True))
-        self._require_units(path, about.get("units", ()))
-        t, start, findings = self._times(path, cells, above)
-        raw = {name: self._values(path, name, cells, above) for name in maps}
-        # each column is let go where its channel is made
-        del table, cells
-        measured = np.zeros(t.size, dtype=bool)
-        for values in raw.values():
-            measured |= np.isfinite(values)
-        undated = np.flatnonzero(measured & ~np.isfinite(t))
-        if undated.size:
-            raise DataError(
-                f"{path}: {self._row(undated[0] + above)} has measurements but no time in column"
-                f" '{config.time.column}' ({undated.size} such rows); delete them or restore their"
-                " time"
-            )
-        for name, values in raw.items():
-            raw[name], said = self._plausible(path, name, values, above)
-            findings += said
-        ends = np.flatnonzero(measured)[[0, -1]] if measured.any() else np.array([0, -1])
-        kept = ends[0] + np.flatnonzero(np.isfinite(t[ends[0] : ends[1] + 1]))
-        require_samples(path, kept)
-        if (np.diff(t[kept]) < 0.0).all():
-            kept = kept[::-1]
-            text = "the rows stand with the newest first, and are read from the last one on"
-            findings.append(remark("note", "newest_first", text))
-        recorded = [*raw.values()]
-        fresh = first_of_copies(t[kept], (_at(values, kept) for values in recorded))
-        if not fresh.all():
-            text = f"{int((~fresh).sum())} rows repeat the one before them and are left out"
-            findings.append(remark("note", "copied_rows", text, rows=float((~fresh).sum())))
-            kept = kept[fresh]
-        held = [name for name in raw if maps[name].hold]
-        for name in held:
-            raw[name] = pd.Series(raw[name]).ffill().to_numpy()
-        if held and len(held) < len(raw):
-            # a row of commands alone belongs to the next sample of the motion
-            moving = [values[kept] for name, values in raw.items() if name not in held]
-            kept = kept[np.isfinite(np.stack(moving)).any(axis=0)]
-        tick = None if config.time.unit == DATE else to_si(config.time.unit)
-        clock, said = steady_clock(t[kept], (_at(values, kept) for values in recorded), tick)
-        findings += said
-        del recorded, values
-        require_increasing(path, clock, lambda i: self._row(int(kept[i]) + above))
-        channels: dict[str, np.ndarray] = {}
-        for name in maps:
-            own = _at(raw.pop(name), kept)
-            channels[name] = maps[name].convert(name, own)
-            require_values(path, name, maps[name].column, channels[name])
-            if name == "psi" and (text := told_headings(own, channels[name])):
-                findings.append(remark("note", "heading_interpolated", text))
-        channels, said = _placed(path, channels, maps)
-        findings += said
-        if channels.keys() >= {*QUATERNION} and "psi" not in channels:
-            # where qw has the frame `enu`, the heading counts anticlockwise from east
-            yaw = yaw_of(*unit_quaternion(*(channels.pop(name) for name in QUATERNION)))
-            if not np.isfinite(yaw).any():
-                columns = [maps[name].column for name in QUATERNION]
-                raise DataError(f"{path}: {', '.join(columns)} hold no attitude, all are empty")
-            channels["psi"] = unwrap(np.pi / 2.0 - yaw if maps["qw"].frame == "enu" else yaw)
-        for name in [one.removesuffix(COSINE) for one in channels if one.endswith(COSINE)]:
-            if name + SINE in channels and name not in channels:
-                sine, cosine = channels.pop(name + SINE), channels.pop(name + COSINE)
-                channels[name] = unwrap(np.arctan2(sine, cosine))
-        made = {"x": "m", "y": "m"}
-        units = {n: maps[n].si(n) if n in maps else made.get(n, "rad") for n in channels}
-        if cut:
-            text = "the file ends within its last line, which is left out"
-            findings.append(remark("note", "cut_line", text))
-        meta = provenance(path, rows, rows - kept.size)
-        meta |= {"findings": findings} if findings else {}
-        if start is not None:
-            first = start + int(np.rint(clock[0] * 1e9))
-            meta |= {"epoch": first * 1e-9, "epoch_ns": first}
-        kind = config.manoeuvre
-        kind = path.resolve().parent.name if kind == "folder" else kind
-        log = Log(path.stem, clock, channels, units, kind or "unknown", meta=meta)
-        return with_true_wind(log)
-
-    def _require_units(self, path: Path, written: Sequence[str]) -> None:
-        """Stop where cells name another unit than the channel map; `written` are those of cells."""
-        time, maps = self._config.time, self._config.channels.values()
-        clock = [(name, time.unit) for name in time.columns]
-        # with a scale, the map says what its numbers mean
-        mapped = [(one.column, "" if one.scale != 1.0 else one.unit) for one in maps]
-        for (column, unit), told in zip([*clock, *mapped], written, strict=False):
-            if told and unit and told != known_unit(unit):
-                raise DataError(
-                    f"{path}: the cells of column '{column}' are in {told}, not in {unit}; set"
-                    f" unit: {told}"
-                )
-
-    def _row(self, i: int) -> str:
-        return self._config.row.format(i + 1, i + 2)
-
-    def _times(
-        self, path: Path, cells: Mapping[str, pd.Series], above: int
-    ) -> tuple[np.ndarray, int | None, list[Remark]]:
-        """Return the times [T] in s, from Unix time in ns where there are dates, and remarks."""
-        time = self._config.time
-        texts = cells[time.column]
-        if time.unit != DATE:
-            return self._numbers(path, texts, time.column, above) * to_si(time.unit), None, []
-        if time.date is not None:
-            days = cells[time.date].astype("string").str.strip()
-            texts = days + " " + texts.astype("string").str.strip()
-        try:
-            stamps = parse_texts(texts, zone=time.zone, order=time.order, dates=True)
-        except DataError as error:
-            raise DataError(f"{path}: column '{time.column}': {error}") from None
-        known = np.ones(len(texts), dtype=bool) if stamps.known is None else stamps.known
-        start = int(stamps.ns[known][0]) if known.any() else 0
-        t = np.where(known, (stamps.ns - start) * 1e-9, np.nan)
-        return t, start if stamps.absolute else None, list(stamps.remarks)
-
-    def _values(
-        self, path: Path, name: str, cells: Mapping[str, pd.Series], above: int
-    ) -> np.ndarray:
-        """Return one channel [T] as it stands in the table, NaN where empty."""
-        import pandas as pd
-
-        entry = self._config.channels[name]
-        column = entry.column
-        written = name in FIX and not pd.api.types.is_numeric_dtype(cells[column])
-        if not entry.is_angle and not written:
-            return self._numbers(path, cells[column], column, above)
-        if known_unit(entry.unit) != "deg":
-            raise DataError(f"{path}: column '{column}' is written in degrees; set unit: deg")
-        try:
-            angles = degrees_of(cells[column], name, entry.form, entry.letter_o)
-            if entry.hemisphere is not None:
-                column = entry.hemisphere
-                angles = angles * side_signs(cells[column], name, entry.letter_o)
-        except DataError as error:
-            raise DataError(f"{path}: column '{column}': {error}") from None
-        return angles
-
-    def _numbers(self, path: Path, column: pd.Series, name: str, above: int) -> np.ndarray:
-        """Return the cells of one column as float64 [T], NaN where empty."""
-        import pandas as pd
-
-        numeric = (
-            column
-            if pd.api.types.is_numeric_dtype(column)
-            else pd.to_numeric(column.astype("string"), errors="coerce")
-        )
-        values = numeric.to_numpy(dtype=np.float64, na_value=np.nan)
-        if np.isfinite(values).all():
-            return values
-        bad = np.flatnonzero((np.isnan(values) & column.notna().to_numpy()) | np.isinf(values))
-        if bad.size:
-            i = int(bad[0])
-            raise DataError(
-                f"{path}: {self._row(i + above)}, column '{name}': '{shown(column.iloc[i])}' is not"
-                f" a finite number ({bad.size} such cells in {len(column)} rows); leave cells"
-                " without a measurement empty, and check `delimiter` and `decimal`"
-            )
-        return values
-
-    def _plausible(
-        self, path: Path, name: str, values: np.ndarray, above: int
-    ) -> tuple[np.ndarray, list[Remark]]:
-        """Return a channel [T] without fill values; stop at one that no vessel can have."""
-        entry, findings = self._config.channels[name], []
-        filled = fills(values)
-        if filled.any():
-            count = int(filled.sum())
-            text = f"{count} cells of {name} hold a fill value and count as missing"
-            findings.append(remark("note", "fill_values", text, count=count))
-            values = np.where(filled, np.nan, values)
-        unit = entry.si(name)
-        bad = np.flatnonzero(beyond_belief(entry.in_si(name, values), unit))
-        if bad.size:
-            i = int(bad[0])
-            raise DataError(
-                f"{path}: {self._row(i + above)}, column '{entry.column}': {values[i]:g} makes"
-                f" {name} larger than {largest(unit):g} {unit}, which no vessel reaches"
-                f" ({bad.size} such cells); correct or empty them, or correct the unit"
-            )
-        return values, findings
 
 
 def _at(values: np.ndarray, rows: np.ndarray) -> np.ndarray:

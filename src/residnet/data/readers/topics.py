@@ -64,9 +64,8 @@ def align_clocks(
     out = {}
     for name, topic in series.items():
         topic = topic.earlier(0.0, shift)
-        if topic.stamp is not None and topic.arrival is not None and len(topic):
-            late_by = topic.arrival - topic.stamp
-            topic = topic.noting(*_latency(name, late_by, prompt[name] - shift))
+        if name in late:
+            topic = topic.noting(*_latency(name, late[name] - shift, prompt[name] - shift))
         given = [seconds for asked, seconds in delays.items() if same_topic(asked, [name])]
         delay = given[0] if given else 0.0
         if delay is None:

@@ -25,27 +25,11 @@ _DAY = 86_400 * _NS
 # Unix time of 1990 and 2090, s
 _EPOCH_FROM, _EPOCH_TO = 631_152_000, 3_786_912_000
 _UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
-_MONTHS = {
-    word: number
-    for number, words in enumerate(
-        (
-            "jan ene gen",
-            "feb fév fev",
-            "mar mär mrz maa mrt",
-            "apr avr abr",
-            "may mai mei maj",
-            "jun jui",
-            "jul",
-            "aug aoû aou ago",
-            "sep set",
-            "oct okt out",
-            "nov",
-            "dec dez déc dic des",
-        ),
-        1,
-    )
-    for word in words.split()
-}
+_MONTHS = (
+    "jan ene gen|feb fév fev|mar mär mrz maa mrt|apr avr abr|may mai mei maj|jun jui|jul"
+    "|aug aoû aou ago|sep set|oct okt out|nov|dec dez déc dic des"
+)
+_MONTH_OF = {word: n for n, words in enumerate(_MONTHS.split("|"), 1) for word in words.split()}
 _PARTS = (
     r"(?:(?P<a>\d{1,4})\s*(?P<mark>[-./年])\s*(?P<b>\d{1,2}|[^\W\d_]{3,9}\.?)\s*[-./月]\s*"
     r"(?P<c>\d{1,4})日?|(?P<packed>\d{8}))"
@@ -286,7 +270,7 @@ def _days(cells: pd.Series, dates: pd.Series, order: Order) -> np.ndarray:
             {"ymd": "abc", "dmy": "cba", "mdy": "cab"}[order], ((0, 4), (4, 6), (6, 8)), strict=True
         )
     )
-    named = month.str.lower().str.slice(0, 3).map(_MONTHS).astype("Int64").astype("string")
+    named = month.str.lower().str.slice(0, 3).map(_MONTH_OF).astype("Int64").astype("string")
     month = month.where(month.str.isdigit(), named)
     year = year.where(year.str.len() != 2, "20" + year)
     text = year + "-" + month + "-" + day
