@@ -25,7 +25,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "dynamics": (2246, 277),
     "export": (1482, 172),
     "heads": (1233, 178),
-    "identification": (2070, 204),
+    "identification": (2068, 205),
     "judge": (1995, 212),
     "manoeuvres": (962, 140),
     "physics": (2099, 262),

@@ -365,9 +365,7 @@ def residual_table(
     Returns:
         Columns model, axis, target, predicted (accelerations, SI); no row where there is no head.
     """
-    import pandas as pd
-
-    parts = []
+    rows: list[tuple[Any, ...]] = []
     for entry in fitted:
         if entry.spec.role != "head":
             continue
@@ -378,16 +376,8 @@ def residual_table(
             pairs.append(np.stack(residuals, axis=-1)[log.good])
         joined = np.concatenate(pairs)
         joined = joined[:: max(len(joined) // most, 1)]
-        for axis, name in _live(logs):
-            columns = {
-                "model": entry.name,
-                "axis": name,
-                "target": joined[:, axis, 0],
-                "predicted": joined[:, axis, 1],
-            }
-            parts.append(pd.DataFrame(columns))
-    names = ["model", "axis", "target", "predicted"]
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=names)
+        rows += [(entry.name, name, *joined[:, axis].T) for axis, name in _live(logs)]
+    return _table(["model", "axis", "target", "predicted"], rows)
 
 
 def term_table(fitted: Iterable[FittedModel], logs: Sequence[Prepared]) -> pd.DataFrame:
@@ -401,10 +391,9 @@ def term_table(fitted: Iterable[FittedModel], logs: Sequence[Prepared]) -> pd.Da
         Columns model, log, axis, term, t (s), value (the term times its coefficient). The term
         `target` is what the baseline leaves of the measured acceleration, NaN where there is none.
     """
-    import pandas as pd
-
     log = max(logs, key=len)
-    parts = []
+    t = log.log.t - log.log.t[0]
+    rows: list[tuple[Any, ...]] = []
     for entry in fitted:
         head = entry.model.head if entry.spec.role == "head" else None
         if not isinstance(head, EquationHead):
@@ -412,20 +401,16 @@ def term_table(fitted: Iterable[FittedModel], logs: Sequence[Prepared]) -> pd.Da
         run = teacher_forced(entry.model, log)
         target = np.where(log.good[:, None], log.nu_dot - run.baseline, np.nan)
         for axis, name in _live([log]):
-            for term, value in {
-                "target": target[:, axis],
-                **head.contributions(run.z, axis),
-            }.items():
-                columns = {
-                    "model": entry.name,
-                    "log": log.log.name,
-                    "axis": name,
-                    "term": term,
-                    "t": log.log.t - log.log.t[0],
-                    "value": value,
-                }
-                parts.append(pd.DataFrame(columns))
-    names = ["model", "log", "axis", "term", "t", "value"]
+            terms = {"target": target[:, axis], **head.contributions(run.z, axis)}
+            rows += [(entry.name, log.log.name, name, term, t, terms[term]) for term in terms]
+    return _table(["model", "log", "axis", "term", "t", "value"], rows)
+
+
+def _table(names: list[str], rows: list[tuple[Any, ...]]) -> pd.DataFrame:
+    """Return a table of rows, each with some arrays of one length in the place of a number."""
+    import pandas as pd
+
+    parts = [pd.DataFrame(dict(zip(names, row, strict=True))) for row in rows]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=names)
 
 
