@@ -177,18 +177,6 @@ def test_free_run_of_a_linear_model_in_closed_form(dtype: torch.dtype, near: flo
         )
 
 
-def test_inputs_are_held_from_their_own_sample() -> None:
-    """u' = tau_x: the prediction is the running sum of the inputs from the window's start to the
-    sample before.
-    """
-    theta = np.zeros((3, 6))
-    theta[0, 3] = 1.0
-    w = np.random.default_rng(0).normal(size=(50, 2))
-    (p,) = ran(hybrid(theta), [window(0, 7, 30)], [made(np.zeros((50, 6)), STEP, w=w)])
-    expected = 1.0 + STEP * np.concatenate(([0.0], np.cumsum(w[7:29, 0])))
-    np.testing.assert_allclose(p.states[:, 3], expected, atol=1e-12)
-
-
 @pytest.mark.parametrize(("growth", "limit"), [(1.0, 50.0), (800.0, 1e300)])
 def test_a_diverged_window_holds_the_prediction_of_zero(growth: float, limit: float) -> None:
     theta = np.zeros((3, 6))

@@ -44,32 +44,6 @@ def candidate(name: str, reference: str | None = None, kind: str = "head") -> Ca
     return Candidate(name, kind, model, reference=reference, ranges=RANGES)
 
 
-def test_by_hand() -> None:
-    y = np.zeros((4, 6))
-    predicted = np.zeros((4, 6))
-    predicted[:, 3] = [0, 0.3, 0.4, 5.0]
-    predicted[:, 4] = [0, -0.1, 0.1, 7.0]
-    predicted[:, 5] = [0, 0.1, 0.1, 0.1]
-    # two turns too many point where the vessel points
-    predicted[-1, :3] = [3.0, -4.0, -0.5 - 4.0 * np.pi]
-    log = made(y, 0.1, usable=np.array([True, True, True, False]))
-    run = FreeRun("T1", "test", [window(0, 0, 4)], {"mine": [Prediction(predicted, False)]})
-    errors = Errors.of(run.windows, run.predictions["mine"], [log])
-    # u and v over the three usable samples, r over all four
-    np.testing.assert_allclose(
-        errors.rmse, [[np.sqrt(0.25 / 3), np.sqrt(0.02 / 3), np.sqrt(0.03 / 4)]]
-    )
-    np.testing.assert_allclose(errors.mae, [[0.7 / 3, 0.2 / 3, 0.3 / 4]])
-    assert errors.ends()["position"].tolist() == [5.0]
-    assert errors.ends()["heading"].tolist() == pytest.approx([0.5])
-    assert errors.samples.tolist() == [3]
-    row = find(Judged(run, [candidate("mine")], [log], SCALES).rows({}), model="mine")
-    labels = [
-        row[key] for key in ("model", "kind", "split", "protocol", "windows", "n", "diverged")
-    ]
-    assert labels == ["mine", "head", "test", "T1", 1, 3, 0]
-
-
 def made_run(seed: int = 0) -> tuple[FreeRun, list]:
     rng = np.random.default_rng(seed)
     kinds = ["zigzag", "constant", "zigzag", "turning"]
@@ -96,18 +70,21 @@ def test_rows_equal_a_loop_over_windows() -> None:
     for row in table:
         wanted = members.get(row["manoeuvre"], {row["manoeuvre"]})
         chosen = [i for i, w in enumerate(run.windows) if logs[w.log].log.manoeuvre in wanted]
-        rmse, position, heading, count = [], [], [], 0
+        rmse, mae, position, heading, count = [], [], [], [], 0
         for i in chosen:
             w, p = run.windows[i], run.predictions[row["model"]][i]
             error = p.states - logs[w.log].y[w.start : w.stop]
             good = logs[w.log].usable[w.start : w.stop]
             parts = (error[good, 3], error[good, 4], error[:, 5])
             rmse.append([np.sqrt((part**2).mean()) for part in parts])
+            mae.append([np.abs(part).mean() for part in parts])
             position.append(np.hypot(*error[-1, :2]))
             heading.append(abs(np.remainder(error[-1, 2] + np.pi, 2.0 * np.pi) - np.pi))
             count += int(good.sum())
         mean = np.mean(rmse, axis=0)
         assert [row["rmse"][c] for c in "uvr"] == pytest.approx(mean.tolist())
+        assert [row["mae"][c] for c in "uvr"] == pytest.approx(np.mean(mae, axis=0).tolist())
+        assert [row[key] for key in ("kind", "split", "protocol")] == ["head", "test", "T3"]
         assert row["nrmse"]["mean"] == pytest.approx(float((mean / [0.5, 0.25, 0.1]).mean()))
         assert row["position_error_end"] == pytest.approx(np.mean(position))
         assert row["heading_error_end"] == pytest.approx(np.mean(heading))
