@@ -308,7 +308,6 @@ def test_a_start_that_diverges_is_brought_near_over_shorter_free_runs(
     torch.testing.assert_close(theta_of(held).detach(), start, rtol=0, atol=1e-4)
 
 
-@pytest.mark.long
 def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
     logs = trials()[:4]
     config = RefitConfig(horizon=4.0, every=4.0, iterations=4, prior=1e-4)
