@@ -211,13 +211,15 @@ def test_every_format_serves_every_policy(
     name: str, make: Callable[[], ExportedController], tmp_path: Path
 ) -> None:
     file = tmp_path / f"p{exporter(name).suffix}"
-    card = exporter(name).export(make(), file)
+    made = make()
+    card = exporter(name).export(made, file)
     assert file.is_file()
     parity = card["parity"]
     parities = [parity] if "share_of_limit" in parity else parity.values()
     assert all(part["share_of_limit"] <= 1e-4 for part in parities)
     if name == "c":
-        assert "int p_step(const p_real *y" in file.with_suffix(".h").read_text()
+        step = f"int {made.name}_step(const {made.name}_real *y"
+        assert step in file.with_suffix(".h").read_text()
 
 
 @pytest.mark.parametrize("name", ["fmu", "parameters", "feed_forward"])
