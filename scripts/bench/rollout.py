@@ -54,7 +54,7 @@ from residnet.heads.base import ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.training.refit import RefitConfig, level_of, place, problem_of, refit
+from residnet.training.refit import RefitConfig, level_of, problem_of, refit
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
 _BATCH, _STEPS, _SLOPE = 1_024, 200, 40
@@ -275,12 +275,12 @@ def refits(repeats: int) -> None:
     RegressorsConfig(terms=_TERMS).fit(baseline, known)
     store = WindowStore.gather(logs, torch.float64)
     plan = RefitConfig(horizon=20.0, every=10.0)
-    start = baseline.theta.detach().clone()
-    problem = problem_of(model, baseline, known, store, plan, _SCALES)
+    start = baseline.free()
+    problem = problem_of(model, known, store, plan, _SCALES)
     windows, steps = problem.w.shape[:2]
     found = []
     for _ in range(1 + repeats):
-        place(baseline, start.flatten()[problem.active], problem.active)
+        baseline.place(start)
         begun = spent()
         notes = refit(model, known, store, plan, _SCALES).notes
         found.append(spent() - begun)
@@ -293,7 +293,7 @@ def refits(repeats: int) -> None:
     each = np.sqrt(problem.nu.numel())
 
     def errors(values: np.ndarray) -> np.ndarray:
-        place(baseline, torch.from_numpy(values), problem.active)
+        baseline.place(torch.from_numpy(values))
         flown = Rollout(model)(problem.x0, problem.w, problem.x0[:, :0])[0]
         error = (velocities_on(flown[:, 1:]) - problem.nu) * problem.weight / each
         return np.append(error.numpy().ravel(), root @ (values - problem.start.numpy()))
@@ -301,7 +301,7 @@ def refits(repeats: int) -> None:
     begun = spent()
     best = least_squares(errors, problem.start.numpy(), method="lm", x_scale="jac", xtol=1e-4)
     taken = spent() - begun
-    place(baseline, torch.from_numpy(best.x), problem.active)
+    baseline.place(torch.from_numpy(best.x))
     level = level_of(model, problem)[0]
     print(f"scipy: {taken:.2f} s, {best.nfev} free runs, cost {level:.9f}")
 
