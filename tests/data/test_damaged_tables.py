@@ -101,6 +101,10 @@ def test_damaged_text_gives_the_samples_as_written_or_one_clear_line(
     assert log is None or foreign(log) == []
 
 
+def with_u(cells: list[Any]) -> Callable[[pa.Table], pa.Table]:
+    return lambda table: table.set_column(3, "u", pa.array(cells))
+
+
 U = TABLE["u"].to_numpy()
 OTHER: dict[str, Callable[[pa.Table], pa.Table]] = {
     "shuffled": lambda table: table.take(pa.array([*range(9, ROWS), *range(9)])),
@@ -109,7 +113,7 @@ OTHER: dict[str, Callable[[pa.Table], pa.Table]] = {
     "a name twice": lambda table: table.rename_columns(["t", "t", "psi", "u", "n"]),
     "one row": lambda table: table.slice(0, 1),
     **{
-        name: lambda table, cells=cells: table.set_column(3, "u", pa.array(cells))
+        name: with_u(cells)
         for name, cells in {
             "text": [f"{u:.6f}" for u in U],
             "words": [f"{u:.6f} m" for u in U],

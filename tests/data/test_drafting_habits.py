@@ -46,6 +46,7 @@ def seen() -> pd.DataFrame:
     ):
         s[name] = [f"{int(a)}°{a % 1 * 60:.5f}'{side}" for a in angle]
         s[f"{name}_s"] = [f"{int(a)} {int(a * 60 % 60)} {a * 3600 % 60:.4f} {side}" for a in angle]
+        s[f"{name}_p"] = [f"{100 * int(a) + a % 1 * 60:.6f},{side}" for a in angle]
     # a true wind in gusts, and the one that is felt, seen from the bow
     s["wind_speed"], s["wind_dir"] = 6.0 + np.sin(0.3 * s.t), 1.0 + 0.05 * np.cos(0.2 * s.t)
     felt = (s.wind_speed * np.exp(1j * (s.wind_dir - s.psi)) + s.u + 1j * s.v).to_numpy()
@@ -131,6 +132,7 @@ HABITS: dict[str, Habit] = {
     ),
     "minutes in the south-west": fixes("Lat = lat_S, Lon = lon_W", guessed=""),
     "seconds in the south-west": fixes("Lat = lat_S_s, Lon = lon_W_s", guessed=""),
+    "degrees and minutes in one, south-west": fixes("Lat = lat_S_p, Lon = lon_W_p", guessed=""),
     "minutes behind degrees, letters beside them": fixes(
         "Lat = 5400 + 60 * (lat - 54), Lon = 1000 + 60 * (lon - 10), NS = 'N', EW = 'E'",
         guessed="",

@@ -110,14 +110,8 @@ def test_masked_outliers_reach_neither_fits_nor_scores_nor_the_start_of_a_window
     assert not store.usable[bad].any()
     windows = Windows(length=10.0, first=5.7).windows(found, 0, STEP)
     assert windows[0].start == 58
-    perfect = [
-        Prediction(
-            np.stack([*[np.zeros(400)] * 3, u, np.zeros(400), np.zeros(400)], axis=1)[
-                w.start : w.stop
-            ],
-            False,
-        )
-        for w in windows
-    ]
+    true = np.zeros((400, 6))
+    true[:, 3] = u
+    perfect = [Prediction(true[w.start : w.stop], False) for w in windows]
     errors = Errors.of(windows, perfect, [found])
     np.testing.assert_allclose(errors.rmse, 0.0, atol=1e-12)

@@ -164,6 +164,7 @@ def test_missing_file_names_the_nearest(tmp_path: Path) -> None:
         ({"delta": {"column": "a", "unit": "rad", "frame": "body_fpu"}}, "frames that do: none"),
         ({"t": {"column": "a", "unit": "s"}}, "cannot name a channel"),
         ({"u": {"column": "a", "unit": "m/s", "sign": 0}}, "sign"),
+        ({key: {"column": "a", "unit": "-"} for key in ("qx", "qw")}, "add qy, qz"),
         ({}, "channels"),
     ],
 )

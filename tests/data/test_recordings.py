@@ -15,7 +15,6 @@ from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.progress import Progress, listen
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.quantities import tangent_plane
 
 
 def folder(tmp_path: Path, **topics: dict[str, Any]) -> Path:
@@ -119,19 +118,6 @@ def test_velocity_of_an_antenna_in_earth_axes(kind: str, tmp_path: Path) -> None
     )
     for name, value in (("u", 2.0), ("v", 0.3), ("psi", PSI)):
         np.testing.assert_allclose(log[name], value, atol=1e-9)
-
-
-def test_tangent_plane_against_the_ellipsoid() -> None:
-    # radii of curvature of WGS 84 at 63.4411 deg, by their closed forms
-    phi, a, e2 = np.radians(63.4411), 6378137.0, 6.69437999014e-3
-    w = np.sqrt(1 - e2 * np.sin(phi) ** 2)
-    meridian, prime = a * (1 - e2) / w**3, a / w
-    step = 1e-6
-    north, east = tangent_plane(
-        phi + step * np.array([0, 1, 0]), 0.2 + step * np.array([0, 0, 1]), phi, 0.2
-    )
-    np.testing.assert_allclose(north, [0.0, meridian * step, 0.0], atol=2e-5)
-    np.testing.assert_allclose(east, [0.0, 0.0, prime * np.cos(phi) * step], atol=2e-5)
 
 
 def test_a_topic_that_lags_and_one_that_speaks_of_another_point(tmp_path: Path) -> None:

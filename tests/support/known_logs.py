@@ -40,17 +40,3 @@ def wavy(step: float = 0.1, seconds: float = 200.0, name: str = "wavy", lag: flo
         "delta": 0.5 * np.sin(0.37 * t),
     }
     return Log(name, t, channels)
-
-
-def frozen_by_loop(x: np.ndarray, y: np.ndarray, after: int = 20, least: int = 5) -> np.ndarray:
-    """The rule for frozen positions, sample by sample."""
-    bad = np.zeros(len(x), dtype=bool)
-    i = 0
-    while i < len(x):
-        last = i
-        while last + 1 < len(x) and x[last + 1] == x[i] and y[last + 1] == y[i]:
-            last += 1
-        if last - i >= least:
-            bad[i : last + after] = True
-        i = last + 1
-    return bad
