@@ -132,6 +132,11 @@ ROWS = "t,u,v\n0,1,2\n1,1,2\n"
         ("t,u,v\n0,1,2\n,1,2\n2,1,2\n", DataError, ["line 3 has measurements but no time"]),
         ("t,u,v\n0,1,5,2\n1,1,2\n", DataError, ["line 2 has 4 cells, the header 3", "decimal"]),
         ("t,u,v\n0,1,2\n1,1,2,3,4\n", DataError, ["line 3 has 5 cells, the header 3"]),
+        (
+            f't,u,v\n0,1,2\n1,1,"{"2" * 200_000}',
+            DataError,
+            ["not a regular table, its header has 3"],
+        ),
     ],
 )
 def test_faulty_tables(tmp_path: Path, text: str, error: type[Exception], words: list[str]) -> None:

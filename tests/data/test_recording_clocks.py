@@ -202,6 +202,7 @@ def test_several_publishers_are_told_from_noise_and_rounding(seed: int) -> None:
 def test_senders_tell_publishers_apart() -> None:
     t = 0.1 * np.arange(100)
     sender = np.array(["bow", "stern"] * 50, dtype=object)
+    assert [entry["code"] for entry in traffic(topic("none", np.zeros(0)))] == ["empty_topic"]
     one = Series("heading", "", {"a": np.where(sender == "bow", 1.0, 2.0)}, t, None, sender)
     assert seen(one) == {"several_publishers"}
     assert (one.of_sender("bow")["a"] == 1.0).all()

@@ -186,6 +186,7 @@ def test_what_is_missing_is_named(
     t = 0.1 * np.arange(50)
     place = folder(tmp_path, gyro={"time": t, "data": t, "none": np.nan, "words": ["a"] * 50})
     (place / "silent.csv").write_text("")
+    (place / "torn.csv").write_text('time,data\n0,"1\n1,2\n')
     if error is not None:
         with pytest.raises(error, match=words):
             read(place, channels=channels)
@@ -193,7 +194,13 @@ def test_what_is_missing_is_named(
     log = read(place, channels=channels)
     assert list(log.channels) == ["r"]
     found = {entry["code"] for entry in log.meta["findings"]}
-    assert found >= {"missing_channels", "empty_topic", "empty_columns", "not_numbers"}
+    assert found >= {
+        "missing_channels",
+        "empty_topic",
+        "empty_columns",
+        "not_numbers",
+        "unreadable",
+    }
     with pytest.raises(UsageError, match="no such file"):
         read(tmp_path / "ran", channels=channels)
 
