@@ -12,9 +12,9 @@ from pydantic import ValidationError
 
 from residnet.control.base import Policy
 from residnet.control.heading.conditions import (
-    ConditionedFlights,
     ConditionedRun,
     ConditionsConfig,
+    Flights,
     HeadingChanges,
     SteadinessLimits,
     SteadyTest,
@@ -29,6 +29,7 @@ from residnet.control.heading.conditions import (
 from residnet.control.heading.controllers import PdConfig, PidConfig, PtosConfig, Steering
 from residnet.control.heading.turning import Turning
 from residnet.control.heading.vessels import SteeredPlant
+from residnet.dynamics.steering_variation import HEADING
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
@@ -88,7 +89,10 @@ def test_the_cost_is_what_it_says() -> None:
     error[0, :start] = 70 * DEG
     command = torch.zeros(1, steps)
     command[0, start + 5 :: 2] = DEG
-    flown = ConditionedFlights(changes, changes.heading[:, None] - side * error, command)
+    psi = changes.heading[:, None] - side * error
+    states = torch.cat((psi, psi[:, -1:]), dim=1).unsqueeze(2)
+    about = (changes.dt, ("psi",), HEADING, changes.start, changes.count)
+    flown = Flights(states, command, changes.heading, *about)
     found = flown.measured(CALM)
     changed = int((np.diff(command[0, : start + 120].numpy()) != 0).sum())
     assert float(found["time_outside"]) == pytest.approx(3.0 * 3 / 4 + 3.0 * 2 / 3, rel=1e-4)

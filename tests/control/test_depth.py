@@ -12,10 +12,10 @@ import yaml
 from pydantic import ValidationError
 from tiny import write_yaml
 
-from residnet.control.heading.conditions import ConditionedRun, ConditionsConfig, DepthChanges
+from residnet.control.heading.conditions import ConditionedRun, ConditionsConfig, DepthChanges, fly
 from residnet.control.heading.controllers import DepthConfig, DepthPolicySpec, Steering
 from residnet.control.heading.turning import Turning
-from residnet.control.heading.vessels import SteeredPlant, fly
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError, FitError
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics

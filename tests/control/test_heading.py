@@ -20,14 +20,16 @@ from torch import Tensor
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.control import BangBangHeading, ClosedLoop, GivenReference, HeadingPD, Policy
 from residnet.control.heading.classical import RatedBangBangHeading
+from residnet.control.heading.conditions import Flights, fly
 from residnet.control.heading.controllers import BangBangConfig, PdConfig, PidConfig, Steering
 from residnet.control.heading.turning import Turning
-from residnet.control.heading.vessels import Flights, SteeredModel, SteeredPlant, fly
+from residnet.control.heading.vessels import SteeredModel, SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.documents.gouletas2020.law import DocumentAutopilot, Predictor, SimulatedPredictor
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.dynamics.steering_variation import DEPTH
+from residnet.dynamics.steering_variation import DEPTH, HEADING
+from residnet.judge.autopilots import sea_row
 from residnet.physics.nomoto import SteeringVessel
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
@@ -209,8 +211,9 @@ def test_wrong_numbers_stop(make: Callable[[], object], message: str) -> None:
 
 def made(error: list[list[float]], dt: float = 0.5) -> Flights:
     errors = torch.tensor(error, dtype=torch.float64)
-    rudder = torch.full((*errors[:, 1:].shape, 1), 0.2, dtype=torch.float64)
-    return Flights(-errors.unsqueeze(-1), rudder, 0.0 * errors[:, 0], dt, ("psi",))
+    rudder, start = torch.full_like(errors[:, 1:], 0.2), torch.zeros(len(errors))
+    about = (dt, ("psi",), HEADING, start, errors.shape[1])
+    return Flights(-errors.unsqueeze(-1), rudder, 0.0 * errors[:, 0], *about)
 
 
 def test_what_is_read_from_a_flight() -> None:
@@ -227,8 +230,9 @@ def test_what_is_read_from_a_flight() -> None:
     assert float(made([[3.0, 0.5, math.nan, math.nan]]).settled(1.0)[0]) == 1.5
     flights = made([[3.0, 1.0, -1.0, 1.0, -1.0]])
     assert float(flights.effort()[0]) == pytest.approx(4 * 0.04 * 0.5)
-    assert float(flights.rms("psi", 0.5)[0]) == pytest.approx(1.0)
-    assert float(flights.rudder_rms()[0]) == pytest.approx(0.2)
+    row = sea_row("pd", "classical", flights, 0.5)
+    assert row["heading_rms"]["mean"] == pytest.approx(1.0)
+    assert row["rudder_rms"]["mean"] == pytest.approx(0.2)
 
 
 def test_the_floor_of_a_slow_rudder_comes_to_rest_in_the_least_time() -> None:
@@ -314,7 +318,7 @@ def test_a_perfect_model_flies_as_its_vessel(name: str) -> None:
         flights.append(fly(vessel, pd, changes, VARIED, dt=0.01, duration=8.0))
     # the model divides what a step changes by `time`, which is of first order in the step
     assert float((flights[0].state("psi") - flights[1].state("psi")).abs().max()) < 1e-3
-    assert float((flights[0].inputs - flights[1].inputs).abs().max()) < 0.1 * DEG
+    assert float((flights[0].command - flights[1].command).abs().max()) < 0.1 * DEG
 
 
 def test_turning_is_that_of_the_model_and_of_a_rudder_that_lags() -> None:

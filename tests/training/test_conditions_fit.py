@@ -7,14 +7,11 @@ import math
 import pytest
 import torch
 
-from residnet.control.heading.conditions import (
-    ConditionedFlights,
-    ConditionsConfig,
-    SteadinessLimits,
-)
+from residnet.control.heading.conditions import ConditionsConfig, Flights, SteadinessLimits
 from residnet.control.heading.controllers import ObservedPolicySpec, PtosConfig
 from residnet.control.heading.policies import ObservedPolicy
 from residnet.control.heading.vessels import SteeredPlant
+from residnet.dynamics.steering_variation import HEADING
 from residnet.physics.vessel import load_vessel
 from residnet.training.policies.config import PolicyTraining
 from residnet.training.policies.fit import PolicyFit, train_policy
@@ -107,7 +104,9 @@ def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:
     def cost(amplitude: float, swinging: int) -> float:
         command = torch.zeros(16, len(time))
         command[:swinging] = math.radians(amplitude) * wave
-        flown = ConditionedFlights(changes, torch.zeros_like(command), command)
+        about = (changes.dt, ("psi",), HEADING, changes.start, changes.count)
+        states = torch.zeros(16, len(time) + 1, 1)
+        flown = Flights(states, command, changes.heading, *about)
         return float(fit._unsteady(flown, over, 8))
 
     # 0.2 s are the overshoot; half of what an epoch may swing is free; of eight quiet flights the

@@ -11,11 +11,8 @@ from torch import Tensor, nn
 from residnet.dynamics.rollout import Source
 
 
-class Policy(nn.Module, ABC):
-    """A controller: commands from the state and a reference, once per step.
-
-    The same tensor code trains, flies and is exported.
-    """
+class Remembering(nn.Module, ABC):
+    """What has a memory [B, n_state] that goes from step to step."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -24,6 +21,13 @@ class Policy(nn.Module, ABC):
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory [B, n_state] at the first state x [B, nx]: zeros."""
         return torch.zeros(x.shape[0], self.n_state, dtype=x.dtype, device=x.device)
+
+
+class Policy(Remembering):
+    """A controller: commands from the state and a reference, once per step.
+
+    The same tensor code trains, flies and is exported.
+    """
 
     @abstractmethod
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -43,17 +47,12 @@ class Policy(nn.Module, ABC):
         return s
 
 
-class Reference(nn.Module, ABC):
+class Reference(Remembering):
     """Guidance: what the controller shall follow."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.n_state = 0
         self.may_finish = False
-
-    def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory [B, n_state] at the first state x [B, nx]: zeros."""
-        return torch.zeros(x.shape[0], self.n_state, dtype=x.dtype, device=x.device)
 
     @abstractmethod
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:

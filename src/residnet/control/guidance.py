@@ -217,7 +217,7 @@ class WaypointGuidance(Reference):
         reached = (ahead <= 0) | (ahead * ahead + error * error <= self.acceptance**2)
         if self.wheel_over is not None:
             change = self.leg(x, number + 1, s)[0] - direction
-            before = self.wheel_over(torch.remainder(change + math.pi, 2.0 * math.pi) - math.pi)
+            before = self.wheel_over(wrap(change))
             aside = error.abs() + before * torch.sin(x[:, self.psi] - direction).abs()
             reached = reached | (
                 (ahead <= before) & (aside <= self.on_leg) & (number < len(self.points) - 1)
@@ -225,9 +225,7 @@ class WaypointGuidance(Reference):
         number = (number + reached.long()).clamp(max=self.points.shape[0])
         direction, _, error = self.leg(x, number, s)
         angle, memory = self.sight(error, direction, s[:, 3:])
-        heading = (
-            torch.remainder(direction + angle + math.pi, 2.0 * math.pi).unsqueeze(-1) - math.pi
-        )
+        heading = wrap(direction + angle).unsqueeze(-1)
         return heading, torch.cat((number.to(x.dtype).unsqueeze(-1), s[:, 1:3], memory), dim=-1)
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
@@ -512,7 +510,7 @@ class CourseGuidance(Reference):
         slope = slope + across
         speed = torch.sqrt(x[:, self.u].square() + x[:, self.v].square())
         stream = speed / torch.sqrt(1.0 + across.square())
-        heading_error = torch.remainder(x[:, self.psi] - heading + math.pi, 2.0 * math.pi) - math.pi
+        heading_error = wrap(x[:, self.psi] - heading)
         closeness = (1.0 - planned[:, 5] * aside).clamp(min=self.least)
         progress = (speed * torch.cos(heading_error) + stream * along).clamp(min=0.0) / closeness
         sliding = (

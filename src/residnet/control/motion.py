@@ -130,16 +130,26 @@ class ReferenceFilter(Reference):
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
         place, rate, change = pose(s), velocities(s), accelerations(s)
-        u, v = to_body(rate[:, 0], rate[:, 1], place[:, 2])
-        along, across = to_body(change[:, 0], change[:, 1], place[:, 2])
-        r = rate[:, 2]
-        # a vector fixed in the earth turns by -r in the body
-        moving = torch.stack((u, v, r, along + r * v, across - r * u, change[:, 2]), dim=-1)
+        nu, nu_dot = in_body_axes(place[:, 2], rate, change)
         target = self.waypoint(k).to(s.dtype)
         error = torch.stack((place - target, rate, change), dim=-1).unsqueeze(-1)
         after = (self.advance.to(s.dtype) @ error).squeeze(-1)
         memory = torch.cat((after[:, :, 0] + target, after[:, :, 1], after[:, :, 2]), dim=-1)
-        return torch.cat((place, moving), dim=-1), memory
+        return torch.cat((place, nu, nu_dot), dim=-1), memory
+
+
+def in_body_axes(psi: Tensor, rate: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
+    """Return nu and nu_dot [..., 3] of a pose's first and second derivative [..., 3] in the earth.
+
+    A vector fixed in the earth turns by -r in the body (correction J7).
+    """
+    u, v = to_body(rate[..., 0], rate[..., 1], psi)
+    along, across = to_body(change[..., 0], change[..., 1], psi)
+    r = rate[..., 2]
+    return (
+        torch.stack((u, v, r), dim=-1),
+        torch.stack((along + r * v, across - r * u, change[..., 2]), dim=-1),
+    )
 
 
 Gain = Annotated[float, Field(ge=0)]
@@ -302,15 +312,8 @@ class Derivatives(NamedTuple):
         )
         rate = self.rate + h * (self.acceleration + h / 2 * (self.jerk + h / 3 * self.snap))
         change = self.acceleration + h * (self.jerk + h / 2 * self.snap)
-        psi, r = pose[..., 2], rate[..., 2]
-        u, v = to_body(rate[..., 0], rate[..., 1], psi)
-        along, across = to_body(change[..., 0], change[..., 1], psi)
-        # a vector fixed in the earth turns by -r in the body (correction J7)
-        return (
-            psi,
-            torch.stack((u, v, r), dim=-1),
-            torch.stack((along + r * v, across - r * u, change[..., 2]), dim=-1),
-        )
+        psi = pose[..., 2]
+        return psi, *in_body_axes(psi, rate, change)
 
 
 def derivatives(

@@ -22,10 +22,12 @@ from residnet.control.courses.course_check import passages
 from residnet.control.heading.conditions import (
     ConditionedRun,
     ConditionsConfig,
+    Flights,
     HeadingChanges,
     SteadinessLimits,
+    fly,
 )
-from residnet.control.heading.vessels import Flights, SteeredPlant, SteeredVessel, fly
+from residnet.control.heading.vessels import SteeredPlant, SteeredVessel
 from residnet.core.columns import velocities_on
 from residnet.core.frames import wrap
 from residnet.core.layout import HEADING, POSITION, RANGE_VELOCITIES
@@ -200,14 +202,12 @@ def sea_row(controller: str, kind: str, flights: Flights, start: float) -> dict[
 
     They are of heading error, rudder and, where the vessel rolls, heel.
     """
-    settled = flights.error[:, round(start / flights.dt) :]
-    found = {
-        "heading_rms": settled.square().mean(1).sqrt(),
-        "rudder_rms": flights.rudder_rms(start),
-    }
+    kept = {"heading": flights.error, "rudder": flights.command}
     if "phi" in flights.names:
-        found["heel_rms"] = flights.rms("phi", start)
-    return _row(controller, kind, "sea", found) | {"n": len(settled)}
+        kept["heel"] = flights.state("phi")
+    first = round(start / flights.dt)
+    found = {f"{key}_rms": of[:, first:].square().mean(1).sqrt() for key, of in kept.items()}
+    return _row(controller, kind, "sea", found) | {"n": len(flights.heading)}
 
 
 def _nominal(rows: int) -> Tensor:
@@ -226,12 +226,12 @@ def series(name: str, flights: Flights, variations: Tensor) -> pd.DataFrame:
                     "controller": name,
                     "effect": float(variation[0]),
                     "time": float(variation[1]),
-                    "t": torch.arange(0, flights.inputs.shape[1], every).numpy() * flights.dt,
+                    "t": torch.arange(0, flights.command.shape[1], every).numpy() * flights.dt,
                     **{
                         state: side * flights.state(state)[i, :-1:every].numpy()
                         for state in (flights.axis.value, flights.axis.rate)
                     },
-                    "rudder": side * flights.inputs[i, ::every, 0].numpy(),
+                    "rudder": side * flights.command[i, ::every].numpy(),
                 }
             )
         )
@@ -264,7 +264,8 @@ def judged(
     the time in the means.
     """
     flown = run.fly(changes)
-    finite = torch.isfinite(flown.value).all(1) & torch.isfinite(flown.command).all(1)
+    value = flown.state(flown.axis.value)[:, :-1]
+    finite = torch.isfinite(value).all(1) & torch.isfinite(flown.command).all(1)
     worst = conditions.duration + 0.5 * 180.0
     found = {
         name: torch.where(finite, values, worst if name == "cost" else torch.nan)

@@ -86,6 +86,11 @@ class StoredWindow:
         found = self.errors(model)[list(self.live.moving)].pow(2).mean().pow(0.5)
         return found.to_numpy()
 
+    def nrmse(self, model: str, scales: Mapping[str, float]) -> float:
+        """Return the mean over the channels of `scales` of the error over the scale."""
+        columns = [self.live.moving.index(name) for name in scales]
+        return float((self.rmse(model)[columns] / [*scales.values()]).mean())
+
 
 class RunFiles:
     """The contents of a run folder of any task, or of what `residnet evaluate` writes.

@@ -158,7 +158,7 @@ class Task(Config):
     description: str = ""
 
     verbs: ClassVar[tuple[str, ...]] = ("report",)
-    """Commands that a finished run of this task answers to."""
+    """Commands that a finished run answers to; each but `report` is a method of the task."""
 
     @abstractmethod
     def carry_out(self, folder: RunFolder) -> Outcome:
@@ -199,25 +199,6 @@ class Task(Config):
     def recorded_seed(self) -> int:
         """Return the seed that stands in the provenance."""
         return 0
-
-    def evaluate_on(self, run: RunFolder, logs: Sequence[Path], out: Path | None) -> Finished:
-        """Judge the models of a finished run on other logs.
-
-        Raises:
-            UsageError: where runs of this task have no such models.
-            ResidnetError: where a log cannot be used.
-        """
-        raise self.lacks_verb(run)
-
-    def export_model(self, asked: ExportRequest) -> Path:
-        """Export one model of a finished run for controllers; returns the file.
-
-        Raises:
-            UsageError: where runs of this task have nothing to export, or there is no such model.
-            WithheldError: where it is worse than doing without it, but for `asked.anyway`.
-            ExportError: where the exported model does not agree with the one that it came from.
-        """
-        raise self.lacks_verb(asked.run)
 
     @final
     def run(

@@ -442,6 +442,7 @@ class AutopilotConfig(ComputingTask):
         return run_autopilot(self, folder)
 
     def export_model(self, asked: ExportRequest) -> Path:
+        """Export a policy of a finished run for controllers; returns the file."""
         from residnet.tasks.autopilot_run import export_policy
 
         return export_policy(self, asked)

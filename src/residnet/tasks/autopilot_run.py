@@ -14,6 +14,7 @@ from residnet.control.base import Policy
 from residnet.control.heading.conditions import (
     ConditionedRun,
     ConditionsConfig,
+    fly,
     quiet,
     quiet_after,
     tune,
@@ -28,7 +29,7 @@ from residnet.control.heading.controllers import (
     observed_of,
 )
 from residnet.control.heading.policies import SIGHT, DepthPolicy, ObservedPolicy
-from residnet.control.heading.vessels import SteeredPlant, fly
+from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.progress import begin, report, say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.compiled import CompiledRollout

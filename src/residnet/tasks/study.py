@@ -223,18 +223,18 @@ def window_nrmse(run: Path, model: str, split: str) -> pd.DataFrame:
 
     files = RunFiles(run)
     name = files.selected if model == "selected" else model
-    live, windows = files.live, files.windows(split)
+    windows = files.windows(split)
     if not windows:
         raise DataError(f"{run}: no rollouts of the split '{split}'")
     if name is None or name not in windows[0].predicted:
         raise DataError(f"{run}: no model '{name}' among {', '.join(windows[0].predicted)}")
-    scales = np.array([float(files.metrics["scales"][channel]) for channel in live.channels])
+    scales = {name: float(files.metrics["scales"][name]) for name in files.live.channels}
     return pd.DataFrame(
         {
             "protocol": one.protocol,
             "log": one.log,
             "window": one.number,
-            "nrmse": float((one.rmse(name)[live.axes] / scales).mean()),
+            "nrmse": one.nrmse(name, scales),
             "diverged": one.diverged[name],
         }
         for one in windows

@@ -6,8 +6,9 @@ Tuning is by differential evolution.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, final
 
 import numpy as np
@@ -15,11 +16,13 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.control.base import Policy
+from residnet.control.base import Followed, Policy
 from residnet.control.heading.controllers import Steering, TunableConfig
-from residnet.control.heading.vessels import SteeredVessel, lacking
+from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ExportError, FitError
+from residnet.core.frames import wrap
+from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.rollout import FreeRun, Rollout, Source
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis, PushedSteering
@@ -303,12 +306,6 @@ class HeadingChanges:
         steps = torch.arange(self.push.shape[1])
         return torch.where(steps >= self.start[:, None], self.heading[:, None], 0.0)
 
-    def counted(self) -> Tensor:
-        """Return which steps [B, T] the cost counts."""
-        steps = torch.arange(self.push.shape[1])
-        begin = self.start[:, None]
-        return (steps >= begin) & (steps < begin + self.count)
-
     def repeated(self, times: int) -> HeadingChanges:
         """Return the same flights several times, one block after the other."""
 
@@ -370,25 +367,82 @@ class ConditionedLoop(Source):
 
 
 @dataclass(frozen=True)
-class ConditionedFlights:
+class Flights:
     """B changes of heading, or of depth, of T steps as they were flown.
 
     Attributes:
-        changes: as they were drawn.
-        value: heading [B, T] in rad, or depth in m, at the start of each step.
+        states: [B, T+1, nx].
         command: rudder command [B, T] in rad, as it was issued.
+        heading: the new reference [B] in rad, or in m of depth.
+        dt: step in s.
+        names: of the states.
         axis: that is steered.
+        start: number [B] of the step at which the reference jumps.
+        count: number of samples that count, from the jump on.
     """
 
-    changes: HeadingChanges
-    value: Tensor
+    states: Tensor
     command: Tensor
-    axis: Axis = HEADING
+    heading: Tensor
+    dt: float
+    names: tuple[str, ...]
+    axis: Axis
+    start: Tensor
+    count: int
 
-    @property
+    def state(self, name: str) -> Tensor:
+        """Return a state [B, T+1] by its name."""
+        return self.states[:, :, self.names.index(name)]
+
+    @cached_property
     def error(self) -> Tensor:
-        """New heading less heading [B, T] in rad, wrapped, or new depth less depth in m."""
-        return lacking(self.axis, self.changes.heading[:, None], self.value)
+        """New heading less heading [B, T+1] in rad, wrapped, or new depth less depth in m."""
+        lacking = self.heading[:, None] - self.state(self.axis.value)
+        return wrap(lacking) if self.axis.value == self.axis.angle else lacking
+
+    def since(self, after: int) -> Tensor:
+        """Return which samples [B, T+1] are so many steps behind the jump, or more."""
+        return torch.arange(self.states.shape[1]) >= self.start[:, None] + after
+
+    @cached_property
+    def counted(self) -> Tensor:
+        """Which samples [B, T+1] count, as ones and zeros."""
+        return (self.since(0) & ~self.since(self.count)).to(self.states.dtype)
+
+    def settled(self, band: float) -> Tensor:
+        """Return the time [B] in s of the last entry into +-band [rad] about the reference.
+
+        It lies between samples along a straight line; it is the flight's length where it ends
+        outside.
+        """
+        size = self.error.abs()
+        outside = ~(size <= band)
+        inside = outside.flip(1).to(torch.int64).argmax(1)
+        last = (size.shape[1] - 1 - inside).unsqueeze(1)
+        before, after = (
+            size.gather(1, k.clamp(max=size.shape[1] - 1))[:, 0] for k in (last, last + 1)
+        )
+        share = torch.where(inside > 0, (before - band) / (before - after).clamp(min=1e-12), 0.0)
+        return torch.where(outside.any(1), last[:, 0] + share, 0.0) * self.dt
+
+    def overshoot(self) -> Tensor:
+        """Return the largest heading beyond the reference [B] in rad; zero where there is none."""
+        beyond = -self.error * self.heading.sign()[:, None]
+        # plus zero: no negative zero is shown
+        return (beyond * self.counted).amax(1).clamp(min=0.0) + 0.0
+
+    def absolute_error(self) -> Tensor:
+        """Return the integral of |error| [B] in rad s."""
+        return (self.error.abs() * self.counted)[:, :-1].sum(1) * self.dt
+
+    def travel(self) -> Tensor:
+        """Return how far the rudder command travels [B] in rad, from amidships on."""
+        moved = torch.diff(self.command, dim=1, prepend=torch.zeros_like(self.command[:, :1]))
+        return (moved.abs() * self.counted[:, :-1]).sum(1)
+
+    def effort(self) -> Tensor:
+        """Return the integral of the squared rudder command [B] in rad^2 s: the control energy."""
+        return self.command.square().sum(1) * self.dt
 
     def swing(self, after: float) -> tuple[Tensor, Tensor]:
         """Return how far heading [rad] or depth [m] and command [rad] move, peak to peak, [B].
@@ -396,47 +450,71 @@ class ConditionedFlights:
         Args:
             after: time in s from the change of heading on, up to the flight's end.
         """
-        steps = torch.arange(self.value.shape[1])
-        late = steps >= self.changes.start[:, None] + round(after / self.changes.dt)
+        late = self.since(round(after / self.dt))[:, :-1]
 
         def between(values: Tensor) -> Tensor:
             highest = torch.where(late, values, -torch.inf).amax(1)
             return highest - torch.where(late, values, torch.inf).amin(1)
 
-        return between(self.value), between(self.command)
+        return between(self.state(self.axis.value)[:, :-1]), between(self.command)
 
     def late_swing(self, share: float) -> Tensor:
         """Return the variance of the rudder command [B] in rad^2 in the last share of what counts.
 
         What counts is the time from the change on that the cost is of.
         """
-        first = self.changes.start[:, None] + round((1.0 - share) * self.changes.count)
-        late = self.changes.counted() & (torch.arange(self.value.shape[1]) >= first)
+        late = (self.counted * self.since(round((1.0 - share) * self.count)))[:, :-1]
         number = late.sum(1, keepdim=True).clamp(min=1)
         mean = (self.command * late).sum(1, keepdim=True) / number
         return ((self.command - mean).square() * late).sum(1) / number[:, 0]
 
     def measured(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
         """Return each of `QUANTITIES` by flight, [B]; what is no number is left so."""
-        dt, band = self.changes.dt, conditions.band
-        if conditions.depth is not None:
-            band = conditions.depth.band
-        counted = self.changes.counted().to(self.value.dtype)
-        error = self.error
-        size = error.abs()
-        outside = (counted * size / (size + band)).sum(1) * dt
-        beyond = -error * self.changes.heading.sign()[:, None]
-        # plus zero: no negative zero is shown
-        overshoot = (beyond * counted).amax(1).clamp(min=0.0) + 0.0
-        moved = torch.diff(self.command, dim=1, prepend=torch.zeros_like(self.command[:, :1]))
-        travel = (moved.abs() * counted).sum(1)
+        band = (conditions.depth or conditions).band
+        size, overshoot, travel = self.error.abs(), self.overshoot(), self.travel()
+        outside = (self.counted * size / (size + band))[:, :-1].sum(1) * self.dt
         cost = (
             outside
             + conditions.overshoot_weight / conditions.unit * overshoot
             + conditions.travel_weight / _DEGREE * travel
         )
-        values = (cost, outside, overshoot, travel, (size * counted).sum(1) * dt)
+        values = (cost, outside, overshoot, travel, self.absolute_error())
         return dict(zip(QUANTITIES, values, strict=True))
+
+
+def fly(
+    vessel: SteeredVessel,
+    policy: Policy,
+    heading: Tensor,
+    variation: Tensor,
+    *,
+    dt: float,
+    duration: float,
+    weather: Mapping[str, float | Tensor] | None = None,
+    surround: Callable[[Source], Source] | None = None,
+) -> Flights:
+    """Return the flights of heading changes [B] in rad from straight ahead, without gradients.
+
+    The vessels are varied by [B, 3]; all is float64, and counts from the first sample to the last.
+
+    Args:
+        weather: exogenous inputs by name, SI, for all rows or [B].
+        surround: what adds to the inputs of the closed loop, for example waves.
+    """
+    heading, variation = heading.double(), variation.double()
+    x, w = vessel.start(torch.ones_like(heading))
+    for name, value in (weather or {}).items():
+        w[:, vessel.inputs.index(name)] = value
+    steps = round(duration / dt)
+    loop: Source = Followed(policy.double(), w.shape[1])
+    given = torch.cat((w, heading[:, None]), dim=1).unsqueeze(1).expand(-1, steps, -1)
+    with torch.no_grad():
+        free = Rollout(vessel.model(dt), loop if surround is None else surround(loop))
+        states, inputs, _ = compiled(free, steps)(x, given, vessel.memory(variation))
+    begun = torch.zeros(len(heading), dtype=torch.int64)
+    return Flights(
+        states, inputs[:, :, 0], heading, dt, vessel.state, vessel.axis, begun, steps + 1
+    )
 
 
 @final
@@ -484,14 +562,13 @@ class ConditionedRun:
         inputs = torch.cat([part.to(self.dtype) for part in parts], dim=2)
         return x, inputs, self.vessel.memory(changes.variation.to(self.dtype))
 
-    def flights(
-        self, changes: HeadingChanges, states: Tensor, inputs: Tensor
-    ) -> ConditionedFlights:
+    def flights(self, changes: HeadingChanges, states: Tensor, inputs: Tensor) -> Flights:
         """Return what a rollout gave: states [B, T+1, nx] and inputs [B, T, m + 2]."""
-        value = states[:, :-1, self.columns[0]]
-        return ConditionedFlights(changes, value, inputs[:, :, -1], self.vessel.axis)
+        vessel, new = self.vessel, changes.heading
+        about = (vessel.state, vessel.axis, changes.start, changes.count)
+        return Flights(states, inputs[:, :, -1], new, changes.dt, *about)
 
-    def fly(self, changes: HeadingChanges) -> ConditionedFlights:
+    def fly(self, changes: HeadingChanges) -> Flights:
         """Fly heading changes without gradients."""
         longest = self.longest or max(int(changes.delay.max()), 1)
         given = self.given(changes)
@@ -806,7 +883,7 @@ class Trials:
             out.append(cost.double().nan_to_num(_LOST, _LOST).clamp(max=_LOST).mean(1))
         return torch.cat(out)
 
-    def _flown(self, rows: dict[str, Tensor], size: int) -> ConditionedFlights:
+    def _flown(self, rows: dict[str, Tensor], size: int) -> Flights:
         policy = self.config.rows(rows, self.steering).float().requires_grad_(False)
         run = ConditionedRun(self.steering.vessel, policy, self.changes.dt, "heun", torch.float32)
         if size not in self.given:

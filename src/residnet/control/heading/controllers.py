@@ -232,12 +232,10 @@ class PdConfig(TunedConfig):
         )
 
 
-class PidConfig(TunedConfig):
+class PidConfig(PdConfig):
     """A PD law with integral action that stops while the rudder is saturated.
 
     Attributes:
-        kp: rad of rudder per rad of error.
-        damping_time: kd/kp.
         integral_time: kp/ki.
     """
 
@@ -248,16 +246,14 @@ class PidConfig(TunedConfig):
         "integral_time": SearchRange(1.0, 50.0, idle=1e6, power=1),
         **_FILTER,
     }
-    kind: Literal["pid"] = "pid"
-    kp: float | None = Field(default=None, gt=0)
-    damping_time: Seconds | None = Field(default=None, gt=0)
+    kind: Literal["pid"] = "pid"  # type: ignore[assignment]
     integral_time: Seconds | None = Field(default=None, gt=0)
 
     def gains(
         self, parameters: Mapping[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
-        kp = parameters["kp"]
-        return kp, kp * parameters["damping_time"], kp / parameters["integral_time"]
+        kp, kd, _ = super().gains(parameters, turning)
+        return kp, kd, kp / parameters["integral_time"]
 
 
 class LqrConfig(TunedConfig):

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import final
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.control.base import Followed, Policy
 from residnet.control.heading.turning import Array, Record, Turning, fit_response, slewed
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.frames import wrap
 from residnet.core.names import nearest
 from residnet.dynamics.actuated import commanded
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.steering_variation import HEADING, Axis, VariedModel, VariedPlant
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.symmetry import live_of
@@ -305,120 +300,6 @@ def _rudder_gear(plant: Plant, axis: Axis) -> tuple[float | None, float | None]:
     # what is at its command within a step has no lag
     lags = abs(near - 2.0 * least) <= 1e-6 * abs(near) and near * dt < 0.5 * 0.02
     return None, 0.02 / near if lags else None
-
-
-def lacking(axis: Axis, reference: Tensor, value: Tensor) -> Tensor:
-    """Return reference less value, any shape: of a heading [rad] wrapped, of a depth [m]."""
-    return wrap(reference - value) if axis.value == axis.angle else reference - value
-
-
-@dataclass(frozen=True)
-class Flights:
-    """B changes of heading, or of depth, of T steps.
-
-    Attributes:
-        states: [B, T+1, nx].
-        inputs: [B, T, m].
-        heading: reference [B] in rad, or in m of depth.
-        dt: step in s.
-        names: of the states.
-        axis: that is steered.
-    """
-
-    states: Tensor
-    inputs: Tensor
-    heading: Tensor
-    dt: float
-    names: tuple[str, ...]
-    axis: Axis = HEADING
-
-    def state(self, name: str) -> Tensor:
-        """Return a state [B, T+1] by its name."""
-        return self.states[:, :, self.names.index(name)]
-
-    @property
-    def error(self) -> Tensor:
-        """Reference less heading [B, T+1], wrapped, or less depth."""
-        return lacking(self.axis, self.heading[:, None], self.state(self.axis.value))
-
-    def settled(self, band: float) -> Tensor:
-        """Return the time [B] in s of the last entry into +-band [rad] about the reference.
-
-        It lies between samples along a straight line; it is the flight's length where it ends
-        outside.
-        """
-        size = self.error.abs()
-        outside = ~(size <= band)
-        inside = outside.flip(1).to(torch.int64).argmax(1)
-        last = (size.shape[1] - 1 - inside).unsqueeze(1)
-        before, after = (
-            size.gather(1, k.clamp(max=size.shape[1] - 1))[:, 0] for k in (last, last + 1)
-        )
-        share = torch.where(inside > 0, (before - band) / (before - after).clamp(min=1e-12), 0.0)
-        return torch.where(outside.any(1), last[:, 0] + share, 0.0) * self.dt
-
-    def overshoot(self) -> Tensor:
-        """Return the largest heading beyond the reference [B] in rad, seen from the first heading.
-
-        Zero where there is none.
-        """
-        error = self.error
-        return (-error * error[:, :1].sign()).amax(1).clamp(min=0.0)
-
-    def absolute_error(self) -> Tensor:
-        """Return the integral of |error| [B] in rad s."""
-        return self.error[:, :-1].abs().sum(1) * self.dt
-
-    def effort(self) -> Tensor:
-        """Return the integral of the squared rudder command [B] in rad^2 s: the control energy."""
-        return self.inputs[:, :, 0].square().sum(1) * self.dt
-
-    def rms(self, name: str, start: float = 0.0) -> Tensor:
-        """Return the root of the mean square [B] of a state from a time [s] on."""
-        return self.state(name)[:, round(start / self.dt) :].square().mean(1).sqrt()
-
-    def rudder_rms(self, start: float = 0.0) -> Tensor:
-        """Return the root mean square [B] of the rudder command in rad from a time [s] on."""
-        return self.inputs[:, round(start / self.dt) :, 0].square().mean(1).sqrt()
-
-    def travel(self) -> Tensor:
-        """Return how far the rudder command travels [B] in rad, from amidships on."""
-        command = self.inputs[:, :, 0]
-        return command[:, 0].abs() + command.diff(dim=1).abs().sum(1)
-
-
-def fly(
-    vessel: SteeredVessel,
-    policy: Policy,
-    heading: Tensor,
-    variation: Tensor,
-    *,
-    dt: float,
-    duration: float,
-    speed: Tensor | None = None,
-    weather: Mapping[str, float | Tensor] | None = None,
-    surround: Callable[[Source], Source] | None = None,
-) -> Flights:
-    """Return the flights of heading changes [B] in rad from straight ahead, without gradients.
-
-    The vessels are varied by [B, 3]; all is float64.
-
-    Args:
-        speed: multiples [B] of the service speed.
-        weather: exogenous inputs by name, SI, for all rows or [B].
-        surround: what adds to the inputs of the closed loop, for example waves.
-    """
-    heading, variation = heading.double(), variation.double()
-    x, w = vessel.start(torch.ones_like(heading) if speed is None else speed.double())
-    for name, value in (weather or {}).items():
-        w[:, vessel.inputs.index(name)] = value
-    steps = round(duration / dt)
-    loop: Source = Followed(policy.double(), w.shape[1])
-    given = torch.cat((w, heading[:, None]), dim=1).unsqueeze(1).expand(-1, steps, -1)
-    with torch.no_grad():
-        free = Rollout(vessel.model(dt), loop if surround is None else surround(loop))
-        states, inputs, _ = compiled(free, steps)(x, given, vessel.memory(variation))
-    return Flights(states, inputs, heading, dt, vessel.state, vessel.axis)
 
 
 @final

@@ -255,11 +255,11 @@ def _chosen(run: RunFiles, windows: Sequence[StoredWindow]) -> list[tuple[Stored
 
 def _ranked(run: RunFiles, windows: Sequence[StoredWindow]) -> list[StoredWindow]:
     """Return the runs of the leading model, the one of least error first."""
-    scales = run.metrics.get("scales") or {}
-    divisor = np.array([float(scales.get(name, 1.0)) for name in run.live.moving])
+    given = run.metrics.get("scales") or {}
+    scales = {name: float(given.get(name, 1.0)) for name in run.live.moving}
     return sorted(
         (one for one in windows if run.lead in one.predicted),
-        key=lambda one: (float((one.rmse(run.lead) / divisor).mean()), one.log, one.number),
+        key=lambda one: (one.nrmse(run.lead, scales), one.log, one.number),
     )
 
 

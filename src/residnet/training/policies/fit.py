@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from residnet.control.heading.conditions import (
     Compiler,
-    ConditionedFlights,
     ConditionedRun,
     ConditionsConfig,
+    Flights,
     HeadingChanges,
     SteadyTest,
     nominal,
@@ -174,7 +174,7 @@ class PolicyFit(EpochTraining):
         self._losses.append(float(found["cost"].detach().mean()))
         return loss
 
-    def _unsteady(self, flown: ConditionedFlights, overshoot: Tensor, quiet: int) -> Tensor:
+    def _unsteady(self, flown: Flights, overshoot: Tensor, quiet: int) -> Tensor:
         """Return what the quiet flights of a batch cost in s for swing and overshoot."""
         settings, steady = self.settings, self.settings.steady
         # the standard deviation of a sine is its movement peak to peak over two roots of two
