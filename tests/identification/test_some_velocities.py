@@ -46,7 +46,9 @@ def test_a_fit_is_of_what_the_logs_tell(
     models = residnet.fit(data, "regressors", ["ridge"] if len(velocities) > 1 else ())
     table = residnet.metrics(models, split="test")
     live = Live(velocities)
-    assert {name for name in table if name.startswith("rmse_")} == {f"rmse_{v}" for v in velocities}
+    assert {name for name in map(str, table) if name.startswith("rmse_")} == {
+        f"rmse_{v}" for v in velocities
+    }
     assert ("position_error_end" in table) == live.moves
     assert ("heading_error_end" in table) == live.turns
     error = table.groupby("model")["nrmse_mean"].mean()
@@ -153,7 +155,7 @@ def test_a_vehicle_that_only_dives(made: Callable[..., Log], channels: tuple[str
     models = residnet.fit(data, {"kind": "regressors", "sets": ["fossen"], "ridge": 1e-6})
     table = residnet.metrics(models, split="test")
     live = Live(velocities)
-    assert {name for name in table if name.startswith("rmse_")} == {
+    assert {name for name in map(str, table) if name.startswith("rmse_")} == {
         f"rmse_{one}" for one in (*velocities, "z", *["theta"] * ("q" in velocities))
     }
     ends = {"position": "u" in velocities, "depth": True, "attitude": "q" in velocities}
