@@ -201,3 +201,28 @@ def test_energy_is_kept_without_damping_and_falls_with_it(
         assert float((energy / energy[:, :1] - 1).abs().max()) < 1e-7
     else:
         assert bool((energy.diff(dim=1) < 0).all())
+
+
+def test_the_torpedo_makes_its_published_speed() -> None:
+    """2.5 m/s at 1525 rpm (Fossen, PythonVehicleSimulator, remus100.py), within 5 %."""
+    plant = load_vessel("remus_100").build()
+    w = torch.zeros(1, 150, len(plant.inputs), dtype=torch.float64)
+    w[:, :, plant.inputs.index("cmd_n")] = 1525.0 / 60.0
+    x0 = plant.approach(1)
+    with torch.no_grad():
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.2))(x0, w, x0[:, :0])
+    assert float(states[0, -1, plant.state.index("u")]) == pytest.approx(2.5, rel=0.05)
+
+
+def test_a_submerged_vessel_rights_itself_and_settles() -> None:
+    """Heeled and pitched at rest it comes back upright, and what is heavier than water sinks."""
+    plant = load_vessel("bluerov2_heavy").build()
+    x0 = torch.zeros(1, len(plant.state), dtype=torch.float64)
+    x0[0, 3], x0[0, 4] = 0.5, 0.4
+    w = torch.zeros(1, 900, len(plant.inputs), dtype=torch.float64)
+    with torch.no_grad():
+        states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.1, 2))(x0, w, x0[:, :0])
+    last = states[0, -1]
+    assert float(last[3:5].abs().max()) < 0.05
+    # of 13.5 kg in 13.4 l of fresh water 1 N weighs down, against 33 N s/m and 190 N s^2/m^2
+    assert float(last[plant.state.index("w")]) == pytest.approx(0.025, abs=0.003)
