@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (886, 129),
     "control": (3155, 359),
     "core": (1615, 245),
-    "data": (9662, 831),
+    "data": (9679, 832),
     "documents": (2462, 227),
     "dynamics": (2246, 277),
     "export": (1482, 172),

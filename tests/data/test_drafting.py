@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 import yaml
 from drafted_logs import assert_read
+from fleets import drawn
 from foreign_tables import CHANNELS, NAMES, Style
 
 import residnet
@@ -256,3 +257,16 @@ def test_volts_are_no_sway_and_thrust_in_per_cent_is_no_force(
     pd.DataFrame(columns).to_csv(file, index=False)
     channels = draft_tables([file], Marks())[0]["channels"]
     assert channels.keys() == {"x", "y", "psi", "throttle_port", "throttle_stbd"}
+
+
+def test_sides_of_thrusters_tell_a_frame_from_its_mirror_image(tmp_path: Path) -> None:
+    """A camera's x ahead and y to the left, headings anticlockwise, as in a laboratory."""
+    (fleet,) = drawn("twin", 14, 1, fewest=3, most=3)
+    files = [tmp_path / f"{log.name}.csv" for log in fleet.logs]
+    for file, log in zip(files, fleet.logs, strict=True):
+        camera = {"t": log.t, "x [m]": log["x"], "y [m]": -log["y"], "yaw [rad]": -log["psi"]}
+        thrust = {"left [1/s]": log["n_port"], "right [1/s]": log["n_stbd"]}
+        pd.DataFrame({**camera, **thrust}).to_csv(file, index=False)
+    channels = draft_tables(files, Marks())[0]["channels"]
+    assert {name: channels[name]["column"] for name in ("x", "y")} == {"x": "y [m]", "y": "x [m]"}
+    assert channels["psi"]["frame"] == "enu"

@@ -331,7 +331,8 @@ def _steering(log: Record) -> tuple[str, np.ndarray]:
     for name in STEERING[:4]:
         if name in log and log.std(name) > 1e-9:
             return name, log[name]
-    for port, starboard in (("n_port", "n_stbd"), ("cmd_port", "cmd_stbd")):
+    for port in ("n_port", "cmd_port", "throttle_port", "thrust_port"):
+        starboard = port.removesuffix("port") + "stbd"
         if port in log and starboard in log:
             steer = log[port] * np.abs(log[port]) - log[starboard] * np.abs(log[starboard])
             if deviation(steer) > 1e-9:

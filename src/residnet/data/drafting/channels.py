@@ -43,6 +43,8 @@ _WINDOW = 1.0
 """Shortest time in s over which positions are differentiated."""
 _FITS = 1.35
 """Largest ratio between a measured factor and that of the unit that it stands for."""
+CERTAIN = 4.0
+"""Standard errors from which a side is told."""
 _TELLING = 0.6
 """Least correlation that says anything."""
 
@@ -592,6 +594,11 @@ class Channels:
         x, y = words_of(self._names["x"]), words_of(self._names["y"])
         told = x.has("north") and y.has("east") and not (x.text == "x" or y.text == "y")
         told = told or self._fixes > 0.0
+        if not told and not self._posed and self._turns_to_port():
+            self._frame = Frame(not self._frame.swapped, not self._frame.from_east)
+            self._motions = [motion_of(raw, self._psi_unit, self._frame) for raw in self._logs]
+            text = "seen in a mirror the motion fits as well, but thrust to port turns it to port"
+            self._marks.guess((*CHANNELS, "psi"), text)
         if self._frame.swapped and not told:
             self._names["x"], self._names["y"] = self._names["y"], self._names["x"]
             text = "the vessel moves where it points only if the column called y is the north"
@@ -614,6 +621,22 @@ class Channels:
             text = f"position, heading and velocities fit together badly ({score:.2f} of 1)"
             self._marks.guess((*CHANNELS, "psi"), f"{text}: check units and axes")
         self._frame = Frame(False, self._frame.from_east)
+
+    def _turns_to_port(self) -> bool:
+        """Return whether more of a thruster on the port side turns the vessel to port."""
+        pairs = [(one, one.removesuffix("port") + "stbd") for one in self._names]
+        for port, stbd in pairs:
+            if not re.match(r"(n|cmd|throttle|thrust)_port$", port) or stbd not in self._names:
+                continue
+            both = [
+                (Raw(raw.t, {"more": raw.columns[port] - raw.columns[stbd]}), motion)
+                for raw, motion in zip(self._logs, self._motions, strict=True)
+                if motion is not None and {port, stbd} <= raw.columns.keys()
+            ]
+            rates = {k: np.interp(raw.t, m.t, m.turning) for k, (raw, m) in enumerate(both)}
+            slope, error = turns_to([raw for raw, _ in both], "more", rates)
+            return slope < -CERTAIN * error
+        return False
 
     def _settle_axes(self) -> None:
         """Leave out velocities along x and y that count along north and east, not along the hull.

@@ -25,6 +25,7 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, STATE
 from residnet.core.progress import report
 from residnet.data.drafting.channels import (
+    CERTAIN,
     CHANNELS,
     FRAMES,
     READER,
@@ -647,7 +648,7 @@ def _turn_rudders(read: DraftedLogs) -> None:
         rates = {number: way * log[rate] for number, log in enumerate(there)}
         slope, error = turns_to(logs, name, rates, "theta" if dives else None)
         key = places.get(name, INPUTS)
-        if abs(slope) < 4.0 * error:
+        if abs(slope) < CERTAIN * error:
             read.marks.guess(key, f"the logs do not tell which way {name} turns the vessel")
         elif slope < 0.0 and name in channels:
             channels[name]["sign"] = -1 * int(channels[name].get("sign", 1))
