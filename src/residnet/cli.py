@@ -40,22 +40,17 @@ def drawn_progress(*, quiet: bool = False, kept: Keep | None = None) -> Iterator
     drawn: AbstractContextManager[ProgressCallback | None] = nullcontext()
     if not quiet:
         drawn = _bars() if sys.stderr.isatty() else _Lines()
-    with drawn as then, listen(_Kept(kept, then)):
-        yield
+    with drawn as then:
 
+        def hear(progress: Progress) -> None:
+            ended = progress.done is not None and progress.done == progress.total
+            if kept is not None and (progress.message or ended):
+                kept(progress.message or f"{progress.stage}: done")
+            if then is not None:
+                then(progress)
 
-class _Kept:
-    """Keeps the lines that are told, and hands everything on."""
-
-    def __init__(self, kept: Keep | None, then: ProgressCallback | None) -> None:
-        self._kept, self._then = kept, then
-
-    def __call__(self, progress: Progress) -> None:
-        ended = progress.done is not None and progress.done == progress.total
-        if self._kept is not None and (progress.message or ended):
-            self._kept(progress.message or f"{progress.stage}: done")
-        if self._then is not None:
-            self._then(progress)
+        with listen(hear):
+            yield
 
 
 class _Lines:

@@ -24,10 +24,10 @@ from residnet.identification.identified import Evaluation, Identified, candidate
 from residnet.identification.prepared import require_window, through_currents, velocity_limit
 from residnet.identification.recipe import integrator
 from residnet.identification.settings import FitSettings, Parts
-from residnet.judge.metrics import columns_of, metrics_table
+from residnet.judge.metrics import metrics_table, rollout_columns
 from residnet.judge.selection import Selection
 from residnet.judge.verdict import Evidence, by_windows, verdict
-from residnet.report.run_reader import StoredWindow
+from residnet.report.run_reader import StoredWindow, windows_of
 from residnet.runs.task import computing
 
 if TYPE_CHECKING:
@@ -62,29 +62,13 @@ class FreeRuns:
     @cached_property
     def windows(self) -> list[StoredWindow]:
         """Every window, as `residnet.report.run_reader.RunFiles` reads them of a run."""
-        live = self.evaluation.logs[0].live
-        order, out = [live.states.index(name) for name in columns_of(live)], []
-        for run in self.evaluation.runs:
-            counted = dict.fromkeys(range(len(self.logs)), 0)
-            for i, window in sorted(enumerate(run.windows), key=lambda pair: pair[1].log):
-                log, rows = self.evaluation.logs[window.log], slice(window.start, window.stop)
-                found = {name: runs[i] for name, runs in run.predictions.items()}
-                out.append(
-                    StoredWindow(
-                        log=log.log.name,
-                        manoeuvre=log.log.manoeuvre,
-                        protocol=run.protocol,
-                        number=counted[window.log],
-                        t=log.log.t[rows],
-                        usable=log.usable[rows],
-                        measured=log.y[rows][:, order],
-                        predicted={name: one.states[:, order] for name, one in found.items()},
-                        diverged={name: one.diverged for name, one in found.items()},
-                        live=log.live,
-                    )
-                )
-                counted[window.log] += 1
-        return out
+        logs, tables = self.evaluation.logs, self.table.groupby("log", sort=False)
+        kinds = {log.log.name: log.log.manoeuvre for log in logs}
+        return [
+            window
+            for name, table in tables
+            for window in windows_of(table, str(name), kinds[str(name)], logs[0].live)
+        ]
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -95,16 +79,8 @@ class FreeRuns:
         """
         import pandas as pd
 
-        parts = [
-            pd.DataFrame(
-                {"log": one.log, "protocol": one.protocol, "model": model, "window": one.number}
-                | {"diverged": one.diverged[model], "t": one.t, "usable": one.usable}
-                | dict(zip(columns_of(one.live), one.measured.T, strict=True))
-                | dict(zip((f"{name}_hat" for name in columns_of(one.live)), states.T, strict=True))
-            )
-            for one in self.windows
-            for model, states in one.predicted.items()
-        ]
+        found = rollout_columns(self.evaluation.runs, self.evaluation.logs)
+        parts = [pd.DataFrame({"log": log.log.name, **columns}) for log, columns in found]
         return pd.concat(parts, ignore_index=True)
 
     def plot_track(self, log: str | None = None, **chosen: Any) -> Figure:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -591,14 +591,13 @@ def columns_of(live: Live) -> tuple[str, ...]:
     return (*planar, "psi", "x", "y", *beside)
 
 
-def write_rollouts(
-    folder: Path,
+def rollout_columns(
     runs: Sequence[FreeRun],
     logs: Sequence[Prepared],
-    inputs: Sequence[str],
+    inputs: Sequence[str] = (),
     bands: Bands | None = None,
-) -> None:
-    """Write one file per log of a split.
+) -> Iterator[tuple[Prepared, dict[str, np.ndarray]]]:
+    """Yield each log that has a window, with a row for each step of each model's free runs.
 
     Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi,
     x, y (and p and phi of a roll) as measured and with `_hat` as predicted (SI, rad), and the
@@ -610,10 +609,6 @@ def write_rollouts(
         inputs: names of the inputs, in the order of their columns.
         bands: by model and protocol; None for none.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    folder.mkdir(parents=True, exist_ok=True)
     known = bands or {}
     for number, log in enumerate(logs):
         parts: list[dict[str, np.ndarray]] = []
@@ -643,11 +638,24 @@ def write_rollouts(
                         }
                         | {f"{INPUT}{n}": log.w[rows, k] for k, n in enumerate(inputs)}
                     )
-        if not parts:
-            continue
-        table = pa.table(
-            {name: pa.array(np.concatenate([one[name] for one in parts])) for name in parts[0]}
-        )
+        if parts:
+            yield log, {name: np.concatenate([one[name] for one in parts]) for name in parts[0]}
+
+
+def write_rollouts(
+    folder: Path,
+    runs: Sequence[FreeRun],
+    logs: Sequence[Prepared],
+    inputs: Sequence[str],
+    bands: Bands | None = None,
+) -> None:
+    """Write one file per log of a split, as `rollout_columns` gives it."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for log, columns in rollout_columns(runs, logs, inputs, bands):
+        table = pa.table({name: pa.array(values) for name, values in columns.items()})
         with whole(folder / f"{file_stem(log.log.name)}.parquet") as file:
             # dictionaries of numbers that do not repeat take time and room
             pq.write_table(table, file, compression="zstd", use_dictionary=["protocol", "model"])

@@ -368,41 +368,48 @@ class RunFiles:
 
     def windows(self, split: str) -> list[StoredWindow]:
         """Return all stored free runs of a split, in the order of the file names."""
-        out: list[StoredWindow] = []
-        names = columns_of(self.live)
         kinds = {file_stem(entry["log"]): entry.get("manoeuvre") for entry in self.quality}
-        for path in sorted((self.path / "rollouts" / split).glob("*.parquet")):
-            table = read_table(path)
-            for (protocol, number), group in table.groupby(["protocol", "window"], sort=True):
-                parts = {str(model): part for model, part in group.groupby("model", sort=False)}
-                first = next(iter(parts.values()))
-                out.append(
-                    StoredWindow(
-                        log=path.stem,
-                        manoeuvre=str(kinds.get(path.stem) or "unknown"),
-                        protocol=str(protocol),
-                        number=int(str(number)),
-                        t=first["t"].to_numpy(float),
-                        usable=first["usable"].to_numpy(bool),
-                        measured=first[list(names)].to_numpy(float),
-                        predicted={
-                            model: part[[f"{name}_hat" for name in names]].to_numpy(float)
-                            for model, part in parts.items()
-                        },
-                        diverged={
-                            model: bool(part["diverged"].any()) for model, part in parts.items()
-                        },
-                        inputs={
-                            name.removeprefix(INPUT): first[name].to_numpy(float)
-                            for name in table.columns
-                            if name.startswith(INPUT)
-                        },
-                        low=_limits(parts, names, "low"),
-                        high=_limits(parts, names, "high"),
-                        live=self.live,
-                    )
-                )
-        return out
+        return [
+            window
+            for path in sorted((self.path / "rollouts" / split).glob("*.parquet"))
+            for window in windows_of(
+                read_table(path), path.stem, str(kinds.get(path.stem) or "unknown"), self.live
+            )
+        ]
+
+
+def windows_of(table: pd.DataFrame, log: str, manoeuvre: str, live: Live) -> list[StoredWindow]:
+    """Return the free runs of a log by protocol and number, from its stored rollouts."""
+    out: list[StoredWindow] = []
+    names = columns_of(live)
+    for (protocol, number), group in table.groupby(["protocol", "window"], sort=True):
+        parts = {str(model): part for model, part in group.groupby("model", sort=False)}
+        first = next(iter(parts.values()))
+        out.append(
+            StoredWindow(
+                log=log,
+                manoeuvre=manoeuvre,
+                protocol=str(protocol),
+                number=int(str(number)),
+                t=first["t"].to_numpy(float),
+                usable=first["usable"].to_numpy(bool),
+                measured=first[list(names)].to_numpy(float),
+                predicted={
+                    model: part[[f"{name}_hat" for name in names]].to_numpy(float)
+                    for model, part in parts.items()
+                },
+                diverged={model: bool(part["diverged"].any()) for model, part in parts.items()},
+                inputs={
+                    name.removeprefix(INPUT): first[name].to_numpy(float)
+                    for name in table.columns
+                    if name.startswith(INPUT)
+                },
+                low=_limits(parts, names, "low"),
+                high=_limits(parts, names, "high"),
+                live=live,
+            )
+        )
+    return out
 
 
 def _limits(parts: Mapping[str, Any], columns: Sequence[str], ending: str) -> dict[str, np.ndarray]:

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from residnet.core.errors import UsageError
@@ -143,14 +144,11 @@ def paired(runs: Sequence[JudgedRun]) -> dict[str, dict[str, Any]]:
     run's scales.
     """
     out: dict[str, dict[str, Any]] = {}
-    scales = _scales(runs)
+    scales = {str(name): float(scale) for name, scale in _scales(runs).items()}
     for protocol, windows in _common(runs).items():
-        squares = [
-            [run.of[window].errors(run.model)[scales.index].pow(2).mean() for window in windows]
-            for run in runs
-        ]
         errors = [
-            (pd.DataFrame(of_run).pow(0.5) / scales).mean(axis=1).to_numpy() for of_run in squares
+            np.array([run.of[window].nrmse(run.model, scales) for window in windows])
+            for run in runs
         ]
         logs = list(dict.fromkeys(window[0] for window in windows))
         resampled = blocks([logs.index(window[0]) for window in windows])

@@ -14,7 +14,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.control.base import ClosedLoop, Followed, Policy
+from residnet.control.base import ClosedLoop, Followed
 from residnet.control.guidance import Crossing, CrossingConfig
 from residnet.control.heading.conditions import quickly
 from residnet.control.motion import (
@@ -139,34 +139,18 @@ def measured(x: Tensor, noise: Tensor) -> Tensor:
 
 
 @final
-class Sensing(Policy):
-    """A controller that sees noise [B, 6] on pose and velocities, which is behind its reference."""
-
-    def __init__(self, policy: Policy) -> None:
-        super().__init__()
-        self.policy, self.n_state = policy, policy.n_state
-
-    def initial_state(self, x: Tensor) -> Tensor:
-        return self.policy.initial_state(x)
-
-    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        command, s = self.policy(measured(x, reference[:, -6:]), reference[:, :-6], s)
-        return command, s
-
-
-@final
 class Sensed(Source):
-    """A closed loop that measures the state with given noise [B, T, 6] on pose and velocities."""
+    """A closed loop that sees noise [B, 6] on pose and velocities, which is behind its inputs."""
 
-    def __init__(self, loop: ClosedLoop, noise: Tensor) -> None:
+    def __init__(self, loop: Source) -> None:
         super().__init__()
-        self.loop, self.noise = loop, noise
+        self.loop, self.counts = loop, loop.counts
 
     def initial(self, x: Tensor) -> Tensor:
         return self.loop.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        inputs, memory = self.loop(measured(x, self.noise[:, k]), w, k, memory)
+        inputs, memory = self.loop(measured(x, w[:, -6:]), w[:, :-6], k, memory)
         return inputs, memory
 
 
@@ -286,15 +270,14 @@ class Ferry:
         with torch.no_grad():
             if isinstance(path, CrossingConfig):
                 guidance = Crossing(path, step, feeds)
-                source = Sensed(ClosedLoop(policy, guidance), noise[..., MOTION])
-                model: FreeRun = Rollout(RecordedPlantDynamics(self.true, step), source)
-                given = (x0, w, x0[:, :0])
+                plant, loop = RecordedPlantDynamics(self.true, step), ClosedLoop(policy, guidance)
+                model: FreeRun = Rollout(plant, Sensed(loop))
+                given = (x0, torch.cat((w, noise[..., MOTION]), dim=2), x0[:, :0])
             else:
-                followed = Followed(Sensing(policy), inputs)
-                model = Rollout(PlantDynamics(self.true, step), followed)
+                model = Rollout(PlantDynamics(self.true, step), Sensed(Followed(policy, inputs)))
                 given = (x0, torch.cat((w, asked, noise[..., MOTION]), dim=2), x0[:, :0])
                 if steps > _WORTH_COMPILING:
-                    own = [f"source.policy.policy.policy.{name}" for name in ("lag", "step")]
+                    own = [f"source.loop.policy.policy.{name}" for name in ("lag", "step")]
                     model = quickly(model, partial(CompiledRollout, own=own), given)
             states, acted, _ = model(*given)
             states = states[:, :-1]
