@@ -171,7 +171,7 @@ def test_what_is_said_twice_stands_once() -> None:
     both = terms(TANKER, sets=["fossen", "linear"], terms=["r u", "n v", "|v|r"])
     assert both == (*terms(TANKER, sets=["fossen"]), "delta", "n v")
     # terms of one axis join a set
-    axes: dict[str, tuple[str, ...]] = {"u": ("u|u|",), "v": (), "r": ("r|r|", "r")}
+    axes: dict[Any, tuple[str, ...]] = {"u": ("u|u|",), "v": (), "r": ("r|r|", "r")}
     rows = RegressorsConfig(sets=("linear",), terms=axes).rows(TANKER)
     assert rows == [(*LINEAR, "u|u|"), LINEAR, (*LINEAR, "r|r|")]
 

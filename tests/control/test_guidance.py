@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,7 +149,7 @@ def turned(change: float) -> np.ndarray:
 
     stopped.terminal = True  # type: ignore[attr-defined]
     stopped.direction = -1  # type: ignore[attr-defined]
-    exact = {"rtol": 1e-8, "atol": 1e-8, "max_step": 0.1}
+    exact: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-8, "max_step": 0.1}
 
     def flown(held: float) -> np.ndarray:
         over = solve_ivp(rate, (0.0, held), np.zeros(4), args=(LIMIT,), **exact)

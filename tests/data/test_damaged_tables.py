@@ -106,24 +106,22 @@ def with_u(cells: list[Any]) -> Callable[[pa.Table], pa.Table]:
 
 
 U = TABLE["u"].to_numpy()
+CELLS: dict[str, list[Any]] = {
+    "text": [f"{u:.6f}" for u in U],
+    "words": [f"{u:.6f} m" for u in U],
+    "nulls": [None if i % 3 == 0 else u for i, u in enumerate(U)],
+    "all null": [None] * ROWS,
+    "lists": [[u] for u in U],
+    "bytes": [f"{u:.6f}".encode() for u in U],
+    "infinite": [np.inf if i == 7 else u for i, u in enumerate(U)],
+}
 OTHER: dict[str, Callable[[pa.Table], pa.Table]] = {
     "shuffled": lambda table: table.take(pa.array([*range(9, ROWS), *range(9)])),
     "repeated": lambda table: table.take(pa.array(sorted([*range(ROWS), 3, 3]))),
     "without a column": lambda table: table.drop_columns(["u"]),
     "a name twice": lambda table: table.rename_columns(["t", "t", "psi", "u", "n"]),
     "one row": lambda table: table.slice(0, 1),
-    **{
-        name: with_u(cells)
-        for name, cells in {
-            "text": [f"{u:.6f}" for u in U],
-            "words": [f"{u:.6f} m" for u in U],
-            "nulls": [None if i % 3 == 0 else u for i, u in enumerate(U)],
-            "all null": [None] * ROWS,
-            "lists": [[u] for u in U],
-            "bytes": [f"{u:.6f}".encode() for u in U],
-            "infinite": [np.inf if i == 7 else u for i, u in enumerate(U)],
-        }.items()
-    },
+    **{name: with_u(cells) for name, cells in CELLS.items()},
 }
 
 

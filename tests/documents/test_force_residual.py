@@ -124,7 +124,8 @@ def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: 
     """The forces are noise, the believed hull predicts others: regressions beat it, not zero."""
     random = np.random.default_rng(7)
     names = [f"tau_{letter}_{kind}" for letter in "xyn" for kind in ("est", "cmd")]
-    log(tmp_path, missing=0.0, **{name: random.normal(0.0, 5.0, 3000) for name in names})
+    noise: dict[str, Any] = {name: random.normal(0.0, 5.0, 3000) for name in names}
+    log(tmp_path, missing=0.0, **noise)
     settings = config(tmp_path)
     rows, results = studied(settings)
     assert rows["ridge"]["reference"] == ["zero"] * 3

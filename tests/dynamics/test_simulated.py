@@ -157,7 +157,7 @@ def test_in_an_ambient_current_it_moves_over_ground_as_a_hull_in_the_current() -
     w[:, 0] = 0.01
     w[:, [felt.inputs.index(f"current_{name}") for name in ("north", "east")]] = current
     # over ground it begins with the current's speed on top
-    carried = torch.stack(to_body(*current.T, y[:, felt.column("psi")]), dim=1)
+    carried = torch.stack(to_body(current[:, 0], current[:, 1], y[:, felt.column("psi")]), dim=1)
     y[:, [felt.column("u"), felt.column("v")]] += carried
     ground = run(felt.model(0.1), y, w.unsqueeze(1).expand(-1, steps, -1), nominal)
     for name in ("x", "y", "psi", "r", "p"):

@@ -102,7 +102,7 @@ def test_cross_validation_of_linear_heads_equals_explicit_refits(
     x, y = head.basis(MIXED.z).numpy(), MIXED.target.numpy()
     error = np.zeros((len(settings), 3))
     for f in range(4):
-        own, rest = f == FOLD, f != FOLD
+        own, rest = np.equal(FOLD, f), np.not_equal(FOLD, f)
         for i, setting in enumerate(settings):
             predict = refitted(config, setting, x[rest], y[rest], rest.sum())
             error[i] += ((predict(x[own]) - y[own]) ** 2).sum(0) / len(x)
@@ -227,7 +227,7 @@ def test_columns_that_say_nothing_get_nothing(kind: Any) -> None:
 
 
 def kernel(form: Rbf | Polynomial, *penalties: float, **settings: Any) -> Any:
-    fixed = {"choose": "one_step", "margin": 1.0}
+    fixed: dict[str, Any] = {"choose": "one_step", "margin": 1.0}
     return KernelConfig(kernel=form, penalties=penalties, **(fixed | settings))
 
 
@@ -302,7 +302,7 @@ def test_cross_validation_of_kernels_equals_explicit_refits(form: Rbf | Polynomi
     for i, found in enumerate(errors):
         error = np.zeros((3, 3))
         for f in range(4):
-            own, rest = f == FOLD, f != FOLD
+            own, rest = np.equal(FOLD, f), np.not_equal(FOLD, f)
             for j, penalty in enumerate(penalties):
                 predict = kernel_refitted(head, form, i, x[rest], y[rest], penalty * len(x))
                 error[j] += ((predict(x[own]) - y[own]) ** 2).sum(0)
@@ -336,10 +336,12 @@ def kernel_refitted(
 
 
 def test_landmarks_that_are_all_samples_give_the_exact_fit() -> None:
-    exact, all_of_them, few = (
-        calibrated(kernel(Rbf(sigma=(10.0,), **landmarks), 1e-4))
-        for landmarks in ({}, {"exact": 1, "landmarks": 300}, {"exact": 1, "landmarks": 80})
+    forms = (
+        Rbf(sigma=(10.0,)),
+        Rbf(sigma=(10.0,), exact=1, landmarks=300),
+        Rbf(sigma=(10.0,), exact=1, landmarks=80),
     )
+    exact, all_of_them, few = (calibrated(kernel(form, 1e-4)) for form in forms)
     for head in (exact, all_of_them, few):
         head.solve(SAMPLES)
     assert (len(all_of_them.kernel.points), len(few.kernel.points)) == (300, 80)

@@ -5,6 +5,7 @@ steered, read off a log.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -156,9 +157,13 @@ def test_imo_limits_of_the_10_10_zigzag(length: float, first: float, second: flo
     assert limits["initial_turning_distance"] == pytest.approx(2.5 * length)
 
 
+def _helm(size: float, thrust: torch.Tensor, steering: torch.Tensor) -> torch.Tensor:
+    return torch.stack((size * steering, thrust), dim=-1)
+
+
 def test_which_manoeuvres_imo_limits() -> None:
     rudder, twin = (
-        Helm(lambda d, s, size=size: torch.stack((size * s, d), dim=-1), ("psi", "r", "u"), inputs)
+        Helm(partial(_helm, size), ("psi", "r", "u"), inputs)
         for size, inputs in ((35 * DEG, ("cmd_delta", "cmd_n")), (1.0, ("cmd_port", "cmd_stbd")))
     )
     assert rudder.hard_over == pytest.approx(35 * DEG)

@@ -16,14 +16,19 @@ from residnet.physics.vessel import load_vessel
 CONFIG: Any = load_vessel("wam_v_cal").actuators
 UNIT: Any = CONFIG.build()
 SEEDS = range(20)
-Test = tuple[np.ndarray, ...]
+Trial = Any
+
+
+def thrusts(test: Trial) -> Any:
+    """Fit two propellers to revolutions and forces."""
+    return fit_thrust(test[0], test[1], 2)
 
 
 def inside(estimate: Estimate, truth: float) -> bool:
     return estimate.low <= truth <= estimate.high
 
 
-def throttle_test(seed: int = 0, top: float = 2380.0) -> Test:
+def throttle_test(seed: int = 0, top: float = 2380.0) -> Trial:
     throttle = np.linspace(-1, 1, 41)
     n = np.clip(2800 * throttle + 30, -top, top) / 60
     return throttle, n + np.random.default_rng(seed).normal(size=41) * 20 / 60
@@ -48,7 +53,7 @@ def test_throttle_map_with_its_bound_and_without() -> None:
     assert fit.n_max.value * 60 == pytest.approx(2830, rel=0.03)
 
 
-def step_test(level: float, seed: int = 0, count: int = 300) -> Test:
+def step_test(level: float, seed: int = 0, count: int = 300) -> Trial:
     """Times, commands and revolutions by the plant's own actuator, which hears commands 0.14 s
     late; 25 rpm of noise.
     """
@@ -76,7 +81,7 @@ def thrust(n: np.ndarray) -> np.ndarray:
     return UNIT.forces.thrust(torch.from_numpy(n)[:, None])[:, 0].numpy()  # type: ignore[no-any-return]
 
 
-def bollard_test(seed: int = 0, noise: float = 5.0) -> Test:
+def bollard_test(seed: int = 0, noise: float = 5.0) -> Trial:
     n = np.concatenate((np.linspace(-2380, -200, 12), np.linspace(200, 2380, 12))) / 60
     return n, 2 * thrust(n) + np.random.default_rng(seed).normal(size=n.size) * noise
 
@@ -86,10 +91,10 @@ def test_thrust_curves_of_both_directions() -> None:
     intervals.
     """
     truths, held = (CONFIG.forward, CONFIG.reverse), []
-    for fit, truth in zip(fit_thrust(*bollard_test(noise=0.0), 2), truths, strict=True):
+    for fit, truth in zip(thrusts(bollard_test(noise=0.0)), truths, strict=True):
         np.testing.assert_allclose([c.value for c in fit.coefficients], truth, rtol=1e-9)
     for seed in SEEDS:
-        for fit, truth in zip(fit_thrust(*bollard_test(seed), 2), truths, strict=True):
+        for fit, truth in zip(thrusts(bollard_test(seed)), truths, strict=True):
             n = np.linspace(fit.low, fit.high, 50)
             known = truth[0] + n * (truth[1] + n * truth[2])
             assert np.abs(fit(n) - known).max() < 0.03 * np.abs(thrust(n)).max()
@@ -98,15 +103,15 @@ def test_thrust_curves_of_both_directions() -> None:
     assert 0.88 <= np.mean(held) <= 1.0
 
 
-def ahead(test: Test) -> list[np.ndarray]:
+def ahead(test: Trial) -> Any:
     return [part[test[0] > 0] for part in test]
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: fit_thrust(*ahead(bollard_test()), 2), "bollard pull astern: 0 points"),
-        (lambda: fit_thrust(*(part[::8] for part in bollard_test()), 2), "needs 5 at 4 revolut"),
+        (lambda: thrusts(ahead(bollard_test())), "bollard pull astern: 0 points"),
+        (lambda: thrusts([part[::8] for part in bollard_test()]), "needs 5 at 4 revolut"),
         (lambda: fit_thrust(bollard_test()[0], -bollard_test()[1], 2), "wrong sign"),
         (lambda: fit_throttle(*(part[20:] for part in throttle_test())), "only one direction"),
         (lambda: fit_throttle(*(part[:3] for part in throttle_test())), "3 points"),

@@ -176,7 +176,13 @@ def test_finds_a_sum_of_products(split: str) -> None:
 
 def test_genes_get_a_coefficient_each() -> None:
     target = 2 * (DATA["a"] + DATA["b"] * DATA["b"]) - 0.3 * DATA["c"]
-    settings = {"genes": 3, "depth": 3, "first_depth": (0, 2), "generations": 40, "patience": 40}
+    settings: dict[str, Any] = {
+        "genes": 3,
+        "depth": 3,
+        "first_depth": (0, 2),
+        "generations": 40,
+        "patience": 40,
+    }
     algebra, found = breed(target, split="gene", population=600, **settings)
     assert found.reached
     assert 2 <= len(found.terms) <= 3

@@ -87,12 +87,13 @@ def test_a_fit_to_csv_is_evaluated_and_exported(
     card = {"card.json": ""}
     torch.jit.load(str(tmp_path / "chosen.pt"), _extra_files=card)
     assert json.loads(card["card.json"])["model"] == content["selected"]
-    for words, told in (
+    refused: tuple[tuple[list[Any], str], ...] = (
         (["export", out, "--model", "rigde"], "did you mean 'ridge'"),
         (["evaluate", out, "--logs", tmp_path / "nothing"], "nothing"),
         (["evaluate", out], "Name files or folders of logs behind the run"),
         (["report", tmp_path], ""),
-    ):
+    )
+    for words, told in refused:
         said = command(*words)
         assert said.code == 2
         assert told in said.err
