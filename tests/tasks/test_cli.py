@@ -22,6 +22,7 @@ from residnet.core.files import shipped_configs
 from residnet.core.progress import say
 from residnet.core.version import __version__
 from residnet.data.drafting.reading import log_files
+from residnet.export import vessel
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Outcome
 from residnet.tasks.simulate import SimulateConfig
@@ -58,6 +59,18 @@ def test_configs_are_found_by_file_or_name_and_folders_of_others_left_alone(
     valid = "quickstart: the config is valid (task fit, run quickstart)"
     assert valid in command("check", "quickstart").out
     assert all(yaml.safe_load(f.read_text())["description"] for f in shipped_configs().values())
+
+
+def test_a_finished_run_is_exported(
+    tiny_run: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
+    out = tmp_path / "model.pt"
+    assert command("export", tiny_run, "--model", "baseline", "--out", out, "--anyway").code == 0
+    assert out.is_file()
+    said = command("export", tiny_run, "--model", "basline", "--out", out)
+    assert said.code == 2
+    assert "did you mean 'baseline'" in said.err
 
 
 @pytest.mark.long
