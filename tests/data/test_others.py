@@ -38,7 +38,7 @@ def test_a_contradiction_is_named_with_its_cause(fleets: list[Fleet], what: str)
         random = np.random.default_rng([_SEED, number])
         logs, at, cause = CONTRADICTIONS[what](fleet, random)
         logs = [log.replace(name=f"log_{i:02d}") for i, log in enumerate(logs)]
-        name = fleet.steering if at is None else f"log_{at:02d}"
+        name = f"log_{at[0]:02d}" if at else fleet.steering
         named = [one for one in found(logs, fleet) if one.text.startswith(name)]
         hits += any(cause in one.code for one in named)
         # scripts/bench/fleets.py tells how often, over many more of them

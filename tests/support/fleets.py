@@ -93,32 +93,65 @@ def _in_current(log: Log, random: Random) -> Log:
     return _with(log, u=ground.real, v=ground.imag, x=place.real, y=place.imag)
 
 
-Planted = tuple[list[Log], int | None, str]
-"""Logs, the number of the one concerned (None for all), and the right cause."""
+def _turned(log: Log) -> Log:
+    """Return the log with a compass and velocities that are off by 15 deg."""
+    way = (log["u"] + 1j * log["v"]) * np.exp(-1j * np.radians(15.0))
+    return _with(log, u=way.real, v=way.imag, psi=log["psi"] + np.radians(15.0))
 
 
-def _one(change: Callable[[Fleet, Log, Random], Log], cause: str) -> Callable[..., Planted]:
+def _exchanged(fleet: Fleet, log: Log) -> Log:
+    port, stbd = fleet.inputs
+    return _with(log, **{port: log[stbd], stbd: log[port]})
+
+
+Planted = tuple[list[Log], tuple[int, ...], str]
+"""Logs, the numbers of those concerned (none for all), and the right cause."""
+
+
+def _in(
+    change: Callable[[Fleet, Log, Random], Log], cause: str, share: float = 0.0
+) -> Callable[..., Planted]:
+    """Return what changes one log of a fleet, or a share of them."""
+
     def plant(fleet: Fleet, random: Random) -> Planted:
-        logs, i = list(fleet.logs), int(random.integers(len(fleet.logs)))
-        logs[i] = change(fleet, logs[i], random)
-        return logs, i, cause
+        logs, count = list(fleet.logs), max(1, round(share * len(fleet.logs)))
+        concerned = random.choice(len(logs), count, replace=False).tolist()
+        for i in concerned:
+            logs[i] = change(fleet, logs[i], random)
+        return logs, tuple(concerned), cause
 
     return plant
 
 
 def _other_boats(fleet: Fleet, random: Random) -> Planted:
-    return [*fleet.sisters[:-1], fleet.logs[-1]], len(fleet.logs) - 1, "vessel"
+    return [*fleet.sisters[:-1], fleet.logs[-1]], (len(fleet.logs) - 1,), "vessel"
 
 
 CONTRADICTIONS: dict[str, Callable[[Fleet, Random], Planted]] = {
-    "dead steering in one": _one(lambda fleet, log, random: _dead(fleet, log), "dead"),
-    "another boat in one": _one(lambda fleet, log, random: fleet.sisters[0], "vessel"),
+    "dead steering in one": _in(lambda fleet, log, random: _dead(fleet, log), "dead"),
+    "another boat in one": _in(lambda fleet, log, random: fleet.sisters[0], "vessel"),
     "another boat but the last": _other_boats,
-    "current in one": _one(lambda fleet, log, random: _in_current(log, random), "current"),
+    "current in one": _in(lambda fleet, log, random: _in_current(log, random), "current"),
     "dead steering in all": lambda fleet, random: (
         [_dead(fleet, log) for log in fleet.logs],
-        None,
+        (),
         "dead",
     ),
 }
 """What is wrong -> how it is planted."""
+_THIRD = 1.0 / 3.0
+SHARED: dict[str, Callable[[Fleet, Random], Planted]] = {
+    "reversed steering": _in(
+        lambda fleet, log, random: _with(log, **{fleet.steering: -log[fleet.steering]}),
+        "sign",
+        _THIRD,
+    ),
+    "steering 1.8 times": _in(
+        lambda fleet, log, random: _with(log, **{fleet.steering: 1.8 * log[fleet.steering]}),
+        "scale",
+        _THIRD,
+    ),
+    "heading off by 15 deg": _in(lambda fleet, log, random: _turned(log), "heading", _THIRD),
+    "exchanged sides": _in(lambda fleet, log, random: _exchanged(fleet, log), "exchanged", _THIRD),
+}
+"""What is wrong in a third of the logs -> how it is planted."""
