@@ -169,8 +169,9 @@ def main() -> None:
     counts: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder) / "copy"
-        ignored = shutil.ignore_patterns(".venv", ".git", "runs", "build", ".*_cache")
-        shutil.copytree(ROOT, scratch, ignore=ignored)
+        # `src/residnet/runs` is no folder of runs
+        left_out = {str(ROOT): [".venv", ".git", "runs", "build", "dist"]}
+        shutil.copytree(ROOT, scratch, ignore=lambda folder, _: left_out.get(folder, []))
         for number, (one, reached) in enumerate(zip(mutants, tests, strict=True)):
             started = time.monotonic()
             state = judged(one, reached, scratch, given.seconds)
