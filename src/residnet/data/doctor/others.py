@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+import scipy
 
 from residnet.core.arrays.paged import LARGE
 from residnet.core.layout import SIX
@@ -641,7 +641,9 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
                 tried = sorted(tried)
                 at = tried.index(size)
                 ends = tried[max(at - 1, 0)], tried[min(at + 1, len(tried) - 1)]
-                near = minimize_scalar(surprise_of, bounds=ends, options={"maxiter": 8})
+                near = scipy.optimize.minimize_scalar(
+                    surprise_of, bounds=ends, options={"maxiter": 8}
+                )
                 surprise, size = min((surprise, size), (float(near.fun), float(near.x)))
             text = _in_words(kind, name, log.units[name], size)
             out.append(Cause(kind, name, size, surprise, text))
@@ -684,7 +686,9 @@ def _heading_off(fleet: Fleet, model: Model, log: Record) -> Cause:
 
     step = math.radians(10.0)
     near = min((step * k for k in range(-17, 19) if k), key=surprise)
-    found = minimize_scalar(surprise, bounds=(near - step, near + step), options={"maxiter": 12})
+    found = scipy.optimize.minimize_scalar(
+        surprise, bounds=(near - step, near + step), options={"maxiter": 12}
+    )
     angle = float(found.x)
     way = "larger" if angle < 0.0 else "smaller"
     text = (
