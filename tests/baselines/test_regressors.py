@@ -14,7 +14,7 @@ from sklearn.linear_model import Ridge
 from sklearn.preprocessing import PolynomialFeatures
 
 from residnet.baselines.given import StillConfig
-from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
+from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig, _undamped
 from residnet.baselines.sets import merged
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, FitError
@@ -227,3 +227,10 @@ def test_a_penalty_decides_between_regressors_that_the_data_cannot_tell_apart() 
     baseline = ridge.build(SHIP)
     ridge.fit(baseline, samples)
     np.testing.assert_allclose(baseline(samples.z), z[:, :3], atol=1e-2)
+
+
+def test_what_feeds_an_axis_most_is_named_by_its_share_and_not_its_slope() -> None:
+    theta = torch.tensor([2.0, 0.5, -0.1], dtype=torch.float64)
+    slopes = torch.tensor([[1.0, 3.0, 1.0]], dtype=torch.float64)
+    assert _undamped(theta, slopes) == 0
+    assert _undamped(-theta, slopes) is None
