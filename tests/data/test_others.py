@@ -170,3 +170,16 @@ def test_a_log_of_one_sample_is_passed_over(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     short = fleet.logs[0].rows(slice(1)).replace(name="short")
     assert found([short, *fleet.logs], fleet) == found(fleet.logs, fleet)
+
+
+@pytest.mark.parametrize(("size", "speed"), [(2, 1.0), (10, 1.0), (400, 0.0)])
+def test_short_logs_and_vessels_at_rest_are_passed_over(size: int, speed: float) -> None:
+    random = np.random.default_rng(0)
+    t = 0.2 * np.arange(size)
+
+    def log(name: str) -> Log:
+        pose = {"x": speed * t, "y": 0.0 * t, "psi": 0.0 * t}
+        return Log(name, t, {**pose, "delta": random.normal(0.0, 0.2, size)})
+
+    codes = [one.code for one in inspect_together([log("a"), log("b"), log("c")]).findings]
+    assert not any(code.startswith("contradicts") for code in codes)

@@ -28,6 +28,7 @@ from residnet.data.doctor.findings import (
 from residnet.data.doctor.others import Fleet, causes, nothing_steers
 from residnet.data.doctor.statistics import MEASURED, Record, averaged, high
 from residnet.data.split import row_hashes, sampling
+from residnet.data.statistics import FEWEST
 
 # so many rows in a row that two logs share are no chance
 _COPIED = 20
@@ -73,13 +74,13 @@ class Together:
 
 def moved(log: Record) -> Record:
     """Return a log with the velocities that its position and heading tell; others as they are."""
-    if "u" in log or not all(name in log for name in POSE):
+    if "u" in log or len(log) < FEWEST or not all(name in log for name in POSE):
         return log
     ground = np.gradient(log.smooth("x") + 1j * log.smooth("y"), log.t)
     ahead = ground * np.exp(-1j * log["psi"])
     made = {"u": ahead.real, "v": ahead.imag}
     whole = log.log.replace(
-        channels={**log.log.channels, **made}, units={**log.units, **dict.fromkeys(made, "m/s")}
+        channels={**made, **log.log.channels}, units={**dict.fromkeys(made, "m/s"), **log.units}
     )
     return Record(whole, log.inputs)
 

@@ -197,7 +197,8 @@ class Model:
     """The fit to some logs: coefficients [k, n], their uncertainty, what is usually left [n]."""
 
     def __init__(self, gram: np.ndarray, moments: np.ndarray) -> None:
-        gram = gram + _RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
+        # of a vessel at rest all is zero
+        gram = gram + _RIDGE * (np.trace(gram) / len(gram) or 1.0) * np.eye(len(gram))
         self.inverse = np.linalg.inv(gram)
         self.theta = self.inverse @ moments
         self.usual = np.ones(self.theta.shape[1])
