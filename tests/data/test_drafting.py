@@ -239,9 +239,12 @@ def test_no_log_is_lost_for_a_roll_that_not_all_of_them_hold(tmp_path: Path) -> 
         residnet.read_logs(tmp_path / "stopped.csv")
 
 
-@pytest.mark.parametrize("volts", ["batt_v", "xx_v"])
-def test_volts_are_no_sway_and_thrust_in_per_cent_is_no_force(
-    logs: list[Log], tmp_path: Path, volts: str
+@pytest.mark.parametrize(
+    ("volts", "thrusters"),
+    [("batt_v", ("Schub BB [%]", "Schub StB [%]")), ("xx_v", ("left_pct", "right_pct"))],
+)
+def test_volts_are_no_sway_and_per_cents_neither_force_nor_revolutions(
+    logs: list[Log], tmp_path: Path, volts: str, thrusters: tuple[str, str]
 ) -> None:
     """By the name where it says so, else by what position and heading tell."""
     log, file = logs[0], tmp_path / "log.csv"
@@ -251,12 +254,13 @@ def test_volts_are_no_sway_and_thrust_in_per_cent_is_no_force(
         "East [m]": log["y"],
         "hdg [deg]": np.degrees(log["psi"]) % 360.0,
         volts: 49.0 + 0.1 * np.sin(log.t),
-        "Schub BB [%]": np.linspace(0.0, 100.0, len(log)),
-        "Schub StB [%]": np.linspace(100.0, 0.0, len(log)),
+        thrusters[0]: np.linspace(0.0, 100.0, len(log)),
+        thrusters[1]: np.linspace(100.0, 0.0, len(log)),
     }
     pd.DataFrame(columns).to_csv(file, index=False)
     channels = draft_tables([file], Marks())[0]["channels"]
     assert channels.keys() == {"x", "y", "psi", "throttle_port", "throttle_stbd"}
+    assert channels["throttle_port"] == {"column": thrusters[0], "unit": "%"}
 
 
 def test_sides_of_thrusters_tell_a_frame_from_its_mirror_image(tmp_path: Path) -> None:

@@ -243,19 +243,7 @@ class Data:
         """One row for each log: log, split, manoeuvre, seconds, samples, usable, learned_from."""
         import pandas as pd
 
-        rows = [
-            {
-                "log": log.log.name,
-                "split": split,
-                "manoeuvre": log.log.manoeuvre,
-                "seconds": float(log.log.t[-1] - log.log.t[0]),
-                "samples": len(log),
-                "usable": float(log.usable.mean()),
-                "learned_from": float(log.good.mean()),
-            }
-            for split, logs in self.splits.items()
-            for log in logs
-        ]
+        rows = [log.described(split) for split, logs in self.splits.items() for log in logs]
         return pd.DataFrame(rows)
 
     def logs(self, split: str) -> list[Prepared]:

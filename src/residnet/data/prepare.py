@@ -99,6 +99,22 @@ class Prepared:
     def __len__(self) -> int:
         return len(self.log)
 
+    def described(self, split: str) -> dict[str, str | float | None]:
+        """Return a row of a table: what the log is, and which shares are usable and learned from.
+
+        Args:
+            split: that it stands under in the table.
+        """
+        return {
+            "log": self.log.name,
+            "split": split,
+            "manoeuvre": self.log.manoeuvre,
+            "seconds": float(self.log.t[-1] - self.log.t[0]),
+            "samples": len(self),
+            "usable": float(self.usable.mean()),
+            "learned_from": float(self.good.mean()),
+        }
+
     def on_disk(self) -> Prepared:
         """Return the same with its arrays in a temporary file, out of memory."""
         moved: dict[str, Any] = {

@@ -402,13 +402,7 @@ def write_judged(
     folder.write_json(folder.limits, limits)
     quality = [
         {
-            "log": log.log.name,
-            "split": split,
-            "manoeuvre": log.log.manoeuvre,
-            "seconds": float(log.log.t[-1] - log.log.t[0]),
-            "samples": len(log),
-            "usable": float(log.usable.mean()),
-            "learned_from": float(log.good.mean()),
+            **log.described(split),
             "masked": {
                 reason: float(np.mean(mask)) for reason, mask in log.log.masks.items() if mask.any()
             },

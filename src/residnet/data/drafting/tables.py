@@ -312,7 +312,11 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
         elif channel and channel.startswith("thrust") and written_unit(column, "1/s"):
             # a thruster that turns, and no force
             channel = "n" + channel.removeprefix("thrust")
-        elif channel and _DRIVEN.match(channel) and other in ("-", "%", "us"):
+        elif (
+            channel
+            and _DRIVEN.match(channel)
+            and (other in ("-", "us") or written_unit(column, "-") == "%")
+        ):
             # no revolutions and no force: the share of the throttle, or pulses to it
             channel = _DRIVEN.sub("throttle", channel)
         elif channel in STATE_NAMES and other:

@@ -150,7 +150,10 @@ def si_of(channel: str) -> str | None:
     return CHANNEL_UNITS.get(channel) or next(found, None)
 
 
-_SI = {r"n(_|$)": "1/s", "delta|azimuth": "rad", "tau_x|tau_y|thrust": "N", "tau_n": "N m"}
+_SI = {
+    **{r"n(_|$)": "1/s", "delta|azimuth": "rad", "tau_x|tau_y|thrust": "N", "tau_n": "N m"},
+    "throttle": "-",
+}
 """How names of one's own begin -> SI unit."""
 # what a name may be about -> parts of words, and whole words behind a bar
 _ABOUT: dict[str, str] = {
