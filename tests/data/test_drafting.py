@@ -274,3 +274,14 @@ def test_sides_of_thrusters_tell_a_frame_from_its_mirror_image(tmp_path: Path) -
     channels = draft_tables(files, Marks())[0]["channels"]
     assert {name: channels[name]["column"] for name in ("x", "y")} == {"x": "y [m]", "y": "x [m]"}
     assert channels["psi"]["frame"] == "enu"
+
+
+def test_the_unit_of_a_gyro_is_told_where_some_logs_have_it_upside_down(tmp_path: Path) -> None:
+    """A slow ship, in deg/s without a unit: by their size alone they would be rad/s."""
+    (fleet,) = drawn("twin", 14, 1, fewest=3, most=3)
+    for log, way in zip(fleet.logs, (1.0, 1.0, -1.0), strict=True):
+        pose = {"t": 20.0 * log.t, "x [m]": log["x"], "y [m]": log["y"], "psi [rad]": log["psi"]}
+        rate = {"gyro_z": way * np.degrees(log["r"]) / 20.0, "rudder": np.zeros(len(log))}
+        pd.DataFrame({**pose, **rate}).to_csv(tmp_path / f"{log.name}.csv", index=False)
+    channels = draft_tables(sorted(tmp_path.glob("*.csv")), Marks())[0]["channels"]
+    assert channels["r"] == {"column": "gyro_z", "unit": "deg/s"}

@@ -176,7 +176,7 @@ def follows(logs: Sequence[Raw], motions: Sequence[Motion | None], channel: str)
         channel: `u`, `v` or `r`.
     """
     which = {"u": 1, "v": 2, "r": 3}[channel]
-    both = column = motion = 0.0
+    both = alike = column = motion = 0.0
     for raw, moved in zip(logs, motions, strict=True):
         values = raw.columns.get(channel)
         if moved is None or values is None:
@@ -193,12 +193,14 @@ def follows(logs: Sequence[Raw], motions: Sequence[Motion | None], channel: str)
         other = 0.0 if channel == "u" else float(told[calm].mean())
         a, b = seen[calm] - mean, told[calm] - other
         both += float(a @ b)
+        # a gyro that was turned over between logs follows in each of them; no frame is told by it
+        alike += abs(float(a @ b)) if channel == "r" else float(a @ b)
         column += float(a @ a)
         motion += float(b @ b)
     if min(column, motion) <= 0.0:
         return Fit(0.0, 0.0)
     # of two noisy quantities neither explains the other: the factor lies between both regressions
-    correlation = both / np.sqrt(column * motion)
+    correlation = alike / np.sqrt(column * motion)
     return Fit(float(np.sign(both) * np.sqrt(motion / column)), abs(float(correlation)))
 
 
