@@ -50,14 +50,19 @@ def test_a_contradiction_is_named_with_its_cause(fleets: list[Fleet], what: str)
 def test_a_sign_an_offset_and_a_scale_are_told_apart(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     name = fleet.steering
-    changes = {"sign": lambda x: -x, "scale": lambda x: 3.0 * x}
-    for cause, change in changes.items():
+    changes = {
+        "sign": (lambda x: -x, "the opposite sign"),
+        "scale": (lambda x: 3.0 * x, "times as large"),
+        "offset": (lambda x: x + np.std(x), "larger by -"),
+    }
+    for cause, (change, words) in changes.items():
         log = fleet.logs[2]
         channels = {**log.channels, name: change(log[name])}
         logs = [*fleet.logs[:2], log.replace(channels=channels), *fleet.logs[3:]]
         (one,) = [one for one in found(logs, fleet) if one.text.startswith(log.name)]
         assert one.code == f"contradicts_{cause}"
-        assert name in one.text
+        assert f"{name} would have to" in one.text
+        assert words in one.text
 
 
 def _exchanged(log: Log) -> dict[str, np.ndarray]:
