@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (886, 129),
     "control": (3155, 359),
     "core": (1615, 245),
-    "data": (9683, 833),
+    "data": (9699, 834),
     "documents": (2452, 224),
     "dynamics": (2246, 277),
     "export": (1482, 172),

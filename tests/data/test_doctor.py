@@ -267,6 +267,26 @@ def test_what_a_reader_noticed_is_told_and_masked_samples_excuse() -> None:
     assert inspect(LOG, masks=[Frozen()]).findings == inspect(LOG).findings
 
 
+@pytest.mark.parametrize("hull", [True, False])
+def test_rates_of_a_vessel_that_heels_may_be_the_hulls_or_the_headings(*, hull: bool) -> None:
+    phi = 0.4 - 1.2 * LOG["r"]
+    level = np.cos(phi) if hull else 1.0
+    log = changed(phi=phi, p=np.gradient(phi, T), r=LOG["r"] / level, v=LOG["v"] / level)
+    found = inspect(log).findings
+    assert [finding.text for finding in found if finding.level != "note"] == []
+
+
+def test_a_slow_gear_with_a_noisy_sensor_is_not_stuck() -> None:
+    demand = np.radians(20.0) * np.sign(np.sin(0.4 * T))
+    angle = [0.0]
+    for wanted in demand[1:]:
+        angle.append(angle[-1] + np.clip(wanted - angle[-1], -0.004, 0.004))
+    gear = np.array(angle) + RANDOM.normal(scale=0.0015, size=T.size)
+    assert not inspect(changed(cmd_delta=demand, delta=gear)).find("stuck")
+    rests = np.where((T > 60.0) & (T < 80.0), gear[600], gear)
+    assert inspect(changed(cmd_delta=demand, delta=rests)).find("stuck")
+
+
 def test_an_effect_on_a_fit_is_measured() -> None:
     jump = one(inspect(changed(u=stepped(LOG["u"], 1500, 0.5))), "jump")
     assert jump.effect is not None

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
+import pandas as pd
 
 from residnet.core.names import BOW_WIND
 from residnet.core.stretches import stretches
@@ -182,14 +183,19 @@ def stuck(log: Record, found: Check) -> Iterator[Finding]:
             continue
         demanded, measured = log[demand], log[actual]
         still = max(6.0 * log.noise(actual), 1e-4 * span)
-        runs = stretches(np.abs(np.nan_to_num(np.diff(measured))) <= still)
+        # a slow gear moves less within a step than its sensor is noisy: it rests where the range
+        # over so many samples is that of noise
+        many = max(2, round(_STUCK / log.step))
+        rolling = pd.Series(measured).rolling(many, min_periods=1)
+        rests = ~((rolling.max() - rolling.min()).to_numpy()[many - 1 :] > still)
         longest = slice(0, 0)
         seconds = 0.0
-        for start, stop in zip(*runs, strict=True):
-            run, lasted = slice(start, stop + 1), float(log.t[stop] - log.t[start])
+        for start, stop in zip(*stretches(rests), strict=True):
+            run = slice(start, stop + many - 1)
+            lasted = float(log.t[run.stop - 1] - log.t[start])
             apart = np.abs(demanded[run] - measured[run]) > _FAR_APART * span
             moved = float(np.ptp(demanded[run])) > _FAR_APART * span
-            if lasted >= max(_STUCK, seconds) and moved and float(apart.mean()) > 0.1:
+            if lasted > seconds and moved and float(apart.sum()) * log.step >= _STUCK:
                 longest, seconds = run, lasted
         if seconds:
             at, first = np.zeros(len(log), dtype=bool), float(log.t[longest.start])

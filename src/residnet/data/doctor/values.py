@@ -85,19 +85,36 @@ def wraps(log: Record, found: Check) -> Iterator[Finding]:
 
 
 def upright(log: Log) -> Log:
-    """Return a log of six degrees of freedom with u, v, r and p as rates of place and angles.
+    """Return a log with roll or pitch with its velocities as rates of place and angles.
 
-    So do checks of the motion see a vessel under water as one on it. Any other log stays.
+    So do checks of the motion see a vessel under water as one on it, and one that heels as one that
+    does not. A gyro's yaw rate falls with the cosine of the roll and a compass's does not; whether
+    v and r are those of the hull is told by what they leave of the pose. Any other log stays.
     """
     live = Live.told(log.channels)
     if not live.spatial:
-        return log
+        return _as_rates(log) if live.rolls else log
     if not log.channels.keys() >= {*live.moving}:
         log = complete_motion(log, MotionConfig(), live)
     nu = log.stack(live.moving)
     u, v, r = levelled(nu).T
     p = log["p"] + r * np.sin(log["theta"])
     return log.replace(channels={**log.channels, "u": u, "v": v, "r": r, "p": p})
+
+
+def _as_rates(log: Log) -> Log:
+    """Return a log whose v and r move the pose, from one in which they may be the hull's."""
+    moved = {}
+    if log.channels.keys() >= {"psi", "r"}:
+        moved["r"] = np.diff(log["psi"])
+    if log.channels.keys() >= {"psi", "x", "y", "v"}:
+        moved["v"] = (np.diff(log["x"] + 1j * log["y"]) * np.exp(-1j * log["psi"][1:])).imag
+    channels = dict(log.channels)
+    for name, change in moved.items():
+        both = (log[name], log[name] * np.cos(log["phi"]))
+        left = [np.nanmean(np.square(change - np.diff(log.t) * rate[1:])) for rate in both]
+        channels[name] = both[int(np.argmin(left))]
+    return log.replace(channels=channels)
 
 
 def unwrapped(log: Log) -> Log:
