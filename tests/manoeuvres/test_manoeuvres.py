@@ -132,6 +132,8 @@ def test_kinds_side_by_side_equal_each_alone_within_bounds_and_with_indices(
         assert 0 < float(inputs[rows, :, :2].abs().max()) <= n_max
         # the propellers follow
         assert float(states[rows, :, 6:].abs().max()) <= n_max
+        before = t < getattr(group[0], "start", 0.0)
+        assert torch.equal(inputs[2 * i, before, 0], inputs[2 * i, before, 1]), "the helm waits"
         alone, own = fly(model, type(group[1]).source(group[1:], helm, t), len(t), zero[:1])
         torch.testing.assert_close(alone[0], states[2 * i + 1], rtol=1e-10, atol=1e-12)
         torch.testing.assert_close(own[0], inputs[2 * i + 1], rtol=1e-10, atol=1e-12)
