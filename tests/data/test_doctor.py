@@ -77,6 +77,8 @@ def test_a_healthy_log_has_nothing_but_information() -> None:
 ARM = -0.99 * np.exp(1j * PSI) - 0.4j * np.exp(1j * PSI)
 KNOTS = changed(u=LOG["u"] / 0.5144, v=LOG["v"] / 0.5144)
 SHAKEN = LOG.replace(t=T + RANDOM.uniform(-0.03, 0.03, len(LOG)))
+SLOW = rows(LOG, slice(None, None, 10))
+SHAKEN_SLOW = SLOW.replace(t=SLOW.t + RANDOM.uniform(-0.45, 0.45, len(SLOW)))
 GAP = rows(LOG, np.r_[0:500, 560:2000])
 TWIN = changed(n=np.full(len(LOG), 10.0), delta_stbd=LOG["delta"].copy())
 STOPPED = {name: np.where(T < 60.0, 0.0, LOG[name]) for name in "uvr"}
@@ -149,7 +151,8 @@ TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
     (changed(u=np.round(LOG["u"], 1)), "resolution", "will mislead", "0.1 m/s", {"levels": 10}),
     # clock
     (GAP, "gaps", "note", "1 gaps", {"count": 1, "longest": 6.1, "lost": 6.0}),
-    (SHAKEN, "clock", "will mislead", "steps vary", {"rate": 10.0}),
+    (SHAKEN, "clock", "note", "steps vary", {"rate": 10.0}),
+    (SHAKEN_SLOW, "clock", "will mislead", "steps vary", {"rate": 1.0}),
     (LOG.replace(t=stepped(T, 1000, 1.7e9)), "clock_span", "fatal", "unit of time", {}),
     (LOG.replace(t=np.where(T == 50.0, 49.9, T)), "duplicate_rows", "fatal", "repeat", {}),
     (LOG.replace(t=np.where(T > 99.95, T - 9, T)), "time_backwards", "fatal", "backwards", {}),
@@ -426,6 +429,8 @@ def test_a_nominal_clock_is_held_against_the_dates(tmp_path: Path, *, epoch: boo
         found = date_findings(LOG, tmp_path / "log.csv")
         assert [finding.code for finding in found] == ["clock_rate"] * (rate != 1.0)
         assert all(f.figures["rate"] == pytest.approx(1.095, abs=1e-4) for f in found)
+        # rows of other topics between them are none of the log's
+        assert date_findings(LOG.replace(meta={"rows_dropped": 900}), tmp_path / "log.csv") == []
     (tmp_path / "log.csv").write_bytes(np.random.default_rng(0).bytes(2000))
     assert date_findings(LOG, tmp_path / "log.csv") == []
 

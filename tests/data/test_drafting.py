@@ -111,6 +111,7 @@ CALLED: dict[str | None, str] = {
     "u": "Longitudinal velocity|Velocidad longitudinal|vx|velocity_x_mps|twist.linear.x"
     "|Long. speed",
     "thrust_stbd": "thruster right",
+    "cmd_thrust_port": "/thrusters/left/cmd/data",
     "wind_dir": "TWD",
     "x": "local_x|Nordposition [m]|pos_n|Nordwert [m]",
     "y": "Posición Y|Ostposition [m]|Ost-Koordinate|Rechtswert|Ostwert [m]|Ostkoordinate",

@@ -392,16 +392,16 @@ def test_thrusters_that_no_number_tells_apart_are_one_each(
 ) -> None:
     called = [f"cmd_thrust_{end}_{side}" for end in ("fore", "aft") for side in ("port", "stbd")]
     called += [f"cmd_thrust_lift_{one.removeprefix('cmd_thrust_')}" for one in called]
-    forces = {one: np.sin((0.1 + 0.02 * k) * seen.t) for k, one in enumerate(called)}
+    forces = {one: 9 * np.sin((0.1 + 0.02 * k) * seen.t) for k, one in enumerate(called)}
     pd.DataFrame({"t": seen.t, "x": seen.x, "y": seen.y, "yaw": seen.psi, **forces}).to_csv(
         file := tmp_path / "rov.csv", index=False
     )
     log, _, marks = drafted(file)
-    inputs = [log[name] for name in log.channels if name.startswith("thrust")]
+    inputs = [log[name] for name in log.channels if name.startswith("cmd_thrust")]
     assert len(inputs) == len(called)
     for force in forces.values():
         assert any(np.allclose(values, force, atol=1e-12) for values in inputs)
-    assert "thrust_port_cmd_1" in {key[-1] for key, _ in marks.guesses}
+    assert "cmd_thrust_port_1" in {key[-1] for key, _ in marks.guesses}
 
 
 def test_logs_with_other_columns_beside_each_other_are_no_messages(

@@ -174,9 +174,9 @@ def test_residnet_divides_many_logs_and_cuts_few(tmp_path: Path) -> None:
     saved(tmp_path, *(f"{kind}_{i}" for kind in ("zigzag", "turn") for i in range(5)))
     found = splits(tmp_path, auto=["."])
     assert {split: [name for name, _, _ in logs] for split, logs in found.items()} == {
-        "train": ["turn_0", "turn_1", "turn_3", "zigzag_0", "zigzag_1", "zigzag_3"],
-        "validation": ["turn_2", "zigzag_2"],
-        "test": ["turn_4", "zigzag_4"],
+        "train": ["turn_0", "turn_1", "turn_4", "zigzag_0", "zigzag_2"],
+        "validation": ["turn_3", "zigzag_3"],
+        "test": ["turn_2", "zigzag_1", "zigzag_4"],
     }
     log = wavy(seconds=100.0)
     cut = divided([log.rows(slice(500)).replace(name="copy"), log])
@@ -258,3 +258,13 @@ def test_folders_called_after_the_splits_are_the_splits(tmp_path: Path) -> None:
     # `trials/test_3.csv` alone says nothing
     named = [log.replace(meta={"source": f"trials/test_{i}.csv"}) for i, log in enumerate(logs)]
     assert [len(part) for part in divided(named).values()] == [3, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("count", "parts"), [(7, [5, 1, 1]), (8, [4, 1, 3]), (10, [5, 2, 3]), (14, [8, 3, 3])]
+)
+def test_a_verdict_has_its_test_logs_where_eight_can_be_divided(
+    count: int, parts: list[int]
+) -> None:
+    logs = [Log(f"{k}", np.arange(3.0), {"u": np.arange(3.0) + k}) for k in range(count)]
+    assert [len(part) for part in divided(logs).values()] == parts

@@ -445,3 +445,15 @@ def test_what_ran_away_or_is_exact_leaves_the_intervals_of_others() -> None:
     assert spans[:2] == plain
     assert spans[2] == [0.0, 0.0]
     assert new_trials(values[:6], numbers[:6]) == [None] * 4
+
+
+def test_a_log_without_an_error_widens_no_interval() -> None:
+    random, held, factors = np.random.default_rng(5), [], []
+    for _ in range(400):
+        # one log in six goes straight, and nothing goes wrong in it
+        seen, new = np.abs(random.normal(size=(2, 12, 2))) * (random.random((2, 12, 1)) > 1 / 6)
+        low, high = np.array(new_trials(seen, np.arange(12))).T
+        held.append((low <= new.mean(0)) & (new.mean(0) <= high))
+        factors.append(high[0] / seen.mean(0)[0])
+    assert 0.92 <= np.mean(held) <= 0.98
+    assert np.median(factors) < 2.5

@@ -174,11 +174,6 @@ _PROPELLERS = ("n", "n_port", "n_stbd")
 _KNOT = 1.0 / 0.5144
 _SIMPLE: list[tuple[str, tuple[str, ...], Damage]] = [
     ("time gap", ("gaps",), lambda s, log, g: at_rows(log, ~stretch(log, g, 0.02, 0.1))),
-    (
-        "jitter",
-        ("clock",),
-        lambda s, log, g: log.replace(t=log.t + g.uniform(-0.3, 0.3, len(log)) * step_of(log)),
-    ),
     ("r in deg/s", ("follows_r", "gain"), lambda s, log, g: scaled(log, ["r"], 180.0 / np.pi)),
     (
         "psi in deg",

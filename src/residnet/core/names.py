@@ -24,6 +24,7 @@ __all__ = [
     "nearest",
     "shown",
     "si_unit",
+    "sides",
     "to_si",
     "units",
 ]
@@ -91,6 +92,13 @@ CHANNEL_UNITS: dict[str, str] = {
     "current_north": "m/s",
     "current_east": "m/s",
 }
+
+
+def sides(names: Iterable[str]) -> dict[str, str]:
+    """Return the channels that end in `_port`, each with the one that ends in `_stbd`."""
+    known = dict.fromkeys(names)
+    ends = {name: f"{name[:-4]}stbd" for name in known if name[:-5] and name.endswith("_port")}
+    return {port: stbd for port, stbd in ends.items() if stbd in known}
 
 
 def shown(text: object, most: int = 60) -> str:

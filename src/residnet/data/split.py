@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 SPLITS = ("train", "validation", "test")
 _ENOUGH = 5
 """Logs from which whole ones are taken for each split."""
+_JUDGED, _SPARED = 3, 8
+"""Test logs without which no verdict is passed, and logs of which so many can be spared."""
 _SHARES = (("train", 0.0, 0.3), ("validation", 0.3, 0.5), ("train", 0.5, 0.8), ("test", 0.8, 1.0))
 """Stretches of each log where there are fewer."""
 _CALLED = {
@@ -238,16 +240,23 @@ def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
     """Return the logs by split (train, validation, test); copies are left out.
 
     Of each five logs, in the order of their manoeuvres, the third is for validation and the fifth
-    for the test. Where there are fewer than five, each is cut in time: its first three tenths and
-    those from the middle on are for training, the rest for validation and test. Where folders or
-    files are called train and test (and validation), that is the split.
+    for the test; of eight or more three at least, fewer cannot tell how good a model is. Where
+    there are fewer than five, each is cut in time: its first three tenths and those from the middle
+    on are for training, the rest for validation and test. Where folders or files are called train
+    and test (and validation), that is the split.
 
     Raises:
         DataError: where a log is too short to be cut.
     """
     kept = without_copies(logs)
     out: dict[str, list[Log]] = {split: [] for split in SPLITS}
-    if owners := called_splits(kept):
+    owners, count = called_splits(kept), len(kept)
+    if not owners and count >= _ENOUGH:
+        each = count / _JUDGED if _SPARED <= count < _JUDGED * _ENOUGH else _ENOUGH
+        test = {int((k + 0.8) * each) for k in range(count)}
+        kept = sorted(kept, key=lambda log: log.manoeuvre)
+        owners = ["test" if place in test else "train" for place in range(count)]
+    if owners:
         for log, owner in zip(kept, owners, strict=True):
             out[owner].append(log)
         if not out["validation"]:
@@ -255,10 +264,6 @@ def divided(logs: Sequence[Log]) -> dict[str, list[Log]]:
             places = range(2, len(known), 4) or range(len(known) - 1, 0, -len(known))
             out["validation"] = [known[place] for place in places]
             out["train"] = [log for place, log in enumerate(known) if place not in places]
-        return out
-    if len(kept) >= _ENOUGH:
-        for place, log in enumerate(sorted(kept, key=lambda log: log.manoeuvre)):
-            out[{2: "validation", 4: "test"}.get(place % 5, "train")].append(log)
         return out
     for log in kept:
         gone, length = without_pauses(log.t), float(log.t[-1] - log.t[0])

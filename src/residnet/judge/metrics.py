@@ -112,9 +112,11 @@ def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]
 
     The windows of a log have its manoeuvre, weather and speed in common, so that the means of logs
     are what scatters. Errors are positive and their size is drawn: Student's t holds for the
-    logarithms of these means, twice over, for the logs seen and the new ones. By how much logs
-    differ is estimated from all columns, since the few logs of one alone tell too little by chance,
-    and what looks best has too narrow an interval then. Columns hang together: they count as two.
+    logarithm of the mean over logs, twice over, for the logs seen and the new ones. It scatters as
+    the logs do beside their mean, so that a log in which next to nothing goes wrong widens nothing.
+    By how much logs differ is estimated from all columns, since the few logs of one alone tell too
+    little by chance, and what looks best has too narrow an interval then. Columns hang together:
+    they count as two.
 
     Args:
         values: errors of windows, none negative; a column is a model's error of one kind.
@@ -128,9 +130,9 @@ def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]
     if count < FEW_LOGS:
         return [None] * values.shape[1]
     sums = np.stack([np.bincount(places, column, count) for column in values.T], axis=1)
-    sizes = np.log(np.maximum(sums / np.bincount(places)[:, None], 1e-12))
-    told = sizes[:, sums.any(axis=0) & np.isfinite(sizes).all(axis=0)]
-    scatter = math.sqrt(told.var(axis=0, ddof=1).mean()) if told.size else 0.0
+    sizes = (sums / np.bincount(places)[:, None])[:, sums.any(axis=0) & np.isfinite(sums).all(0)]
+    told = (sizes / sizes.mean(axis=0)).var(axis=0, ddof=1)
+    scatter = math.sqrt(told.mean()) if told.size else 0.0
     freedom = min(values.shape[1], 2) * (count - 1)
     wide = scipy.stats.t.ppf(0.5 + LEVEL / 2, freedom) * math.sqrt(2 / count)
     factor = math.exp(wide * scatter)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import final
 
 from residnet.core.layout import ALIVE, Live
+from residnet.core.names import sides
 from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 
 _PARITY = dict.fromkeys(
@@ -31,9 +32,7 @@ class ChannelNames(tuple[str, ...]):
     ) -> ChannelNames:
         """From the names, the pairs that are declared, and the velocities that live."""
         made = super().__new__(cls, names)
-        port = [name.removesuffix("_port") for name in made if name[:-5] and name.endswith("_port")]
-        ending = [(f"{stem}_port", f"{stem}_stbd") for stem in port if f"{stem}_stbd" in made]
-        both = [*pairs, *ending]
+        both = [*pairs, *sides(made).items()]
         made.partners = {**dict(both), **{b: a for a, b in both}}
         made.live = live
         return made

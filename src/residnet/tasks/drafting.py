@@ -349,7 +349,7 @@ def _split(
     root = common.as_posix() if near.count("..") > 2 else Path(near).as_posix()
     why = (
         "of each five logs, in the order of their manoeuvres, one is for validation and one for the"
-        " test"
+        " test, of eight logs or more three at least"
     )
     if called_splits(list(usable.values())):
         why = "folders or files are called after the splits"
@@ -526,7 +526,7 @@ def _measured(names: Sequence[str], marks: Marks) -> list[str]:
     for name in names:
         partners = []
         if "cmd" in name:
-            measured = name.removesuffix("_cmd").removeprefix("cmd_")
+            measured = name.removeprefix("cmd_")
             partners = [measured, measured.replace("cmd_", "")]
         if name.startswith("cmd_"):
             partners.append(f"n_{name.removeprefix('cmd_')}")
@@ -535,7 +535,7 @@ def _measured(names: Sequence[str], marks: Marks) -> list[str]:
             marks.guess(INPUTS, f"{found} is taken as measured, and not what was ordered ({name})")
         elif name.removesuffix("_rate") in {*names} - {name}:
             marks.note(INPUTS, f"{name} is left out beside {name.removesuffix('_rate')}")
-        elif name.startswith("thrust") and turning:
+        elif name.removeprefix("cmd_").startswith("thrust") and turning:
             marks.note(INPUTS, f"{name} is left out beside {turning[0]}: it follows from it")
         else:
             out.append(name)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from residnet.core.names import sides
 from residnet.core.stretches import stretches
 from residnet.data.channels import SIGMA_OF_MAD, deviation, quantiles
 from residnet.data.doctor.findings import Check, Finding, check, correction
@@ -331,9 +332,8 @@ def _steering(log: Record) -> tuple[str, np.ndarray]:
     for name in STEERING[:4]:
         if name in log and log.std(name) > 1e-9:
             return name, log[name]
-    for port in ("n_port", "cmd_port", "throttle_port", "thrust_port"):
-        starboard = port.removesuffix("port") + "stbd"
-        if port in log and starboard in log:
+    for port, starboard in sides(log).items():
+        if log.units[port] != "rad":
             steer = log[port] * np.abs(log[port]) - log[starboard] * np.abs(log[starboard])
             if deviation(steer) > 1e-9:
                 return f"{port} over {starboard}", steer

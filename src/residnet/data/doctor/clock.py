@@ -13,15 +13,15 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.doctor.findings import Check, Finding, Level, check, share_of
-from residnet.data.doctor.statistics import Record
+from residnet.data.doctor.statistics import WINDOW, Record
 from residnet.data.readers.texts import as_utf8
 from residnet.data.readers.written import parse_numbers, parse_texts
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# stamps scatter by this share of a step before interpolation between them suffers
-_MOST_JITTER = 0.05
+# stamps that scatter move a velocity by this share of its spread before a fit suffers
+_MOST_MOVED = 0.05
 # longest time step, in usual ones, that the grid interpolates across, and rounding
 _BRIDGED = 3.0 * (1.0 + 1e-6)
 # stamps beyond this count from 1970
@@ -50,9 +50,14 @@ def order(log: Record, found: Check) -> Iterator[Finding]:
 
 @check("clock", "clock")
 def rate(log: Record, found: Check) -> Iterator[Finding]:
-    """Report the rate of the samples, and how much their times scatter."""
+    """Report the rate of the samples, and how much their times scatter.
+
+    Stamps that scatter mislead by what the vessel does meanwhile, not by their share of a step.
+    """
     dt, step, span = np.diff(log.t), log.step, float(log.t[-1] - log.t[0])
     jitter = float(dt[dt <= 1.5 * step].std() / step)
+    moving = log.moving if len(log) > WINDOW else []
+    changes = [log.std(n) and np.diff(log.smooth(n)).std() / log.std(n) for n in moving]
     text = (
         f"{1.0 / step:.4g} Hz over {span:.1f} s from t = {log.t[0]:.1f} s, steps vary by"
         f" {share_of(jitter)} (standard deviation)"
@@ -61,7 +66,8 @@ def rate(log: Record, found: Check) -> Iterator[Finding]:
         "use the sender's stamps, or a coarser grid (prepare.grid.step), so that averaging replaces"
         " interpolation"
     )
-    level: Level = "will mislead" if jitter > _MOST_JITTER else "note"
+    moved = jitter / np.sqrt(2.0) * max(changes, default=0.0)
+    level: Level = "will mislead" if moved > _MOST_MOVED else "note"
     fix = fix if level != "note" else ""
     yield found(text, {"rate": 1.0 / step, "jitter": jitter, "span": span}, level=level, fix=fix)
 
@@ -117,10 +123,12 @@ def date_findings(log: Log, path: Path) -> list[Finding]:
     """Return the columns of dates that go faster or slower than the log's time.
 
     Args:
-        log: as read from the table, row by row.
+        log: as read from the table, row by row; where rows were dropped, a row of the table is none
+            of the log's, and nothing is told.
         path: the table; anything that is no csv or Parquet file has no such columns.
     """
-    table, out = _dated_columns(path), []
+    dropped = log.meta.get("rows_dropped", 0) > _LEAST_RATE * len(log)
+    table, out = None if dropped else _dated_columns(path), []
     if table is None:
         return []
     for name in table.columns:

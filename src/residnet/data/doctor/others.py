@@ -22,7 +22,7 @@ import scipy
 
 from residnet.core.arrays.paged import LARGE
 from residnet.core.layout import SIX
-from residnet.core.names import VELOCITY
+from residnet.core.names import VELOCITY, sides
 from residnet.core.stretches import stretches
 from residnet.data.channels import SIGMA_OF_MAD
 from residnet.data.doctor.findings import show, slip_in_words
@@ -653,11 +653,10 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
         text = f"{name} and its command would have to have the opposite sign"
         surprise = model.surprise(fleet.of(changed(log, both)))
         out.append(Cause("sign", name, -1.0, surprise, text))
-    for port in (one for one in fleet.driving if one.endswith("_port")):
-        if (stbd := port.removesuffix("port") + "stbd") in fleet.driving:
-            surprise = model.surprise(fleet.of(changed(log, {port: log[stbd], stbd: log[port]})))
-            text = f"{port} and {stbd} would have to be exchanged"
-            out.append(Cause("exchanged", port, 0.0, surprise, text))
+    for port, stbd in sides(fleet.driving).items():
+        surprise = model.surprise(fleet.of(changed(log, {port: log[stbd], stbd: log[port]})))
+        text = f"{port} and {stbd} would have to be exchanged"
+        out.append(Cause("exchanged", port, 0.0, surprise, text))
     if {"u", "v"} <= set(fleet.moving):
         out.append(_heading_off(fleet, model, log))
         out += _current(fleet, model, log) if "psi" in log else []

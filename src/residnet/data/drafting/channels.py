@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from residnet.core.layout import Live
-from residnet.core.names import BOW_WIND, CHANNEL_UNITS
+from residnet.core.names import BOW_WIND, CHANNEL_UNITS, sides
 from residnet.core.units import si_unit, to_si, units
 from residnet.data.channels import STILL
 from residnet.data.derivatives import local_polynomials
@@ -626,9 +626,8 @@ class Channels:
 
     def _turns_to_port(self) -> bool:
         """Return whether more of a thruster on the port side turns the vessel to port."""
-        pairs = [(one, one.removesuffix("port") + "stbd") for one in self._names]
-        for port, stbd in pairs:
-            if not re.match(r"(n|cmd|throttle|thrust)_port$", port) or stbd not in self._names:
+        for port, stbd in sides(self._names).items():
+            if re.match(r"(cmd_)?(delta|azimuth)", port):
                 continue
             both = [
                 (Raw(raw.t, {"more": raw.columns[port] - raw.columns[stbd]}), motion)

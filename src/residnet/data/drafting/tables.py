@@ -63,7 +63,7 @@ _FIRST_ROWS = {"parquet": parquet_rows, "json_lines": json_rows}
 _BRACKETS = re.compile(r"[\[(]")
 _QUOTIENT = re.compile(r"(?P<name>.*\S)\s+/\s+(?P<unit>\S.*)")
 _TURNS = re.compile(r"rpm|rev|1/s|hz|turns|u/?min|umdr|drehz|toeren|tours|giri|varv", re.IGNORECASE)
-_DRIVEN = re.compile(r"^(?:(?:cmd_)?n(?=_|$)|thrust)")
+_DRIVEN = re.compile(r"^(?:cmd_)?(?:n(?=_|$)|thrust)")
 _PULSES = (900.0, 2100.0)
 """Pulses in us that servos and speed controllers take."""
 _PARTS_OF_TIME = (
@@ -309,9 +309,9 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
         other = other_dimension(column, si) if si else None
         if channel == "n" and other == "m":
             channel = "x"
-        elif channel and channel.startswith("thrust") and written_unit(column, "1/s"):
+        elif channel and "thrust" in channel and written_unit(column, "1/s"):
             # a thruster that turns, and no force
-            channel = "n" + channel.removeprefix("thrust")
+            channel = channel.replace("thrust", "n")
         elif (
             channel
             and _DRIVEN.match(channel)
@@ -333,7 +333,7 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
             alike.setdefault(channel, [names[channel]]).append(column)
     for channel, called in alike.items():
         each = {f"{channel}_{k}": one for k, one in enumerate(sorted(called, key=columns.index), 1)}
-        if not channel.startswith("thrust") or names.keys() & each.keys():
+        if "thrust" not in channel or names.keys() & each.keys():
             # of a rudder or a shaft that is told twice, one is an indicator
             for column in called[1:]:
                 marks.note(CHANNELS, f"'{column}' may be {channel} as well as '{called[0]}' is")
@@ -381,22 +381,24 @@ def _angles(names: dict[str, str], pairs: Mapping[str, tuple[str, str]]) -> dict
 
 
 def _pulsed(names: Mapping[str, str], sheets: Sequence[Sheet]) -> dict[str, str]:
-    """Return channel -> column, where pulses to a motor are no revolutions but its throttle.
+    """Return channel -> column, where pulses to a motor are its throttle, and no revolutions.
 
-    Pulses are whole microseconds between 900 and 2,100, and a share of a motor's all is one at
-    most; revolutions say in their name what they are, or are zero at rest.
+    Pulses are whole microseconds between 900 and 2,100, and a share of a motor's or thruster's all
+    is one at most; revolutions say in their name what they are, or are zero at rest.
     """
     out = {}
     for channel, column in names.items():
         values = np.concatenate([one.numbers.get(column, np.zeros(0)) for one in sheets])
         values = values[np.isfinite(values)]
-        if re.match(r"(cmd_)?n(_|$)", channel) and values.size and not _TURNS.search(column):
+        if _DRIVEN.match(channel) and values.size and not _TURNS.search(column):
             whole = bool((values == np.round(values)).all())
             pulses = whole and values.min() >= _PULSES[0] and values.max() <= _PULSES[1]
             motor = words_of(column)
-            share = motor.has("engine") and motor.lacks("revolutions", "propeller", "speed")
-            if pulses or (share and not whole and np.abs(values).max() <= 1.0):
-                channel = re.sub(r"^(cmd_)?n", "throttle", channel)
+            share = "thrust" in channel or motor.has("engine")
+            share &= motor.lacks("revolutions", "propeller", "speed") and not whole
+            throttle = _DRIVEN.sub("throttle", channel)
+            if throttle not in names and (pulses or (share and np.abs(values).max() <= 1.0)):
+                channel = throttle
         out[channel] = column
     return out
 

@@ -480,7 +480,7 @@ _LETTER = re.compile(r"(?<=\w) ([lr])(?= |$)")
 
 _INPUTS = (
     _Rule(None, "torque"),
-    _Rule("azimuth{side}{_cmd}", "azimuth"),
+    _Rule("{cmd_}azimuth{side}", "azimuth"),
     _Rule("{cmd_}delta_s{side}", "planes"),
     _Rule("{cmd_}delta_rate{side}", "rudder rate"),
     _Rule("{cmd_}delta{side}", "rudder"),
@@ -488,7 +488,7 @@ _INPUTS = (
     _Rule("throttle{side}", "engine throttle", "revolutions angle"),
     _Rule("{cmd_}n{side}", "revolutions|propeller", "thrust"),
     _Rule("{cmd_}n{side}", "engine", "thrust angle"),
-    _Rule("thrust{side}{_cmd}", "thrust"),
+    _Rule("{cmd_}thrust{side}", "thrust"),
     _Rule("servo{side}", "servo"),
     _Rule("throttle{side}", "throttle"),
 )
@@ -517,8 +517,7 @@ def input_channel(words: Words) -> str | None:
         return f"cmd{side}" if w.has("command") else f"n{side}"
     if w.has("planes"):
         side = side.removesuffix("_stern")
-    before, behind = ("cmd_", "_cmd") if w.has("command") else ("", "")
-    return found and found.format(side=side, cmd_=before, _cmd=behind)
+    return found and found.format(side=side, cmd_="cmd_" if w.has("command") else "")
 
 
 _ACTUATED = frozenset({"port", "starboard", "command", "measured"})
