@@ -13,7 +13,7 @@ from residnet.core.layout import Live
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.align import GridConfig
-from residnet.data.motion import MotionConfig, complete_motion, smooth_motion
+from residnet.data.motion import MotionConfig, complete_motion, fill_sparse, smooth_motion
 from residnet.data.prepare import PrepareConfig, prepare
 from residnet.data.readers.quantities import Antenna
 
@@ -185,3 +185,16 @@ def test_what_was_not_measured_under_water_follows_from_attitude_and_depth(
         inside = slice(40, -40)
         np.testing.assert_allclose(whole[name][inside], truth[name][inside], atol=0.01)
     assert any("not measured" in one["text"] for one in whole.meta["findings"])
+
+
+def test_sparse_commands_hold_and_sparse_states_are_interpolated_up_to_three_intervals() -> None:
+    t = np.arange(40.0)
+    values = np.where((t % 4 == 2) & ~((t > 15) & (t < 33)), t, np.nan)
+    log = Log("log", t, {"u": values, "delta": values})
+    filled = fill_sparse(log, ("u", "delta"), held=("delta",))
+    between = (t >= 2) & (t <= 14) | (t >= 34) & (t <= 38)
+    np.testing.assert_allclose(filled["u"][between], t[between])
+    np.testing.assert_array_equal(filled["delta"][between], (2 + (t - 2) // 4 * 4)[between])
+    for name in ("u", "delta"):
+        assert np.isnan(filled[name][:2]).all()
+        assert np.isnan(filled[name][20:30]).all()
