@@ -541,13 +541,13 @@ class CompiledRollout:
     ) -> None:
         self.rollout, self.dtype, self.own = rollout, x.dtype, tuple(own)
         self.most = math.inf
-        self.apart = not math.isinf(most)
         alone = copy.deepcopy(rollout).double()
         held = _numbers(alone)
         self.shared = [
             name for name, part in held.items() if name not in self.own and part.is_floating_point()
         ]
         trained = torch.is_grad_enabled() and any(held[name].requires_grad for name in self.shared)
+        self.apart = trained and not math.isinf(most)
         one = _Step(alone)
         own_shapes = [held[name][:1].shape for name in self.own]
 
