@@ -196,8 +196,8 @@ def ahead(evidence: Evidence) -> list[str]:
         }
         good = listed(list(dict.fromkeys(limits[END_UNITS[of]] for of in ends)))
         wanted = [
-            f"Good would be within {good}, or twice the noise floor, without a diverged window"
-            " and near the best model of the run."
+            f"Good would be within {good} up to the upper end of the interval, or twice the noise"
+            " floor, without a diverged window and near the best model of the run."
         ]
     named = {ZERO: ZERO, evidence.baseline: "the baseline"}
     beside = [
