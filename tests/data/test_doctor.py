@@ -97,10 +97,10 @@ TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
     (changed(u=-LOG["u"], v=-LOG["v"]), "frames", "will mislead", "sign turned", {}),
     (changed(v=-LOG["v"]), "frames", "will mislead", "v positive to port", {}),
     (changed(psi=PSI - 1.2), "frames", "will mislead", "+68.8 deg added", {"best_offset": 1.2}),
-    (KNOTS, "frames", "will mislead", "knots taken as m/s", {"speed_ratio": 1.944}),
+    (KNOTS, "frames", "will mislead", "kn taken as m/s", {"speed_ratio": 1.944}),
     (changed(psi=PSI + 0.14), "frames", "will mislead", "compass offset", {"offset": -0.14}),
     (changed(r=-LOG["r"]), "follows_r", "will mislead", "opposite sign", {"correlation": -1}),
-    (changed(r=np.degrees(LOG["r"])), "follows_r", "will mislead", "deg taken as rad", {}),
+    (changed(r=np.degrees(LOG["r"])), "follows_r", "will mislead", "deg/s taken as rad/s", {}),
     (changed(r=RANDOM.normal(size=50).repeat(40) / 20), "follows_r", "fatal", "one motion", {}),
     (
         changed(phi=0.1 * np.sin(0.5 * T), p=-0.05 * np.cos(0.5 * T)),
@@ -406,6 +406,9 @@ def test_noise_of_v_on_a_slow_straight_course_is_no_drift() -> None:
 def test_spikes_are_bridged_and_fill_values_told_from_measurements() -> None:
     assert spike_cells(LOG) == {}
     assert without_spikes(LOG) is LOG
+    shown = np.full(len(LOG), 132.0)
+    shown[[300, 701]] = 131.0, 133.0
+    assert "delta" not in spike_cells(changed(delta=shown))
     u = LOG["u"].copy()
     u[700] = -999.0
     clean = without_spikes(changed(u=u))

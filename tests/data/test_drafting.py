@@ -123,7 +123,9 @@ CALLED: dict[str | None, str] = {
     "throttle_port": "thr_port",
     "psi": "Gyro [deg]|Stävriktning|船首角",
     "longitude": "Longitudine",
-    "throttle": "Gashendel",
+    "throttle": "Gashendel|Propeller pitch [deg]|CPP [%]",
+    "azimuth_diff": "azi_diff_deg",
+    "n_bow": "rpm_fwd",
 }
 
 

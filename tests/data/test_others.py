@@ -158,6 +158,31 @@ def test_logs_of_a_surge_alone_are_looked_at_too() -> None:
     assert one.text.startswith("run_6")
 
 
+@pytest.mark.parametrize("name", ["azimuth", "delta"])
+def test_what_no_other_log_has_run_accuses_none(name: str) -> None:
+    """A thruster turns round once where it had not; a rudder stalls at angles not held before."""
+    random, t = np.random.default_rng(4), np.arange(0.0, 240.0, 0.5)
+    logs = []
+    for number in range(8):
+        angle = np.repeat(random.uniform(-0.35, 0.35, t.size // 20), 20)
+        if number == 7:
+            angle = 0.05 * t if name == "azimuth" else np.where(t < 20.0, 0.2, 1.2)
+        n = np.repeat(random.uniform(1.0, 3.0, t.size // 40), 40)
+        lift = np.sin(angle) if name == "azimuth" else np.minimum(angle, 0.4)
+        u, v, r = motion = np.zeros((3, t.size))
+        for k in range(t.size - 1):
+            thrust, drag = 0.02 * n[k] ** 2, np.hypot(u[k], v[k])
+            u[k + 1] = u[k] + thrust * np.cos(angle[k]) - 0.1 * u[k] * drag
+            v[k + 1] = v[k] + thrust * lift[k] - 0.2 * v[k] * drag
+            r[k + 1] = 0.9 * r[k] - 0.3 * thrust * lift[k]
+        motion += 0.003 * random.standard_normal(motion.shape)
+        logs.append(Log(f"run_{number}", t, {"u": u, "v": v, "r": r, "n": n, name: angle}))
+    fleet = Fleet("ferry", logs, [], ("n", name), name)
+    assert [one.text for one in found(logs, fleet)] == []
+    beyond = inspect_together(logs, fleet.inputs)
+    assert [one.level for one in beyond.find("beyond_others")] == ["note"]
+
+
 def test_gusts_on_straight_runs_are_no_dead_rudder(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     random, logs = np.random.default_rng(5), []

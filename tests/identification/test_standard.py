@@ -183,6 +183,9 @@ def test_terms_follow_from_what_moves() -> None:
     assert "n^2 delta" in astern
     assert not [term for term in astern if "wind" in term]
     assert not [term for term in hull(moving=("delta",)) if "n" in term.split()]
+    turned = short(("u", "v", "r", "n_bow", "azimuth_bow"))["baselines"]["hull"]["terms"]["r"]
+    assert {"n_bow|n_bow| sin(azimuth_bow)", "u |n_bow| cos(azimuth_bow)"} <= set(turned)
+    assert not {"n_bow", "azimuth_bow"} & set(turned)
 
 
 NAMES_OF_A_BOAT = ("u", "v", "r", "n", "delta")

@@ -8,7 +8,7 @@ deg"`) and is converted by `residnet.core.units`.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from residnet.core.units import si_unit, to_si, units
 
@@ -114,3 +114,15 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     if close:
         return f"; did you mean '{close[0]}'?"
     return f"; valid: {', '.join(names[:24])}" + (", ..." if len(names) > 24 else "")
+
+
+def thrusters_that_turn(names: Sequence[str]) -> dict[str, str]:
+    """Return the angle of each azimuth thruster -> what its thrust goes with."""
+    plain = {one.removeprefix("cmd_"): one for one in names}
+    out = {}
+    for angle in (one for one in plain if one.startswith("azimuth")):
+        end = angle.removeprefix("azimuth")
+        by = next((n for n in ("n", "throttle", "thrust") if f"{n}{end}" in plain), None)
+        if by and end != "_diff":
+            out[plain[angle]] = plain[f"{by}{end}"]
+    return out

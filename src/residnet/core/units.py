@@ -94,6 +94,20 @@ _PARTS = ("m", "km", "cm", "rad", "deg", "kg", "rpm", "1")
 _POWERS = {"²": "^2", "³": "^3", "**": "^", "⁻": "^-", "¹": "1"}
 
 
+@cache
+def slips(si: str) -> dict[float, str]:
+    """Return factor by which values are too large -> the two units of a dimension in question."""
+    factors, out = _FACTORS.get(si, {}), dict[float, str]()
+    for usual in (si.replace("rad", "deg"), si):
+        for unit, factor in factors.items() if usual in factors else ():
+            size = factors[usual] / factor
+            # those closer together, as gon and deg, are no better explanation than chance
+            if abs(math.log(size)) > 0.2:
+                out.setdefault(round(size, 9), f"{unit} taken as {usual}")
+                out.setdefault(round(1.0 / size, 9), f"{usual} taken as {unit}")
+    return out
+
+
 def units() -> tuple[str, ...]:
     """Return the names of all units that residnet converts."""
     return tuple(_UNITS)

@@ -284,7 +284,9 @@ def _spikes(values: np.ndarray, moved: bool) -> np.ndarray:
         whole = (beyond > _BEYOND * span) & (distance > _BEYOND * span) & (span > 0.0)
         far = (distance > max(least, _GLANCE * most, 1e-6 * span)) | whole
     else:
-        far = (beyond > 0.5 * span) & (distance > 0.5 * span) if span > 0.0 else beyond < -1.0
+        # a display that flickers between its last digits leaves its range by one step of them
+        room = 0.5 * span + np.min(change[change > 0.0])
+        far = (np.minimum(beyond, distance) > 1.001 * room) if span > 0.0 else beyond < -1.0
     starts, stops = stretches(far)
     single = (stops - starts <= _LONGEST) & (starts > 0) & (stops < known.size)
     out[at] = covered(known.size, starts[single], stops[single])

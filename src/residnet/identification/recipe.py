@@ -12,7 +12,7 @@ import numpy as np
 from residnet.baselines.sets import HULL, ROLL, WIND, Roles, submerged
 from residnet.core.layout import ALIVE, Live
 from residnet.core.log import Log
-from residnet.core.names import BOW_WIND, CHANNEL_UNITS, WIND_INPUTS
+from residnet.core.names import BOW_WIND, CHANNEL_UNITS, WIND_INPUTS, thrusters_that_turn
 from residnet.core.samples import Samples
 from residnet.core.stretches import stretches
 from residnet.data.motion import without_pauses
@@ -183,7 +183,8 @@ def long(facts: Facts) -> bool:
 def _acting_terms(facts: Facts) -> tuple[list[str], list[str], list[str]]:
     """Return the inputs that are forces, that turn the flow, and that drive."""
     forces = [name for name in facts.inputs if name in FORCE_CHANNELS]
-    acting = [name for name in facts.inputs if name not in forces]
+    turned = thrusters_that_turn(facts.inputs)
+    acting = [n for n in facts.inputs if n not in (*forces, *turned, *turned.values())]
     turning = [name for name in acting if _turns(name)]
     return forces, turning, [name for name in acting if name not in turning]
 
@@ -191,12 +192,13 @@ def _acting_terms(facts: Facts) -> tuple[list[str], list[str], list[str]]:
 def _terms(facts: Facts) -> list[str]:
     """Return the terms of all axes together."""
     forces, turning, driving = _acting_terms(facts)
-    live = live_of(facts.names)
+    turned, live = thrusters_that_turn(facts.inputs), live_of(facts.names)
     moving = live.moving
     if live.spatial:
         return submerged(Roles(live.channels, (*forces, *driving), tuple(turning), (), False))
     return [
         *("1", *moving, *HULL, *(ROLL if "p" in moving else ()), *forces),
+        *(term for at in turned.items() for term in _azimuth(*at, moving)),
         *(term for name in driving for term in _propeller(name, name in facts.astern)),
         *(term for name in turning for term in _rudder(name, driving, facts)),
         *(WIND if facts.wind else ()),
@@ -212,6 +214,12 @@ def _propeller(name: str, astern: bool) -> list[str]:
     """Return the thrust of a propeller; one that turns astern differs from one ahead."""
     back = [f"{name}^2", f"{name} u"] if astern else []
     return [name, f"{name}|{name}|", f"|{name}| u", *back]
+
+
+def _azimuth(angle: str, n: str, moving: Sequence[str]) -> list[str]:
+    """Return the thrust of a thruster that turns, along and across, which falls with the inflow."""
+    flows = (f"{n}|{n}|", *((f"u |{n}|",) if "u" in moving else ()))
+    return [f"{flow} {way}({angle})" for flow in flows for way in ("cos", "sin")]
 
 
 def _rudder(name: str, driving: Sequence[str], facts: Facts) -> list[str]:

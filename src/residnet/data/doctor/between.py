@@ -80,7 +80,9 @@ def moved(log: Record) -> Record:
     ahead = ground * np.exp(-1j * log["psi"])
     made = {"u": ahead.real, "v": ahead.imag}
     whole = log.log.replace(
-        channels={**made, **log.log.channels}, units={**dict.fromkeys(made, "m/s"), **log.units}
+        channels={**made, **log.log.channels},
+        units={**dict.fromkeys(made, "m/s"), **log.units},
+        meta={**log.log.meta, "derived": tuple(made)},
     )
     return Record(whole, log.inputs)
 
@@ -368,6 +370,13 @@ def contradictions(logs: Together, found: Check) -> Iterator[Finding]:
     for i in fleet.apart:
         log, likely = fleet.logs[i], causes(fleet, i)[0]
         split = logs.splits.get(log.name, "")
+        if likely.kind == "vessel" and fleet.agreed and fleet.goes_beyond(i):
+            text = (
+                f"{log.name} goes beyond the inputs of the {count} other logs that agree: they"
+                " cannot tell whether it is right"
+            )
+            yield found(text, code="beyond_others", level="note")
+            continue
         left = float(np.nanmax(fleet.scores(fleet.core, [i])[i].left))
         text = (
             f"{log.name}{f' ({split})' if split else ''}: a model of {count} other logs does not"

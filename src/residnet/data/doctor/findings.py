@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from residnet.core.log import Log
+from residnet.core.units import slips
 
 Level = Literal["note", "will mislead", "fatal"]
 LEVELS = ("note", "will mislead", "fatal")
@@ -305,25 +306,16 @@ def share_of(part: float) -> str:
     return f"{100.0 * part:.2g} %" if part < 0.1 else f"{100.0 * part:.0f} %"
 
 
-_TAKEN = (
-    *((180.0 / math.pi, "deg", "rad"), (3600.0 / 1852.0, "knots", "m/s"), (3.6, "km/h", "m/s")),
-    *((1.0 / 0.3048, "feet", "metres"), (1000.0, "mm", "m"), (100.0, "cm", "m")),
-    (60.0, "per minute", "per second"),
-)
-# values too large by this factor -> what happened to them
-_SLIPS = {size: f"{one} taken as {other}" for size, one, other in _TAKEN}
-_SLIPS |= {1.0 / size: f"{other} taken as {one}" for size, one, other in _TAKEN}
-
-
-def slip_in_words(factor: float) -> str:
+def slip_in_words(factor: float, *dimensions: str) -> str:
     """Return the mistake of units that makes values too large by a factor, in brackets.
 
-    Empty where none is within 8 %.
+    Empty where none of these dimensions, each told by its SI unit, has one within 8 %.
     """
     if factor <= 0.0:
         return ""
-    best = min(_SLIPS, key=lambda known: abs(math.log(known / factor)))
-    return f" ({_SLIPS[best]})" if abs(math.log(best / factor)) < 0.08 else ""
+    known = {size: text for si in reversed(dimensions) for size, text in slips(si).items()}
+    best = min(known, key=lambda size: abs(math.log(size / factor)), default=1.0)
+    return f" ({known[best]})" if known and abs(math.log(best / factor)) < 0.08 else ""
 
 
 def with_channels(log: Log, **channels: np.ndarray) -> Log:

@@ -196,7 +196,7 @@ def frames(log: Record, found: Check) -> Iterator[Finding]:
         level, fix = "fatal", "are the columns of one run, one clock and one vessel?"
         text += "; no change of sign or angle makes them fit"
     elif not 0.8 < ratio < 1.25:
-        text += f"; check the units of u, v and x, y{slip_in_words(ratio)}"
+        text += f"; check the units of u, v and x, y{slip_in_words(ratio, 'm/s', 'm')}"
     elif abs(offset) > 5.0:
         text += "; a compass offset, or velocities through the water in a current"
         fix = "correct psi, or give the current as an input"
@@ -351,7 +351,7 @@ def _follow(
         level, fix = "fatal", "are both columns of this vessel and this clock?"
         text += "; they do not describe one motion"
     elif correlation > 0.9 and not 0.6 < gain < 1.6:
-        text += f"; check its unit{slip_in_words(gain)}"
+        text += f"; check its unit{slip_in_words(gain, log.units[name])}"
         fix = "correct the unit in the channel map"
     else:
         # how far a lag misleads is measured with the causes, which tell the channels apart

@@ -67,7 +67,7 @@ def positions_scaled(log: Record, found: Check) -> Iterator[Finding]:
     elif abs(scale - 1.0) >= 0.02 or abs(turn) >= math.radians(3.0):
         text = (
             f"x, y are {scale:.3f} times as far as {latitude}, {longitude} say, turned by"
-            f" {math.degrees(turn):+.1f} deg{slip_in_words(scale)}"
+            f" {math.degrees(turn):+.1f} deg{slip_in_words(scale, 'm')}"
         )
     else:
         return

@@ -22,8 +22,9 @@ import scipy
 
 from residnet.core.arrays.paged import LARGE
 from residnet.core.layout import SIX
-from residnet.core.names import VELOCITY, sides
+from residnet.core.names import VELOCITY, sides, thrusters_that_turn
 from residnet.core.stretches import stretches
+from residnet.core.units import slips
 from residnet.data.channels import SIGMA_OF_MAD
 from residnet.data.doctor.findings import show, slip_in_words
 from residnet.data.doctor.statistics import STEERING, Record, blocks_of, bridged, reversals
@@ -60,6 +61,9 @@ _MOST_USUAL = 40
 the more logs there are."""
 _MATERIAL = 0.15
 """Share of what there is to predict that must be wrong: smaller differences mislead no fit."""
+_ROOM, _SAME = 0.1, 0.02
+"""Share of the others' range, or of their size, by which an input may leave it: a polynomial holds
+so far beyond its data, and a smaller change moves nothing that counts."""
 _WIND = ("wind_speed", "wind_dir")
 
 
@@ -84,6 +88,14 @@ def _weight(log: _Sampled, moving: Sequence[str]) -> list[np.ndarray]:
     return [np.sin(log["theta"]), level * np.sin(log["phi"]), level * np.cos(log["phi"])]
 
 
+def _thrusts(log: _Sampled, driving: Sequence[str]) -> tuple[list[np.ndarray], list[str]]:
+    """Return the thrusts of azimuth thrusters along and across the vessel, and all other inputs."""
+    turned = thrusters_that_turn(driving)
+    along = [log[by] * np.abs(log[by]) * np.exp(1j * log[angle]) for angle, by in turned.items()]
+    rest = [name for name in driving if name not in turned and name not in turned.values()]
+    return [part for one in along for part in (one.real, one.imag)], rest
+
+
 def _quadratic(
     log: _Sampled, units: Mapping[str, str], moving: Sequence[str], driving: Sequence[str]
 ) -> list[np.ndarray]:
@@ -96,6 +108,8 @@ def _quadratic(
     out = [state * np.abs(state) for state in states]
     out += [a * b for i, a in enumerate(states) for b in states[i + 1 :]]
     out += [np.abs(ahead) * state for state in states[1:]] + _weight(log, moving)
+    thrusts, driving = _thrusts(log, driving)
+    out += [*thrusts, *(ahead * thrust for thrust in thrusts)]
     angles = [log[name] for name in driving if units[name] == "rad"]
     turns = [log[name] for name in driving if units[name] != "rad"]
     for turn in turns:
@@ -112,7 +126,8 @@ def _polynomial(
     log: _Sampled, units: Mapping[str, str], moving: Sequence[str], driving: Sequence[str]
 ) -> list[np.ndarray]:
     """Return a polynomial in velocities and inputs with constants and linear terms."""
-    states, given = [log[name] for name in moving], [log[name] for name in driving]
+    states, (thrusts, rest) = [log[name] for name in moving], _thrusts(log, driving)
+    given = [*thrusts, *(log[name] for name in rest)]
     ahead = states[0]
     out = [np.ones_like(ahead), *states, *(state * np.abs(state) for state in states)]
     out += [a * b for i, a in enumerate(states) for b in states[i + 1 :]] + _weight(log, moving)
@@ -484,6 +499,28 @@ class Fleet:
         self.rows = [whole[i] if i in self.apart else one for i, one in enumerate(self.rows)]
         self._settle(sorted((*self.core, *again)))
 
+    def goes_beyond(self, i: int) -> bool:
+        """Return whether inputs leave those of the logs that agree, and only there it differs."""
+
+        def acting(log: Record) -> np.ndarray:
+            thrusts, rest = _thrusts(dict(log.log.channels), self.driving)
+            return np.stack([*thrusts, *(log[name] for name in (*rest, *self.moving))])
+
+        others = [acting(self.logs[j]) for j in self.core if j != i]
+        low = np.min([np.nanmin(one, axis=1) for one in others], axis=0)
+        top = np.max([np.nanmax(one, axis=1) for one in others], axis=0)
+        room = np.maximum(_ROOM * (top - low), _SAME * np.maximum(np.abs(low), np.abs(top)))
+        here, whole = acting(self.logs[i]), self.rows[i]
+        out = (here < (low - room)[:, None]) | (here > (top + room)[:, None])
+        if not out[: -len(self.moving)].any():
+            return False
+        count = np.append(0, np.cumsum(out.any(axis=0)))
+        # where it moves as none of them did, nothing is known of it either
+        self.rows[i] = whole.some(count[whole.first + whole.size + 1] == count[whole.first])
+        agrees = not self.rows[i].known or self.scores(self.core, [i])[i].size <= 1.0
+        self.rows[i] = whole
+        return agrees
+
     def _settle(self, core: list[int]) -> None:
         """Take logs for those that agree, and what is usually left of them."""
         models = self._others(core, core) if len(core) > 1 else {}
@@ -578,7 +615,6 @@ class Cause:
 
 
 _FACTORS = (0.2, 0.33, 0.5, 0.67, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0)
-_UNITS = (math.pi / 180.0, 180.0 / math.pi, 60.0, 1.0 / 60.0, 0.5144, 1.944, 3.6, 1.0 / 3.6)
 # a change of three numbers for each velocity explains more by chance than one of a single number
 _OF_MANY = 2.0
 _STEPS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)
@@ -604,7 +640,7 @@ def _in_words(kind: str, name: str, unit: str, size: float) -> str:
     if kind == "sign":
         return f"{would} have the opposite sign"
     if kind == "scale":
-        return f"{would} be {size:.3g} times as large{slip_in_words(1.0 / size)}"
+        return f"{would} be {size:.3g} times as large{slip_in_words(1.0 / size, unit)}"
     if kind == "late":
         word = "later" if size > 0.0 else "earlier"
         return f"{would} act {abs(size):.2g} s {word}: the clocks differ"
@@ -616,26 +652,34 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
     log, model, rows = fleet.logs[i], fleet.model(without=i), fleet.rows[i]
     unsure = model.surprise(rows) - float((model.rest(rows) ** 2).sum(1).mean())
     out: list[Cause] = []
+    # what follows from the position has its scale, and no sign of its own
+    derived = log.log.meta.get("derived", ())
     for name in (*fleet.driving, *fleet.moving):
-        drives = name in fleet.driving
+        if name in derived[1:]:
+            continue
+        drives, whole = name in fleet.driving, derived if name in derived else (name,)
+        said, unit = ("x, y", "m") if name in derived else (name, log.units[name])
         spread = float(np.nanmedian([fleet.logs[j].std(name) for j in fleet.core])) or 1.0
         if drives and resting(fleet, i, name):
             surprise = _freed(fleet, model, i, name, 0.01 * spread) + unsure
             text = f"the record of {name} is dead: it rests while the vessel answers to it"
             out.append(Cause("dead", name, 0.0, surprise, text))
             continue
-        sizes = {"sign": [-1.0], "scale": [*_UNITS]}
+        sizes = {"sign": [-1.0]} if name not in derived else {}
+        sizes["scale"] = [1.0 / size for size in slips(unit)]
         if drives:
             sizes["scale"] += _FACTORS
             sizes["late"] = [step * fleet.seconds for step in _STEPS]
             sizes["offset"] = [step * spread for step in _STEPS]
-        for kind, tried in sizes.items():
+        for kind, tried in (one for one in sizes.items() if one[1]):
 
-            def surprise_of(size: float, kind: str = kind, name: str = name) -> float:
-                values = _with_change(kind, log[name], log.t, size)
-                surprise = model.surprise(fleet.of(changed(log, {name: values})))
+            def surprise_of(
+                size: float, kind: str = kind, whole: Sequence[str] = whole, drives: bool = drives
+            ) -> float:
+                new = {one: _with_change(kind, log[one], log.t, size) for one in whole}
+                surprise = model.surprise(fleet.of(changed(log, new)))
                 # what is predicted has another density where it is scaled
-                return surprise - (0.0 if name in fleet.driving else 2.0 * math.log(abs(size)))
+                return surprise - (0.0 if drives else 2.0 * len(whole) * math.log(abs(size)))
 
             surprise, size = min((surprise_of(size), size) for size in tried)
             if drives and kind != "sign":
@@ -646,7 +690,7 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
                     surprise_of, bounds=ends, options={"maxiter": 8}
                 )
                 surprise, size = min((surprise, size), (float(near.fun), float(near.x)))
-            text = _in_words(kind, name, log.units[name], size)
+            text = _in_words(kind, said, unit, size)
             out.append(Cause(kind, name, size, surprise, text))
     for name in (one for one in fleet.driving if f"cmd_{one}" in fleet.driving):
         both = {one: -log[one] for one in (name, f"cmd_{name}")}
@@ -661,7 +705,9 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
         out.append(_heading_off(fleet, model, log))
         out += _current(fleet, model, log) if "psi" in log else []
     out.append(_vessel(fleet, model, i, unsure))
-    return sorted(out, key=lambda one: one.surprise)
+    # a change that leaves the log as strange as it was explains nothing
+    most = _LEFT**2 * len(fleet.moving) + unsure
+    return sorted(out, key=lambda one: (one.kind != "vessel" and one.surprise > most, one.surprise))
 
 
 def _freed(fleet: Fleet, model: Model, i: int, name: str, step: float) -> float:
@@ -738,7 +784,10 @@ def _vessel(fleet: Fleet, model: Model, i: int, unsure: float) -> Cause:
     for table, rest in zip(tables, model.rest(rows).T, strict=True):
         sizes = np.linalg.lstsq(table, rest, rcond=1e-6)[0]
         left += float(np.mean((rest - table @ sizes) ** 2))
-    text = "it is another vessel or another loading: no single change of a channel explains it"
+    text = (
+        "it is another vessel or another loading, or something acted that was not recorded: no"
+        " single change of a channel explains it"
+    )
     return Cause("vessel", "", 0.0, _OF_MANY * left + unsure, text)
 
 

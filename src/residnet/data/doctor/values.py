@@ -489,6 +489,8 @@ def clipping(log: Record, found: Check) -> Iterator[Finding]:
 
 # levels between the 5th and the 95th percentile below which a resolution is too coarse
 _FEWEST_LEVELS = 50
+# of a channel that moves less nothing is learned: .05 deg/s either way, over a minute in an angle
+_STILL = {"rad": math.radians(3.0), "rad/s": math.radians(0.1)}
 
 
 @check("values", "resolution", fix="decimals were dropped on the way: log more digits", few=True)
@@ -510,7 +512,7 @@ def resolution(log: Record, found: Check) -> Iterator[Finding]:
             f"{name} has a resolution of {show(step, log.units[name])}, {count:.0f} levels between"
             " its 5th and 95th percentile"
         )
-        fine = count >= _FEWEST_LEVELS
+        fine = count >= _FEWEST_LEVELS or high - low < _STILL.get(log.units[name], 0.0)
         level: Level = "note" if fine else "will mislead"
         fix = "" if fine else None
         yield found(text, {"resolution": step, "levels": count}, level=level, fix=fix)

@@ -305,6 +305,9 @@ def named(columns: Sequence[str], marks: Marks, *, headed: bool = True) -> dict[
     # before `heading of the second compass`
     for column in sorted(columns, key=order):
         channel = sided.get(column) or state_channel(about[column]) or input_channel(about[column])
+        if channel is None and about[column].has("pitch") and written_unit(column, "-") == "%":
+            # no angle, but that of a propeller's blades
+            channel = input_channel(words_of(f"propeller {column}"))
         si = si_of(channel) if channel else None
         other = other_dimension(column, si) if si else None
         if channel == "n" and other == "m":

@@ -205,7 +205,7 @@ _ABOUT: dict[str, str] = {
     "planes": "sternplane diveplane hydroplane tiefenruder hohenruder elevator dybderor djuproder"
     " hoogteroer 潜舵 横舵 升降舵 | plane planes",
     "propeller": "propel schraube helice schroef 推進 プロペラ propulseur 螺旋桨 винт srub pervane"
-    " 프로펠러 | prop screw shaft welle eje arbre aksel 軸 elica",
+    " 프로펠러 | prop screw shaft welle eje arbre aksel 軸 elica cpp",
     "engine": "engine motor maschine maquina moteur hovedmaskin 主機 двигат silnik makine 엔진"
     " 모터 | main motoru",
     "revolutions": "drehzahl revolution umdreh tours toerental omdreining turtall varvtal regime"
@@ -227,7 +227,7 @@ _ABOUT: dict[str, str] = {
     "angle": "angle winkel angulo hoek vinkel lage 角 | ang angolo",
     "roll": "roll roulis balanceo krenging krangung 横揺 kranken slagside 横摇 横倾 крен przechyl"
     " 횡동요 | phi heel yalpa",
-    "pitch": "pitch tangage cabeceo stampf | theta trim",
+    "pitch": "pitch tangage cabeceo stampf | theta trim cpp",
     "heave": "heave vertical tauch sink pilonnement arfada 升沉 上下揺 | hiv descent",
     "acceleration": "accel beschleun versnell akselerasjon 加速 | udot vdot rdot dot acc",
     "command": "command soll setpoint consigne befehl gevraagd onsket 指令 demand reference"
@@ -240,8 +240,9 @@ _ABOUT: dict[str, str] = {
     "depth": "depth tiefe profond profund diepte dybde 水深 수심 derinlik",
     "voltage": "volt spannung tension battery batterie bateria batteri | amp ampere current_a batt"
     " bat bus solar supply",
-    "bow": "| bow bug proue proa boeg baug",
+    "bow": "| bow bug proue proa boeg baug fwd fore",
     "stern": "| stern heck poupe popa hek akter aft",
+    "difference": "differen | diff",
     "index": "| index idx id number nr no num count counter flag valid",
     "age": "| age alter",
     "machinery": "temperat pressure presion pression fuel kraftstoff carburant oil coolant load"
@@ -484,7 +485,7 @@ _INPUTS = (
     _Rule("{cmd_}delta_s{side}", "planes"),
     _Rule("{cmd_}delta_rate{side}", "rudder rate"),
     _Rule("{cmd_}delta{side}", "rudder"),
-    _Rule("throttle{side}", "propeller throttle", "revolutions"),
+    _Rule("throttle{side}", "propeller throttle|pitch", "revolutions"),
     _Rule("throttle{side}", "engine throttle", "revolutions angle"),
     _Rule("{cmd_}n{side}", "revolutions|propeller", "thrust"),
     _Rule("{cmd_}n{side}", "engine", "thrust angle"),
@@ -506,6 +507,7 @@ def input_channel(words: Words) -> str | None:
     if _GROUND.search(w.text):
         return None
     sides = {"port": "_port", "starboard": "_stbd", "bow": "_bow", "stern": "_stern"}
+    sides["difference"] = "_diff"
     side = next((end for name, end in sides.items() if w.has(name)), "")
     if lettered := _LETTER.search(w.text):
         side = side or {"l": "_port", "r": "_stbd"}[lettered[1]]
