@@ -151,6 +151,7 @@ TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
     (changed(u=np.round(LOG["u"], 1)), "resolution", "will mislead", "0.1 m/s", {"levels": 10}),
     # clock
     (GAP, "gaps", "note", "1 gaps", {"count": 1, "longest": 6.1, "lost": 6.0}),
+    (changed(u=np.repeat(LOG["u"][::2], 2)), "held", "note", "once in 2 samples", {"every": 2}),
     (SHAKEN, "clock", "note", "steps vary", {"rate": 10.0}),
     (SHAKEN_SLOW, "clock", "will mislead", "steps vary", {"rate": 1.0}),
     (LOG.replace(t=stepped(T, 1000, 1.7e9)), "clock_span", "fatal", "unit of time", {}),
@@ -318,6 +319,13 @@ def test_the_side_and_the_time_of_an_answer() -> None:
     assert fine.figures["effect"] == pytest.approx(0.25, rel=0.05)
     turned = inspect(answering(STEPS, 0.0, gain=-0.3)).find("rudder_sign")
     assert {finding.level for finding in turned} == {"will mislead"}
+    # commands to two sides steer by their difference
+    log = answering(STEPS, 0.0)
+    pair = {"cmd_thrust_port": np.ones(len(log)), "cmd_thrust_stbd": np.sqrt(1.0 + log["delta"])}
+    (crossed,) = inspect(Log("two", log.t, {**pair, "u": log["u"], "r": log["r"]})).find(
+        "rudder_sign"
+    )
+    assert (crossed.level, crossed.action[:8]) == ("will mislead", "exchange")
     for early in (0.8, 1.6):
         late = one(inspect(answering(STEPS, -early)), "acausal")
         assert late.level == "will mislead"
@@ -449,6 +457,8 @@ SAME = changed(OTHER, delta=NOISY["delta"])
 FAST = changed(SAME, u=SAME["u"] + 0.6).replace(name="fast")
 STRAIGHT = {name: np.zeros(2000) for name in ("y", "psi", "v", "r")}
 DULL = Log("dull", T, {**STRAIGHT, "x": 2.0 * T, "u": np.full(2000, 2.0), "delta": LOG["delta"]})
+ROUND, OTHER_ROUND = (changed(one, r=np.abs(one["r"])) for one in (LOG, OTHER))
+AHEAD, OTHER_AHEAD = (changed(one, r=1e-3 * RANDOM.standard_normal(2000)) for one in (LOG, OTHER))
 TRAIN_TEST = {"whole": "train", "part": "test", "fast": "test", "first": "train", "second": "test"}
 
 
@@ -464,6 +474,9 @@ TRAIN_TEST = {"whole": "train", "part": "test", "fast": "test", "first": "train"
         ([WHOLE, SAME], {}, "same_commands", "note", "(delta) over 2000 samples"),
         ([WHOLE, FAST], TRAIN_TEST, "extrapolation", "will mislead", "u of fast (test) lies out"),
         ([DULL], {}, "no_excitation", "fatal", "no velocity varies beyond its noise"),
+        ([ROUND, OTHER_ROUND], {}, "one_side", "will mislead", "all of 2 logs turn to starboard"),
+        ([ROUND], {}, "one_side", "note", "how it turns to the other"),
+        ([AHEAD, OTHER_AHEAD], {}, "one_side", "will mislead", "nothing is learned of steering"),
     ],
 )
 def test_logs_beside_each_other(

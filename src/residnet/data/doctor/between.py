@@ -296,6 +296,11 @@ def _relative(*parts: np.ndarray) -> float:
     return max(float(known.std()) - 1.5 * noise_of(known), 0.0) / size if size > 0.0 else 0.0
 
 
+_OTHER_SIDE = 0.05
+"""Share of turning below which only noise and overshoots turn to a side: .0001 in circles behind
+a straight run, .3 and more in zigzags and random steps of five vessels."""
+
+
 def _awake(log: Record, name: str) -> float:
     """Return the spread of a velocity over the least that counts; below 1 it does not vary.
 
@@ -322,6 +327,20 @@ def excitation(logs: Together, found: Check) -> Iterator[Finding]:
             " but noise"
         )
         yield found(text, {f"{n}_over_noise": v for n, v in awake.items()}, level="fatal")
+    elif logs.inputs and "r" in awake:
+        smooth = [averaged(log["r"], max(round(2.0 / log.step), 5)) for log in members]
+        rate = np.concatenate(smooth)
+        to_port = float(np.nansum(np.abs(rate[rate < 0.0])) / np.nansum(np.abs(rate)))
+        text, side = "", "port" if to_port > 0.5 else "starboard"
+        if awake["r"] < 1.0:
+            text = f"none of {count} logs turns beyond its noise: nothing is learned of steering"
+        elif min(to_port, 1.0 - to_port) < _OTHER_SIDE:
+            text = f"all of {count} logs turn to {side}: how it turns to the other is unknown"
+        # one log may stand for many
+        level: Level = "will mislead" if count > 1 else "note"
+        if text:
+            fix = "add turns to both sides: zigzag, 3-2-1-1"
+            yield found(text, {"port": to_port}, code="one_side", level=level, fix=fix)
     driving = [name for name in logs.inputs if not name.startswith(("wind", "current"))]
     within = {name: max(_relative(log[name]) for log in members) for name in driving}
     among = {name: _relative(*(log[name] for log in members)) for name in driving}
@@ -390,7 +409,7 @@ def contradictions(logs: Together, found: Check) -> Iterator[Finding]:
 
 _ADVICE = {
     "dead": "leave this log out, or restore the record",
-    "scale": "correct its unit or scale in this log",
+    "scale": "correct its unit or scale in this log, or leave it out if an actuator had failed",
     "sign": "correct its sign in this log",
     "offset": "take the offset off in this log",
     "late": "shift the clock of the inputs in this log",

@@ -350,7 +350,7 @@ def _follow(
     elif correlation < 0.5 and name == "r" and clear:
         level, fix = "fatal", "are both columns of this vessel and this clock?"
         text += "; they do not describe one motion"
-    elif correlation > 0.9 and not 0.6 < gain < 1.6:
+    elif correlation > 0.9 and clear and not 0.6 < gain < 1.6:
         text += f"; check its unit{slip_in_words(gain, log.units[name])}"
         fix = "correct the unit in the channel map"
     else:

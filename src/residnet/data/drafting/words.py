@@ -187,9 +187,9 @@ _ABOUT: dict[str, str] = {
     "turn_rate": "turnrate drehrate gierrate wenderate drehgeschwind giergeschwind wendegeschwind"
     " angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet drejehastighed"
     " bochtaanwijzer girhastighet 回頭角速度 回頭率 旋回角速度 转艏角速度 선회율 선회각속도"
-    " 회두각속도 | rot yawrate wz gyroz omega gz",
+    " 회두각속도 | rot yawrate wz gyroz zgyro omega gz",
     "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 углов katowa 각속도 |"
-    " gyro gyrz acisal",
+    " gyro gyr gyrz acisal",
     "speed": "speed velo 風速 geschwind vitesse velocidad velocita snelheid hastighet 速度 船速"
     " fahrt vaart 速力 скорост predkosc 속도 속력 | velo sog stw fart vel spd log tws hiz hizi"
     " surat vw aws",
@@ -207,7 +207,7 @@ _ABOUT: dict[str, str] = {
     "propeller": "propel schraube helice schroef 推進 プロペラ propulseur 螺旋桨 винт srub pervane"
     " 프로펠러 | prop screw shaft welle eje arbre aksel 軸 elica cpp",
     "engine": "engine motor maschine maquina moteur hovedmaskin 主機 двигат silnik makine 엔진"
-    " 모터 | main motoru",
+    " 모터 | main motoru fan",
     "revolutions": "drehzahl revolution umdreh tours toerental omdreining turtall varvtal regime"
     " giri 回転 revoluc 转速 оборот obrot rotac 회전수 devir devri | rpm erpm rps rev revs n",
     "thrust": "thrust schub poussee empuje stuwkracht skyv 推力 тяг spinta empuxo 추력 itki",
@@ -436,6 +436,10 @@ _DEEP = (
 )
 
 
+_UNIT = re.compile(r"(?<=\b[pqr]) (?:dps|deg s|rad s)$|(?<=\b[uvw]) (?:mps|m s)$")
+"""What stands behind the letter of a velocity."""
+
+
 @lru_cache(maxsize=4096)
 def state_channel(words: Words) -> str | None:
     """Return the channel of the motion or of the wind that a name stands for; None for none.
@@ -445,7 +449,7 @@ def state_channel(words: Words) -> str | None:
     w, name = words, words.text.replace(" ", "_")
     if name in MOTION:
         return name
-    last = w.text.rpartition(" ")[2]
+    last = _UNIT.sub("", w.text).rpartition(" ")[2]
     if last in ("psi", "u", "v", "r", "phi", "p") and w.about <= words_of(last).about:
         # what stands before it, as in `body.r`, says nothing
         return last
@@ -462,8 +466,11 @@ def state_channel(words: Words) -> str | None:
 
 def deep_channel(words: Words) -> str | None:
     """Return w, q, z or theta of a vessel under water that a name stands for; None for others."""
-    if words.text in ("w", "q", "z", "theta"):
-        return words.text
+    bare = _UNIT.sub("", words.text)
+    # a last w without a unit may be a quaternion's
+    bare = bare if bare == words.text or words.about else bare.rpartition(" ")[2]
+    if bare in ("w", "q", "z", "theta"):
+        return bare
     none = ("command", "acceleration", "age", "index", "machinery", "thrust", "engine")
     return _first(_DEEP, words) if words.lacks(*none) else None
 
