@@ -331,7 +331,7 @@ def test_a_base_is_a_file_or_a_shipped_config(tmp_path: Path) -> None:
             "4: sensors.0.limits: item 1 is missing (given [1])",
         ),
         # quantities
-        ("dt: -50 ms", "2: dt: must be greater than 0 (given -0.05)"),
+        ("dt: -50 ms", "2: dt: must be greater than 0 s (given -0.05)"),
         (
             "rates:\n  gnss: [1 Hz, 2 kn]",
             "3: rates.gnss.1: unit 'kn' does not measure [1/s]; units that do: Hz, 1/s, 1/min, rps,"

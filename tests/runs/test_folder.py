@@ -84,7 +84,7 @@ def test_only_a_finished_run_whose_files_are_whole_is_opened(tmp_path: Path) -> 
         with pytest.raises(UsageError, match=wanted):
             RunFolder.open(path)
 
-    closed(r"not a run folder \(no resolved.yaml\)")
+    closed("no such folder")
     folder = RunFolder.create(path, "a: 1\n", resume=False)
     closed(r"is not finished .* --resume")
     given = ("fit", ["Good."], {"error": {"value": 1.0, "unit": "m"}})

@@ -600,7 +600,17 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
         case _ if kind in _EXPECTED:
             text = f"expected {_EXPECTED[kind]} {given(value)}"
         case _:
-            text = f"{details['msg'].replace('Input should', 'must')} {given(value)}"
+            types_of = [
+                (field.annotation, field.metadata)
+                for model in parents
+                if path and _is_model(model)
+                for name, field in model.model_fields.items()
+                if (field.alias or name) == path[-1]
+            ]
+            # a bound is told in the unit that it counts in, however deep it stands in the type
+            unit = re.search(r"Quantity\(si='(.+?)'\)", repr(types_of))
+            bound = details["msg"].replace("Input should", "must") + (f" {unit[1]}" if unit else "")
+            text = f"{bound} {given(value)}"
     return _Fault(kind, path, text)
 
 

@@ -183,7 +183,8 @@ class RunFolder:
         """
         folder = cls(path)
         if not folder.resolved.is_file():
-            raise UsageError(f"{path}: not a run folder (no resolved.yaml)")
+            what = "not a run folder (no resolved.yaml)" if path.exists() else "no such folder"
+            raise UsageError(f"{path}: {what}; `residnet runs` lists what there is")
         if not folder.finished:
             raise UsageError(
                 f"{path}: the run is not finished (summary.json does not say so); continue it with"
