@@ -14,28 +14,33 @@ from pydantic import ValidationError
 from residnet.control.heading.turning import Turning
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import UsageError
+from residnet.core.progress import listen
 from residnet.tasks.autopilot import AutopilotConfig, least_time
 from residnet.tasks.own_autopilot import draft_autopilot
 
-GAIN, TIME, GEAR, DELAY, NOISE = 0.31, 7.4, 6.0, 0.3, 0.15
+GAIN, TIME, GEAR, DELAY, NOISE, SPEED = 0.31, 7.4, 6.0, 0.3, 0.15, 2.5
 
 
 def zigzag(file: Path, angle: float, seed: int) -> Path:
     """Write a zigzag of Nomoto's model with a steering gear, integrated here by Euler's rule."""
     dt, fine, rng = 0.1, 10, np.random.default_rng(seed)
-    r = psi = rudder = 0.0
+    r = psi = rudder = north = east = 0.0
     side, held, rows = 1.0, [0.0] * (round(DELAY / dt) + 1), []
     for k in range(2400):
         side = -side if side * psi > angle else side
         noise = NOISE * rng.normal(size=2)
-        rows.append((k * dt, psi + noise[0], r + noise[1], side * angle))
+        fix = north + 2.0 * noise[1], east - 2.0 * noise[0]
+        rows.append((k * dt, psi + noise[0], r + noise[1], side * angle, *fix))
         held.append(side * angle)
         for _ in range(fine):
             step = GEAR * dt / fine
             rudder += min(max(held[-1 - round(DELAY / dt)] - rudder, -step), step)
             r += dt / fine * (GAIN * rudder - r) / TIME
             psi += dt / fine * r
+            north += dt / fine * SPEED * math.cos(math.radians(psi))
+            east += dt / fine * SPEED * math.sin(math.radians(psi))
     names = ("time [s]", "heading [deg]", "yaw rate [deg/s]", "rudder command [deg]")
+    names += ("north [m]", "east [m]")
     pd.DataFrame(rows, columns=names).to_csv(file, index=False)
     return file
 
@@ -47,6 +52,7 @@ def test_logs_give_the_vessel_and_the_conditions(tmp_path: Path) -> None:
     assert vessel["K"]["value"] == pytest.approx(GAIN, rel=0.03)
     assert vessel["T"]["value"] == pytest.approx(TIME, rel=0.05)
     assert float(vessel["rudder"]["rate"].split()[0]) == pytest.approx(GEAR, rel=0.05)
+    assert vessel["speed"] == pytest.approx(SPEED, rel=0.02)
     config = load_config(file, [], AutopilotConfig)
     config.check()
     assert config.conditions is not None
@@ -61,7 +67,10 @@ def test_logs_give_the_vessel_and_the_conditions(tmp_path: Path) -> None:
 
 
 def test_gain_and_time_are_enough(tmp_path: Path) -> None:
-    file = draft_autopilot(["0.31, 7.4"], tmp_path / "kt.yaml", rate="6 deg/s", rudder="15 deg")
+    told: list[str] = []
+    with listen(lambda progress: told.append(progress.message)):
+        file = draft_autopilot(["0.31, 7.4"], tmp_path / "kt.yaml", rate="6 deg/s", rudder="15 deg")
+    assert any("give --speed" in line for line in told)
     config = load_config(file, [], AutopilotConfig)
     assert math.degrees(config.steered.rate or 0.0) == pytest.approx(6.0)
     turning = config.steered.turning(config.rudder, config.turning_time)
@@ -110,6 +119,8 @@ def test_times_follow_the_pace_and_delays_do_not() -> None:
     assert slow.conditions.stated.delay == (0.0, 0.4)
     assert slow.policies["learned"].training.dt == 0.32
     assert slow.paced() == slow
+    odd = AutopilotConfig.model_validate(CONFIG | {"pace": 2.9}).paced()
+    assert odd.test.dt == 0.058
 
 
 def test_the_pace_of_a_vessel_is_measured_and_belongs_to_conditions() -> None:

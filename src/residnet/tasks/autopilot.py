@@ -407,7 +407,11 @@ class AutopilotConfig(ComputingTask):
         def longer(part: Any, *names: str) -> Any:
             given = {name: getattr(part, name) for name in names}
             return part.model_copy(
-                update={name: pace * value for name, value in given.items() if value is not None}
+                update={
+                    name: float(f"{pace * value:.6g}")
+                    for name, value in given.items()
+                    if value is not None
+                }
             )
 
         def slower(conditions: ConditionsConfig) -> ConditionsConfig:

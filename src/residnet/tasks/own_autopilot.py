@@ -80,7 +80,7 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
             f"steering: the rudder of the logs moves by {spread:.2g} rad (rms); K and T need turns,"
             " such as a zigzag"
         )
-    speeds = [log["u"][log.usable] for log in logs if "u" in log.channels]
+    speeds = [ahead for log in logs if (ahead := _ahead(log)).size]
     speed = float(np.nanmean(np.concatenate(speeds))) if speeds else float("nan")
     return IdentifiedSteering(
         fit_response(records, longest_delay, commands=names == {"cmd_delta"}),
@@ -89,6 +89,19 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
         float(np.median([record.dt for record in records])),
         max(float(np.abs(record.rudder).max()) for record in records),
     )
+
+
+def _ahead(log: Log) -> np.ndarray:
+    """Return the surge velocity, as measured or from one fix to the next; empty where unknown."""
+    if "u" in log.channels:
+        return np.asarray(log["u"][log.usable])
+    if not log.channels.keys() >= {"x", "y", "psi"}:
+        return np.zeros(0)
+    way, at = (log["x"] + 1j * log["y"])[log.usable], log["psi"][log.usable]
+    known = np.isfinite(way) & np.isfinite(at)
+    way, at, t = way[known], at[known], log.t[log.usable][known]
+    # along the heading, where the noise of a fix has no mean
+    return np.asarray((np.diff(way) * np.exp(-0.5j * (at[1:] + at[:-1]))).real / np.diff(t))
 
 
 def _noise(logs: Sequence[Log], name: str) -> float:
@@ -213,6 +226,12 @@ def draft_autopilot(
     given = {key: value for key, value in told.items() if value is not None}
     asked = validate(given, _Asked, "residnet autopilot").model_dump(exclude_none=True)
     vessel = _known(source)
+    if math.isnan(asked.get("speed", vessel.speed)):
+        say(
+            "  the speed is not known, and K and T are taken to hold at 1 m/s: give --speed, or"
+            " the policy takes its measurement u in multiples of the usual speed"
+        )
+        asked["speed"] = 1.0
     vessel = vessel._replace(**asked)
     out.parent.mkdir(parents=True, exist_ok=True)
     vessel_file.write_text(
@@ -239,7 +258,7 @@ def _known(source: Sequence[str | Path]) -> OwnVessel:
         spread = (1.0 - _SPREAD, 1.0 + _SPREAD)
         bias = math.radians(_BIAS)
         return OwnVessel(
-            gain, time, None, 1.0, math.radians(20.0), spread, spread, _DELAY, bias, None,
+            gain, time, None, math.nan, math.radians(20.0), spread, spread, _DELAY, bias, None,
             f"K = {gain:g} 1/s and T = {time:g} s as given",
         )  # fmt: skip
     logs, name = _logs([Path(one) for one in source])
@@ -265,7 +284,7 @@ def _known(source: Sequence[str | Path]) -> OwnVessel:
         response.gain,
         response.time,
         response.rate,
-        found.speed if found.speed > 0 else 1.0,
+        found.speed if found.speed > 0 else math.nan,
         found.rudder,
         around(response.gain, gain),
         around(response.time, time),
