@@ -96,7 +96,7 @@ def test_parameters_heads_data_and_provenance(page: str) -> None:
     assert terms["r′: v|v|"] == ["0.50", "0.10", "5.0", "rad/m²"]
     heads = read.table("head", "plsr (selected)")
     assert heads["plsr (selected)"][1:3] == ["23 basis functions; order 7 (latent variables)", "72"]
-    assert heads["mlp"][2] == "1\u2009347"
+    assert heads["mlp"][1:4] == ["layers of 16, 8", "1\u2009347", "u, n"]
     quality = read.table("split, manoeuvre", "test: zigzag")["test: zigzag"]
     assert quality[:6] == ["3", "180", "1800", "97.5", "95.0", "frozen 2.5 %"]
     assert quality[6:] == ["1.50", "0.200", "5.73"]

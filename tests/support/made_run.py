@@ -170,6 +170,9 @@ def made_run(run: Path, *, split: str = "test") -> Path:
     }
     for name, fit in fits.items():
         write_json(run / "models" / name / "fit.json", fit)
+    # the terms of a card are names, those of a fit their count
+    head = {"hidden": [16, 8], "terms": ["n|n|"], "features": ["u", "n"]}
+    write_json(run / "models" / "mlp" / "model.json", {"head": head})
     return run
 
 
