@@ -332,6 +332,12 @@ def test_the_side_and_the_time_of_an_answer() -> None:
         assert late.figures["lag"] == pytest.approx(-early, abs=0.25)
 
 
+def test_a_row_that_repeats_by_chance_is_logged_once() -> None:
+    u = RANDOM.standard_normal(2000).round(4)
+    u[501] = u[500]
+    assert not inspect(Log("one", T, {"u": u, "delta": np.ones(2000)})).find("repeated_rows")
+
+
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_turning_circle_that_loses_its_speed_is_no_reversed_rudder(side: float) -> None:
     t, r = np.arange(0.0, 900.0), np.zeros(900)

@@ -23,7 +23,7 @@ from residnet.dynamics.hybrid import Missed
 from residnet.identification.fit import Identified, fit
 from residnet.identification.fitter import FitStore, Fitter, burden
 from residnet.identification.prepared import PreparedSplits, prepare_logs
-from residnet.identification.recipe import PARTS, Facts, portfolio
+from residnet.identification.recipe import PARTS, Facts, Preparation, portfolio
 from residnet.identification.settings import FitSettings
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import dissipates
@@ -194,6 +194,12 @@ NAMES_OF_A_BOAT = ("u", "v", "r", "n", "delta")
 def short(names: tuple[str, ...]) -> dict[str, Any]:
     """The parts for what is supposed of nine minutes of logs."""
     return portfolio(replace(Facts.supposed(names), samples=5_400))
+
+
+def test_a_yaw_rate_of_noise_alone_tells_no_memory() -> None:
+    random, t = np.random.default_rng(1), np.arange(0.0, 200.0, 0.1)
+    straight = Log("straight", t, {"u": np.sin(0.1 * t), "r": random.normal(size=t.size)})
+    assert Preparation.of([straight], []).memory > 5.0
 
 
 def test_networks_stand_alone_and_horizons_are_long_where_logs_are() -> None:

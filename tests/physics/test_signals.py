@@ -59,6 +59,11 @@ def test_names_and_forces_are_the_vessels() -> None:
     assert torch.equal(z[:, 5:], load_vessel("wam_v_cal").actuators.build().forces(w))
 
 
+def test_inputs_of_ones_own_have_the_unit_that_their_name_says() -> None:
+    units = SignalsConfig(inputs=("cmd_azimuth", "thrust_port", "servo_1")).units()
+    assert [*units.values()][-3:] == ["rad", "N", "-"]
+
+
 def test_wind_keeps_a_gradient_in_a_calm() -> None:
     signals = build(exogenous=WIND)
     x = torch.zeros(1, 6, dtype=torch.float64, requires_grad=True)

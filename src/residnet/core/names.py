@@ -8,6 +8,7 @@ deg"`) and is converted by `residnet.core.units`.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 
 from residnet.core.units import si_unit, to_si, units
@@ -23,6 +24,7 @@ __all__ = [
     "WIND_INPUTS",
     "nearest",
     "shown",
+    "si_of",
     "si_unit",
     "sides",
     "to_si",
@@ -92,6 +94,20 @@ CHANNEL_UNITS: dict[str, str] = {
     "current_north": "m/s",
     "current_east": "m/s",
 }
+
+
+_SI = {
+    **{r"n(_|$)": "1/s", "delta|azimuth": "rad", "tau_x|tau_y|thrust": "N", "tau_n": "N m"},
+    "throttle": "-",
+}
+"""How names of one's own begin -> SI unit."""
+
+
+def si_of(channel: str) -> str | None:
+    """Return the SI unit of a channel, by its name where residnet does not know it, or None."""
+    first = channel.removeprefix("cmd_")
+    found = (si for start, si in _SI.items() if re.match(start, first))
+    return CHANNEL_UNITS.get(channel) or next(found, None)
 
 
 def sides(names: Iterable[str]) -> dict[str, str]:

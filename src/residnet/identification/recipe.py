@@ -524,20 +524,24 @@ def judging(
 def _memory(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float:
     """Return the time in s after which the yaw rate is correlated by 1/e only.
 
-    Where it does not move that of the speed is taken; so with other names, the first that moves.
+    Where it holds noise alone that of the speed is taken; so with other names, the first that
+    remembers a sample.
     """
-    values = next((log[n] for n in names if n in log.channels and log[n].any()), log.t)
-    known = np.isfinite(values)
-    if known.sum() < 50:
-        return float("nan")
-    t, x = log.t[known], values[known] - values[known].mean()
-    step = float(np.median(np.diff(t)))
-    gone = without_pauses(t)
-    even = np.interp(np.arange(0.0, gone[-1], step), gone, x)[:20_000]
-    power = np.abs(np.fft.rfft(even, 2 * even.size)) ** 2
-    correlation = np.fft.irfft(power)[: even.size]
-    below = np.flatnonzero(correlation < correlation[0] / np.e)
-    return float(below[0] * step) if below.size else float("nan")
+    for name in names:
+        values = log[name] if name in log.channels else log.t[:0]
+        known = np.isfinite(values)
+        if known.sum() < 50:
+            continue
+        t, x = log.t[known], values[known] - values[known].mean()
+        step = float(np.median(np.diff(t)))
+        gone = without_pauses(t)
+        even = np.interp(np.arange(0.0, gone[-1], step), gone, x)[:20_000]
+        power = np.abs(np.fft.rfft(even, 2 * even.size)) ** 2
+        correlation = np.fft.irfft(power)[: even.size]
+        below = np.flatnonzero(correlation < correlation[0] / np.e)
+        if below.size and below[0] > 1:
+            return float(below[0] * step)
+    return float("nan")
 
 
 def window_length(lasting: Sequence[float], memory: float) -> float:

@@ -18,7 +18,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
 from residnet.core.layout import PLANAR, ROLL, SIX, VERTICAL, Live
-from residnet.core.names import CHANNEL_UNITS, WIND_INPUTS, nearest
+from residnet.core.names import WIND_INPUTS, nearest, si_of
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig
 from residnet.physics.hull import FossenConfig
@@ -154,7 +154,7 @@ class SignalsConfig(Config):
 
     def units(self) -> dict[str, str]:
         """Return SI unit of each state and input."""
-        return {name: CHANNEL_UNITS.get(name, "-") for name in self.live.states + self.columns}
+        return {name: si_of(name) or "-" for name in self.live.states + self.columns}
 
     def build(self) -> Signals:
         """Build the module that computes the channels."""

@@ -161,17 +161,22 @@ def missing(log: Record, found: Check) -> Iterator[Finding]:
 
 @check("values", "repeated_rows", fix="delete them, or log at the sensors' rate", certain=True)
 def repeated_rows(log: Record, found: Check) -> Iterator[Finding]:
-    """Report rows that repeat the row before in every channel, which noise never does."""
-    same, noisy = np.ones(len(log) - 1, dtype=bool), False
+    """Report rows that repeat the row before in every channel, more than by chance.
+
+    Digits are few, so that now and then each channel repeats itself.
+    """
+    same, noisy, chance = np.ones(len(log) - 1, dtype=bool), False, float(len(log))
     for name in log:
         rests = log[name][1:] == log[name][:-1]
         same &= rests
+        chance *= float(rests.mean())
         noisy |= name in MEASURED and float(rests.mean()) < 0.5
     same = np.append(False, same)
     share = float(same.mean())
     # commands alone rest for as long as nobody moves them
     moved = any(name in MEASURED for name in log)
-    if same.any() and moved and (noisy or share > 0.5):
+    more = int(same.sum()) > chance + 3.0 * np.sqrt(chance)
+    if moved and ((noisy and more) or share > 0.5):
         text = (
             f"{int(same.sum())} rows ({share_of(share)}) repeat the row before in every channel:"
             " logged twice, or faster than measured"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from residnet.core.errors import DataError, ResidnetError, UsageError
-from residnet.core.names import CHANNEL_UNITS, shown
+from residnet.core.names import CHANNEL_UNITS, shown, si_of
 from residnet.core.units import is_unit, to_si
 from residnet.data.channels import ALIKE, REGULAR, without_fills
 from residnet.data.drafting.channels import (
@@ -33,7 +33,6 @@ from residnet.data.drafting.words import (
     input_channel,
     other_dimension,
     plain,
-    si_of,
     state_channel,
     words_of,
     written_unit,

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from residnet.core.errors import UsageError
-from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS
+from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS, si_of
 from residnet.core.units import is_unit, known_unit, si_unit
 
 _IN_BRACKETS = re.compile(r"[\[({]([^\])}]*)[\])}]")
@@ -143,18 +143,6 @@ def is_pulse(channel: str, values: np.ndarray) -> bool:
     return bool(low >= 800.0 and high <= 2300.0 and high > 1200.0)
 
 
-def si_of(channel: str) -> str | None:
-    """Return the SI unit of a channel, by its name where residnet does not know it, or None."""
-    first = channel.removeprefix("cmd_")
-    found = (si for start, si in _SI.items() if re.match(start, first))
-    return CHANNEL_UNITS.get(channel) or next(found, None)
-
-
-_SI = {
-    **{r"n(_|$)": "1/s", "delta|azimuth": "rad", "tau_x|tau_y|thrust": "N", "tau_n": "N m"},
-    "throttle": "-",
-}
-"""How names of one's own begin -> SI unit."""
 # what a name may be about -> parts of words, and whole words behind a bar
 _ABOUT: dict[str, str] = {
     "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻 時間"
