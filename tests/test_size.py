@@ -26,7 +26,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "export": (1482, 172),
     "heads": (1233, 178),
     "identification": (2075, 206),
-    "judge": (1999, 213),
+    "judge": (2001, 213),
     "manoeuvres": (962, 140),
     "physics": (2098, 262),
     "regression": (1737, 192),

@@ -11,6 +11,7 @@ from made_logs import made, random_states
 from scipy import stats
 
 from residnet.baselines.given import StillConfig
+from residnet.core.layout import Live
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ZeroHead
@@ -317,11 +318,16 @@ def test_every_model_is_compared_with_zero_and_the_first_baseline(
     assert apart == pytest.approx(expected.mean())
 
 
-def test_samples_outside_the_training_range_are_counted(run: FreeRun, logs: list[Prepared]) -> None:
+def test_samples_outside_the_training_range_are_counted(
+    run: FreeRun, logs: list[Prepared], monkeypatch: pytest.MonkeyPatch
+) -> None:
     # one of six logs is faster than 2 m/s
     found = Judged(run, CANDIDATES, logs, SCALES).outside()
     assert found["share"] == pytest.approx(1 / 6)
     assert found["channels"] == {"u": pytest.approx(1 / 6)}
+    # nor does a channel that drives nothing, as the depth
+    monkeypatch.setattr(Live, "hidden", property(lambda _: ("u",)))
+    assert Judged(run, CANDIDATES, logs, SCALES).outside() == {"share": 0.0, "channels": {}}
 
 
 @pytest.mark.parametrize(("count", "of", "blocks"), [(6, "logs", 6), (2, "stretches", 8)])

@@ -471,7 +471,8 @@ class Judged:
 
         Returns:
             `share` of the usable samples with a velocity or an input outside its range, and
-            `channels`: the share of each channel that is; empty where no model says its ranges.
+            `channels`: the share of each channel that is; empty where no model says its ranges. A
+            depth, which drives nothing, does not count.
         """
         ranges = next((one.ranges for one in self.candidates if one.ranges), {})
         if not ranges:
@@ -485,7 +486,9 @@ class Judged:
             ]
         )
         low, high = np.array(list(ranges.values())).T
+        hidden = self.parts[0][0].live.hidden
         beyond = (values < low) | (values > high)
+        beyond &= np.array([name not in hidden for name in ranges])
         shares = dict(zip(ranges, beyond.mean(0).tolist(), strict=True))
         return {
             "share": float(beyond.any(1).mean()),
