@@ -30,7 +30,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "manoeuvres": (962, 140),
     "physics": (2098, 262),
     "regression": (1737, 192),
-    "report": (2519, 282),
+    "report": (2521, 283),
     "runs": (377, 48),
     "simulators": (351, 40),
     "tasks": (3219, 266),

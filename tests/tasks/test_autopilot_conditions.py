@@ -31,6 +31,7 @@ SMALL: dict[str, Any] = {
     "vessel": "nomoto_oceanos",
     "rudder": "5 deg",
     "turning_time": "40 s",
+    "pace": 1.25,
     "test": {"dt": "0.1 s", "duration": "8 s", "plants": 2, "bias_time": "10 s"},
     "conditions": {
         "stated": STATED,
@@ -99,6 +100,8 @@ def test_rows_and_page_sum_up_the_flights(run: Path) -> None:
     text = plain(run / "report.html")
     for words in ("Under the stated conditions", "policy, network switched off", "epoch 0 is"):
         assert words in text
+    # the times that were flown, and not those before they were multiplied by the pace
+    assert "over 7.5 s from the change on" in text
     fit = read_json(run / "models" / "learned" / "fit.json")
     assert fit["best_validation"] <= fit["start_validation"]
     assert read_json(run / "summary.json")["finished"]

@@ -132,6 +132,7 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
             "run": config.name,
             "channels": channels,
             "floor": config.floor,
+            "flown": config.model_dump(mode="json", include={"test", "conditions"}),
             "rows": rows,
         },
     )

@@ -42,6 +42,11 @@ _TURNS = Words("heading", "deg", DEG, "yaw rate", "rudder", ("psi", "r"))
 _DIVES = Words("depth", "m", 1.0, "pitch rate", "stern planes", ("z", "q"))
 
 
+def _flown(run: RunFiles) -> Mapping[str, Any]:
+    """Return the config with the times that were flown, those of its pace."""
+    return {**run.resolved, **run.metrics.get("flown", {})}
+
+
 def words_of(test: Mapping[str, Any]) -> Words:
     """Return the words of a run by its `test`."""
     return _DIVES if test.get("depth") else _TURNS
@@ -69,8 +74,8 @@ _KINDS = {
 def _figures(run: RunFiles) -> Iterator[Figure]:
     kinds = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "conditions"}
     flown = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "nominal"}
-    yield _responses(run.frame(FLIGHTS), flown, run.resolved["test"], run.title)
-    words = words_of(run.resolved["test"])
+    yield _responses(run.frame(FLIGHTS), flown, _flown(run)["test"], run.title)
+    words = words_of(_flown(run)["test"])
     yield _distributions(run.frame(PLANTS), flown, run.title, words)
     conditioned = run.frame(CONDITIONS)
     if conditioned is not None:
@@ -252,17 +257,17 @@ def sections(run: RunFiles) -> list[Section]:
         UsageError: where the folder holds no metrics.json.
     """
     write_figures(run.path / "figures", _figures(run))
-    test = run.resolved["test"]
+    test = _flown(run)["test"]
     words = words_of(test)
     compared = settling_table(run.rows, run.metrics.get("floor"), words)
-    stated = run.resolved.get("conditions")
+    stated = _flown(run).get("conditions")
     cost = cost_table(run.rows, words) if stated else None
     drawn = [one.part() for one in read_figures(run.path / "figures", "responses")]
     # settling of the nominal vessel and of the spread, or the cost of a change
     first = compared.part(0, 3) if cost is None else cost.part(1, 4)
     out = [
         Section("", [*drawn, first]),
-        Section("Controllers compared", [compared, Text(_definition(run.resolved), quiet=True)]),
+        Section("Controllers compared", [compared, Text(_definition(_flown(run)), quiet=True)]),
         Section("Effort", [effort_table(run.rows, words), Text(_effort(test), quiet=True)]),
         *figures_section(run.path / "figures"),
     ]
