@@ -210,7 +210,9 @@ _COMPLEXITY = {
 def _complexity(run: RunFiles, model: str) -> str:
     head, parts = run.card(model).get("head") or {}, []
     # a card's `terms` are names
-    known = run.fit(model) | {key: head[key] for key in ("hidden", "hidden_size") if key in head}
+    known = dict(run.fit(model)) | {
+        key: head[key] for key in ("hidden", "hidden_size") if key in head
+    }
     for key, words in _COMPLEXITY.items():
         if key in known:
             values = known[key] if isinstance(known[key], list) else [known[key]]
