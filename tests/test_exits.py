@@ -40,6 +40,7 @@ def raising(error: BaseException) -> Callable[[], NoReturn]:
         (DataError("two\nlines"), 1, "residnet: two lines"),
         (OSError(errno.ENOSPC, "No space left on device", "/full/x"), 2, "/full/x: No space left"),
         (MemoryError(), 1, "memory"),
+        (ModuleNotFoundError("no", name="typer"), 2, "has no package 'typer'; install residnet"),
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )

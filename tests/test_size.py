@@ -33,10 +33,10 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2521, 283),
     "runs": (377, 48),
     "simulators": (351, 40),
-    "tasks": (3219, 266),
+    "tasks": (3222, 266),
     "testing": (446, 26),
     "training": (1332, 143),
-    "": (446, 51),
+    "": (448, 51),
 }
 
 

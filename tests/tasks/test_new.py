@@ -119,6 +119,9 @@ def test_one_log_is_cut_in_time(folder: Path) -> None:
     draft = residnet.draft(only, folder=folder)
     assert draft.config["data"]["split"]["test"] == [{"log": only.name, "from": "47.9 s"}]
     assert any("cut in time" in why for _, why in draft.guesses)
+    out = folder / "Fähre Süd.yaml"
+    assert new_config([only], out, None, overwrite=False)[-1] == f"next: residnet run '{out}'"
+    assert yaml.safe_load(out.read_text())["name"] == "Fahre_Sud"
 
 
 def test_answers_are_taken(logs: list[Log], tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
+import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,7 +85,8 @@ def new_config(
         raise UsageError(f"--out {out}: a config is a YAML file; name it {out}.yaml")
     if out.exists() and not overwrite:
         raise UsageError(f"--out {out}: exists; give --overwrite, or another name")
-    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", out.stem).strip("_.-") or "my_boat"
+    plain = unicodedata.normalize("NFKD", out.stem).encode("ascii", "ignore").decode()
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", plain).strip("_.-") or "my_boat"
     draft = drafted(logs, out.parent, name, answer)
     file, count = draft.save(out), len(draft.guesses)
     lines = [f"{key}: {why}" for key, why in draft.guesses[:_SHOWN]]
@@ -93,7 +96,12 @@ def new_config(
         lines.insert(0, "one value is a guess, marked in the file:")
     elif count:
         lines.insert(0, f"{count} values are guesses, each marked in the file:")
-    return [*lines, *draft.unused, f"config: {file}", f"next: residnet run {file}"]
+    return [
+        *lines,
+        *draft.unused,
+        f"config: {file}",
+        f"next: residnet run {shlex.quote(str(file))}",
+    ]
 
 
 def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | None = None) -> Draft:
