@@ -158,6 +158,19 @@ def test_logs_of_a_surge_alone_are_looked_at_too() -> None:
     assert one.text.startswith("run_6")
 
 
+def test_twin_rudders_have_one_fault() -> None:
+    fleet, logs = drawn("boat", _SEED, _COUNT)[0], []
+    for number, log in enumerate(fleet.logs):
+        rudders = dict.fromkeys(
+            ("delta", "delta_stbd"), log["delta"] * (-1.0 if number == 2 else 1.0)
+        )
+        units = {**log.units, "delta_stbd": "rad"}
+        logs.append(log.replace(channels={**log.channels, **rudders}, units=units))
+    (one,) = inspect_together(logs, (*fleet.inputs, "delta_stbd")).find("contradicts_sign")
+    assert one.text.startswith(logs[2].name)
+    assert "delta and delta_stbd would have to have the opposite sign" in one.text
+
+
 @pytest.mark.parametrize("name", ["azimuth", "delta"])
 def test_what_no_other_log_has_run_accuses_none(name: str) -> None:
     """A thruster turns round once where it had not; a rudder stalls at angles not held before."""

@@ -190,7 +190,10 @@ def _acting_terms(facts: Facts) -> tuple[list[str], list[str], list[str]]:
 
 
 def _terms(facts: Facts) -> list[str]:
-    """Return the terms of all axes together."""
+    """Return the terms of all axes together.
+
+    A thruster that turns pushes along and across; its thrust falls with the inflow.
+    """
     forces, turning, driving = _acting_terms(facts)
     turned, live = thrusters_that_turn(facts.inputs), live_of(facts.names)
     moving = live.moving
@@ -198,7 +201,12 @@ def _terms(facts: Facts) -> list[str]:
         return submerged(Roles(live.channels, (*forces, *driving), tuple(turning), (), False))
     return [
         *("1", *moving, *HULL, *(ROLL if "p" in moving else ()), *forces),
-        *(term for at in turned.items() for term in _azimuth(*at, moving)),
+        *(
+            f"{flow} {way}({angle})"
+            for angle, n in turned.items()
+            for flow in (f"{n}|{n}|", f"u |{n}|")[: 1 + ("u" in moving)]
+            for way in ("cos", "sin")
+        ),
         *(term for name in driving for term in _propeller(name, name in facts.astern)),
         *(term for name in turning for term in _rudder(name, driving, facts)),
         *(WIND if facts.wind else ()),
@@ -214,12 +222,6 @@ def _propeller(name: str, astern: bool) -> list[str]:
     """Return the thrust of a propeller; one that turns astern differs from one ahead."""
     back = [f"{name}^2", f"{name} u"] if astern else []
     return [name, f"{name}|{name}|", f"|{name}| u", *back]
-
-
-def _azimuth(angle: str, n: str, moving: Sequence[str]) -> list[str]:
-    """Return the thrust of a thruster that turns, along and across, which falls with the inflow."""
-    flows = (f"{n}|{n}|", *((f"u |{n}|",) if "u" in moving else ()))
-    return [f"{flow} {way}({angle})" for flow in flows for way in ("cos", "sin")]
 
 
 def _rudder(name: str, driving: Sequence[str], facts: Facts) -> list[str]:

@@ -617,6 +617,8 @@ class Cause:
 _FACTORS = (0.2, 0.33, 0.5, 0.67, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0)
 # a change of three numbers for each velocity explains more by chance than one of a single number
 _OF_MANY = 2.0
+_TOGETHER = 0.9
+"""Correlation from which two inputs are moved by one lever: twin rudders, as most ships have."""
 _STEPS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)
 _STILL = 1e-3
 """Share of an input's usual spread, or of its size, below which it rests; chosen by hand."""
@@ -647,6 +649,14 @@ def _in_words(kind: str, name: str, unit: str, size: float) -> str:
     return f"{would} be larger by {show(size, unit)}"
 
 
+def _alike(log: Record, names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return inputs that move together: of one recorder, so that one fault has them all."""
+    table = np.atleast_2d(np.corrcoef(np.nan_to_num(log.log.stack([*names]).T)))
+    pairs = [[one == f"cmd_{name}" for one in names] for name in names]
+    same = (table > _TOGETHER) | np.eye(len(names), dtype=bool) | np.array(pairs)
+    return [tuple(np.array(names)[row].tolist()) for row in same]
+
+
 def causes(fleet: Fleet, i: int) -> list[Cause]:
     """Return what would explain a log by the others' model, the likeliest first."""
     log, model, rows = fleet.logs[i], fleet.model(without=i), fleet.rows[i]
@@ -654,18 +664,17 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
     out: list[Cause] = []
     # what follows from the position has its scale, and no sign of its own
     derived = log.log.meta.get("derived", ())
-    for name in (*fleet.driving, *fleet.moving):
-        if name in derived[1:]:
-            continue
-        drives, whole = name in fleet.driving, derived if name in derived else (name,)
-        said, unit = ("x, y", "m") if name in derived else (name, log.units[name])
+    alone = [(name,) for name in (*fleet.driving, *fleet.moving) if name not in derived]
+    for whole in dict.fromkeys((*alone, *_alike(log, fleet.driving), *([derived] * bool(derived)))):
+        name, drives = whole[0], whole[0] in fleet.driving
+        said, unit = ("x, y", "m") if derived == whole else (" and ".join(whole), log.units[name])
         spread = float(np.nanmedian([fleet.logs[j].std(name) for j in fleet.core])) or 1.0
-        if drives and resting(fleet, i, name):
+        if (name,) == whole and drives and resting(fleet, i, name):
             surprise = _freed(fleet, model, i, name, 0.01 * spread) + unsure
             text = f"the record of {name} is dead: it rests while the vessel answers to it"
             out.append(Cause("dead", name, 0.0, surprise, text))
             continue
-        sizes = {"sign": [-1.0]} if name not in derived else {}
+        sizes = {"sign": [-1.0]} if derived != whole else {}
         sizes["scale"] = [1.0 / size for size in slips(unit)]
         if drives:
             sizes["scale"] += _FACTORS
@@ -692,11 +701,6 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
                 surprise, size = min((surprise, size), (float(near.fun), float(near.x)))
             text = _in_words(kind, said, unit, size)
             out.append(Cause(kind, name, size, surprise, text))
-    for name in (one for one in fleet.driving if f"cmd_{one}" in fleet.driving):
-        both = {one: -log[one] for one in (name, f"cmd_{name}")}
-        text = f"{name} and its command would have to have the opposite sign"
-        surprise = model.surprise(fleet.of(changed(log, both)))
-        out.append(Cause("sign", name, -1.0, surprise, text))
     for port, stbd in sides(fleet.driving).items():
         surprise = model.surprise(fleet.of(changed(log, {port: log[stbd], stbd: log[port]})))
         text = f"{port} and {stbd} would have to be exchanged"
