@@ -19,8 +19,8 @@ STATEMENTS_AND_FUNCTIONS = {
     "api": (700, 79),
     "baselines": (886, 129),
     "control": (3155, 359),
-    "core": (1646, 249),
-    "data": (9768, 837),
+    "core": (1647, 249),
+    "data": (9766, 837),
     "documents": (2452, 224),
     "dynamics": (2246, 277),
     "export": (1482, 172),
@@ -33,10 +33,10 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2521, 283),
     "runs": (377, 48),
     "simulators": (351, 40),
-    "tasks": (3222, 266),
+    "tasks": (3221, 266),
     "testing": (446, 26),
     "training": (1332, 143),
-    "": (448, 51),
+    "": (449, 51),
 }
 
 

@@ -120,10 +120,8 @@ def _told(error: Exception) -> tuple[str, int]:
         place = "" if error.filename is None else f"{error.filename}: "
         return f"{place}{error.strerror}; make room or give another place", 2
     if isinstance(error, ModuleNotFoundError) and "residnet" not in str(error.name):
-        return (
-            f"{sys.executable} has no package '{error.name}'; install residnet for this Python, or"
-            " take the one in the .venv that residnet was installed into"
-        ), 2
+        what = f"{sys.executable} has no package '{error.name}'"
+        return f"{what}; install residnet for this Python, or take that of its .venv", 2
     file = write_crash_file(error)
     first = next(iter(str(error).splitlines()), "")
     place = "it could not be described in a file" if file is None else f"attach {file} to an issue"

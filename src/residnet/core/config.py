@@ -600,15 +600,12 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
         case _ if kind in _EXPECTED:
             text = f"expected {_EXPECTED[kind]} {given(value)}"
         case _:
-            types_of = [
-                (field.annotation, field.metadata)
-                for model in parents
-                if path and _is_model(model)
-                for name, field in model.model_fields.items()
-                if (field.alias or name) == path[-1]
-            ]
             # a bound is told in the unit that it counts in, however deep it stands in the type
-            unit = re.search(r"Quantity\(si='(.+?)'\)", repr(types_of))
+            fields = [kind.model_fields for kind in parents if _is_model(kind)]
+            found = {
+                f.alias or n: (f.annotation, f.metadata) for one in fields for n, f in one.items()
+            }
+            unit = re.search(r"Quantity\(si='(.+?)'\)", repr(found.get(path[-1] if path else "")))
             bound = details["msg"].replace("Input should", "must") + (f" {unit[1]}" if unit else "")
             text = f"{bound} {given(value)}"
     return _Fault(kind, path, text)

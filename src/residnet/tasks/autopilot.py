@@ -407,11 +407,7 @@ class AutopilotConfig(ComputingTask):
         def longer(part: Any, *names: str) -> Any:
             given = {name: getattr(part, name) for name in names}
             return part.model_copy(
-                update={
-                    name: float(f"{pace * value:.6g}")
-                    for name, value in given.items()
-                    if value is not None
-                }
+                update={n: float(f"{pace * v:.6g}") for n, v in given.items() if v is not None}
             )
 
         def slower(conditions: ConditionsConfig) -> ConditionsConfig:

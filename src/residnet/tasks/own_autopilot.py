@@ -97,9 +97,8 @@ def _ahead(log: Log) -> np.ndarray:
         return np.asarray(log["u"][log.usable])
     if not log.channels.keys() >= {"x", "y", "psi"}:
         return np.zeros(0)
-    way, at = (log["x"] + 1j * log["y"])[log.usable], log["psi"][log.usable]
-    known = np.isfinite(way) & np.isfinite(at)
-    way, at, t = way[known], at[known], log.t[log.usable][known]
+    known = log.usable & np.isfinite(log["x"] + log["y"] + log["psi"])
+    way, at, t = (log["x"] + 1j * log["y"])[known], log["psi"][known], log.t[known]
     # along the heading, where the noise of a fix has no mean
     return np.asarray((np.diff(way) * np.exp(-0.5j * (at[1:] + at[:-1]))).real / np.diff(t))
 
@@ -227,10 +226,7 @@ def draft_autopilot(
     asked = validate(given, _Asked, "residnet autopilot").model_dump(exclude_none=True)
     vessel = _known(source)
     if math.isnan(asked.get("speed", vessel.speed)):
-        say(
-            "  the speed is not known, and K and T are taken to hold at 1 m/s: give --speed, or"
-            " the policy takes its measurement u in multiples of the usual speed"
-        )
+        say("  speed unknown: give --speed, or u is measured in multiples of the usual speed")
         asked["speed"] = 1.0
     vessel = vessel._replace(**asked)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -183,8 +183,7 @@ def stuck(log: Record, found: Check) -> Iterator[Finding]:
             continue
         demanded, measured = log[demand], log[actual]
         still = max(6.0 * log.noise(actual), 1e-4 * span)
-        # a slow gear moves less within a step than its sensor is noisy: it rests where the range
-        # over so many samples is that of noise
+        # a slow gear moves less in a step than its sensor is noisy: ranges over many steps tell
         many = max(2, round(_STUCK / log.step))
         rolling = pd.Series(measured).rolling(many, min_periods=1)
         rests = ~((rolling.max() - rolling.min()).to_numpy()[many - 1 :] > still)

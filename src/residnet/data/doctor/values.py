@@ -104,9 +104,7 @@ def upright(log: Log) -> Log:
 
 def _as_rates(log: Log) -> Log:
     """Return a log whose v and r move the pose, from one in which they may be the hull's."""
-    moved = {}
-    if log.channels.keys() >= {"psi", "r"}:
-        moved["r"] = np.diff(log["psi"])
+    moved = {"r": np.diff(log["psi"])} if log.channels.keys() >= {"psi", "r"} else {}
     if log.channels.keys() >= {"psi", "x", "y", "v"}:
         moved["v"] = (np.diff(log["x"] + 1j * log["y"]) * np.exp(-1j * log["psi"][1:])).imag
     channels = dict(log.channels)
