@@ -532,12 +532,8 @@ def _measured(names: Sequence[str], marks: Marks) -> list[str]:
     turning = [name for name in names if name == "n" or name.startswith("n_")]
     out = []
     for name in names:
-        partners = []
-        if "cmd" in name:
-            measured = name.removeprefix("cmd_")
-            partners = [measured, measured.replace("cmd_", "")]
-        if name.startswith("cmd_"):
-            partners.append(f"n_{name.removeprefix('cmd_')}")
+        bare = name.removeprefix("cmd_")
+        partners = [bare, f"n_{bare}"] if bare != name else []
         found = next((other for other in partners if other in names and other != name), None)
         if found is not None:
             marks.guess(INPUTS, f"{found} is taken as measured, and not what was ordered ({name})")

@@ -321,15 +321,11 @@ def rudder_sign(log: Record, found: Check) -> Iterator[Finding]:
             f"positive {name} turns the vessel to port (yaw acceleration {effect:.3g} per unit,"
             f" {-sure:.0f} standard errors)"
         )
-        sides_fix = "exchange the columns of both sides, or check the sign of r and psi"
-        yield found(text, figures, fix=sides_fix if _OVER in name else _TURN_AND_CHECK)
+        both = "exchange the columns of both sides, or check the sign of r and psi"
+        yield found(text, figures, fix=both if " less " in name else _TURN_AND_CHECK)
     elif sure > _SURE:
         text = f"positive {name} turns the vessel to starboard ({sure:.0f} standard errors)"
         yield found(text, figures, level="note", fix="")
-
-
-_OVER = " less "
-"""Stands between the two sides whose difference steers."""
 
 
 def _steering(log: Record) -> tuple[str, np.ndarray]:
@@ -341,7 +337,7 @@ def _steering(log: Record) -> tuple[str, np.ndarray]:
         if log.units[port] != "rad":
             steer = log[port] * np.abs(log[port]) - log[starboard] * np.abs(log[starboard])
             if deviation(steer) > 1e-9:
-                return port + _OVER + starboard, steer
+                return f"{port} less {starboard}", steer
     return "", np.zeros(0)
 
 

@@ -340,9 +340,8 @@ def excitation(logs: Together, found: Check) -> Iterator[Finding]:
             text = f"none of {count} logs turns beyond its noise: nothing is learned of steering"
         elif min(to_port, 1.0 - to_port) < _OTHER_SIDE:
             text = f"all of {count} logs turn to {side}: how it turns to the other is unknown"
-        # one log may stand for many
-        level: Level = "will mislead" if count > 1 else "note"
         if text:
+            level: Level = "will mislead" if count > 1 else "note"
             fix = "add turns to both sides: zigzag, 3-2-1-1"
             yield found(text, {"port": to_port}, code="one_side", level=level, fix=fix)
     driving = [name for name in logs.inputs if not name.startswith(("wind", "current"))]

@@ -537,8 +537,7 @@ def held(log: Record, found: Check) -> Iterator[Finding]:
         usual = usual_interval(log[name])
         if usual >= 2.0:
             text = f"{name} changes once in {usual:.0f} samples, its last value is held in between"
-            level: Level = "note" if name in STATE else "will mislead"
-            yield found(text, {"every": usual}, level=level)
+            yield found(text, {"every": usual}, level="note" if name in STATE else None)
 
 
 @check("values", "jump")
