@@ -33,7 +33,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "report": (2521, 283),
     "runs": (377, 48),
     "simulators": (351, 40),
-    "tasks": (3217, 266),
+    "tasks": (3218, 266),
     "testing": (446, 26),
     "training": (1332, 143),
     "": (449, 51),

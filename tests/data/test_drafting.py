@@ -99,7 +99,7 @@ CALLED: dict[str | None, str] = {
     "apparent_wind_angle": "wind_dir_relative_mid [rad]|scheinbare Windrichtung [°]|AWA",
     "wind_speed": "wind_velo_true [m/s]|TWS|wind speed x",
     None: "Kurs über Grund [°]|course over ground|alloc_age|lateral acceleration"
-    "|Battery_V|engine temperature [°C]|engine load|oil pressure main engine"
+    "|Battery_V|cooling fan [%]|engine temperature [°C]|engine load|oil pressure main engine"
     "|twist.linear.z",
     "speed": "speed over ground [kn]|speed through water",
     "v": "speed to starboard [kn]|Vy [m/s]|SpeedTrans_kn|pose.twist.linear.y",

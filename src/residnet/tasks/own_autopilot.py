@@ -134,7 +134,7 @@ def _record(log: Log) -> tuple[Record, str]:
     return Record(dt, log[name][usable][held], rate, usable[near]), name
 
 
-_PAIR = re.compile(r"\s*([0-9.eE+-]+)\s*,\s*([0-9.eE+-]+)\s*")
+_PAIR = re.compile(r"\s*([0-9.eE+-]+)\s*,?\s*([0-9.eE+-]*)\s*")
 _SPREAD = 0.2
 """Share by which K and T may be off where nobody has measured how far."""
 _LEAST = 0.1
@@ -244,7 +244,8 @@ def draft_autopilot(
 
 def _known(source: Sequence[str | Path]) -> OwnVessel:
     """Return what a source says of a vessel's steering."""
-    if len(source) == 1 and (pair := _PAIR.fullmatch(str(source[0]))):
+    pair = _PAIR.fullmatch(str(source[0])) if len(source) == 1 else None
+    if pair and not Path(source[0]).exists():
         try:
             gain, time = (float(number) for number in pair.groups())
         except ValueError:

@@ -233,7 +233,7 @@ _ABOUT: dict[str, str] = {
     "difference": "differen | diff",
     "index": "| index idx id number nr no num count counter flag valid",
     "age": "| age alter",
-    "machinery": "temperat pressure presion pression fuel kraftstoff carburant oil coolant load"
+    "machinery": "temperat pressure presion pression fuel kraftstoff carburant oil cool kuhl load"
     " consumption verbrauch hours stunden alarm druck | temp last water",
     "estimate": "estimat filtered hat mean | est",
     "measured": "| meas measured actual ist",
