@@ -500,7 +500,10 @@ class Fleet:
         self._settle(sorted((*self.core, *again)))
 
     def goes_beyond(self, i: int) -> bool:
-        """Return whether inputs leave those of the logs that agree, and only there it differs."""
+        """Return whether inputs leave those of the logs that agree, and only there it differs.
+
+        Of a log that lies beyond them from end to end no part tells that it is right.
+        """
 
         def acting(log: Record) -> np.ndarray:
             thrusts, rest = _thrusts(dict(log.log.channels), self.driving)
@@ -512,10 +515,13 @@ class Fleet:
         room = np.maximum(_ROOM * (top - low), _SAME * np.maximum(np.abs(low), np.abs(top)))
         here, whole = acting(self.logs[i]), self.rows[i]
         out = (here < (low - room)[:, None]) | (here > (top + room)[:, None])
-        if not out[: -len(self.moving)].any():
+        led, out = out[: -len(self.moving)].any(axis=0), out.any(axis=0)
+        if not led.any() or led.all():
             return False
-        count = np.append(0, np.cumsum(out.any(axis=0)))
-        # where it moves as none of them did, nothing is known of it either
+        # where such inputs led to a motion of which nothing is known, it lasts beyond them
+        for start, stop in zip(*stretches(out), strict=True):
+            out[start:stop] = led[start:stop].any()
+        count = np.append(0, np.cumsum(out))
         self.rows[i] = whole.some(count[whole.first + whole.size + 1] == count[whole.first])
         agrees = not self.rows[i].known or self.scores(self.core, [i])[i].size <= 1.0
         self.rows[i] = whole
