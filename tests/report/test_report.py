@@ -163,6 +163,17 @@ def test_five_questions_are_answered_before_the_first_section(level: str, tmp_pa
     assert five_answers(f"{opening[0]} {rows}", level)
 
 
+def test_free_runs_of_logs_that_turn_to_one_side_make_no_good_model(tmp_path: Path) -> None:
+    run = judged(tmp_path / "run", "good")
+    doctor = json.loads((run / "doctor.json").read_text())
+    said = {"code": "one_side", "text": "all of 9 logs turn to port", "action": "", "effect": None}
+    for known, found in (("good", "note"), ("limited", "will mislead")):
+        write_json(run / "doctor.json", doctor | {"together": [{**said, "level": found}]})
+        text = html.unescape(shown(run)).partition('id="at-a-glance"')[0]
+        assert LEVELS[known] in text
+        assert (said["text"] in text) == (known == "limited")
+
+
 @pytest.mark.long
 @pytest.mark.skipif(browser() is None, reason="no browser is installed")
 @pytest.mark.parametrize("level", ["good", "do not use"])

@@ -44,6 +44,8 @@ class Evidence:
         limits: contents of limits.json for that split by protocol; empty where a run has none.
         doctor: one sentence on what the data doctor found; empty where nobody looked.
         protocol: by which those runs were made.
+        one_sided: what the doctor said of logs that turn to one side, or to none; free runs on such
+            logs cannot tell how the model turns.
     """
 
     selected: str
@@ -54,6 +56,7 @@ class Evidence:
     limits: Content = field(default_factory=dict)
     doctor: str = ""
     protocol: str = ""
+    one_sided: str = ""
 
 
 LEVELS = {
@@ -91,6 +94,7 @@ def verdict(evidence: Evidence) -> list[str]:
     first, *rest = [compared(evidence)] if useless(evidence) else ahead(evidence)
     sentences = [
         first,
+        f"That is no more than limited, for {evidence.one_sided}." * bool(evidence.one_sided),
         evidence.doctor,
         *rest,
         soundness(evidence),
@@ -109,7 +113,7 @@ def level(evidence: Evidence) -> str:
     entries = horizons(evidence)
     if entries and not any(_enough(evidence, entry) for entry in entries):
         return UNKNOWN
-    return GOOD if good_until(evidence) else LIMITED
+    return GOOD if good_until(evidence) and not evidence.one_sided else LIMITED
 
 
 def horizons(evidence: Evidence) -> list[Content]:

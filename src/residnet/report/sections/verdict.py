@@ -49,6 +49,7 @@ def evidence(run: RunFiles, selected: str) -> Evidence:
         doctor = f"{_NO_PLACE.format(', '.join(made))} {doctor}".strip() if not told else doctor
         told += "; no heading was measured" if told and run.live.turns and "psi" in made else ""
     doctor = f"{told[0].upper()}{told[1:]}. {doctor}".strip() if told else doctor
+    sides = (one for one in inspection.get("together") or [] if one["code"] == "one_side")
     return Evidence(
         selected,
         split,
@@ -58,6 +59,7 @@ def evidence(run: RunFiles, selected: str) -> Evidence:
         (run.limits.get("splits") or {}).get(split, {}),
         doctor,
         protocol,
+        next((one["text"] for one in sides if one["level"] != "note"), ""),
     )
 
 
