@@ -39,8 +39,8 @@ def zigzag(file: Path, angle: float, seed: int) -> Path:
             psi += dt / fine * r
             north += dt / fine * SPEED * math.cos(math.radians(psi))
             east += dt / fine * SPEED * math.sin(math.radians(psi))
-    names = ("time [s]", "heading [deg]", "yaw rate [deg/s]", "rudder command [deg]")
-    names += ("north [m]", "east [m]")
+    names = ["time [s]", "heading [deg]", "yaw rate [deg/s]", "rudder command [deg]"]
+    names += ["north [m]", "east [m]"]
     pd.DataFrame(rows, columns=names).to_csv(file, index=False)
     return file
 
