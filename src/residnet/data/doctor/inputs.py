@@ -11,7 +11,6 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
-import pandas as pd
 
 from residnet.core.names import BOW_WIND
 from residnet.core.stretches import stretches
@@ -173,6 +172,8 @@ Chosen by hand: longer than actuators lag, and farther than they are inaccurate.
 @check("inputs", "stuck", fix="leave this part out", certain=True)
 def stuck(log: Record, found: Check) -> Iterator[Finding]:
     """Report actuators that rest although their demand goes elsewhere."""
+    import pandas as pd
+
     for demand in log:
         bare = _DEMAND.sub("", demand)
         names = [bare, f"n_{bare}", f"actual_{bare}", f"{bare}_actual", f"acting_{bare}"]
