@@ -41,7 +41,8 @@ from residnet.judge.band import Band, covered, interval_score, worst
 from residnet.judge.bands import RunErrors, calibrate, run_errors
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
-from residnet.tasks.fit import FitConfig, limit_of
+from residnet.tasks.fit import FitConfig
+from residnet.tasks.fit_outcome import limit_of
 
 Judged = tuple[RunErrors, Band]
 Found = dict[tuple[str, str, int], list[Judged]]

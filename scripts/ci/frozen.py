@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import pickle
 import re
 import subprocess
 import sys
@@ -163,6 +162,8 @@ def differences(old: Any, new: Any, tolerance: float, where: str = "") -> Iterat
         if all(isinstance(line, str) for line in (*old, *new)):
             yield from (f"{where}: gone: {line[:200]}" for line in old if line not in new)
             yield from (f"{where}: new:  {line[:200]}" for line in new if line not in old)
+        elif all(isinstance(one, int | float) for one in (*old, *new)):
+            yield from differences(np.array(old), np.array(new), tolerance, where)
         else:
             left, right = dict(enumerate(old)), dict(enumerate(new))
             yield from differences(left, right, tolerance, where)
@@ -192,11 +193,12 @@ def main() -> int:
         samples(kept / "samples")
     for part in given.only.split(","):
         print(part, flush=True)
-        file, found = kept / f"{part}.pickle", dict(PARTS[part](kept))
+        file = kept / f"{part}.json"
+        text = json.dumps(dict(PARTS[part](kept)), default=np.ndarray.tolist)
         if given.verb == "make":
-            file.write_bytes(pickle.dumps(found))
+            file.write_text(text)
             continue
-        before = pickle.loads(file.read_bytes())
+        before, found = json.loads(file.read_text()), json.loads(text)
         for name in sorted({*before, *found}):
             tolerance = LOGS if part == "logs" else FIGURES
             told = list(differences(before.get(name), found.get(name), tolerance))

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -35,15 +35,17 @@ from residnet.report.page import write_page
 from residnet.runs.folder import Provenance, RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import Outcome
-from residnet.tasks.fit import (
+from residnet.tasks.fit_outcome import (
     SPLIT,
-    FitConfig,
     external_logs,
     fit_outcome,
     limit_of,
     write_judged,
 )
 from residnet.training.left_out import left_open
+
+if TYPE_CHECKING:
+    from residnet.tasks.fit import FitConfig
 
 _NAMED = 3
 """Causes that are named."""

@@ -28,6 +28,7 @@ from residnet.core.progress import say
 from residnet.data.channels import noise_of
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.reading import log_files, read_drafted
+from residnet.data.motion import MotionConfig, complete_motion
 from residnet.tasks.autopilot import REFERENCE, least_time
 from residnet.tasks.registry import finished_task
 
@@ -80,7 +81,11 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
             f"steering: the rudder of the logs moves by {spread:.2g} rad (rms); K and T need turns,"
             " such as a zigzag"
         )
-    speeds = [ahead for log in logs if (ahead := _ahead(log)).size]
+    moving = [
+        complete_motion(log, MotionConfig()) if {"x", "y", "psi"} <= log.channels.keys() else log
+        for log in logs
+    ]
+    speeds = [log["u"][log.usable] for log in moving if "u" in log.channels]
     speed = float(np.nanmean(np.concatenate(speeds))) if speeds else float("nan")
     return IdentifiedSteering(
         fit_response(records, longest_delay, commands=names == {"cmd_delta"}),
@@ -89,18 +94,6 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
         float(np.median([record.dt for record in records])),
         max(float(np.abs(record.rudder).max()) for record in records),
     )
-
-
-def _ahead(log: Log) -> np.ndarray:
-    """Return the surge velocity, as measured or from one fix to the next; empty where unknown."""
-    if "u" in log.channels:
-        return np.asarray(log["u"][log.usable])
-    if not log.channels.keys() >= {"x", "y", "psi"}:
-        return np.zeros(0)
-    known = log.usable & np.isfinite(log["x"] + log["y"] + log["psi"])
-    way, at, t = (log["x"] + 1j * log["y"])[known], log["psi"][known], log.t[known]
-    # along the heading, where the noise of a fix has no mean
-    return np.asarray((np.diff(way) * np.exp(-0.5j * (at[1:] + at[:-1]))).real / np.diff(t))
 
 
 def _noise(logs: Sequence[Log], name: str) -> float:

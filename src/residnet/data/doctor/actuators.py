@@ -322,7 +322,7 @@ def rudder_sign(log: Record, found: Check) -> Iterator[Finding]:
             f" {-sure:.0f} standard errors)"
         )
         both = "exchange the columns of both sides, or check the sign of r and psi"
-        yield found(text, figures, fix=both if " less " in name else _TURN_AND_CHECK)
+        yield found(text, figures, fix=_TURN_AND_CHECK if name in log else both)
     elif sure > _SURE:
         text = f"positive {name} turns the vessel to starboard ({sure:.0f} standard errors)"
         yield found(text, figures, level="note", fix="")
