@@ -20,7 +20,7 @@ STATEMENTS_AND_FUNCTIONS = {
     "baselines": (886, 129),
     "control": (3155, 359),
     "core": (1647, 249),
-    "data": (9774, 838),
+    "data": (9776, 838),
     "documents": (2452, 224),
     "dynamics": (2246, 277),
     "export": (1482, 172),

@@ -509,3 +509,18 @@ def test_the_report_has_every_finding_and_names_what_to_fix_first() -> None:
     assert counted.tally.startswith("Data doctor: 1 of 2 logs hold something")
     assert counted.first.startswith("First fix this: sick: ")
     assert [content["tally"], content["first"]] == counted.lines
+
+
+@pytest.mark.parametrize("slow", [0.5, 3.0])
+def test_a_rudder_is_told_by_samples_whose_speed_is_known(*, slow: float) -> None:
+    """Where a speed fails the last one known is none: the rudder may seem to be reversed."""
+    t = np.arange(0.0, 180.0, 0.2)
+    u, delta, r = np.where(t < 90.0, slow, 2.0), 0.2 * np.sign(np.sin(0.3 * t)), np.zeros(t.size)
+    for k in range(t.size - 1):
+        turn = 0.18 * u[k] ** 2 * delta[k] - 0.8 * u[k] * r[k] - 0.9 * r[k] * abs(r[k])
+        r[k + 1] = r[k] + 0.2 * turn
+    noise = 0.003 * np.random.default_rng(0).standard_normal(t.size)
+    channels = {"u": np.where(t < 90.0, u, np.nan), "r": r + noise, "delta": delta}
+    (said,) = inspect(Log("log", t, channels)).find("rudder_sign")
+    assert said.level == "note"
+    assert said.figures["effect"] == pytest.approx(0.18 * slow**2, rel=0.2)

@@ -303,7 +303,9 @@ def rudder_sign(log: Record, found: Check) -> Iterator[Finding]:
         if one_sided:
             return
     # a rudder turns by the square of the speed past it
-    flow = np.abs(log.smooth("u")) if "delta" in name and "u" in log else np.ones(len(log))
+    flow = np.ones(len(log))
+    if "delta" in name and "u" in log:
+        flow, good = np.abs(log.smooth("u")), good & np.isfinite(log["u"])
     without, fits = _answers(log, steer, flow, good)
     if not fits:
         return
