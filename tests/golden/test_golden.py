@@ -12,8 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
-from golden_tables import name_of, over_its_length, table
+import torch
+from golden_tables import accelerations, name_of, over_its_length, rounding_bound, table
+from kinds import of_kind
+
+from residnet.physics.plant import HullPlant
+from residnet.physics.vessel import load_vessel
 
 GROUPS = ("g1_4dof", "g2_odin", "g3_milliampere", "g4_wamv", "g5_nomoto")
 
@@ -61,6 +67,29 @@ def test_rows(path: Path) -> None:
     for name, found, truth, allowed in set_up(path.parent.name).by_row(path, table(path)):
         assert found.shape == truth.shape
         assert (np.abs(found - truth) <= allowed).all(), name
+
+
+def test_the_rounding_bound_has_a_floor_where_terms_cancel_exactly() -> None:
+    """A column of zeros: 1e-17 of a thrust is rounding there, 1e-14 of it is a fault."""
+    parts, truth, thrust = np.array([[200.0, 0.0], [150.0, 0.0]]), np.zeros((2, 2)), 200.0
+    bound = rounding_bound(parts, truth, thrust)
+    assert (1e-17 * thrust < bound[:, 1]).all()
+    assert (bound[:, 1] < 1e-14 * thrust).all()
+    # beside large parts the floor changes nothing
+    np.testing.assert_array_equal(bound[:, 0], 1e-12 * parts[:, 0])
+
+
+def test_accelerations_agree_where_symmetric_thrust_leaves_one_unit_in_the_last_place() -> None:
+    """Golden runs straight ahead: the moment of two thrusters is exactly zero or one rounding."""
+    hull = of_kind(load_vessel("wam_v_cal").build(), HullPlant).hull
+    nu = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    tau = torch.tensor([[100.0, 0.0, 0.0]], dtype=torch.float64)
+    values = hull(nu, tau).numpy()
+    frame = pd.DataFrame(values, columns=["du", "dv", "dr"])
+    for moment, agrees in ((2e-14, True), (1e-10, False)):
+        tau[0, 2] = moment
+        _, found, truth, allowed = accelerations(hull, nu, tau, frame)
+        assert (np.abs(found - truth) <= allowed).all() == agrees
 
 
 @pytest.mark.parametrize("group", GROUPS)

@@ -16,7 +16,7 @@ from typing import Any, final
 import numpy as np
 import pandas as pd
 import torch
-from golden_tables import Row, accelerations, beside, name_of, run, tensor
+from golden_tables import Row, accelerations, beside, name_of, rounding_bound, run, tensor
 from kinds import of_kind
 from scipy.signal import square
 from torch import Tensor
@@ -202,7 +202,7 @@ def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
         largest = 2 * (a + u * (b + u * c)) * (d + n * (e + n * f)) / whole
         across = largest * torch.sin(command[:, 1]).abs()
         size = torch.stack((largest, across, 3.82 * across), dim=-1)
-    within = 1e-12 * np.maximum(size.numpy(), np.abs(tau.numpy()))
+    within = rounding_bound(size.numpy(), tau.numpy(), float(size.max()))
     yield "forces", made.numpy(), tau.numpy(), within
     yield accelerations(plant.hull, nu, tau, frame)
 

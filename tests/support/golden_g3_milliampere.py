@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from golden_tables import Row, accelerations, beside, name_of, run, table, tensor
+from golden_tables import Row, accelerations, beside, name_of, rounding_bound, run, table, tensor
 from kinds import of_kind
 from torch import Tensor
 
@@ -218,7 +218,8 @@ def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
     size = ((nu_dot_d @ believed.mass.T).abs() + water).numpy()
     forward = frame[["ff_u", "ff_v", "ff_r"]].to_numpy()
     asked = believed.required(nu_dot_d, nu_d).numpy()
-    yield "feed-forward", asked, forward, 2e-12 * np.maximum(size, np.abs(forward))
+    allowed = 2.0 * rounding_bound(size, forward, float(size.max()))
+    yield "feed-forward", asked, forward, allowed
 
 
 def described(case: Flight | OpenLoop) -> Any:

@@ -65,10 +65,32 @@ Row = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 
 def accelerations(hull: Hull, nu: Tensor, tau: Tensor, frame: pd.DataFrame) -> Row:
     """The right-hand side of a hull row by row: no more exact than its largest term."""
-    parts = (hull.terms(nu).abs() @ hull.coefficients.abs() + tau.abs()) @ hull.inverse.abs().T
+    forces = hull.terms(nu).abs() @ hull.coefficients.abs() + tau.abs()
+    parts = forces @ hull.inverse.abs().T
     truth = frame[["du", "dv", "dr"]].to_numpy()
-    allowed = 1e-12 * np.maximum(parts.numpy(), np.abs(truth))
+    allowed = rounding_bound(parts.numpy(), truth, forces.amax() * hull.inverse.abs().sum(dim=1))
     return "accelerations", hull(nu, tau).numpy(), truth, allowed
+
+
+def rounding_bound(
+    parts: np.ndarray, truth: np.ndarray, column_scale: np.ndarray | Tensor | float
+) -> np.ndarray:
+    """The largest difference that rounding explains, in each row and column.
+
+    A share of 1e-12 of the largest part of the sum vanishes where all parts do, for example the yaw
+    moment of two equal thrusters. Whether their difference is exactly zero or one unit in the last
+    place of a thrust depends on the processor (fused multiply-add), hence an absolute floor of four
+    such units.
+
+    Args:
+        parts: magnitudes of the parts of each sum [T, n].
+        truth: the sums of the reference implementation [T, n].
+        column_scale: largest magnitude that terms of a column have in the run before they cancel,
+            one number or [n].
+    """
+    floor = 4.0 * np.finfo(np.float64).eps * np.asarray(column_scale)
+    bound: np.ndarray = np.maximum(1e-12 * np.maximum(parts, np.abs(truth)), floor)
+    return bound
 
 
 def tensor(frame: pd.DataFrame, *columns: str) -> Tensor:
