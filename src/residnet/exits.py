@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from residnet.core.errors import ResidnetError
+from residnet.core.errors import ResidnetError, Terminated
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
@@ -37,10 +37,6 @@ _OF_THE_SYSTEM = {
     errno.EROFS,
 }
 """Faults that are the machine's: nothing in residnet could be repaired to avoid them."""
-
-
-class Terminated(BaseException):
-    """The signal SIGTERM, which asks a process to end; no `except Exception` holds it up."""
 
 
 class _Signals:
@@ -91,8 +87,10 @@ def enter(command: Callable[[], object]) -> None:
     try:
         with signals.heard():
             command()
+        _report_skipped_packages()
     except SystemExit as end:
         if not signals.interrupted:
+            _report_skipped_packages()
             raise
         _leave(_continue("interrupted"), INTERRUPTED, end)
     except KeyboardInterrupt as end:
@@ -107,6 +105,14 @@ def enter(command: Callable[[], object]) -> None:
             # a library has turned the interruption into an error of its own
             _leave(_continue("interrupted"), INTERRUPTED, error)
         _leave(*_told(error), error)
+
+
+def _report_skipped_packages() -> None:
+    """Print one line for each entry point of another package that could not be loaded."""
+    # a command that needs no parts of other packages never imports the registry
+    registry = sys.modules.get("residnet.core.registry")
+    for line in registry.load_faults() if registry is not None else ():
+        print(f"residnet: warning: {ResidnetError(line)}", file=sys.stderr)
 
 
 def _told(error: Exception) -> tuple[str, int]:

@@ -13,6 +13,7 @@ from residnet.core import registry
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
 from residnet.data.readers import ReaderConfig
+from residnet.exits import enter
 from residnet.export import FORMATS, exporter
 from residnet.heads import HeadConfig
 from residnet.heads.linear import PlsrConfig
@@ -91,6 +92,37 @@ def test_faults_of_kinds(installed: Path, target: str, fault: str) -> None:
     # no package takes a name away
     assert isinstance(validate({"kind": "plsr"}, HeadConfig, "here"), PlsrConfig)
     assert "residnet has a kind of that name" in listed["plsr"]
+
+
+@pytest.mark.parametrize(
+    ("statement", "fault"),
+    [
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("raise GeneratorExit('no')", "GeneratorExit: no"),
+        ("class Stop(BaseException): pass\nraise Stop('two\\nlines')", "Stop: two"),
+    ],
+)
+def test_a_package_that_ends_the_process_is_skipped_and_reported(
+    installed: Path, statement: str, fault: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (installed / "site" / "made_package.py").write_text(statement + "\n")
+    declare(installed / "site", "residnet.heads", boom="made_package:Head")
+    listed: dict[str, str] = {}
+    enter(lambda: listed.update(catalogue("heads")))
+    assert listed["boom"].startswith(f"(cannot be used: {fault}; from made 1.0")
+    assert "slow_water" in listed
+    lines = [line for line in capsys.readouterr().err.splitlines() if "boom" in line]
+    assert lines == [
+        "residnet: warning: entry point 'boom' in residnet.heads of the package made 1.0 was"
+        f" skipped ({fault}); repair or uninstall that package"
+    ]
+
+
+def test_an_interruption_while_a_package_is_loaded_is_not_swallowed(installed: Path) -> None:
+    (installed / "site" / "made_stop.py").write_text("raise KeyboardInterrupt\n")
+    declare(installed / "site", "residnet.heads", boom="made_stop:Head")
+    with pytest.raises(KeyboardInterrupt):
+        catalogue("heads")
 
 
 def test_faults_of_formats_and_vessels(installed: Path) -> None:

@@ -29,6 +29,10 @@ class ResidnetError(Exception):
         )
 
 
+class Terminated(BaseException):
+    """The signal SIGTERM, which asks a process to end; no `except Exception` holds it up."""
+
+
 class UsageError(ResidnetError):
     """The error of a wrong call, path or unit (exit code 2)."""
 

@@ -28,7 +28,7 @@ from pydantic import BaseModel, GetCoreSchemaHandler, TypeAdapter, ValidationInf
 from pydantic_core import CoreSchema, core_schema, to_json
 
 import residnet
-from residnet.core.errors import UsageError
+from residnet.core.errors import Terminated, UsageError
 from residnet.core.files import config_folder
 
 
@@ -63,6 +63,8 @@ class ThirdParty:
 
 
 _loading: list[str] = []
+_broken: dict[tuple[str, str, str], ThirdParty] = {}
+"""Entry points that raised while they were loaded, by group, name and package."""
 
 
 @functools.cache
@@ -92,9 +94,23 @@ def _loaded(point: importlib.metadata.EntryPoint) -> ThirdParty:
     package = "unknown" if point.dist is None else f"{point.dist.name} {point.dist.version}"
     try:
         return ThirdParty(point.name, package, point.load())
-    except Exception as error:  # whatever a foreign package does wrong must not stop all others
+    except (KeyboardInterrupt, Terminated):
+        raise
+    # a foreign package that raises anything at all, SystemExit included, must not stop the others
+    except BaseException as error:
         lines = str(error).splitlines() or [""]
-        return ThirdParty(point.name, package, None, f"{type(error).__name__}: {lines[0]}")
+        broken = ThirdParty(point.name, package, None, f"{type(error).__name__}: {lines[0]}")
+        _broken.setdefault((point.group, point.name, package), broken)
+        return broken
+
+
+def load_faults() -> list[str]:
+    """Return one line for each entry point that could not be loaded so far and was skipped."""
+    return [
+        f"entry point '{name}' in {group} of the package {package} was skipped ({part.fault});"
+        " repair or uninstall that package"
+        for (group, name, package), part in sorted(_broken.items())
+    ]
 
 
 @functools.cache
@@ -106,6 +122,7 @@ def adapter(model: Any) -> TypeAdapter[Any]:
 def forget() -> None:
     """Read the entry points anew when they are next needed, for tests that install packages."""
     third_party.cache_clear()
+    _broken.clear()
     adapter.cache_clear()
 
 
