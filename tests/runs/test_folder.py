@@ -57,7 +57,7 @@ def test_a_folder_is_used_again_without_results_or_where_that_is_asked_for(tmp_p
     folder.write_json(folder.models / "zero" / "fit.json", {})
     refused("exists already", path, "a: 2\n")
     folder = RunFolder.create(path, "a: 3\n", overwrite=True)
-    assert [entry.name for entry in path.iterdir()] == ["resolved.yaml"]
+    assert {entry.name for entry in path.iterdir()} == {"resolved.yaml", "checksums.jsonl"}
     assert folder.resolved.read_text() == "a: 3\n"
     with pytest.raises(UsageError, match="not both"):
         RunFolder.create(path, "a: 2\n", overwrite=True, resume=True)
@@ -136,13 +136,13 @@ def test_two_processes_do_not_write_into_one_folder(
     run = tmp_path / "run"
     with RunFolder(run).held():
         for overwrite in (False, True):
-            RunFolder.create(run, "a: 1\n", overwrite=overwrite)
+            folder = RunFolder.create(run, "a: 1\n", overwrite=overwrite)
             with (
                 pytest.raises(UsageError, match="another run is being written here"),
                 RunFolder(run).held(),
             ):
                 pass
-            (run / "metrics.json").write_text("{}")
+            folder.write_json(folder.metrics, {})
     with RunFolder(run).held():
         assert (run / "resolved.yaml").read_text() == "a: 1\n"
 

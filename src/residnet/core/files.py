@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -16,6 +17,14 @@ from typing import TYPE_CHECKING, Any
 
 import residnet
 from residnet.core.errors import UsageError
+from residnet.core.ownership import (
+    FILE_MANIFEST,
+    Manifest,
+    manifest_for,
+    require_replaceable,
+    run_manifest_above,
+)
+from residnet.core.ownership import sha256 as sha256
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,18 +38,30 @@ _DEEPER = 300
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def whole(path: Path, manifest: Manifest | None = None) -> Iterator[Path]:
     """Yield a path to write to, which takes the place of `path` once it is written to its end.
 
-    A process that is killed meanwhile leaves the old file, or none. The file's folder is made.
+    A process that is killed meanwhile leaves the old file, or none. The file's folder is made. In a
+    run folder, or with a manifest, the file is recorded, and replaces only what residnet wrote.
+
+    Args:
+        path: of the file.
+        manifest: that records the file; that of the run folder around it if None.
 
     Raises:
-        UsageError: where the file cannot be written.
+        UsageError: if the file cannot be written, or is not residnet's to replace.
     """
-    partial = path.with_name(f"{path.name}.partial")
+    manifest = manifest or run_manifest_above(path)
+    # a name that no file of the user has
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}.partial")
     try:
+        if manifest is not None:
+            manifest.require_replaceable(path)
+            manifest.record(partial, None)
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
+        if manifest is not None:
+            manifest.record(path, sha256(partial))
         partial.replace(path)
     except BaseException as error:
         # where the folder itself cannot be written, the error under way says so
@@ -51,10 +72,44 @@ def whole(path: Path) -> Iterator[Path]:
         raise
 
 
-def sha256(path: Path) -> str:
-    """Return the hexadecimal SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+@contextmanager
+def write_owned(path: Path) -> Iterator[Path]:
+    """Yield a path to write to, as `whole`, for a file that a command writes at any place.
+
+    The file is recorded in the manifest of its run folder or, outside, of its own folder. It
+    replaces nothing but a file that residnet wrote and nobody edited.
+
+    Raises:
+        UsageError: if the file cannot be written, or is not residnet's to replace.
+    """
+    manifest = manifest_for(path)
+    with whole(path, manifest) as partial:
+        yield partial
+    if manifest.path.name == FILE_MANIFEST:
+        manifest.compact()
+
+
+@contextmanager
+def staged_files(file: Path) -> Iterator[Path]:
+    """Yield a path of the same name in an empty folder, for a writer of several files.
+
+    At the end of the context all files that were written beside it move to the folder of `file`,
+    none of them if one would replace a file that is not owned.
+
+    Raises:
+        UsageError: if a file is the user's or was edited, or cannot be written.
+    """
+    require_replaceable(file)
+    with tempfile.TemporaryDirectory(prefix="residnet-") as name:
+        staging = Path(name)
+        yield staging / file.name
+        sources = [path for path in sorted(staging.rglob("*")) if path.is_file()]
+        targets = [file.parent / path.relative_to(staging) for path in sources]
+        for target in targets:
+            require_replaceable(target)
+        for source, target in zip(sources, targets, strict=True):
+            with write_owned(target) as partial:
+                shutil.copyfile(source, partial)
 
 
 _UNSAFE = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]+')

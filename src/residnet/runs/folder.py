@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import shutil
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json, require_room, sha256, whole
+from residnet.core.ownership import RUN_MANIFEST, Manifest
 from residnet.core.version import __version__
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ SUMMARY = "residnet.summary/1"
 
 LOG = "log.txt"
 """File that holds the progress of a run, where that is kept."""
-CHECKSUMS = "checksums.json"
+CHECKSUMS = RUN_MANIFEST
 _RESULTS = {".json", ".yaml", ".parquet", ".safetensors"}
 _ELSEWHERE = {"figures", "exports", "tensorboard", "checkpoints"}
 """Folders that have no checksums: nothing reads them back as a result."""
@@ -47,6 +47,7 @@ class RunFolder:
 
     Attributes:
         path: the folder itself.
+        manifest: record of the files that residnet wrote into it.
         resolved: the complete configuration, with every default and in SI units.
         provenance: versions, seed, revision and the SHA-256 of every input file.
         summary: task, finished mark, verdict and main figures.
@@ -68,6 +69,7 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.manifest = Manifest(path)
         self.resolved = path / "resolved.yaml"
         self.provenance = path / "provenance.json"
         self.summary = path / "summary.json"
@@ -104,18 +106,13 @@ class RunFolder:
         """
         folder = cls(path)
         folder.require(resolved, resume=resume, overwrite=overwrite)
-        if folder._has_results():
-            if resume and folder.resolved.is_file():
-                # what is done again must not look finished meanwhile
-                folder.summary.unlink(missing_ok=True)
-                return folder
-            for entry in path.iterdir():
-                # the folder itself stays, since it is held
-                if entry.is_dir() and not entry.is_symlink():
-                    shutil.rmtree(entry)
-                else:
-                    entry.unlink()
-        path.mkdir(parents=True, exist_ok=True)
+        if resume and folder.resolved.is_file() and folder._has_results():
+            # what is done again must not look finished meanwhile
+            folder.summary.unlink(missing_ok=True)
+            return folder
+        # the folder itself stays, since it is locked
+        folder.manifest.remove_owned()
+        folder.manifest.begin()
         folder.write(folder.resolved, resolved)
         return folder
 
@@ -128,7 +125,11 @@ class RunFolder:
         if resume and overwrite:
             raise UsageError(f"{self.path}: give --resume or --overwrite, not both")
         require_room(self.path)
+        if resume and self.resolved.is_file():
+            require_recorded(self.path)
         if not self._has_results():
+            if self.path.is_dir():
+                self.manifest.require_all_owned()
             return
         if not (resume and self.resolved.is_file()):
             self._require_replaceable(overwrite)
@@ -259,6 +260,7 @@ class RunFolder:
 
     def _has_results(self) -> bool:
         names = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
+        names -= {self.manifest.path.name, self.manifest.journal.name}
         # without a configuration the files are somebody else's
         return bool(names - _BEFORE_RESULTS) or (bool(names) and not self.resolved.is_file())
 
@@ -272,6 +274,7 @@ class RunFolder:
                 f"{self.path}: exists already; give another --out (in Python `folder`), continue it"
                 " with --resume (`resume=True`), or replace it with --overwrite (`overwrite=True`)"
             )
+        self.manifest.require_all_owned()
 
 
 def _text(path: Path) -> str:
@@ -282,15 +285,30 @@ def _text(path: Path) -> str:
         raise UsageError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def seal(run: Path) -> None:
-    """Write checksums.json: the SHA-256 of every result that stands in the folder.
+def require_recorded(run: Path) -> None:
+    """Check that the files of a run folder are recorded, before more are written into it.
 
-    A run within the folder, such as an evaluation, has checksums of its own.
+    Raises:
+        UsageError: if there is no manifest, as in the run of an earlier version.
     """
-    sums = {file.relative_to(run).as_posix(): sha256(file) for file in _results(run, run)}
-    with whole(run / CHECKSUMS) as file:
-        content = {"schema": "residnet.checksums/1", "files": sums}
-        file.write_text(json.dumps(content, indent=1) + "\n")
+    if not Manifest(run).exists:
+        raise UsageError(
+            f"{run}: has no {CHECKSUMS}, so nothing says which of its files residnet wrote; give"
+            " another --out"
+        )
+
+
+def seal(run: Path) -> None:
+    """Bring checksums.json up to date: the SHA-256 of every file that residnet wrote there.
+
+    In a folder without a manifest, such as that of a single model, the results that stand there are
+    recorded. A run within the folder, such as an evaluation, has checksums of its own.
+    """
+    manifest = Manifest(run)
+    if not manifest.exists:
+        for file in _results(run, run):
+            manifest.record(file, sha256(file))
+    manifest.compact()
 
 
 def require_sealed(run: Path) -> None:
@@ -301,23 +319,9 @@ def require_sealed(run: Path) -> None:
     Raises:
         UsageError: where a file is missing, cut off, edited or from elsewhere.
     """
-    if not (run / CHECKSUMS).is_file():
-        return
-    sums = read_json(run / CHECKSUMS).get("files")
-    if not isinstance(sums, dict):
-        raise UsageError(f"{run / CHECKSUMS}: holds no checksums; restore the folder")
-    for name, expected in sums.items():
-        try:
-            found = sha256(run / name)
-        except (OSError, ValueError) as error:
-            raise UsageError(
-                f"{run / name}: cannot be read ({error}); restore the folder or run it again"
-            ) from error
-        if found != expected:
-            raise UsageError(
-                f"{run / name}: its SHA-256 is not the one in {CHECKSUMS}, so it is cut off, edited"
-                " or from elsewhere; restore the folder or run it again"
-            )
+    manifest = Manifest(run)
+    if os.path.lexists(manifest.path) or os.path.lexists(manifest.journal):
+        manifest.verify(skipped={*_ELSEWHERE, "report.html"})
 
 
 def _results(folder: Path, run: Path) -> Iterator[Path]:

@@ -285,8 +285,8 @@ class Task(Config):
                     verdict += [f"Not exported: {fault}." for fault in faults]
                     folder.write_summary(self.task, verdict, **about, finished=False)
                     self._write_page(folder, sections, drawn)
-        seal(folder.path)
         folder.write_summary(self.task, verdict, **about, finished=True)
+        seal(folder.path)
         if outcome.failure:
             raise DataError(outcome.failure)
         for fault in faults:

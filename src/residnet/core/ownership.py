@@ -1,0 +1,448 @@
+"""Ownership of files: residnet replaces or deletes a file only if it wrote it and nobody edited it.
+
+The rule is the same for every command. A *manifest* in the folder lists the SHA-256 of each file
+that residnet wrote there. A file is *owned* if the manifest lists its name and its contents have
+that SHA-256. A file that is not owned is neither replaced nor deleted: the command ends with one
+line that names it.
+
+A run folder has the manifest `checksums.json`, which lists every file below it. Files elsewhere
+(`export --out`, `new --out`, `inspect --out`, the logs of `demo`, the cache) are listed in
+`.residnet.json` in their folder: one record for all formats, which also covers files that have no
+room for a mark of their own. If that record is lost, the files count as the user's.
+
+While a command runs, the manifest grows by a journal (`checksums.jsonl`, `.residnet.jsonl`): one
+line of JSON is appended *before* the file is moved to its place, so that after a kill every file
+is still recognised, the earlier one and the new one. `Manifest.compact` merges the journal into the
+manifest. An entry without a SHA-256 belongs to a file that is still growing, such as a
+log or a checkpoint; it is recognised by its name.
+
+Checksums detect accidents, not attackers: whoever can edit a folder can edit its manifest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+from typing import Any, final
+
+from residnet.core.errors import UsageError
+
+RUN_MANIFEST = "checksums.json"
+"""Name of the manifest of a run folder."""
+FILE_MANIFEST = ".residnet.json"
+"""Name of the manifest of files that are written outside of a run folder."""
+SCHEMA = "residnet.checksums/1"
+
+_SIZE_LIMIT = 64_000_000
+"""Bytes of the largest manifest that is read; 100,000 files need 15 MB."""
+_FORBIDDEN_CHARACTERS = frozenset("\\\0")
+
+Digests = dict[str, set[str | None]]
+"""Name of a file -> SHA-256 of each version that residnet wrote; None if it is still growing."""
+
+
+def sha256(path: Path) -> str:
+    """Return the hexadecimal SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def resolve_name(folder: Path, name: object, source: Path | None = None) -> Path:
+    """Return the path of a file by the relative name that stands in a JSON file.
+
+    The name is one that `PurePosixPath` leaves as it is: relative, without `..`. Symbolic links are
+    not looked at, see `require_inside`.
+
+    Args:
+        folder: that the name is relative to.
+        name: what the JSON file holds.
+        source: the JSON file, for the error message; the folder if None.
+
+    Raises:
+        UsageError: if the name is no text, or leads out of the folder.
+    """
+    if (
+        isinstance(name, str)
+        and name not in ("", ".")
+        and not _FORBIDDEN_CHARACTERS & set(name)
+        and PurePosixPath(name).as_posix() == name
+        and not PurePosixPath(name).is_absolute()
+        and ".." not in PurePosixPath(name).parts
+    ):
+        return folder / name
+    raise UsageError(
+        f"{source or folder}: {name!r} is not the name of a file inside of the folder; restore the"
+        " folder or run it again"
+    )
+
+
+def require_inside(folder: Path, path: Path) -> None:
+    """Check that no symbolic link below a folder leads a path out of it.
+
+    The folder itself may be a link; the path need not exist.
+
+    Raises:
+        UsageError: if the path, or a folder between, is a symbolic link.
+    """
+    current = folder
+    for part in path.relative_to(folder).parts:
+        current = current / part
+        if current.is_symlink():
+            raise UsageError(
+                f"{current}: is a symbolic link; residnet reads and writes only inside of {folder}:"
+                " replace the link by the folder or file itself"
+            )
+
+
+def read_regular(path: Path, limit: int) -> bytes:
+    """Return the contents of a regular file that is no symbolic link.
+
+    Raises:
+        OSError: if the file is missing or cannot be read.
+        ValueError: if it is a device, a FIFO or a link, or larger than the limit in bytes.
+    """
+    # without O_NONBLOCK a FIFO would wait for its writer for ever
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    if path.is_symlink():
+        raise ValueError("it is a symbolic link")
+    with os.fdopen(os.open(path, flags), "rb") as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError("it is no regular file")
+        content = file.read(limit + 1)
+    if len(content) > limit:
+        raise ValueError(f"it is larger than {limit / 1e6:.0f} MB")
+    return content
+
+
+@final
+class Manifest:
+    """The record of the files that residnet wrote into a folder and the folders below it.
+
+    Args:
+        folder: that the names are relative to.
+        name: of the manifest file.
+
+    Attributes:
+        folder: as given.
+        path: the manifest file.
+        journal: lines that are not merged into it yet.
+    """
+
+    def __init__(self, folder: Path, name: str = RUN_MANIFEST) -> None:
+        self.folder = folder
+        self.path = folder / name
+        self.journal = folder / f"{name}l"
+
+    @property
+    def exists(self) -> bool:
+        """Whether residnet recorded any file here; a file of that name by others does not count."""
+        if self.journal.is_file():
+            return True
+        if not self.path.is_file():
+            return False
+        try:
+            self._read_merged()
+        except UsageError:
+            return False
+        return True
+
+    def read(self) -> Digests:
+        """Return the SHA-256 of each recorded file; empty if there is no manifest.
+
+        Raises:
+            UsageError: if the manifest is damaged, no regular file, or larger than 64 MB.
+        """
+        digests: Digests = {}
+        if os.path.lexists(self.path):
+            digests = {name: {digest} for name, digest in self._read_merged().items()}
+        if os.path.lexists(self.journal):
+            for line in self._read(self.journal).splitlines():
+                # a process that was killed leaves its last line incomplete
+                with suppress(ValueError):
+                    entry = json.loads(line)
+                    if isinstance(entry, dict) and set(entry) == {"name", "sha256"}:
+                        name = self._checked_name(entry["name"], self.journal)
+                        digests.setdefault(name, set()).add(entry["sha256"])
+        return digests
+
+    def begin(self) -> None:
+        """Let everything that is written below the folder from now on be recorded here.
+
+        Raises:
+            UsageError: if the manifest is damaged or somebody else's, or cannot be written.
+        """
+        self.read()
+        self._append("")
+
+    def record(self, path: Path, digest: str | None) -> None:
+        """Append to the journal that residnet writes a file; to be called before it is in place.
+
+        Args:
+            path: of the file, inside of the folder.
+            digest: SHA-256 of its contents; None while it grows.
+
+        Raises:
+            UsageError: if the journal cannot be written.
+        """
+        self._append(json.dumps({"name": self._name_of(path), "sha256": digest}) + "\n")
+
+    def record_existing(self) -> None:
+        """Record every regular file of the folder as it is, except those of a nested manifest."""
+        for path, manifest in self._files_below(self.folder):
+            if manifest is self and not path.is_symlink() and path.is_file():
+                self.record(path, sha256(path))
+
+    def is_owned(self, path: Path) -> bool:
+        """Return whether residnet wrote a file, and its contents are still the same."""
+        return self._is_owned(path, self.read())
+
+    def require_replaceable(self, path: Path) -> None:
+        """Check that a file may be written: it does not exist, or is owned.
+
+        Raises:
+            UsageError: if it is the user's, was edited, or lies behind a symbolic link.
+        """
+        require_inside(self.folder, path)
+        if not os.path.lexists(path):
+            return
+        digests = self.read()
+        if self._is_owned(path, digests):
+            return
+        raise self._not_owned(path, digests)
+
+    def require_all_owned(self, below: Path | None = None) -> None:
+        """Check that every file of the folder, or of one below it, is owned.
+
+        A folder below with a manifest of its own, such as an evaluation, is checked by that.
+
+        Raises:
+            UsageError: if one is the user's or was edited; it names the file.
+        """
+        known: dict[Path, Digests] = {}
+        for path, manifest in self._files_below(below or self.folder):
+            if manifest.folder not in known:
+                known[manifest.folder] = manifest.read()
+            digests = known[manifest.folder]
+            if not manifest._is_owned(path, digests):
+                raise manifest._not_owned(path, digests)
+
+    def remove_owned(self, below: Path | None = None) -> None:
+        """Delete every file of the folder, or of one below it; all of them must be owned.
+
+        Folders that become empty are deleted, except the folder of the manifest.
+
+        Raises:
+            UsageError: if a file is the user's or was edited; then nothing was deleted.
+        """
+        top = below or self.folder
+        if not top.is_dir():
+            return
+        require_inside(self.folder, top)
+        self.require_all_owned(top)
+        paths = [path for path, _ in self._files_below(top, with_manifests=True)]
+        own = {self.path, self.journal}
+        # the manifest is last, so that a kill leaves nothing that is not recorded
+        for path in [*(path for path in paths if path not in own), *(own & set(paths))]:
+            path.unlink(missing_ok=True)
+        parents = {parent for path in paths for parent in path.parents if parent != self.folder}
+        for parent in sorted(parents, key=lambda parent: -len(parent.parts)):
+            if parent.is_relative_to(self.folder):
+                with suppress(OSError):
+                    parent.rmdir()
+
+    def compact(self) -> None:
+        """Merge the journal into the manifest, which is replaced in one step.
+
+        Files that no longer exist are left out. An edited file keeps a SHA-256 that it no longer
+        has, unless a nested manifest lists it.
+
+        Raises:
+            UsageError: if the manifest is damaged or somebody else's, or cannot be written.
+        """
+        digests = self.read()
+        files: dict[str, str | None] = {}
+        for name, versions in sorted(digests.items()):
+            path = self.folder / name
+            if not os.path.lexists(path):
+                continue
+            if None in versions:
+                # a log grows after the end of the work, too
+                files[name] = None
+            elif self._is_owned(path, digests):
+                files[name] = sha256(path)
+            elif (nearest := run_manifest_above(path)) is None or nearest.path == self.path:
+                files[name] = max(digest for digest in versions if digest is not None)
+        partial = self.path.with_name(f"{self.path.name}.{os.getpid()}.partial")
+        content = {"schema": SCHEMA, "files": files}
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+            partial.replace(self.path)
+            self.journal.unlink(missing_ok=True)
+        except OSError as error:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise UsageError(f"{self.path}: cannot be written ({error.strerror})") from error
+
+    def verify(self, skipped: Collection[str] = ()) -> None:
+        """Check that each recorded file is there, is a regular file and has its SHA-256.
+
+        Args:
+            skipped: first parts of the names of files that are not looked at.
+
+        Raises:
+            UsageError: if a file is missing, a link or a device, cut off, edited or from elsewhere.
+        """
+        for name, versions in self.read().items():
+            if PurePosixPath(name).parts[0] in skipped or None in versions:
+                continue
+            path = resolve_name(self.folder, name, self.path)
+            require_inside(self.folder, path)
+            try:
+                if not stat.S_ISREG(path.lstat().st_mode):
+                    raise ValueError("it is no regular file")
+                digest = sha256(path)
+            except (OSError, ValueError) as error:
+                raise UsageError(
+                    f"{path}: cannot be read ({error}); restore the folder or run it again"
+                ) from error
+            if digest not in versions:
+                raise UsageError(
+                    f"{path}: its SHA-256 is not the one in {self.path.name}, so it is cut off,"
+                    " edited or from elsewhere; restore the folder or run it again"
+                )
+
+    def _append(self, line: str) -> None:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if self.journal.is_symlink():
+                raise UsageError(f"{self.journal}: is a symbolic link; remove it")
+            with self.journal.open("a", encoding="utf-8") as file:
+                file.write(line)
+        except OSError as error:
+            raise UsageError(
+                f"{self.journal}: cannot be written ({error.strerror}); make room or give a place"
+                " that can be written"
+            ) from error
+
+    def _name_of(self, path: Path) -> str:
+        return path.relative_to(self.folder).as_posix()
+
+    def _checked_name(self, name: object, source: Path) -> str:
+        resolve_name(self.folder, name, source)
+        return str(name)
+
+    def _is_owned(self, path: Path, digests: Digests) -> bool:
+        versions = digests.get(self._name_of(path))
+        try:
+            mode = path.lstat().st_mode
+            if versions is None or not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+                return False
+            # a lock may be a link; to delete it does not touch what it points to
+            return None in versions or (stat.S_ISREG(mode) and sha256(path) in versions)
+        except FileNotFoundError:
+            return False
+
+    def _not_owned(self, path: Path, digests: Digests) -> UsageError:
+        if path.is_symlink():
+            reason = "is a symbolic link, which residnet did not make"
+        elif self._name_of(path) in digests:
+            reason = "was edited after residnet wrote it"
+        else:
+            reason = f"exists, and {self.path.name} does not say that residnet wrote it"
+        return UsageError(f"{path}: {reason}; move it away, or give another place to write to")
+
+    def _read(self, path: Path) -> str:
+        try:
+            return read_regular(path, _SIZE_LIMIT).decode("utf-8")
+        except (OSError, ValueError) as error:
+            raise UsageError(
+                f"{path}: cannot be read ({error}); restore the file or run it again"
+            ) from error
+
+    def _read_merged(self) -> dict[str, str | None]:
+        """Return the entries of the manifest file without those of the journal."""
+        try:
+            content: Any = json.loads(self._read(self.path))
+        except (ValueError, RecursionError) as error:
+            raise UsageError(
+                f"{self.path}: not readable as JSON ({error}); restore the file or run it again"
+            ) from error
+        files = content.get("files") if isinstance(content, dict) else None
+        if (
+            not isinstance(files, dict)
+            or content.get("schema") != SCHEMA
+            or not all(digest is None or isinstance(digest, str) for digest in files.values())
+        ):
+            raise UsageError(f"{self.path}: holds no checksums; restore the folder")
+        return {self._checked_name(name, self.path): digest for name, digest in files.items()}
+
+    def _files_below(
+        self, folder: Path, *, with_manifests: bool = False
+    ) -> Iterator[tuple[Path, Manifest]]:
+        """Yield each file, link or device below a folder, and the manifest that it belongs to.
+
+        Symbolic links are not followed.
+        """
+        for entry in sorted(folder.iterdir()):
+            if entry.is_dir() and not entry.is_symlink():
+                nested = Manifest(entry)
+                yield from (nested if nested.exists else self)._files_below(
+                    entry, with_manifests=with_manifests
+                )
+            elif with_manifests or entry not in (self.path, self.journal):
+                yield entry, self
+
+
+def run_manifest_above(path: Path) -> Manifest | None:
+    """Return the manifest of the run folder that a path lies in; None outside of run folders.
+
+    In nested run folders it is the innermost; a folder that a symbolic link stands for counts only
+    if no other run folder lies above.
+    """
+    behind_link: Manifest | None = None
+    for folder in path.parents:
+        manifest = Manifest(folder)
+        if not manifest.exists:
+            continue
+        if not folder.is_symlink():
+            return manifest
+        behind_link = behind_link or manifest
+    return behind_link
+
+
+def manifest_for(path: Path) -> Manifest:
+    """Return the manifest that a file belongs to: of its run folder, else of its own folder."""
+    return run_manifest_above(path) or Manifest(path.parent, FILE_MANIFEST)
+
+
+def require_replaceable(path: Path) -> None:
+    """Check that a file may be written: it does not exist, or residnet wrote it and it is the same.
+
+    To be called before the work whose result the file will hold.
+
+    Raises:
+        UsageError: if it is the user's, was edited, or lies behind a symbolic link.
+    """
+    manifest_for(path).require_replaceable(path)
+
+
+@contextmanager
+def recorded_folder(folder: Path) -> Iterator[Manifest]:
+    """Record each file that is written below a folder within the context in its `checksums.json`.
+
+    Raises:
+        UsageError: if the manifest is damaged or somebody else's, or cannot be written.
+    """
+    manifest = Manifest(folder)
+    manifest.begin()
+    try:
+        yield manifest
+    finally:
+        manifest.compact()
