@@ -4,15 +4,19 @@ multiple, and refused at other steps.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import fmpy
 import numpy as np
 import pytest
 import torch
 from exported_models import built
+from fmpy.fmi1 import FMICallException
+from fmpy.simulation import instantiate_fmu
 from fmpy.validation import validate_fmu
 
 from residnet.dynamics.c_code import compiler
@@ -61,6 +65,119 @@ def test_a_unit_is_imported_and_stepped(name: str, tmp_path: Path) -> None:
         assert not table["outside"].any()
     with pytest.raises(fmpy.fmi1.FMICallException, match="DoStep failed"):
         flown(0.25)
+
+
+class Unit:
+    """An instance of a unit, called function by function, with the messages that it logs."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        self.version = 2 if name == "fmu2" else 3
+        file = folder / f"{name}.fmu"
+        if not file.is_file():
+            exporter(name).export(ExportedVessel(*built("plsr")), file)
+        description = fmpy.read_model_description(str(file))
+        self.references = {v.name: v.valueReference for v in description.modelVariables}
+        self.messages: list[str] = []
+        self.unit = instantiate_fmu(
+            fmpy.extract(str(file)),
+            description,
+            fmi_type="CoSimulation",
+            logger=self.log,
+        )
+
+    def log(self, *given: Any) -> None:
+        self.messages.append(given[-1].decode())
+
+    def initialize(self, start: float, stop: float | None = None) -> None:
+        if self.version == 2:
+            self.unit.setupExperiment(startTime=start, stopTime=stop)
+            self.unit.enterInitializationMode()
+        else:
+            self.unit.enterInitializationMode(startTime=start, stopTime=stop)
+
+    def set(self, name: str, value: float) -> None:
+        part = self.unit.setReal if self.version == 2 else self.unit.setFloat64
+        part([self.references[name]], [value])
+
+    def value(self, name: str) -> float:
+        part = self.unit.getReal if self.version == 2 else self.unit.getFloat64
+        return float(part([self.references[name]])[0])
+
+    def step(self, point: float, size: float) -> None:
+        self.unit.doStep(currentCommunicationPoint=point, communicationStepSize=size)
+
+
+@pytest.mark.parametrize("name", ["fmu", "fmu2"])
+def test_simulation_time_may_be_unix_time(name: str, tmp_path: Path) -> None:
+    """Steps that are differences of rounded times, as an importer computes them."""
+    ends = []
+    for start in (0.0, 1.764e9):
+        unit = Unit(name, tmp_path)
+        unit.initialize(start, start + 200.0)
+        unit.set("u_start", 1.0)
+        unit.set("n_port", 20.0)
+        unit.unit.exitInitializationMode()
+        time = start
+        for k in range(2000):
+            following = start + 0.1 * (k + 1)
+            unit.step(time, following - time)
+            time = following
+        ends.append([unit.value(state) for state in ("x", "y", "psi", "u", "v", "r")])
+        assert unit.messages == []
+        # beyond the stop time, at a size of a step and a half, and from another time
+        for point, size, why, refuses in (
+            (time, 0.1, "no step beyond the stop time", True),
+            (time, 0.15, "is not a multiple of the model's step of 0.1 s", True),
+            (start, 0.1, "the importer's time is used", False),
+        ):
+            with pytest.raises(FMICallException) if refuses else contextlib.nullcontext():
+                unit.step(point, size)
+            assert why in unit.messages.pop()
+    assert ends[0] == ends[1]
+    # a time that does not resolve the step makes no size a multiple of it
+    unit = Unit(name, tmp_path)
+    unit.initialize(1e15)
+    unit.unit.exitInitializationMode()
+    with pytest.raises(FMICallException):
+        unit.step(1e15, 0.125)
+
+
+@pytest.mark.parametrize("name", ["fmu", "fmu2"])
+def test_calls_in_the_wrong_phase_are_refused_with_a_message(name: str, tmp_path: Path) -> None:
+    unit = Unit(name, tmp_path)
+    before = "no step before the initialization mode was entered and left"
+    with pytest.raises(FMICallException):
+        unit.step(0.0, 0.1)
+    unit.set("u_start", 0.5)
+    unit.initialize(0.0)
+    with pytest.raises(FMICallException):
+        unit.step(0.0, 0.1)
+    assert unit.messages == [before, before]
+    unit.set("u_start", 1.0)
+    # an output follows its start value during initialization
+    assert unit.value("u") == 1.0
+    unit.unit.exitInitializationMode()
+    unit.step(0.0, 0.1)
+    u = unit.value("u")
+    assert 0.5 < u < 1.0
+    for variable, why in (("u_start", "start values can be set until"), ("u", "an output cannot")):
+        with pytest.raises(FMICallException):
+            unit.set(variable, 2.0)
+        assert unit.messages.pop().startswith(why)
+    assert (unit.value("u_start"), unit.value("u")) == (1.0, u)
+    with pytest.raises(FMICallException):
+        unit.initialize(0.0)
+    unit.unit.terminate()
+    with pytest.raises(FMICallException):
+        unit.step(0.1, 0.1)
+    # reset instances begin anew
+    unit.unit.reset()
+    assert unit.value("u_start") == 0.0
+    unit.initialize(5.0)
+    unit.set("u_start", 1.0)
+    unit.unit.exitInitializationMode()
+    unit.step(5.0, 0.1)
+    assert unit.value("u") == u
 
 
 def test_compilers_for_other_machines_are_used(

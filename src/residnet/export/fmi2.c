@@ -23,7 +23,8 @@ typedef struct {
 static void say(void *environment, int status, const char *message, void *callback) {
     Log log;
     memcpy(&log, &callback, sizeof log);
-    log(environment, "model", status, "logStatusError", message);
+    log(environment, "model", status,
+        status == STATUS_WARNING ? "logStatusWarning" : "logStatusError", message);
 }
 
 EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
@@ -47,7 +48,7 @@ EXPORT void *fmi2Instantiate(
         memcpy(&m->callback, &callbacks->logger, sizeof callbacks->logger);
         m->logger = say;
     }
-    begin(m);
+    restart(m);
     return m;
 }
 
@@ -56,27 +57,24 @@ EXPORT void fmi2FreeInstance(void *m) { free(m); }
 EXPORT Status fmi2SetupExperiment(
     void *instance, int tolerance_defined, double tolerance, double start, int stop_defined,
     double stop) {
-    (void)tolerance_defined; (void)tolerance; (void)stop_defined; (void)stop;
-    ((Instance *)instance)->time = start;
-    return 0;
+    (void)tolerance_defined; (void)tolerance;
+    return set_experiment((Instance *)instance, start, stop_defined, stop);
 }
 
-EXPORT Status fmi2EnterInitializationMode(void *m) { (void)m; return 0; }
+EXPORT Status fmi2EnterInitializationMode(void *m) {
+    return change_phase((Instance *)m, INSTANTIATED, INITIALIZING);
+}
 
 EXPORT Status fmi2ExitInitializationMode(void *instance) {
-    begin((Instance *)instance);
-    return 0;
+    return finish_initialization((Instance *)instance);
 }
 
-EXPORT Status fmi2Terminate(void *m) { (void)m; return 0; }
+EXPORT Status fmi2Terminate(void *m) {
+    return change_phase((Instance *)m, STEPPING, TERMINATED);
+}
 
 EXPORT Status fmi2Reset(void *instance) {
-    Instance *m = (Instance *)instance;
-    memset(m->w, 0, sizeof m->w);
-    memset(m->start, 0, sizeof m->start);
-    m->time = 0.0;
-    begin(m);
-    return 0;
+    return restart((Instance *)instance);
 }
 
 EXPORT Status fmi2GetReal(void *m, const Reference references[], size_t count, double values[]) {
@@ -99,10 +97,8 @@ EXPORT Status fmi2GetBoolean(
 }
 
 EXPORT Status fmi2DoStep(void *instance, double point, double size, int no_set) {
-    Instance *m = (Instance *)instance;
     (void)no_set;
-    m->time = point;
-    return advance(m, size);
+    return advance((Instance *)instance, point, size);
 }
 
 EXPORT Status fmi2GetFMUstate(void *instance, void **state) {

@@ -16,7 +16,8 @@ typedef void (*Log)(void *environment, Status status, const char *category, cons
 static void say(void *environment, int status, const char *message, void *callback) {
     Log log;
     memcpy(&log, &callback, sizeof log);
-    log(environment, status, "logStatusError", message);
+    log(environment, status,
+        status == STATUS_WARNING ? "logStatusWarning" : "logStatusError", message);
 }
 
 EXPORT const char *fmi3GetVersion(void) { return "3.0"; }
@@ -41,7 +42,7 @@ EXPORT void *fmi3InstantiateCoSimulation(
         memcpy(&m->callback, &log, sizeof log);
         m->logger = say;
     }
-    begin(m);
+    restart(m);
     return m;
 }
 
@@ -66,29 +67,26 @@ EXPORT void fmi3FreeInstance(void *m) { free(m); }
 EXPORT Status fmi3EnterInitializationMode(
     void *instance, bool tolerance_defined, double tolerance, double start, bool stop_defined,
     double stop) {
-    (void)tolerance_defined; (void)tolerance; (void)stop_defined; (void)stop;
-    ((Instance *)instance)->time = start;
-    return 0;
+    Instance *m = (Instance *)instance;
+    const Status status = set_experiment(m, start, stop_defined, stop);
+    (void)tolerance_defined; (void)tolerance;
+    return status ? status : change_phase(m, INSTANTIATED, INITIALIZING);
 }
 
 EXPORT Status fmi3ExitInitializationMode(void *instance) {
-    begin((Instance *)instance);
-    return 0;
+    return finish_initialization((Instance *)instance);
 }
 
 EXPORT Status fmi3EnterConfigurationMode(void *m) { (void)m; return 0; }
 EXPORT Status fmi3ExitConfigurationMode(void *m) { (void)m; return 0; }
 EXPORT Status fmi3EnterEventMode(void *m) { (void)m; return 3; }
 EXPORT Status fmi3EnterStepMode(void *m) { (void)m; return 3; }
-EXPORT Status fmi3Terminate(void *m) { (void)m; return 0; }
+EXPORT Status fmi3Terminate(void *m) {
+    return change_phase((Instance *)m, STEPPING, TERMINATED);
+}
 
 EXPORT Status fmi3Reset(void *instance) {
-    Instance *m = (Instance *)instance;
-    memset(m->w, 0, sizeof m->w);
-    memset(m->start, 0, sizeof m->start);
-    m->time = 0.0;
-    begin(m);
-    return 0;
+    return restart((Instance *)instance);
 }
 
 EXPORT Status fmi3GetFloat64(
@@ -123,8 +121,7 @@ EXPORT Status fmi3DoStep(
     Status status;
     (void)no_set;
     *event = *terminate = *early = false;
-    m->time = point;
-    status = advance(m, size);
+    status = advance(m, point, size);
     *last = m->time;
     return status;
 }
